@@ -1,0 +1,1 @@
+"""Plug-in methods that ChronoGS is compared with."""

@@ -1,0 +1,41 @@
+"""Checks on arguments that cross a package boundary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
+from typing import Any
+
+from chronoscene.errors import ChronoSceneError, ConfigError, ShapeError
+
+
+def check_shape(name: str, array: Any, shape: Sequence[int | None]) -> None:
+    """Raise unless ``array.shape`` matches ``shape``; ``None`` matches any length.
+
+    Raises:
+        ShapeError: If the number of axes or a given length differs.
+    """
+    actual = tuple(array.shape)
+    if len(actual) != len(shape) or any(
+        want is not None and want != have for want, have in zip(shape, actual, strict=True)
+    ):
+        wanted = "[" + ", ".join("*" if n is None else str(n) for n in shape) + "]"
+        raise ShapeError(
+            name, expected=f"shape {wanted}", found=str(list(actual)), todo="reshape the argument"
+        )
+
+
+def check_choice(
+    place: str,
+    value: str,
+    known: Iterable[str],
+    *,
+    error: type[ChronoSceneError] = ConfigError,
+) -> str:
+    """Return ``value`` if it is one of ``known``, else raise naming the known ones."""
+    names = sorted(known)
+    if value in names:
+        return value
+    close = get_close_matches(value, names, n=1)
+    hint = f"did you mean {close[0]!r}?" if close else "choose one of them"
+    raise error(place, expected=f"one of {', '.join(names)}", found=repr(value), todo=hint)

@@ -1,0 +1,52 @@
+"""Errors that a user can act on."""
+
+from __future__ import annotations
+
+
+class ChronoSceneError(Exception):
+    """A problem with what the user gave us, never with our own invariants.
+
+    The message has one form: ``place: expected X, found Y; what to do``. The command line prints it
+    on one line and exits with status 2.
+
+    Args:
+        place: File, file and line, option or argument where the problem sits.
+        expected: What would have been right there.
+        found: What is there instead.
+        todo: What the user can do about it.
+    """
+
+    def __init__(self, place: object, *, expected: str, found: str, todo: str) -> None:
+        self.place = str(place)
+        self.expected = expected
+        self.found = found
+        self.todo = todo
+        super().__init__(f"{place}: expected {expected}, found {found}; {todo}")
+
+
+class ConfigError(ChronoSceneError):
+    """An option, preset or configuration value that does not exist or does not fit."""
+
+
+class SceneError(ChronoSceneError):
+    """A scene folder that cannot be read or does not say what it must."""
+
+
+class ImageError(SceneError):
+    """An image that is missing, damaged or of a kind that we do not read."""
+
+
+class CheckpointError(ChronoSceneError):
+    """A checkpoint or run folder that is incomplete or of another kind."""
+
+
+class ShapeError(ChronoSceneError):
+    """An array argument with the wrong shape, type or values."""
+
+
+class BackendError(ChronoSceneError):
+    """A compute backend that is unknown or not usable on this machine."""
+
+
+class MetricUnavailableError(ChronoSceneError):
+    """A metric that cannot be computed on this machine (its weights are missing, say)."""

@@ -1,0 +1,242 @@
+"""What a method is: data that describes it, and the interface that the harness drives.
+
+A method is a plug-in. Its `MethodSpec` is pure data, found through the entry-point group
+``chronoscene.methods``; listing methods imports nothing heavy. Its class fulfils `Method`. The
+harness owns the loop, the clock, the seeds and the files; a method sees a `TrainingSet` in the
+normalised training frame and never a dataset folder.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
+from chronoscene.geometry import Sim3
+
+PeriodInput = Literal["none", "label", "continuous"]
+ENTRY_POINT_GROUP = "chronoscene.methods"
+
+
+@dataclass(frozen=True, slots=True)
+class MethodSpec:
+    """What the harness knows of a method without importing it."""
+
+    name: str
+    """Name on the command line."""
+    title: str
+    """Name in tables."""
+    paper: str
+    licence: str
+    """Licence of this implementation, and of the official code where it differs."""
+    period_input: PeriodInput
+    """``none``: the period is hidden from it; ``label``: integer; ``continuous``: fractional too."""
+    outputs: tuple[str, ...]
+    """Subset of ``rgb, alpha, depth``."""
+    devices: tuple[str, ...]
+    """Subset of ``cpu, cuda``."""
+    method: str
+    """``module:Class`` that fulfils `Method`."""
+    config: str
+    """``module:Class``, a frozen dataclass with a field ``iterations``."""
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Preset name to the values that differ from the defaults of the config class."""
+    resumable: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A pinhole camera to render: intrinsics in pixels, pose in the training frame."""
+
+    K: NDArray[np.float64]
+    """[3, 3]"""
+    width: int
+    height: int
+    cam_from_world: NDArray[np.float64]
+    """[4, 4]; the world here is the training frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingView(View):
+    """A view with an image to learn from."""
+
+    name: str
+    period: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingSet:
+    """Everything that a method may learn from, in the normalised training frame.
+
+    The training frame is the world, recentred and scaled in float64 before anything is cast to
+    float32: learning rates and voxel sizes are tied to its scale. `training_from_world` leads back.
+    """
+
+    views: tuple[TrainingView, ...]
+    num_periods: int
+    """1 where the harness hides the period."""
+    points: NDArray[np.float32]
+    """Sparse points. [P, 3]"""
+    colors: NDArray[np.uint8]
+    """[P, 3]"""
+    point_periods: NDArray[np.bool_]
+    """Whether a training view of the period sees the point. [P, T]"""
+    training_from_world: Sim3
+    camera_extent: float
+    """1.1 times the largest distance of a training camera from their mean, in training units."""
+    background: NDArray[np.float32]
+    """Colour behind everything, 0..1. [3]"""
+    load_image: Callable[[int], NDArray[np.uint8]]
+    """Image of ``views[i]``, decoded lazily and cached. [H, W, 3]"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """A rendered view."""
+
+    rgb: NDArray[np.float32]
+    """0..1. [H, W, 3]"""
+    alpha: NDArray[np.float32] | None = None
+    """[H, W]"""
+    depth: NDArray[np.float32] | None = None
+    """Expected z-depth in units of the training frame; 0 where alpha is 0. [H, W]"""
+
+
+@dataclass(frozen=True, slots=True)
+class StepReport:
+    """What one training step tells the harness."""
+
+    loss: float
+    primitives: int
+    """Gaussians or anchors held now."""
+
+
+@dataclass(frozen=True, slots=True)
+class MethodSize:
+    """How big a trained model is."""
+
+    primitives: int
+    parameters: int
+    """Numbers stored in the checkpoint."""
+
+
+class Method(Protocol):
+    """The interface of a method. ``method(config)`` makes an empty one; then `setup` or `load`."""
+
+    def __init__(self, config: Any) -> None: ...
+
+    def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
+        """Build the initial model. Nothing else draws from the global random state."""
+        ...
+
+    def step(self, index: int, progress: float) -> StepReport:
+        """Do one training step.
+
+        Args:
+            index: Number of steps done before, from 0.
+            progress: Share of the training that is over, 0..1. Every schedule (learning rates,
+                densification) follows it, so that a run that ends by the clock goes through the
+                same phases as one that ends by a number of iterations.
+        """
+        ...
+
+    def render(self, view: View, period: float) -> Prediction:
+        """Render a view as of a period; fractional only where the spec says ``continuous``."""
+        ...
+
+    def save(self, folder: Path) -> None:
+        """Write ``model.safetensors`` and ``model.json`` into an existing empty folder."""
+        ...
+
+    def load(self, folder: Path, *, device: str) -> None:
+        """Read what `save` wrote; afterwards `render` gives the same pixels."""
+        ...
+
+    def size(self) -> MethodSize: ...
+
+
+def import_object(reference: str) -> Any:
+    """Import ``module:Name``."""
+    module, _, name = reference.partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            reference,
+            expected="an importable module:Name",
+            found=f"{type(error).__name__}: {error}",
+            todo="check the spelling, and that its package is installed",
+        ) from error
+
+
+def method_names() -> tuple[str, ...]:
+    """Names of all installed methods, sorted; imports none of them."""
+    return tuple(sorted({entry.name for entry in entry_points(group=ENTRY_POINT_GROUP)}))
+
+
+def load_spec(name: str) -> MethodSpec:
+    """Find a method by its name, or by ``module:SPEC`` while it is being developed.
+
+    Raises:
+        ConfigError: If there is no such method; names those that there are.
+    """
+    if ":" in name:
+        spec = import_object(name)
+    else:
+        check_choice("--method", name, method_names())
+        (entry, *_) = entry_points(group=ENTRY_POINT_GROUP, name=name)
+        spec = entry.load()
+    if not isinstance(spec, MethodSpec):
+        raise ConfigError(
+            name, expected="a MethodSpec", found=type(spec).__name__, todo="name its SPEC object"
+        )
+    return spec
+
+
+def build_config(
+    spec: MethodSpec, *, preset: str, overrides: Mapping[str, Any] | None = None
+) -> Any:
+    """Make the frozen config of a method from a preset and values given by the user.
+
+    String values are parsed to the type of the field's default, so ``--set`` can pass them as typed.
+
+    Raises:
+        ConfigError: If the preset or a key is unknown, or a value does not parse.
+    """
+    config_class = import_object(spec.config)
+    check_choice(f"{spec.name} --preset", preset, spec.presets)
+    values = dict(spec.presets[preset])
+    fields = {f.name: f for f in dataclasses.fields(config_class)}
+    for key, value in (overrides or {}).items():
+        check_choice(f"{spec.name} --set", key, fields)
+        default = getattr(config_class(), key)
+        values[key] = _parse_like(f"{spec.name} --set {key}", value, default)
+    return config_class(**values)
+
+
+def _parse_like(place: str, value: Any, default: Any) -> Any:
+    if not isinstance(value, str) or isinstance(default, str):
+        return value
+    try:
+        parsed = json.loads(value.lower() if value.lower() in ("true", "false") else value)
+        if isinstance(default, tuple) and isinstance(parsed, list):
+            return tuple(parsed)
+        if isinstance(default, float) and isinstance(parsed, int) and not isinstance(parsed, bool):
+            return float(parsed)
+        if default is None or type(parsed) is type(default):
+            return parsed
+    except json.JSONDecodeError:
+        pass
+    raise ConfigError(
+        place, expected=f"a value like {default!r}", found=repr(value), todo="correct the value"
+    )

@@ -1,0 +1,169 @@
+"""The scene in memory: frames, cameras, sparse points, periods. No torch, no file access."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Split = Literal["train", "test"]
+
+PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
+"""Camera models without distortion: the ones that methods train on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Intrinsics as COLMAP stores them. Units are pixels of an image of ``width`` x ``height``."""
+
+    camera_id: int
+    model: str
+    """COLMAP model name, ``PINHOLE`` for example."""
+    width: int
+    height: int
+    params: tuple[float, ...]
+    """In COLMAP's order: ``f, cx, cy, ...`` or ``fx, fy, cx, cy, ...``."""
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """Calibration matrix with unequal fx, fy and the principal point kept. [3, 3]"""
+        single_focal = self.model.startswith("SIMPLE_") or self.model.startswith("RADIAL")
+        fx, fy, cx, cy = (self.params[0], *self.params[:3]) if single_focal else self.params[:4]
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def distortion(self) -> tuple[float, ...]:
+        """The parameters after focal lengths and principal point."""
+        single_focal = self.model.startswith("SIMPLE_") or self.model.startswith("RADIAL")
+        return self.params[3:] if single_focal else self.params[4:]
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether a pinhole projection describes the camera exactly."""
+        return self.model in PINHOLE_MODELS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One registered image with its camera, pose, period and split."""
+
+    name: str
+    """Path below ``images/`` with its folders and extension: the key everywhere."""
+    image_id: int
+    camera: Camera
+    cam_from_world: NDArray[np.float64]
+    """[4, 4]"""
+    period: int
+    split: Split
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """Sparse points with their tracks, as flat arrays (P points, M observations)."""
+
+    ids: NDArray[np.int64]
+    """COLMAP's point ids. [P]"""
+    xyz: NDArray[np.float64]
+    """World units. [P, 3]"""
+    rgb: NDArray[np.uint8]
+    """[P, 3]"""
+    error: NDArray[np.float64]
+    """Mean reprojection error in pixels as stored in the model. [P]"""
+    track_start: NDArray[np.int64]
+    """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
+    track_frame: NDArray[np.int32]
+    """Index into ``Scene.frames``. [M]"""
+    track_xy: NDArray[np.float64]
+    """Pixel position of the observation. [M, 2]"""
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @classmethod
+    def empty(cls) -> Points:
+        return cls(
+            ids=np.zeros(0, np.int64),
+            xyz=np.zeros((0, 3)),
+            rgb=np.zeros((0, 3), np.uint8),
+            error=np.zeros(0),
+            track_start=np.zeros(1, np.int64),
+            track_frame=np.zeros(0, np.int32),
+            track_xy=np.zeros((0, 2)),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Period:
+    """One date of capture."""
+
+    id: int
+    label: str
+    """What people call it; the id as text where nothing better is known."""
+    date: str | None = None
+    """ISO 8601 date, if known."""
+
+
+@dataclass(frozen=True, slots=True)
+class WorldFrame:
+    """What the world coordinates mean."""
+
+    unit: str = "unknown"
+    """``metre``, or ``unknown``: COLMAP models have no unit of their own."""
+    crs: str | None = None
+    """Coordinate reference system of ``world + offset``, if known (``EPSG:32650``)."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Added to world coordinates to get coordinates in ``crs``."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """One place, photographed at T periods, all cameras in one world frame."""
+
+    name: str
+    root: Path
+    images_root: Path
+    frames: tuple[Frame, ...]
+    """Sorted by name."""
+    points: Points
+    periods: tuple[Period, ...]
+    """Ids are 0..T-1 in this order."""
+    split_rule: str
+    """How the split came about, in words: ``sparse/0/test.txt`` or the default rule."""
+    format: str
+    world: WorldFrame = field(default_factory=WorldFrame)
+
+    @property
+    def num_periods(self) -> int:
+        return len(self.periods)
+
+    def select(self, *, split: Split | None = None, period: int | None = None) -> tuple[Frame, ...]:
+        """Frames of a split, of a period, or of both, in name order."""
+        return tuple(
+            f
+            for f in self.frames
+            if (split is None or f.split == split) and (period is None or f.period == period)
+        )
+
+    def image_path(self, frame: Frame) -> Path:
+        return self.images_root / frame.name
+
+    def point_periods(self) -> NDArray[np.bool_]:
+        """Whether an image of the period sees the point. [P, T]"""
+        seen = np.zeros((len(self.points), self.num_periods), dtype=bool)
+        frame_period = np.array([f.period for f in self.frames], dtype=np.int64)
+        lengths = np.diff(self.points.track_start)
+        rows = np.repeat(np.arange(len(self.points)), lengths)
+        seen[rows, frame_period[self.points.track_frame]] = True
+        return seen
+
+    def with_frames(self, frames: Sequence[Frame]) -> Scene:
+        """The same scene with other attributes on the same frames (same names, same order).
+
+        Tracks refer to frames by position, so frames cannot be added, dropped or moved here.
+        """
+        assert [f.name for f in frames] == [f.name for f in self.frames]
+        return replace(self, frames=tuple(frames))
