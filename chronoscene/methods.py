@@ -40,7 +40,7 @@ class MethodSpec:
     licence: str
     """Licence of this implementation, and of the official code where it differs."""
     period_input: PeriodInput
-    """``none``: the period is hidden from it; ``label``: integer; ``continuous``: fractional too."""
+    """``none``: the period is hidden from it; ``label``: integers; ``continuous``: fractions too."""
     outputs: tuple[str, ...]
     """Subset of ``rgb, alpha, depth``."""
     devices: tuple[str, ...]
@@ -208,7 +208,7 @@ def build_config(
 ) -> Any:
     """Make the frozen config of a method from a preset and values given by the user.
 
-    String values are parsed to the type of the field's default, so ``--set`` can pass them as typed.
+    Strings are parsed to the type of the field's default, so ``--set`` can pass them as typed.
 
     Raises:
         ConfigError: If the preset or a key is unknown, or a value does not parse.
