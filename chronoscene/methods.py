@@ -40,7 +40,7 @@ class MethodSpec:
     licence: str
     """Licence of this implementation, and of the official code where it differs."""
     period_input: PeriodInput
-    """``none``: the period is hidden from it; ``label``: integers; ``continuous``: fractions too."""
+    """``none``: hidden from it; ``label``: integer; ``continuous``: fractional too."""
     outputs: tuple[str, ...]
     """Subset of ``rgb, alpha, depth``."""
     devices: tuple[str, ...]

@@ -1,1 +1,54 @@
-"""TODO."""
+"""The ``chronoscene`` command: one file per noun, imported only when it is called."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+from chronoscene import __version__
+from chronoscene.errors import ChronoSceneError
+
+COMMANDS = {
+    "bench": "chronoscene.cli.bench:command",
+    "methods": "chronoscene.cli.methods:command",
+    "score": "chronoscene.cli.score:command",
+    "stats": "chronoscene.cli.stats:command",
+    "synth": "chronoscene.cli.synth:command",
+    "table": "chronoscene.cli.table:command",
+    "validate": "chronoscene.cli.validate:command",
+}
+"""Command name to ``module:attribute``."""
+
+USAGE_ERROR = 2
+"""Exit status for wrong usage and for input that cannot be read at all."""
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command's module only when the command is needed."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, attribute = COMMANDS[cmd_name].partition(":")
+        command: click.Command = getattr(importlib.import_module(module), attribute)
+        return command
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="chronoscene")
+def cli() -> None:
+    """Datasets and benchmarks for multi-period scene reconstruction."""
+
+
+def main() -> None:
+    """Run the command line; turns our errors into one line and exit status 2."""
+    try:
+        cli.main(prog_name="chronoscene")
+    except ChronoSceneError as error:
+        click.secho(f"error: {error}", fg="red", err=True)
+        sys.exit(USAGE_ERROR)
