@@ -21,7 +21,7 @@ def set_threads(count: int | None = None) -> int:
     import numba
     import torch
 
-    count = min(count or available_threads(), numba.config.NUMBA_NUM_THREADS)
+    count = min(count or available_threads(), numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
     torch.set_num_threads(count)
     numba.set_num_threads(count)
     return count
