@@ -1,0 +1,50 @@
+"""The command starts quickly, lists its commands, and turns our errors into one line."""
+
+import subprocess
+import sys
+
+import click
+import pytest
+from click.testing import CliRunner
+
+import chronoscene.cli as cli_package
+from chronoscene.cli import COMMANDS, cli, main
+from chronoscene.errors import SceneError
+
+
+def test_help_lists_every_command():
+    result = CliRunner().invoke(cli, ["--help"])
+    assert result.exit_code == 0
+    for name in COMMANDS:
+        assert name in result.output
+
+
+def test_unknown_command_is_a_usage_error():
+    result = CliRunner().invoke(cli, ["frobnicate"])
+    assert result.exit_code == 2
+    assert "No such command" in result.output
+
+
+def test_our_errors_become_one_line_and_status_2(monkeypatch, capsys):
+    @click.command("boom")
+    def boom() -> None:
+        raise SceneError("scene", expected="a model", found="nothing", todo="add one")
+
+    monkeypatch.setattr(cli_package.cli, "get_command", lambda ctx, name: boom)
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "boom"])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err == "error: scene: expected a model, found nothing; add one\n"
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; from chronoscene.cli import cli\n"
+        "try: cli.main(['--version'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'torch', 'numba', 'open3d', 'cv2', 'pandas', 'pycolmap'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,83 @@
+"""Method specs are found by name, and configs are built from presets and typed overrides."""
+
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import pytest
+
+from chronoscene.errors import ConfigError
+from chronoscene.methods import MethodSpec, build_config, load_spec, method_names
+
+
+@dataclass(frozen=True)
+class Config:
+    iterations: int = 100
+    rate: float = 0.5
+    name: str = "a"
+    flag: bool = False
+    sizes: tuple[int, ...] = (1, 2)
+    limit: int | None = None
+
+
+SPEC = MethodSpec(
+    name="toy",
+    title="Toy",
+    paper="none",
+    licence="Apache-2.0",
+    period_input="none",
+    outputs=("rgb",),
+    devices=("cpu",),
+    method=f"{__name__}:Config",
+    config=f"{__name__}:Config",
+    presets={"balanced": {}, "fast": {"iterations": 10}},
+)
+
+
+@pytest.fixture(autouse=True)
+def _importable(monkeypatch):
+    monkeypatch.setitem(sys.modules, __name__, sys.modules[__name__])
+
+
+def test_overrides_are_parsed_like_the_default():
+    config = build_config(
+        SPEC,
+        preset="fast",
+        overrides={"rate": "1", "flag": "True", "sizes": "[3]", "limit": "7", "name": "12"},
+    )
+    assert config == Config(10, 1.0, "12", True, (3,), 7)
+    assert isinstance(config.rate, float)
+
+
+@pytest.mark.parametrize("value", ["fast", "1.5", "true", "[1]"])
+def test_values_of_another_type_are_refused(value):
+    with pytest.raises(ConfigError, match="toy --set iterations: expected a value like 100"):
+        build_config(SPEC, preset="fast", overrides={"iterations": value})
+
+
+def test_unknown_preset_and_key_name_the_known_ones():
+    with pytest.raises(ConfigError, match="balanced, fast"):
+        build_config(SPEC, preset="best")
+    with pytest.raises(ConfigError, match="did you mean 'iterations'"):
+        build_config(SPEC, preset="fast", overrides={"iteration": "3"})
+
+
+def test_unknown_method_names_the_known_ones():
+    with pytest.raises(ConfigError, match="chronogs"):
+        load_spec("chronosg")
+    with pytest.raises(ConfigError, match="importable"):
+        load_spec("no.such.module:SPEC")
+    with pytest.raises(ConfigError, match="expected a MethodSpec"):
+        load_spec("json:dumps")
+
+
+def test_listing_methods_imports_nothing_heavy():
+    code = (
+        "import sys; from chronoscene.methods import load_spec, method_names\n"
+        "for name in method_names(): load_spec(name)\n"
+        "heavy = {'torch', 'numba', 'open3d', 'cv2', 'matplotlib', 'pycolmap'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    assert len(method_names()) >= 3
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
