@@ -1,0 +1,152 @@
+"""Models on disk: ``model.safetensors`` for numbers, ``model.json`` for everything else. No pickle.
+
+The JSON file is written last and holds the digest of the tensor file, so a folder whose
+``model.json`` is present and agrees is complete. Equal models give equal bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from chronoscene.errors import CheckpointError
+from chronoscene.geometry import Sim3
+
+TENSOR_FILE = "model.safetensors"
+META_FILE = "model.json"
+FORMAT_VERSION = 1
+
+
+def build_meta(
+    method: str,
+    version: str,
+    config: Any,
+    *,
+    training_from_world: Sim3,
+    num_periods: int,
+    **extra: Any,
+) -> dict[str, Any]:
+    """What every model says about itself.
+
+    Args:
+        method: Name of the method on the command line.
+        version: Version of the implementation.
+        config: The method's frozen config dataclass.
+        training_from_world: Leads from the world to the frame that the model lives in.
+        num_periods: Number of periods that the model knows.
+        extra: Further entries that JSON can hold.
+    """
+    return {
+        "method": method,
+        "version": version,
+        "config": dataclasses.asdict(config),
+        "training_from_world": training_from_world.to_matrix().tolist(),
+        "num_periods": num_periods,
+        **extra,
+    }
+
+
+def save_tensors(folder: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
+    """Write ``model.safetensors`` and ``model.json`` into an existing folder.
+
+    Args:
+        folder: Where to write.
+        tensors: Stored contiguous, in the order of their names, from any device.
+        meta: What `build_meta` returns, or any mapping that JSON can hold without NaN.
+    """
+    # Copies, since views that share memory cannot be told apart in the file.
+    stored = {k: tensors[k].detach().cpu().contiguous().clone() for k in sorted(tensors)}
+    partial = folder / f"{TENSOR_FILE}.partial"
+    save_file(stored, partial)
+    digest = _sha256(partial)
+    os.replace(partial, folder / TENSOR_FILE)
+    document = {**meta, "format_version": FORMAT_VERSION, "tensors_sha256": digest}
+    text = json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n"
+    partial = folder / f"{META_FILE}.partial"
+    partial.write_text(text, encoding="utf-8")
+    os.replace(partial, folder / META_FILE)
+
+
+def load_tensors(
+    folder: Path, *, device: str = "cpu", method: str | None = None
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what `save_tensors` wrote.
+
+    Args:
+        folder: Folder of the model.
+        device: Where the tensors go.
+        method: Name of the method that the model must be of, if given.
+
+    Returns:
+        tensors: By name.
+        meta: The content of ``model.json``.
+
+    Raises:
+        CheckpointError: If a file is missing or damaged, or the model is of another method.
+    """
+    meta = _read_meta(folder / META_FILE)
+    if method is not None and meta.get("method") != method:
+        raise CheckpointError(
+            folder / META_FILE,
+            expected=f"a model of {method}",
+            found=f"one of {meta.get('method')}",
+            todo="name another folder or another method",
+        )
+    path = folder / TENSOR_FILE
+    if not path.is_file():
+        raise CheckpointError(
+            path, expected="the tensors of the model", found="no such file", todo="train again"
+        )
+    if _sha256(path) != meta["tensors_sha256"]:
+        raise _damaged(path, f"the digest given in {META_FILE}", "another one")
+    try:
+        return load_file(path, device=device), meta
+    except SafetensorError as error:
+        raise _damaged(path, "a safetensors file", str(error)) from error
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            path,
+            expected="the description of a trained model",
+            found="no such file",
+            todo="name the folder that a finished training wrote",
+        ) from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise _damaged(path, "JSON", str(error)) from error
+    if not isinstance(meta, dict) or "tensors_sha256" not in meta:
+        raise _damaged(path, "an object with the key 'tensors_sha256'", "none")
+    if meta.get("format_version") != FORMAT_VERSION:
+        raise CheckpointError(
+            path,
+            expected=f"format_version {FORMAT_VERSION}",
+            found=repr(meta.get("format_version")),
+            todo="use the version of the software that wrote it, or train again",
+        )
+    return meta
+
+
+def _damaged(path: Path, expected: str, found: str) -> CheckpointError:
+    return CheckpointError(
+        path,
+        expected=expected,
+        found=found,
+        todo="the file is damaged or was edited: copy it again or train again",
+    )
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
