@@ -1,0 +1,131 @@
+"""Decode anchors into Gaussians: the small MLPs of ChronoGS and Scaffold-GS.
+
+`decode_reference` is the definition, in plain torch.
+
+Source: ChronoGS (arXiv 2511.18794), section 3, and Scaffold-GS, whose anchors it extends.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from chronoscene.checks import check_shape
+
+MIN_QUAT_NORM = 1e-12
+"""Shorter quaternions carry no direction: they become the identity and get no gradient."""
+
+
+class HeadWeights(NamedTuple):
+    """One MLP with a ReLU hidden layer. I inputs, H hidden units, O outputs.
+
+    Input order: base feature, period feature, unit direction, global feature.
+    """
+
+    w1: Tensor
+    """[H, I]"""
+    b1: Tensor
+    """[H]"""
+    w2: Tensor
+    """[O, H]"""
+    b2: Tensor
+    """[O]"""
+
+
+class Decoded(NamedTuple):
+    """Gaussians of the M visible anchors, k to each, anchor by anchor."""
+
+    means: Tensor
+    """Centres in world units. [M * k, 3]"""
+    quats: Tensor
+    """Unit quaternions wxyz. [M * k, 4]"""
+    scales: Tensor
+    """In world units. [M * k, 3]"""
+    opacities: Tensor
+    """-1..1; a Gaussian with an opacity <= 0 is switched off. [M * k]"""
+    colors: Tensor
+    """RGB, 0..1. [M * k, 3]"""
+
+
+def decode_reference(
+    anchors: Tensor,
+    offsets: Tensor,
+    features: Tensor,
+    log_scales: Tensor,
+    global_features: Tensor,
+    period_weights: Tensor,
+    opacity_head: HeadWeights,
+    covariance_head: HeadWeights,
+    color_head: HeadWeights,
+    camera_centre: Tensor,
+    visible: Tensor,
+    *,
+    base_dim: int,
+    period_dim: int,
+) -> Decoded:
+    """Decode the visible anchors in plain torch; the definition that `decode` is compared with.
+
+    With e the period weights, f = (base, sum_s e_s period_s), d the unit vector from the camera to
+    the anchor and g = sum_s e_s global_s, every head sees the input (f, d, g) and
+
+        opacity = tanh(o), color = sigmoid(c), scale = exp(log_scales[3:6]) sigmoid(s),
+        quat = q / |q|, mean = anchor + offset exp(log_scales[0:3]).
+
+    Convention:
+        The covariance head gives 3 scales and 4 quaternion numbers per offset, the colour head rgb
+        per offset. The direction of an anchor in the camera centre is zero.
+
+    Args:
+        anchors: Positions in world units; get no gradient. [A, 3]
+        offsets: In units of the anchor's scale. [A, k, 3]
+        features: Base feature, then one block per period. [A, Fb + T * Fv]
+        log_scales: Logarithms in world units; 0:3 for offsets, 3:6 for Gaussians. [A, 6]
+        global_features: One row per period. [T, G]
+        period_weights: One-hot, or a mixture of periods. [T]
+        opacity_head: k outputs.
+        covariance_head: 7 k outputs.
+        color_head: 3 k outputs.
+        camera_centre: In world units; gets no gradient. [3]
+        visible: Sorted indices of the anchors to decode. int64 [M]
+        base_dim: Fb.
+        period_dim: Fv.
+    """
+    num_offsets, num_periods = opacity_head.w2.shape[0], period_weights.shape[0]
+    check_shape("features", features, (anchors.shape[0], base_dim + num_periods * period_dim))
+    rows = features[visible]
+    periods = rows[:, base_dim:].reshape(-1, num_periods, period_dim)
+    centres = anchors[visible].detach()
+    directions = centres - camera_centre.detach()
+    lengths = directions.norm(dim=-1, keepdim=True)
+    inputs = torch.cat(
+        (
+            rows[:, :base_dim],
+            torch.einsum("t,mtv->mv", period_weights, periods),
+            directions / lengths.clamp_min(torch.finfo(lengths.dtype).tiny),
+            (period_weights @ global_features).expand(len(visible), -1),
+        ),
+        dim=-1,
+    )
+    factors = torch.exp(log_scales[visible])[:, None, :]
+    covariances = _mlp(inputs, covariance_head).reshape(-1, num_offsets, 7)
+    return Decoded(
+        means=(centres[:, None] + offsets[visible] * factors[..., :3]).reshape(-1, 3),
+        quats=_unit_quats(covariances[..., 3:].reshape(-1, 4)),
+        scales=(factors[..., 3:] * torch.sigmoid(covariances[..., :3])).reshape(-1, 3),
+        opacities=torch.tanh(_mlp(inputs, opacity_head)).reshape(-1),
+        colors=torch.sigmoid(_mlp(inputs, color_head)).reshape(-1, 3),
+    )
+
+
+def _mlp(inputs: Tensor, head: HeadWeights) -> Tensor:
+    return torch.relu(inputs @ head.w1.T + head.b1) @ head.w2.T + head.b2
+
+
+def _unit_quats(quats: Tensor) -> Tensor:
+    squares = quats.square().sum(-1, keepdim=True)
+    valid = squares > MIN_QUAT_NORM**2
+    identity = torch.zeros_like(quats)
+    identity[:, 0] = 1
+    return torch.where(valid, quats * torch.where(valid, squares, 1).rsqrt(), identity)
