@@ -95,7 +95,7 @@ def decode_reference(
     num_offsets, num_periods = opacity_head.w2.shape[0], period_weights.shape[0]
     check_shape("features", features, (anchors.shape[0], base_dim + num_periods * period_dim))
     rows = features[visible]
-    periods = rows[:, base_dim:].reshape(-1, num_periods, period_dim)
+    periods = rows[:, base_dim:].reshape(len(visible), num_periods, period_dim)
     centres = anchors[visible].detach()
     directions = centres - camera_centre.detach()
     lengths = directions.norm(dim=-1, keepdim=True)
