@@ -1,1 +1,77 @@
-"""TODO."""
+"""Dataset formats. Each is one module with ``NAME``, ``MARKS``, ``matches``, ``read`` and,
+where we can, ``write``; `FORMATS` lists the modules."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import SceneError
+from chronoscene.scene import Scene
+
+FORMATS = {"chronoscene": "chronoscene.formats.chronoscene"}
+"""Format name to the module that reads it."""
+
+
+def format_names() -> tuple[str, ...]:
+    """Names of all formats, sorted."""
+    return tuple(sorted(FORMATS))
+
+
+def load_format(name: str) -> Any:
+    """Module of a format.
+
+    Raises:
+        ConfigError: If there is no such format; names those that there are.
+    """
+    check_choice("--format", name, FORMATS)
+    return import_module(FORMATS[name])
+
+
+def detect_format(path: Path) -> str:
+    """Name of the one format whose marks a folder has.
+
+    Raises:
+        SceneError: If no format matches; says what was looked for.
+    """
+    if not path.is_dir():
+        found = "a file" if path.exists() else "nothing"
+        raise SceneError(path, expected="a scene folder", found=found, todo="check the path")
+    modules = {name: load_format(name) for name in format_names()}
+    matching = [name for name, module in modules.items() if module.matches(path)]
+    if len(matching) == 1:
+        return matching[0]
+    if matching:
+        raise SceneError(
+            path,
+            expected="a folder of one format",
+            found=f"marks of {' and '.join(matching)}",
+            todo="name the format",
+        )
+    looked_for = "; ".join(f"{name}: {module.MARKS}" for name, module in modules.items())
+    content = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
+    raise SceneError(
+        path,
+        expected=f"a scene of a known format ({looked_for})",
+        found=", ".join(content[:8]) + (", ..." if len(content) > 8 else "") or "an empty folder",
+        todo="give the folder of one scene; DATASET.md describes its files",
+    )
+
+
+def read_scene(path: str | Path, *, format: str | None = None) -> Scene:
+    """Read a scene folder. Writes nothing into it.
+
+    Args:
+        path: Folder of one scene.
+        format: Name of its format; None to find out.
+
+    Raises:
+        SceneError: If the folder is of no known format, or damaged.
+        ConfigError: If there is no such format.
+    """
+    path = Path(path)
+    name = format if format is not None else detect_format(path)
+    scene: Scene = load_format(name).read(path)
+    return scene

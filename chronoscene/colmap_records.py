@@ -1,0 +1,176 @@
+"""Bulk reading of the records in COLMAP's binary files. Plain numpy.
+
+Two reasons for a reader beside pycolmap: pycolmap gives points and observations one Python object
+at a time (seconds for a scene of half a million points), and it does not notice that a file ends
+early. Every length is checked here against the size of the file before it is used.
+
+Records are little endian; a count comes first (u64). Camera: i32 id, i32 model, u64 width, u64
+height, f64 parameters. Image: i32 id, f64 quaternion wxyz, f64 translation, i32 camera, name ended
+by a zero byte, u64 n, then n times (f64 x, f64 y, i64 point id or -1). Point: u64 id, f64 xyz, u8
+rgb, f64 error, u64 n, then n times (i32 image id, i32 keypoint index).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.errors import SceneError
+
+CAMERA_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
+"""Number of parameters by COLMAP's model id, SIMPLE_PINHOLE (0) to EQUIRECTANGULAR (17)."""
+
+_COUNT = struct.Struct("<Q")
+_CAMERA_HEAD = struct.Struct("<iiQQ")
+_IMAGE_HEAD = struct.Struct("<i7di")
+_KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
+_POINT_HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
+_POINT_BYTES = _POINT_HEAD.itemsize + _COUNT.size
+_TRACK_BYTES = 8
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointRecords:
+    """The points of a model, sorted by id (P points, M observations)."""
+
+    heads: NDArray[np.void]
+    """Fields ``id``, ``xyz``, ``rgb`` and ``error``. [P]"""
+    track_start: NDArray[np.int64]
+    """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
+    tracks: NDArray[np.int32]
+    """Image id and keypoint index of each observation. [M, 2]"""
+
+
+def read_points(path: Path) -> PointRecords:
+    """Read ``points3D.bin``.
+
+    Raises:
+        SceneError: If the file cannot be read or ends inside a record.
+    """
+    return _guarded(path, _walk_points)
+
+
+def read_keypoints(path: Path) -> dict[int, NDArray[np.float64]]:
+    """Read the pixel positions in ``images.bin``: image id to keypoints [n, 2].
+
+    Raises:
+        SceneError: If the file cannot be read or ends inside a record.
+    """
+    return _guarded(path, _walk_images)
+
+
+def check_cameras(path: Path) -> None:
+    """Raise unless ``cameras.bin`` consists of whole records of known camera models."""
+    _guarded(path, _walk_cameras)
+
+
+class _DamagedError(Exception):
+    """What is wrong inside a file, in words."""
+
+
+def _guarded(path: Path, walk: Callable[[bytes], T]) -> T:
+    try:
+        return walk(path.read_bytes())
+    except OSError as error:
+        found = error.strerror or "unreadable"
+    except (struct.error, ValueError, IndexError):
+        found = "a file that ends inside a record"
+    except _DamagedError as error:
+        found = str(error)
+    raise SceneError(
+        path,
+        expected="complete COLMAP records",
+        found=found,
+        todo="copy the file again or write the model again with COLMAP",
+    )
+
+
+def _count(data: bytes, smallest_record: int) -> int:
+    """The leading count, refused if so many records cannot fit into the file."""
+    (count,) = _COUNT.unpack_from(data, 0)
+    if count * smallest_record > len(data) - _COUNT.size:
+        raise _DamagedError(f"{count} records announced in {len(data)} bytes")
+    return int(count)
+
+
+def _finish(data: bytes, at: int) -> None:
+    if at != len(data):
+        raise _DamagedError(f"{len(data) - at} bytes after the last record")
+
+
+def _walk_cameras(data: bytes) -> None:
+    at = _COUNT.size
+    for _ in range(_count(data, _CAMERA_HEAD.size)):
+        camera_id, model, _width, _height = _CAMERA_HEAD.unpack_from(data, at)
+        if not 0 <= model < len(CAMERA_PARAMETERS):
+            raise _DamagedError(f"camera {camera_id} with the unknown model id {model}")
+        at += _CAMERA_HEAD.size + 8 * CAMERA_PARAMETERS[model]
+    _finish(data, at)
+
+
+def _walk_images(data: bytes) -> dict[int, NDArray[np.float64]]:
+    keypoints = {}
+    at = _COUNT.size
+    for _ in range(_count(data, _IMAGE_HEAD.size + 1 + _COUNT.size)):
+        image_id = _IMAGE_HEAD.unpack_from(data, at)[0]
+        at = data.index(0, at + _IMAGE_HEAD.size) + 1
+        (length,) = _COUNT.unpack_from(data, at)
+        at += _COUNT.size
+        if length * _KEYPOINT.itemsize > len(data) - at:
+            raise _DamagedError(f"image {image_id} with {length} keypoints, more than the file has")
+        if image_id in keypoints:
+            raise _DamagedError(f"image id {image_id} twice")
+        records = np.frombuffer(data, _KEYPOINT, count=length, offset=at)
+        keypoints[image_id] = np.ascontiguousarray(records["xy"])
+        at += length * _KEYPOINT.itemsize
+    _finish(data, at)
+    return keypoints
+
+
+def _walk_points(data: bytes) -> PointRecords:
+    count = _count(data, _POINT_BYTES)
+    offsets = np.empty(count, np.int64)
+    lengths = np.empty(count, np.int64)
+    unpack = _COUNT.unpack_from
+    at, end = _COUNT.size, len(data)
+    for i in range(count):
+        (length,) = unpack(data, at + _POINT_HEAD.itemsize)
+        if length > end:
+            raise _DamagedError(f"record {i} with {length} observations, more than the file has")
+        offsets[i] = at
+        lengths[i] = length
+        at += _POINT_BYTES + _TRACK_BYTES * length
+    _finish(data, at)
+    return _gather_points(np.frombuffer(data, np.uint8), offsets, lengths)
+
+
+def _gather_points(
+    data: NDArray[np.uint8], offsets: NDArray[np.int64], lengths: NDArray[np.int64]
+) -> PointRecords:
+    """Copy the records at ``offsets`` out of the file, in the order of the point ids."""
+    heads = data[offsets[:, None] + np.arange(_POINT_HEAD.itemsize)]
+    heads = np.ascontiguousarray(heads).view(_POINT_HEAD)[:, 0]
+    order = np.argsort(heads["id"], kind="stable")
+    ids = heads["id"][order]
+    if (ids[1:] == ids[:-1]).any():
+        raise _DamagedError(f"point id {ids[:-1][ids[1:] == ids[:-1]][0]} twice")
+    if len(ids) and ids[-1] > np.iinfo(np.int64).max:
+        raise _DamagedError(f"point id {ids[-1]}, more than 63 bits")
+    start = np.concatenate([[0], np.cumsum(lengths[order])])
+    # Observation j of point i begins track_start[j] pairs after the first one of the point.
+    first = (offsets + _POINT_BYTES)[order]
+    at = np.repeat(first - _TRACK_BYTES * start[:-1], lengths[order])
+    at += _TRACK_BYTES * np.arange(start[-1])
+    tracks = np.empty((len(at), 2), np.int32)
+    for column in (0, 1):
+        raw = data[(at + 4 * column)[:, None] + np.arange(4)]
+        tracks[:, column] = np.ascontiguousarray(raw).view("<i4")[:, 0]
+    return PointRecords(heads[order], start, tracks)

@@ -1,0 +1,332 @@
+"""Period table (``split.txt``), test list (``test.txt``) and the default split.
+
+The parsers return what they could read and a list of problems, so that a reader can stop at the
+first one and a validator can report them all.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from chronoscene.errors import SceneError
+from chronoscene.scene import Scene, Split
+
+TEST_EVERY = 8
+"""The default split takes the images 0, 8, 16, ... of each period for testing."""
+
+DEFAULT_RULE = "every 8th image of each period in name order (index 0, 8, ...)"
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+"""Extensions that are cut off a name when it is compared without its extension."""
+
+ProblemKind = Literal[
+    "encoding",  # not text
+    "fields",  # a line without two fields
+    "period",  # a period id that is not a number 0, 1, ...
+    "ambiguous",  # a name that fits several images
+    "contradiction",  # an image with two different periods
+    "duplicate",  # an image listed twice, with the same period
+    "unknown",  # a name that fits no registered image
+    "missing",  # a registered image without a period
+    "ids",  # period ids that are not 0..T-1
+    "empty",  # a period without any registered image
+]
+
+FATAL: frozenset[ProblemKind] = frozenset(
+    {"encoding", "fields", "period", "ambiguous", "contradiction", "missing", "ids", "empty"}
+)
+"""Kinds that make a scene unreadable; the others are worth a remark."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One finding about a file."""
+
+    kind: ProblemKind
+    line: int | None
+    """Line number from 1; None where the whole file is meant."""
+    expected: str
+    found: str
+    todo: str
+
+    def error(self, path: Path) -> SceneError:
+        """The same finding as an exception that names the file."""
+        place = str(path) if self.line is None else f"{path}:{self.line}"
+        return SceneError(place, expected=self.expected, found=self.found, todo=self.todo)
+
+
+@dataclass(frozen=True, slots=True)
+class SplitEntry:
+    """One line of ``split.txt``: an image by some form of its name, and its period."""
+
+    line: int
+    name: str
+    period: int
+
+
+@dataclass(frozen=True, slots=True)
+class NameEntry:
+    """One line of ``test.txt``."""
+
+    line: int
+    name: str
+
+
+def read_text(path: Path) -> str:
+    """Read a small text file written by any common editor (UTF-8 with or without BOM, UTF-16).
+
+    Raises:
+        SceneError: If it is missing or not text.
+    """
+    try:
+        return decode_text(path.read_bytes())
+    except UnicodeDecodeError:
+        found = "bytes that are not UTF-8"
+    except OSError as error:
+        found = error.strerror or "a file that cannot be read"
+    raise SceneError(path, expected="a text file", found=found, todo="save it as UTF-8")
+
+
+def decode_text(data: bytes) -> str:
+    """Decode UTF-8 or, where a byte order mark says so, UTF-16 (as some Windows shells write)."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return data.decode("utf-16")
+    return data.decode("utf-8-sig")
+
+
+def parse_split_text(text: str) -> tuple[list[SplitEntry], list[Problem]]:
+    """Parse ``<image name> <period id>`` lines.
+
+    The last field is the period and all before it the name, so names may contain blanks. Fields
+    are separated by blanks or tabs, also repeated ones; empty lines are skipped.
+    """
+    entries, problems = [], []
+    for number, line in _lines(text):
+        fields = line.rsplit(maxsplit=1)
+        if len(fields) < 2:
+            problems.append(
+                _problem("fields", number, '"<image name> <period id>"', f"one field: {line!r}")
+            )
+        elif not re.fullmatch("[0-9]{1,9}", fields[1]):
+            problems.append(
+                _problem("period", number, "a period id 0, 1, ... as the last field", f"{line!r}")
+            )
+        else:
+            entries.append(SplitEntry(number, fields[0].strip(), int(fields[1])))
+    return entries, problems
+
+
+def format_split_text(periods: Mapping[str, int]) -> str:
+    """Inverse of `parse_split_text` for names without leading or trailing blanks."""
+    return "".join(f"{name} {period}\n" for name, period in periods.items())
+
+
+def parse_test_text(text: str) -> list[NameEntry]:
+    """Parse ``test.txt``: one name a line, empty lines skipped. Every line is a name."""
+    return [NameEntry(number, line) for number, line in _lines(text)]
+
+
+def _lines(text: str) -> Iterable[tuple[int, str]]:
+    """Non-empty lines without surrounding blanks, numbered from 1."""
+    for number, line in enumerate(re.split("\r\n|\r|\n", text), start=1):
+        if stripped := line.strip():
+            yield number, stripped
+
+
+def _problem(kind: ProblemKind, line: int | None, expected: str, found: str) -> Problem:
+    return Problem(kind, line, expected, found, "see DATASET.md")
+
+
+class NameIndex:
+    """Finds images by full name, file name, or file name without extension.
+
+    The forms are tried in this order, and the first that fits any image decides:
+
+    1. the full name below ``images/``;
+    2. the file name, without folders;
+    3. either of these without extension;
+    4. the file name up to its first dot, which is how the official loader identifies images.
+
+    An entry with folders is matched with its folders, unless no image has any.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.names = tuple(names)
+        flat = not any("/" in name for name in self.names)
+        self._flat = flat
+        self._levels: tuple[dict[str, list[str]], ...] = ({}, {}, {}, {})
+        for name in self.names:
+            for level, keys in zip(self._levels, _image_keys(name), strict=True):
+                for key in keys:
+                    level.setdefault(key, []).append(name)
+
+    def find(self, entry: str) -> list[str]:
+        """Images that an entry may mean: one if all is well, none or several if not."""
+        entry = entry.removeprefix("./")
+        if self._flat:
+            entry = PurePosixPath(entry).name
+        for level, key in zip(self._levels, _entry_keys(entry), strict=True):
+            if key is not None and key in level:
+                return level[key]
+        return []
+
+
+def _image_keys(name: str) -> tuple[set[str], ...]:
+    """Keys of an image on each level."""
+    path = PurePosixPath(name)
+    first_dot = path.name.split(".")[0]
+    return (
+        {name},
+        {path.name},
+        {str(path.with_suffix("")), path.stem},
+        {str(path.parent / first_dot), first_dot},
+    )
+
+
+def _entry_keys(entry: str) -> tuple[str | None, ...]:
+    """Key of an entry on each level; None where the level cannot apply.
+
+    Only a known extension is cut, so ``a.1`` never turns into ``a``; and on the last level a dot
+    that is left says that the entry means another image.
+    """
+    suffix = PurePosixPath(entry).suffix
+    bare = entry[: -len(suffix)] if suffix.lower() in IMAGE_SUFFIXES else entry
+    return entry, entry, bare, None if "." in PurePosixPath(bare).name else bare
+
+
+def assign_periods(
+    names: Sequence[str], entries: Sequence[SplitEntry]
+) -> tuple[dict[str, int], list[Problem]]:
+    """Give each registered image its period.
+
+    Args:
+        names: Full names of all registered images.
+        entries: The parsed ``split.txt``.
+
+    Returns:
+        Period by full name, for the images that have exactly one; and every problem.
+    """
+    index = NameIndex(names)
+    periods: dict[str, int] = {}
+    lines: dict[str, int] = {}
+    problems: list[Problem] = []
+    for entry in entries:
+        problem = _place(entry, index.find(entry.name), periods, lines)
+        if problem is not None:
+            problems.append(problem)
+    problems += [
+        _problem("missing", None, f"a period for every registered image, {name!r} too", "none")
+        for name in names
+        if name not in periods
+    ]
+    return periods, problems + check_period_ids(entries, periods.values())
+
+
+def _place(
+    entry: SplitEntry, found: list[str], periods: dict[str, int], lines: dict[str, int]
+) -> Problem | None:
+    """Put one entry into ``periods``, or say why not."""
+    if not found:
+        return _problem("unknown", entry.line, "the name of a registered image", repr(entry.name))
+    if len(found) > 1:
+        return Problem(
+            "ambiguous",
+            entry.line,
+            "a name that fits one image",
+            f"{entry.name!r}, which fits {', '.join(map(repr, found[:3]))}",
+            "write the full names below images/",
+        )
+    (name,) = found
+    if name not in periods:
+        periods[name], lines[name] = entry.period, entry.line
+        return None
+    if periods[name] != entry.period:
+        return Problem(
+            "contradiction",
+            entry.line,
+            f"period {periods[name]} for {name!r} as in line {lines[name]}",
+            f"period {entry.period}",
+            "keep one of the two lines",
+        )
+    return _problem("duplicate", entry.line, "each image once", f"{name!r} as in {lines[name]}")
+
+
+def check_period_ids(entries: Iterable[SplitEntry], used: Iterable[int]) -> list[Problem]:
+    """Check that the ids are 0..T-1 and that every period has a registered image."""
+    ids, used = sorted({entry.period for entry in entries}), set(used)
+    if not ids:
+        return [_problem("ids", None, "at least one line", "none")]
+    if ids != list(range(len(ids))):
+        shown = ", ".join(map(str, ids[:10])) + (", ..." if len(ids) > 10 else "")
+        return [
+            Problem(
+                "ids",
+                None,
+                f"period ids 0..{len(ids) - 1} for {len(ids)} periods",
+                shown,
+                "number the periods from 0 without gaps",
+            )
+        ]
+    return [
+        Problem(
+            "empty",
+            None,
+            f"a registered image of period {i}",
+            "none",
+            "register images of this period, or renumber the others",
+        )
+        for i in ids
+        if i not in used
+    ]
+
+
+def assign_tests(
+    names: Sequence[str], entries: Sequence[NameEntry]
+) -> tuple[set[str], list[Problem]]:
+    """Full names of the test images that ``test.txt`` lists, and every problem."""
+    index = NameIndex(names)
+    tests: set[str] = set()
+    problems = []
+    for entry in entries:
+        found = index.find(entry.name)
+        if len(found) == 1:
+            tests.add(found[0])
+        elif found:
+            problems.append(
+                Problem(
+                    "ambiguous",
+                    entry.line,
+                    "a name that fits one image",
+                    f"{entry.name!r}, which fits {', '.join(map(repr, found[:3]))}",
+                    "write the full names below images/",
+                )
+            )
+        else:
+            problems.append(
+                _problem("unknown", entry.line, "the name of a registered image", repr(entry.name))
+            )
+    return tests, problems
+
+
+def default_tests(periods: Mapping[str, int]) -> set[str]:
+    """The default split: every 8th image of each period in name order, from the first on."""
+    by_period: dict[int, list[str]] = {}
+    for name in sorted(periods):
+        by_period.setdefault(periods[name], []).append(name)
+    return {name for names in by_period.values() for name in names[::TEST_EVERY]}
+
+
+def split_hash(scene: Scene) -> str:
+    """Fingerprint of the split: SHA-256 over the sorted lines ``name TAB period TAB split``."""
+    lines = sorted(f"{f.name}\t{f.period}\t{f.split}\n" for f in scene.frames)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def split_of(name: str, tests: set[str]) -> Split:
+    """``test`` for the names in ``tests``, else ``train``."""
+    return "test" if name in tests else "train"
