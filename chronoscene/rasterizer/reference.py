@@ -1,0 +1,238 @@
+"""The definition of the image: plain vectorised torch, any float type, differentiable by autograd.
+
+Written to be read and checked, in the order of the equations of README.md; it shares no code with
+the fast backends. Pixels are composited in square tiles only to bound memory: a Gaussian is left
+out of a tile where its alpha is below the threshold on every pixel, which changes nothing.
+
+Source: Kerbl et al. 2023 (3D Gaussian splatting), Zwicker et al. 2001 (EWA splatting); constants
+and clamping follow the classic mode of gsplat.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from chronoscene.rasterizer.constants import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    CLAMP_MARGIN,
+    TRANSMITTANCE_MIN,
+)
+from chronoscene.rasterizer.types import RasterInfo, Rasterization
+
+TILE = 16
+
+
+@dataclass(slots=True, eq=False)
+class _Projected:
+    """Gaussians on the screen of one camera. M is N, or the number of visible ones."""
+
+    means2d: Tensor  # [M, 2]
+    covariances: Tensor  # [M, 2, 2]
+    depths: Tensor  # [M]
+
+
+@dataclass(slots=True, eq=False)
+class _Splats:
+    """Visible Gaussians of one camera from front to back. V of N."""
+
+    means2d: Tensor  # [V, 2]
+    covariances: Tensor  # [V, 2, 2]
+    opacities: Tensor  # [V]
+    values: Tensor  # [V, D], the depth appended if asked for
+    extents: Tensor  # [V, 2]
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float,
+    far_plane: float,
+    eps2d: float,
+    backgrounds: Tensor | None,
+    render_depth: bool,
+) -> Rasterization:
+    """Render Gaussians; see `chronoscene.rasterizer.rasterize` for the arguments."""
+    info = _new_info(means, viewmats.shape[0], (means, quats, scales, opacities, colors))
+    images, alphas, depths = [], [], []
+    for c, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
+        camera = (viewmat, K, width, height, eps2d)
+        with torch.no_grad():
+            everything = _project(means, quats, scales, *camera)
+            extents = _extents(everything.covariances, opacities)
+            visible = _visible(everything, extents, width, height, near_plane, far_plane)
+            _fill_info(info, c, everything, extents, visible)
+            # A stable sort: Gaussians at equal depth are drawn in the order of the input.
+            order = torch.argsort(torch.where(visible, everything.depths, torch.inf), stable=True)
+            index = order[: int(visible.sum())]
+        projected = _project(means[index], quats[index], scales[index], *camera)
+        values = colors[index]
+        if render_depth:
+            values = torch.cat([values, projected.depths[:, None]], dim=1)
+        # The leaf has the values, the projection the gradient; both receive it in backward().
+        means2d = info.means2d[c, index] + (projected.means2d - projected.means2d.detach())
+        splats = _Splats(means2d, projected.covariances, opacities[index], values, extents[index])
+        image, transmittance = _composite(splats, width, height)
+        alphas.append(1 - transmittance)
+        if render_depth:
+            image, weighted = image[..., :-1], image[..., -1:]
+            depths.append(_expected_depth(weighted, alphas[-1]))
+        if backgrounds is not None:
+            image = image + transmittance * backgrounds[c]
+        images.append(image)
+    return Rasterization(
+        image=torch.stack(images),
+        alphas=torch.stack(alphas),
+        depths=torch.stack(depths) if render_depth else None,
+        info=info,
+    )
+
+
+def _new_info(means: Tensor, cameras: int, inputs: tuple[Tensor, ...]) -> RasterInfo:
+    """Zeros of the right shapes; ``means2d`` is a leaf that collects a gradient if any does."""
+    shape = (cameras, means.shape[0])
+    wants_grad = torch.is_grad_enabled() and any(x.requires_grad for x in inputs)
+    return RasterInfo(
+        means2d=means.new_zeros(*shape, 2).requires_grad_(wants_grad),
+        radii=torch.zeros(*shape, 2, dtype=torch.int32, device=means.device),
+        depths=means.new_zeros(shape),
+    )
+
+
+def _fill_info(
+    info: RasterInfo, c: int, projected: _Projected, extents: Tensor, visible: Tensor
+) -> None:
+    info.means2d.data[c, visible] = projected.means2d[visible]
+    info.radii[c, visible] = torch.ceil(extents[visible]).clamp(max=2**31 - 128).int()
+    info.depths[c, visible] = projected.depths[visible]
+
+
+def _rotation(quats: Tensor) -> Tensor:
+    """Rotation matrices of quaternions wxyz of any length. [M, 4] -> [M, 3, 3]"""
+    w, x, y, z = (quats / torch.linalg.vector_norm(quats, dim=-1, keepdim=True)).unbind(-1)
+    return torch.stack(
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        dim=-2,
+    )
+
+
+def _clamped(ratio: Tensor, size: int, focal: Tensor, centre: Tensor) -> Tensor:
+    """x / z or y / z, held within the image and a margin around it. [M]"""
+    margin = CLAMP_MARGIN * 0.5 * size / focal
+    return torch.clamp(ratio, -centre / focal - margin, (size - centre) / focal + margin)
+
+
+def _project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    eps2d: float,
+) -> _Projected:
+    """Centres in pixels and covariances J R Sigma R^T J^T + eps2d I."""
+    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    x, y, z = (means @ rotation.T + translation).unbind(-1)
+    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
+    tx = z * _clamped(x / z, width, fx, cx)
+    ty = z * _clamped(y / z, height, fy, cy)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [
+            torch.stack([fx / z, zero, -fx * tx / z**2], dim=-1),
+            torch.stack([zero, fy / z, -fy * ty / z**2], dim=-1),
+        ],
+        dim=-2,
+    )
+    axes = jacobian @ rotation @ _rotation(quats) * scales[:, None, :]  # [M, 2, 3]
+    blur = eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
+    return _Projected(means2d, axes @ axes.mT + blur, z)
+
+
+def _extents(covariances: Tensor, opacities: Tensor) -> Tensor:
+    """Half width and height of the ellipse where alpha reaches the threshold; may be nan. [M, 2]"""
+    level = 2 * torch.log(opacities / ALPHA_MIN)
+    variances = torch.diagonal(covariances, dim1=-2, dim2=-1)
+    return torch.sqrt(level[:, None] * variances)
+
+
+def _visible(
+    projected: _Projected,
+    extents: Tensor,
+    width: int,
+    height: int,
+    near_plane: float,
+    far_plane: float,
+) -> Tensor:
+    """Between the planes, finite, and with an ellipse that meets the image. [M]"""
+    (u, v), (du, dv), z = projected.means2d.unbind(-1), extents.unbind(-1), projected.depths
+    determinants = torch.linalg.det(projected.covariances)
+    meets = (u + du > 0) & (u - du < width) & (v + dv > 0) & (v - dv < height)
+    finite = torch.isfinite(extents).all(-1) & torch.isfinite(determinants) & (determinants > 0)
+    # Comparisons with nan are false, so a Gaussian that cannot be projected is not visible.
+    return meets & finite & (extents > 0).all(-1) & (z >= near_plane) & (z <= far_plane)
+
+
+def _composite(splats: _Splats, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Values over nothing [H, W, D] and what light is left [H, W, 1]."""
+    rows = []
+    for top in range(0, height, TILE):
+        tiles = [
+            _composite_tile(splats, left, top, min(TILE, width - left), min(TILE, height - top))
+            for left in range(0, width, TILE)
+        ]
+        rows.append(torch.cat(tiles, dim=1))
+    values = torch.cat(rows, dim=0)
+    return values[..., :-1], values[..., -1:]
+
+
+def _composite_tile(splats: _Splats, left: int, top: int, width: int, height: int) -> Tensor:
+    """Values and transmittance of a rectangle of pixels. [height, width, D + 1]"""
+    with torch.no_grad():
+        low, high = splats.means2d - splats.extents, splats.means2d + splats.extents
+        near = (low < low.new_tensor([left + width, top + height])) & (
+            high > low.new_tensor([left, top])
+        )
+        index = torch.nonzero(near.all(-1))[:, 0]
+    means2d = splats.means2d[index]
+    xs = torch.arange(left, left + width, dtype=means2d.dtype, device=means2d.device) + 0.5
+    ys = torch.arange(top, top + height, dtype=means2d.dtype, device=means2d.device) + 0.5
+    pixels = torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1).reshape(-1, 1, 2)
+    offsets = pixels - means2d  # [P, V, 2]
+    conics = torch.linalg.inv(splats.covariances[index])
+    distances = torch.einsum("pvi,vij,pvj->pv", offsets, conics, offsets)
+    alphas = splats.opacities[index] * torch.exp(-0.5 * distances)
+    alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp(max=ALPHA_MAX), 0)
+    with torch.no_grad():
+        alive = torch.cumprod(1 - alphas, dim=1) > TRANSMITTANCE_MIN
+    alphas = torch.where(alive, alphas, 0)
+    after = torch.cumprod(1 - alphas, dim=1)
+    ones = after.new_ones(len(after), 1)
+    transmittance = torch.cat([ones, after], dim=1)
+    weights = alphas * transmittance[:, :-1]
+    values = weights @ splats.values[index]
+    return torch.cat([values, transmittance[:, -1:]], dim=1).reshape(height, width, -1)
+
+
+def _expected_depth(weighted: Tensor, alphas: Tensor) -> Tensor:
+    """Weighted depth over accumulated opacity, 0 where nothing was hit. [H, W, 1]"""
+    hit = alphas > 0
+    return torch.where(hit, weighted / torch.where(hit, alphas, 1), 0)

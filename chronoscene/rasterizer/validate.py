@@ -1,0 +1,61 @@
+"""Checks of what goes into the rasterizer: shapes always, finite numbers unless switched off."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from chronoscene.checks import check_shape
+from chronoscene.errors import ShapeError
+
+
+def check_inputs(
+    arrays: dict[str, Tensor], backgrounds: Tensor | None, width: int, height: int
+) -> None:
+    """Raise a ShapeError that names the first argument with a wrong shape.
+
+    Args:
+        arrays: The tensor arguments of `chronoscene.rasterizer.rasterize` by name.
+        backgrounds: Its argument of that name.
+        width: Image width in pixels.
+        height: Image height in pixels.
+    """
+    for name, size in (("width", width), ("height", height)):
+        if size < 1:
+            raise ShapeError(name, expected="at least 1", found=str(size), todo="give a size")
+    for name, array in arrays.items():
+        if not array.is_floating_point():
+            raise ShapeError(
+                name, expected="floating point", found=str(array.dtype), todo="call .float()"
+            )
+    count, cameras = len(arrays["means"]), len(arrays["viewmats"])
+    check_shape("means", arrays["means"], (count, 3))
+    check_shape("quats", arrays["quats"], (count, 4))
+    check_shape("scales", arrays["scales"], (count, 3))
+    check_shape("opacities", arrays["opacities"], (count,))
+    check_shape("colors", arrays["colors"], (count, None))
+    check_shape("viewmats", arrays["viewmats"], (cameras, 4, 4))
+    check_shape("Ks", arrays["Ks"], (cameras, 3, 3))
+    if backgrounds is not None:
+        check_shape("backgrounds", backgrounds, (cameras, arrays["colors"].shape[1]))
+
+
+def check_finite_inputs(arrays: dict[str, Tensor]) -> None:
+    """Raise a ShapeError that names the first nan or infinite element.
+
+    A sum is finite only if every element is, and costs a fraction of an elementwise test; that
+    test is run only if the sum is not finite, since large finite elements may overflow it.
+    """
+    for name, array in arrays.items():
+        data = array.detach()
+        if bool(torch.isfinite(data.sum())):
+            continue
+        bad = torch.nonzero(~torch.isfinite(data))
+        if len(bad):
+            index = bad[0].tolist()
+            raise ShapeError(
+                f"{name}{index}",
+                expected="a finite number",
+                found=str(data[tuple(index)].item()),
+                todo="find where it comes from, or pass check_finite=False to cull such Gaussians",
+            )
