@@ -1,0 +1,281 @@
+"""Images at the evaluation resolution: one way to decode, one rule to resize, one cache.
+
+The rule, for every method alike: an image wider than ``max_width`` is scaled to that width, its
+height truncated to whole pixels, with Pillow's bicubic filter, which smooths before it shrinks.
+What counts is the size that the camera of the model has; a file of another size is resized from
+the file to the target in one step. Intrinsics are scaled by the exact ratio of the sizes per axis.
+
+Orientation tags are not applied: COLMAP works on the pixels as stored, and so do the poses.
+"""
+
+from __future__ import annotations
+
+import struct
+import threading
+import zlib
+from collections import OrderedDict
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from chronoscene.errors import ImageError, SceneError
+from chronoscene.scene import Camera, Frame, Scene
+
+MAX_WIDTH = 1600
+"""Pixels; the limit that the field's loaders use."""
+
+_TWO_FOCALS = {
+    "SIMPLE_PINHOLE": ("PINHOLE", 0),
+    "SIMPLE_RADIAL": ("OPENCV", 3),
+    "RADIAL": ("OPENCV", 2),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 3),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 2),
+    "SIMPLE_DIVISION": ("DIVISION", 0),
+    "SIMPLE_FISHEYE": ("FISHEYE", 0),
+}
+"""Models with one focal length: the same model with two, and the zeros that it needs at the end."""
+
+_ORIENTATION_TAG = 0x0112
+_UNDO_ORIENTATION = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
+"""Orientation tag to the operation that takes Pillow's rotation of a TIFF back."""
+
+_DECODE_ERRORS = (
+    OSError,  # also what Pillow raises for unknown and truncated files
+    ValueError,
+    SyntaxError,  # broken PNG chunks
+    TypeError,
+    KeyError,
+    IndexError,
+    EOFError,
+    MemoryError,
+    OverflowError,
+    struct.error,
+    zlib.error,
+    Image.DecompressionBombError,
+)
+
+
+def evaluation_size(width: int, height: int, max_width: int = MAX_WIDTH) -> tuple[int, int]:
+    """Width and height in pixels after the resize rule."""
+    if width <= max_width:
+        return width, height
+    return max_width, max(1, height * max_width // width)
+
+
+def resize_camera(camera: Camera, width: int, height: int) -> Camera:
+    """The camera of the same image, resized; each axis is scaled by its exact ratio.
+
+    Where truncation makes the two ratios differ, a model with one focal length turns into the same
+    model with two.
+
+    Raises:
+        SceneError: If the model has no focal length in pixels.
+    """
+    sx, sy = width / camera.width, height / camera.height
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    model, params = camera.model, camera.params
+    if model == "EQUIRECTANGULAR":
+        raise SceneError(
+            f"camera {camera.camera_id}",
+            expected="a camera with a focal length",
+            found=model,
+            todo="render perspective views of the panorama first",
+        )
+    single = model in _TWO_FOCALS
+    if single and sx == sy:
+        scales: tuple[float, ...] = (sx, sx, sy)
+    else:
+        if single:
+            model, zeros = _TWO_FOCALS[model]
+            params = (params[0], *params, *(0.0,) * zeros)
+        scales = (sx, sy, sx, sy)
+    scaled = tuple(p * s for p, s in zip(params, scales, strict=False))
+    return replace(
+        camera, model=model, width=width, height=height, params=scaled + params[len(scales) :]
+    )
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of the stored pixels; reads only the header.
+
+    Raises:
+        ImageError: If the file is missing or not an image.
+    """
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            turned = image.format == "TIFF" and _orientation(image) >= 5
+            return (height, width) if turned else (width, height)
+    except _DECODE_ERRORS as error:
+        raise _image_error(path, error) from error
+
+
+def load_rgb(
+    path: Path,
+    *,
+    size: tuple[int, int] | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> NDArray[np.uint8]:
+    """Decode any image to RGB. [H, W, 3]
+
+    Args:
+        path: The file.
+        size: Width and height to resize to; None to keep the file's.
+        background: Colour 0..1 behind transparent pixels.
+
+    Raises:
+        ImageError: If the file is missing, damaged, or of a kind that has no plain colours.
+    """
+    try:
+        with Image.open(path) as image:
+            rgb = _to_rgb(_decode(image), background)
+            if size is not None and rgb.size != size:
+                rgb = rgb.resize(size, Image.Resampling.BICUBIC)
+            return np.array(rgb)
+    except _DECODE_ERRORS as error:
+        raise _image_error(path, error) from error
+
+
+def _orientation(image: Image.Image) -> int:
+    value = image.getexif().get(_ORIENTATION_TAG, 1)
+    return value if value in _UNDO_ORIENTATION else 1
+
+
+def _decode(image: Image.Image) -> Image.Image:
+    """The pixels as stored. Pillow turns TIFF files while it decodes them; that is undone."""
+    orientation = _orientation(image) if image.format == "TIFF" else 1
+    image.load()
+    if orientation == 1:
+        return image
+    return image.transpose(_UNDO_ORIENTATION[orientation])
+
+
+def _to_rgb(image: Image.Image, background: tuple[float, float, float]) -> Image.Image:
+    if image.mode.startswith("I"):
+        image = _from_16_bit(image)
+    if image.mode == "F":
+        raise ValueError("pixels that are floating point numbers")
+    if "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La"):
+        behind = tuple(round(255 * c) for c in background)
+        canvas = Image.new("RGBA", image.size, (behind[0], behind[1], behind[2], 255))
+        image = Image.alpha_composite(canvas, image.convert("RGBA"))
+    return image.convert("RGB")
+
+
+def _from_16_bit(image: Image.Image) -> Image.Image:
+    """Grey values 0..65535 as 0..255, rounded to the nearest."""
+    values = np.asarray(image).astype(np.int64)
+    if values.size and not 0 <= values.min() <= values.max() <= 65535:
+        raise ValueError("grey values outside 0..65535")
+    return Image.fromarray(((values * 255 + 32767) // 65535).astype(np.uint8))
+
+
+def _image_error(path: Path, error: BaseException) -> ImageError:
+    if isinstance(error, FileNotFoundError):
+        return ImageError(path, expected="an image", found="nothing", todo="copy the image there")
+    return ImageError(
+        path,
+        expected="an image that can be decoded",
+        found=str(error) or type(error).__name__,
+        todo="copy the file again, or convert it to JPEG or PNG",
+    )
+
+
+class ImageStore:
+    """The images of a scene at the evaluation size, decoded when they are first needed.
+
+    Safe to use from several threads. What was used longest ago leaves the cache first.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        max_width: int = MAX_WIDTH,
+        memory_limit: int = 2 * 1024**3,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Decode nothing yet.
+
+        Args:
+            scene: Where the images are.
+            max_width: Limit of the resize rule in pixels.
+            memory_limit: Bytes that cached images may take; 0 for no cache.
+            background: Colour 0..1 behind transparent pixels.
+        """
+        self._scene = scene
+        self._max_width = max_width
+        self._limit = memory_limit
+        self._background = background
+        self._cache: OrderedDict[str, NDArray[np.uint8]] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    @property
+    def cached_bytes(self) -> int:
+        """Bytes that the cache takes now."""
+        return self._bytes
+
+    def camera(self, frame: Frame) -> Camera:
+        """Camera of a frame at the evaluation size."""
+        camera = frame.camera
+        return resize_camera(camera, *evaluation_size(camera.width, camera.height, self._max_width))
+
+    def load(self, frame: Frame) -> NDArray[np.uint8]:
+        """Image of a frame at the evaluation size. Shared with others: not to be written to.
+
+        Returns:
+            RGB. [H, W, 3]
+
+        Raises:
+            ImageError: If the file is missing or damaged.
+        """
+        with self._lock:
+            image = self._cache.get(frame.name)
+            if image is not None:
+                self._cache.move_to_end(frame.name)
+                return image
+        camera = frame.camera
+        image = load_rgb(
+            self._scene.image_path(frame),
+            size=evaluation_size(camera.width, camera.height, self._max_width),
+            background=self._background,
+        )
+        return self._keep(frame.name, image)
+
+    def warm(self, frames: Iterable[Frame], *, threads: int = 2) -> None:
+        """Decode frames ahead of time, until the cache is full."""
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(self._load_if_room, frames))
+
+    def _load_if_room(self, frame: Frame) -> None:
+        width, height = evaluation_size(frame.camera.width, frame.camera.height, self._max_width)
+        if self._bytes + 3 * width * height <= self._limit:
+            self.load(frame)
+
+    def _keep(self, name: str, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Put an image into the cache; another thread may have been quicker."""
+        with self._lock:
+            if name in self._cache:
+                return self._cache[name]
+            if image.nbytes > self._limit:
+                return image
+            self._cache[name] = image
+            self._bytes += image.nbytes
+            while self._bytes > self._limit:
+                self._bytes -= self._cache.popitem(last=False)[1].nbytes
+        return image
