@@ -191,8 +191,6 @@ def _posed_images(folder: Path, model: pycolmap.Reconstruction) -> tuple[PosedIm
             raise _model_error(folder, "image names in UTF-8", f"image {image_id}") from error
         matrix = image.cam_from_world().matrix()
         pose = pose_from_rotation_translation(matrix[:, :3], matrix[:, 3])
-        if not np.isfinite(pose).all():
-            raise _model_error(folder, "finite poses", f"the pose of {name!r} with NaN or infinity")
         if name in images:
             raise _model_error(folder, "one image of each name", f"{name!r} twice")
         images[name] = PosedImage(int(image_id), name, cameras[image.camera_id], pose)

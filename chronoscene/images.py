@@ -84,7 +84,6 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     Raises:
         SceneError: If the model has no focal length in pixels.
     """
-    sx, sy = width / camera.width, height / camera.height
     if (width, height) == (camera.width, camera.height):
         return camera
     model, params = camera.model, camera.params
@@ -95,17 +94,18 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
             found=model,
             todo="render perspective views of the panorama first",
         )
+    x, y = (width, camera.width), (height, camera.height)
     single = model in _TWO_FOCALS
-    if single and sx == sy:
-        scales: tuple[float, ...] = (sx, sx, sy)
+    if single and x[0] * y[1] == y[0] * x[1]:
+        ratios: tuple[tuple[int, int], ...] = (x, x, y)
     else:
         if single:
             model, zeros = _TWO_FOCALS[model]
             params = (params[0], *params, *(0.0,) * zeros)
-        scales = (sx, sy, sx, sy)
-    scaled = tuple(p * s for p, s in zip(params, scales, strict=False))
+        ratios = (x, y, x, y)
+    scaled = tuple(p * new / old for p, (new, old) in zip(params, ratios, strict=False))
     return replace(
-        camera, model=model, width=width, height=height, params=scaled + params[len(scales) :]
+        camera, model=model, width=width, height=height, params=scaled + params[len(ratios) :]
     )
 
 

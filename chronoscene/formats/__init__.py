@@ -26,7 +26,7 @@ def load_format(name: str) -> Any:
     Raises:
         ConfigError: If there is no such format; names those that there are.
     """
-    check_choice("--format", name, FORMATS)
+    check_choice("dataset format", name, FORMATS)
     return import_module(FORMATS[name])
 
 
@@ -58,6 +58,26 @@ def detect_format(path: Path) -> str:
         found=", ".join(content[:8]) + (", ..." if len(content) > 8 else "") or "an empty folder",
         todo="give the folder of one scene; DATASET.md describes its files",
     )
+
+
+def find_scenes(path: Path, *, format: str | None = None) -> list[Path]:
+    """The scene folder itself, or the scenes directly inside a folder, sorted by name.
+
+    Raises:
+        SceneError: If there is no scene at all; says what was looked for.
+    """
+    modules = [load_format(name) for name in ([format] if format else format_names())]
+
+    def is_scene(folder: Path) -> bool:
+        return any(module.matches(folder) for module in modules)
+
+    if path.is_dir() and not is_scene(path):
+        inside = sorted(child for child in path.iterdir() if child.is_dir() and is_scene(child))
+        if inside:
+            return inside
+    if format is None:
+        detect_format(path)
+    return [path]
 
 
 def read_scene(path: str | Path, *, format: str | None = None) -> Scene:

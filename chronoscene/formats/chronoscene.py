@@ -12,8 +12,10 @@ from datetime import date
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Literal
 
+import numpy as np
+
 from chronoscene.checks import check_choice
-from chronoscene.colmap import Model, read_model, write_model
+from chronoscene.colmap import Model, PosedImage, read_model, write_model
 from chronoscene.errors import SceneError
 from chronoscene.scene import Frame, Period, Scene, WorldFrame
 from chronoscene.splits import (
@@ -59,8 +61,8 @@ def read(path: Path) -> Scene:
     raise_first(path / SPLIT, problems)
     model = read_model(path / MODEL)
     names = [image.name for image in model.images]
-    for name in names:
-        check_name(path / MODEL, name)
+    for image in model.images:
+        check_image(path / MODEL, image)
     periods, problems = assign_periods(names, entries)
     raise_first(path / SPLIT, problems)
     tests, rule = read_tests(path, names, periods)
@@ -82,6 +84,27 @@ def raise_first(path: Path, problems: Iterable[Problem]) -> None:
     for problem in problems:
         if problem.kind in FATAL:
             raise problem.error(path)
+
+
+def check_image(place: Path, image: PosedImage) -> None:
+    """Refuse an image that no method could use: its name, its pose, its camera."""
+    check_name(place, image.name)
+    camera = image.camera
+    if not np.isfinite(image.cam_from_world).all():
+        raise SceneError(
+            place,
+            expected=f"a finite pose of {image.name!r}",
+            found="NaN or infinity",
+            todo="remove the image from the model, or register it again",
+        )
+    focal = camera.K[[0, 1], [0, 1]] if camera.params else np.zeros(2)
+    if min(camera.width, camera.height) < 1 or not (np.isfinite(focal) & (focal > 0)).all():
+        raise SceneError(
+            place,
+            expected=f"a camera {camera.camera_id} with positive size and focal length",
+            found=f"{camera.width} x {camera.height}, {camera.params}",
+            todo="correct the camera",
+        )
 
 
 def check_name(place: Path, name: str) -> None:

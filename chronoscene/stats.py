@@ -1,0 +1,232 @@
+"""Images and points of scenes by period, laid out as in the paper's table of counts."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.scene import Scene
+from chronoscene.splits import split_hash
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+CountRule = Literal["assigned", "seen"]
+COUNT_RULES = ("assigned", "seen")
+
+
+@dataclass(frozen=True, slots=True)
+class PeriodCount:
+    """Counts of one period."""
+
+    id: int
+    label: str
+    date: str | None
+    images: int
+    train: int
+    test: int
+    points: int
+
+
+@dataclass(frozen=True, slots=True)
+class SceneCount:
+    """Counts of one scene."""
+
+    name: str
+    path: str
+    format: str
+    split_rule: str
+    split_hash: str
+    count: CountRule
+    """How points are counted."""
+    periods: tuple[PeriodCount, ...]
+    images: int
+    points: int
+    """All points of the model, each once."""
+    points_without_period: int
+    """Points that no image sees; they are in `points` and in no period."""
+
+
+def observation_counts(scene: Scene) -> NDArray[np.int64]:
+    """How often images of a period see a point. [P, T]"""
+    points, periods = len(scene.points), scene.num_periods
+    frame_period = np.array([f.period for f in scene.frames], dtype=np.int64)
+    rows = np.repeat(np.arange(points) * periods, np.diff(scene.points.track_start))
+    cells = rows + frame_period[scene.points.track_frame]
+    return np.bincount(cells, minlength=points * periods).reshape(points, periods)
+
+
+def assign_points(scene: Scene) -> NDArray[np.int64]:
+    """The one period that each point is counted in: that with the most observations of it.
+
+    Ties go to the earliest period; -1 marks a point that no image sees. [P]
+    """
+    counts = observation_counts(scene)
+    if not counts.size:
+        return np.full(len(counts), -1, np.int64)
+    return np.where(counts.any(axis=1), counts.argmax(axis=1), -1)
+
+
+def count_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneCount:
+    """Count the images and points of a scene by period.
+
+    Args:
+        scene: The scene.
+        count: ``assigned`` counts each point once, in the period that `assign_points` gives, so
+            that the periods add up to the total; ``seen`` counts it in every period whose images
+            see it.
+    """
+    if count == "assigned":
+        assigned = assign_points(scene)
+        by_period = np.bincount(assigned[assigned >= 0], minlength=scene.num_periods)
+    else:
+        by_period = scene.point_periods().sum(axis=0)
+    return SceneCount(
+        name=scene.name,
+        path=str(scene.root),
+        format=scene.format,
+        split_rule=scene.split_rule,
+        split_hash=split_hash(scene),
+        count=count,
+        periods=tuple(_count_period(scene, i, int(n)) for i, n in enumerate(by_period)),
+        images=len(scene.frames),
+        points=len(scene.points),
+        points_without_period=int((np.diff(scene.points.track_start) == 0).sum()),
+    )
+
+
+def _count_period(scene: Scene, period: int, points: int) -> PeriodCount:
+    info = scene.periods[period]
+    train = len(scene.select(split="train", period=period))
+    test = len(scene.select(split="test", period=period))
+    return PeriodCount(period, info.label, info.date, train + test, train, test, points)
+
+
+def count_table(counts: Sequence[SceneCount]) -> list[list[int | str | None]]:
+    """Rows of the table: scene, images and points of each period, images and points in total.
+
+    The last row holds the totals; None stands where a scene has no such period.
+    """
+    periods = max((len(c.periods) for c in counts), default=0)
+    rows: list[list[int | str | None]] = []
+    sums = [0] * (2 * periods + 2)
+    for scene in counts:
+        cells: list[int | None] = []
+        for period in scene.periods:
+            cells += [period.images, period.points]
+        cells += [None] * (2 * periods - len(cells)) + [scene.images, scene.points]
+        sums = [total + (cell or 0) for total, cell in zip(sums, cells, strict=True)]
+        rows.append([scene.name, *cells])
+    return [*rows, ["Total", *sums]]
+
+
+def _period_names(counts: Sequence[SceneCount]) -> list[str]:
+    """Heads of the column pairs; periods are numbered from 0."""
+    periods = max((len(c.periods) for c in counts), default=0)
+    return [*(f"Period {i}" for i in range(periods)), "Total"]
+
+
+def _text(cell: int | str | None) -> str:
+    if cell is None:
+        return "-"
+    return cell if isinstance(cell, str) else f"{cell:,}"
+
+
+def to_csv(counts: Sequence[SceneCount]) -> str:
+    """Wide table; empty cells where a scene has no such period."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    heads = [name.lower().replace(" ", "_") for name in _period_names(counts)]
+    writer.writerow(["scene", *(f"{h}_{what}" for h in heads for what in ("images", "points"))])
+    writer.writerows(count_table(counts))
+    return out.getvalue()
+
+
+def to_markdown(counts: Sequence[SceneCount]) -> str:
+    """Pipe table with one head row."""
+    heads = ["Scene"]
+    for name in _period_names(counts):
+        heads += [f"{name} images", f"{name} points"]
+    rows = [[_text(cell).replace("|", "\\|") for cell in row] for row in count_table(counts)]
+    rows[-1] = [f"**{cell}**" for cell in rows[-1]]
+    lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+_LATEX_ESCAPES = str.maketrans(
+    {c: f"\\{c}" for c in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+)
+
+
+def to_latex(counts: Sequence[SceneCount]) -> str:
+    """A ``tabular`` for the booktabs package."""
+    names = _period_names(counts)
+    rows = [[_text(cell).translate(_LATEX_ESCAPES) for cell in row] for row in count_table(counts)]
+    lines = [
+        r"\begin{tabular}{l" + "rr" * len(names) + "}",
+        r"\toprule",
+        "Scene & " + " & ".join(rf"\multicolumn{{2}}{{c}}{{{name}}}" for name in names) + r" \\",
+        " & " + " & ".join(["Images & Points"] * len(names)) + r" \\",
+        r"\midrule",
+        *(" & ".join(row) + r" \\" for row in rows[:-1]),
+        r"\midrule",
+        " & ".join(rows[-1]) + r" \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def to_json(counts: Sequence[SceneCount]) -> str:
+    """Everything that was counted, with train and test images and the split's fingerprint."""
+    _, *sums = count_table(counts)[-1]
+    pairs = [{"images": sums[i], "points": sums[i + 1]} for i in range(0, len(sums), 2)]
+    data = {
+        "scenes": [asdict(c) for c in counts],
+        "totals": {"periods": pairs[:-1], "all": pairs[-1]},
+    }
+    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+
+
+def to_text(counts: Sequence[SceneCount]) -> str:
+    """Table for a terminal, without colours."""
+    from rich.console import Console
+
+    out = io.StringIO()
+    console = Console(file=out, width=10_000, color_system=None, markup=False, emoji=False)
+    console.print(_rich_table(counts))
+    return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
+
+
+def _rich_table(counts: Sequence[SceneCount]) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, show_footer=True)
+    *rows, totals = [[_text(cell) for cell in row] for row in count_table(counts)]
+    table.add_column("Scene\n", footer=totals[0], no_wrap=True)
+    for i, name in enumerate(_period_names(counts)):
+        for what, total in zip(("images", "points"), totals[1 + 2 * i :], strict=False):
+            head = f"{name}\n{what}" if what == "images" else f"\n{what}"
+            table.add_column(head, footer=total, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+WRITERS: dict[str, Callable[[Sequence[SceneCount]], str]] = {
+    "table": to_text,
+    "csv": to_csv,
+    "markdown": to_markdown,
+    "latex": to_latex,
+    "json": to_json,
+}
+"""Output format to the function that writes it."""
