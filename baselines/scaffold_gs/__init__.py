@@ -1,0 +1,32 @@
+"""Scaffold-GS: Gaussians decoded from anchors, without any notion of time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from chronoscene.methods import MethodSpec
+
+_SHORT: dict[str, Any] = {
+    "voxel_size": 0.5,
+    "voxel_unit": "spacing",
+    "max_initial_anchors": 100_000,
+    "max_anchors": 200_000,
+}
+
+SPEC = MethodSpec(
+    name="scaffold-gs",
+    title="Scaffold-GS",
+    paper="Scaffold-GS: Structured 3D Gaussians for View-Adaptive Rendering, CVPR 2024",
+    licence="Apache-2.0; the official code is for non-commercial use",
+    period_input="none",
+    outputs=("rgb", "alpha", "depth"),
+    devices=("cpu", "cuda"),
+    method="baselines.scaffold_gs.method:ScaffoldGS",
+    config="baselines.scaffold_gs.config:ScaffoldGSConfig",
+    presets={
+        "paper": {},
+        "fast": _SHORT | {"iterations": 800, "density_interval": 40, "offsets_per_anchor": 5},
+        "balanced": _SHORT | {"iterations": 2_500, "density_interval": 50},
+        "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
+    },
+)

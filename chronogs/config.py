@@ -1,0 +1,44 @@
+"""Options of ChronoGS. The defaults are the official code's, which is the preset ``paper``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
+from chronoscene.training.anchor_config import HEADS, AnchorConfig
+
+
+@dataclass(frozen=True)
+class ChronoGSConfig(AnchorConfig):
+    """Where paper and official code differ, the option names both and defaults to the code."""
+
+    period_dim: int = 16
+    """Length of an anchor's feature per period (d_v); 0: without local changes."""
+    global_dim: int = 32
+    """Length of the feature of a period (d_g); 0: without global changes."""
+    fusion: str = "concat"
+    """``concat``: base, period and global feature side by side (code); ``sum``: added (paper's
+    formula; needs equal lengths)."""
+    global_init: str = "gaussian"
+    """``gaussian``: standard normal (code); ``zero`` (paper: all features start at zero);
+    ``uniform``: within -1..1."""
+    global_lr: tuple[float, float] = (0.05, 0.0005)
+    """Not given in the paper."""
+    global_heads: tuple[str, ...] = HEADS
+    """MLPs that see the global feature; all three in paper and code. ``("color",)`` with
+    ``period_dim`` 0 is Scaffold-GS with an appearance vector per period."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("fusion", self.fusion, ("concat", "sum"))
+        check_choice("global_init", self.global_init, ("gaussian", "zero", "uniform"))
+        for head in self.global_heads:
+            check_choice("global_heads", head, HEADS)
+        if min(self.period_dim, self.global_dim) < 0:
+            raise ConfigError(
+                "period_dim, global_dim",
+                expected="0 or more",
+                found=f"{self.period_dim}, {self.global_dim}",
+                todo="correct the value",
+            )

@@ -1,0 +1,56 @@
+"""ChronoGS as a plug-in of the harness.
+
+Source: ChronoGS (arXiv 2511.18794) and the official code; where they differ, `ChronoGSConfig`
+names both. The training machinery is shared with Scaffold-GS.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronogs.config import ChronoGSConfig
+from chronogs.periods import period_weights
+from chronoscene.methods import Prediction, View
+from chronoscene.training.anchor_method import AnchorMethod
+from chronoscene.training.anchor_model import AnchorLayout
+
+
+class ChronoGS(AnchorMethod):
+    """Anchors with a shared feature, one feature per period, and one global feature per period.
+
+    Args:
+        config: Options.
+    """
+
+    name = "chronogs"
+
+    def __init__(self, config: ChronoGSConfig) -> None:
+        super().__init__(config)
+        self.config: ChronoGSConfig = config
+
+    def layout(self, num_periods: int) -> AnchorLayout:
+        config = self.config
+        return AnchorLayout.of(
+            config,
+            num_periods,
+            period_dim=config.period_dim,
+            global_dim=config.global_dim,
+            fusion=config.fusion,
+            global_heads=tuple(config.global_heads),
+        )
+
+    def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
+        return super().rates(camera_extent) | {"global_features": self.config.global_lr}
+
+    def weights(self, period: float) -> NDArray[np.float32]:
+        return period_weights(period, self.model.layout.num_periods)
+
+    def render_split(
+        self, view: View, *, geometry_period: float, appearance_period: float
+    ) -> Prediction:
+        """Render the geometry of one period in the colours of another.
+
+        Opacities and shapes come from the first, colours from the second; both may be fractional.
+        """
+        return self._draw(view, self.weights(geometry_period), self.weights(appearance_period))

@@ -1,0 +1,161 @@
+"""Options that all methods with anchors share. Steps of the training are counted as shares of it.
+
+Defaults are those of the official ChronoGS code, whose numbers are mostly those of Scaffold-GS.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class AnchorConfig:
+    """Shared options. ``(a, b)`` is a learning rate that falls log-linearly from a to b."""
+
+    iterations: int = 40_000
+    """Training steps; one image each."""
+
+    # Anchors
+    offsets_per_anchor: int = 10
+    """Gaussians per anchor (K, also k)."""
+    voxel_size: float = 0.001
+    """Edge of the cells that start anchors, in `voxel_unit`; 0 takes the size from the cloud."""
+    voxel_unit: str = "world"
+    """``world``: scene units (official code); ``training``: units of the normalised frame;
+    ``spacing``: multiples of the median distance of neighbouring sparse points."""
+    voxel_origin: str = "zero"
+    """``zero``: cells centred on multiples of the size (code); ``box``: counted from the lower
+    corner of the bounding box (paper)."""
+    point_stride: int = 1
+    """Use every n-th sparse point."""
+    max_initial_anchors: int = 0
+    """Coarsen the voxel until there are at most so many anchors; 0: no limit."""
+    max_anchors: int = 0
+    """Growth stops at so many anchors; 0: no limit."""
+    base_dim: int = 16
+    """Length of the feature that all periods share (d_b)."""
+    hidden_dim: int = 0
+    """Hidden units per MLP; 0: the length of the feature of an anchor in one period (code)."""
+    feature_init: str = "zero"
+    """``zero`` | ``uniform`` | ``gaussian``: start of the anchor features."""
+    feature_init_scale: float = 0.1
+    """Half width of the uniform, or standard deviation of the Gaussian start."""
+
+    # Forward pass
+    direction: str = "unit"
+    """``unit``: viewing direction of length one (code); ``full``: anchor minus camera centre
+    (paper)."""
+    direction_heads: tuple[str, ...] = ("opacity", "covariance", "color")
+    """MLPs that see the viewing direction; all three in the papers."""
+    offset_unit: str = "anchor"
+    """``anchor``: offsets are multiples of the anchor's scale (code); ``frame``: of the training
+    frame's unit (paper)."""
+    scale_unit: str = "anchor"
+    """``anchor``: the MLP's sigmoid times the anchor's scale (code); ``frame``: times one unit of
+    the training frame (paper)."""
+    visibility: str = "radius"
+    """Anchors decoded per view. ``radius``: projected footprint touches the image (code);
+    ``frustum``: centre inside the image (paper)."""
+
+    # Loss
+    ssim_weight: float = 0.2
+    """Weight of 1 - SSIM; L1 gets the rest."""
+    scale_weight: float = 0.01
+    """Weight of the mean product of the three scales (code; 0 in the paper)."""
+    direction_noise: float = 0.0
+    """Standard deviation of the random shift of the camera centre that the MLPs see in training,
+    in units of the camera's distance from the mean anchor. Not in the papers."""
+    feature_decay: float = 0.0
+    """Decoupled weight decay of the anchor features, per step and learning rate. Not in the
+    papers."""
+    head_decay: float = 0.0
+    """The same for the first layer of the MLPs."""
+
+    # Learning rates
+    offset_lr: tuple[float, float] = (0.01, 0.0001)
+    """Multiplied by the extent of the cameras."""
+    feature_lr: tuple[float, float] = (0.0075, 0.0075)
+    scaling_lr: tuple[float, float] = (0.007, 0.007)
+    opacity_lr: tuple[float, float] = (0.002, 0.00002)
+    covariance_lr: tuple[float, float] = (0.004, 0.004)
+    color_lr: tuple[float, float] = (0.008, 0.00005)
+
+    # Growth and pruning
+    statistics_from: float = 500 / 40_000
+    """Share of the training after which views are counted."""
+    density_from: float = 1_500 / 40_000
+    """Share after which anchors grow and are pruned."""
+    density_until: float = 0.5
+    """Share at which the set of anchors is final."""
+    density_interval: int = 100
+    """Steps from one round to the next."""
+    first_round: str = "after"
+    """``after``: the first round is the first multiple of the interval after `density_from`
+    (code: 1600); ``at``: the multiple at `density_from` counts too (paper: 1500)."""
+    grad_threshold: float = 0.0002
+    """Mean gradient of a 2-D centre that makes a Gaussian a candidate (tau_g)."""
+    success_threshold: float = 0.8
+    """Share of the interval in which an anchor must be visible to be judged."""
+    min_opacity: float = 0.005
+    """Anchors whose mean summed opacity is below this are pruned."""
+    prune_by: str = "opacity"
+    """``opacity`` (code); ``gradient`` (main text of the paper); ``both``."""
+    prune_gradient: float = 1e-6
+    """Mean gradient per visit below which ``gradient`` prunes; the paper gives no value."""
+    growth_levels: int = 3
+    coarsest_cell: int = 16
+    """Edge of the coarsest growth cell in voxels."""
+    cell_refinement: int = 4
+    """Ratio of the edges of successive growth cells."""
+    chained_levels: bool = True
+    """Finer levels are skipped in a round in which the coarser ones added nothing (code)."""
+    random_growth: bool = True
+    """Candidates are dropped by chance (code)."""
+    max_log_scale: float = 0.05
+    """Upper bound of the logarithm of the Gaussians' scale, applied at each round (code)."""
+
+    def __post_init__(self) -> None:
+        for name, known in _CHOICES.items():
+            check_choice(name, getattr(self, name), known)
+        for head in self.direction_heads:
+            check_choice("direction_heads", head, HEADS)
+        for name, low in _LOWER_BOUNDS.items():
+            if getattr(self, name) < low:
+                raise ConfigError(
+                    name, expected=f"at least {low}", found=str(getattr(self, name)),
+                    todo="correct the value",
+                )  # fmt: skip
+
+
+HEADS = ("opacity", "covariance", "color")
+"""The three MLPs."""
+
+_CHOICES: dict[str, tuple[str, ...]] = {
+    "voxel_unit": ("world", "training", "spacing"),
+    "voxel_origin": ("zero", "box"),
+    "feature_init": ("zero", "uniform", "gaussian"),
+    "direction": ("unit", "full"),
+    "offset_unit": ("anchor", "frame"),
+    "scale_unit": ("anchor", "frame"),
+    "visibility": ("radius", "frustum"),
+    "first_round": ("after", "at"),
+    "prune_by": ("opacity", "gradient", "both"),
+}
+
+_LOWER_BOUNDS: dict[str, float] = {
+    "iterations": 1,
+    "offsets_per_anchor": 1,
+    "voxel_size": 0.0,
+    "point_stride": 1,
+    "max_initial_anchors": 0,
+    "max_anchors": 0,
+    "base_dim": 0,
+    "hidden_dim": 0,
+    "density_interval": 1,
+    "growth_levels": 0,
+    "coarsest_cell": 1,
+    "cell_refinement": 1,
+}

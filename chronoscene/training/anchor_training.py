@@ -1,0 +1,252 @@
+"""One training step of a model with anchors; shared by ChronoGS and Scaffold-GS.
+
+Every schedule follows the progress of the training. Gradients come from kernels that reduce in a
+fixed order or from elementwise torch, and random numbers only from the seed, so a seed gives the
+same bytes for any number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chronoscene.methods import StepReport, TrainingSet, TrainingView
+from chronoscene.rasterizer.types import RasterInfo
+from chronoscene.training.anchor_config import AnchorConfig
+from chronoscene.training.anchor_model import PER_ANCHOR, AnchorModel, draw
+from chronoscene.training.decode import Decoded
+from chronoscene.training.density import (
+    AnchorArrays,
+    DensityRules,
+    DensityStatistics,
+    grow,
+    prune_mask,
+)
+from chronoscene.training.losses import photometric_loss
+from chronoscene.training.optimizer import Adam
+from chronoscene.training.sampler import ViewSampler
+from chronoscene.training.schedule import log_linear
+from chronoscene.training.view import camera_centre_tensor
+from chronoscene.training.volume_loss import mean_volume
+
+Rates = Mapping[str, tuple[float, float]]
+
+_ADAM_EPS = 1e-15
+_MARGIN = 1e-9
+"""Shares of the training this close are equal: progress is a quotient of rounded numbers."""
+
+
+def learning_rates(config: AnchorConfig, camera_extent: float) -> dict[str, tuple[float, float]]:
+    """Start and end of the learning rate of every tensor, by its name in the model."""
+    start, end = config.offset_lr
+    rates = {
+        "offsets": (start * camera_extent, end * camera_extent),
+        "features": config.feature_lr,
+        "log_scales": config.scaling_lr,
+    }
+    by_head = {
+        "opacity": config.opacity_lr,
+        "covariance": config.covariance_lr,
+        "color": config.color_lr,
+    }
+    for head, rate in by_head.items():
+        rates |= {f"{head}.{layer}": rate for layer in ("w1", "b1", "w2", "b2")}
+    return rates
+
+
+def density_rules(config: AnchorConfig, voxel_size: float) -> DensityRules:
+    """Thresholds of growth and pruning: counts are shares of the steps between two rounds."""
+    visits = config.density_interval * config.success_threshold
+    return DensityRules(
+        voxel_size=voxel_size,
+        grad_threshold=config.grad_threshold,
+        min_hits=0.5 * visits,
+        min_visits=visits,
+        min_opacity=config.min_opacity,
+        prune_by=config.prune_by,
+        prune_gradient=config.prune_gradient,
+        levels=config.growth_levels,
+        coarsest=config.coarsest_cell,
+        refinement=config.cell_refinement,
+        chained=config.chained_levels,
+        random_mask=config.random_growth,
+        max_anchors=config.max_anchors,
+    )
+
+
+class AnchorTrainer:
+    """Trains a model on the views of a training set.
+
+    Args:
+        config: Options.
+        model: Trained in place.
+        train: Views, images, background.
+        voxel_size: Smallest growth cell in training units.
+        seed: All random choices follow from it.
+        rates: Learning rates by tensor name.
+        weights: Period weights of each period. [T, T]
+    """
+
+    def __init__(
+        self,
+        config: AnchorConfig,
+        model: AnchorModel,
+        train: TrainingSet,
+        *,
+        voxel_size: float,
+        seed: int,
+        rates: Rates,
+        weights: Tensor,
+    ) -> None:
+        self.config = config
+        self.model = model.requires_grad()
+        self.train = train
+        self.rules = density_rules(config, voxel_size)
+        trained = {n: t for n, t in model.tensors().items() if n in rates and t.numel() > 0}
+        self.rates = {name: rates[name] for name in trained}
+        self.optimizer = Adam(trained, eps=_ADAM_EPS)
+        self.weights = weights.to(model.device)
+        self.background = torch.from_numpy(train.background).to(model.device)
+        self.sampler = ViewSampler(len(train.views), seed)
+        self._middle = train.points.astype(np.float64).mean(axis=0)
+        self.growth_generator = np.random.default_rng((seed, 1))
+        self.noise_generator = np.random.default_rng((seed, 2))
+        self.statistics: DensityStatistics | None = None
+
+    def step(self, index: int, progress: float) -> StepReport:
+        """Render one training view, learn from it, and grow and prune where a round is due."""
+        done = self._progress_after(index, progress)
+        position = self.sampler.next()
+        view = self.train.views[position]
+        visible = self.model.visible(view)
+        if len(visible) == 0:  # nothing to learn from; the image is the background
+            return StepReport(loss=float("nan"), primitives=len(self.model))
+        loss = self._learn(view, position, visible, done)
+        resized = self._densify_if_due(index, done)
+        self._update(done, skip=PER_ANCHOR if resized else ())
+        return StepReport(loss=loss, primitives=len(self.model))
+
+    def _progress_after(self, index: int, progress: float) -> float:
+        """Share of the training that is over once this step is done."""
+        return progress * (index + 1) / index if index > 0 else 1.0 / self.config.iterations
+
+    def _learn(self, view: TrainingView, position: int, visible: np.ndarray, done: float) -> float:
+        decoded = self.model.decode(
+            self.weights[view.period], self._seen_from(view), torch.from_numpy(visible)
+        )
+        raster = draw(decoded, view, self.background, check_finite=False)
+        target = torch.from_numpy(self.train.load_image(position)).to(self.model.device)
+        loss = photometric_loss(raster.image[0], target, ssim_weight=self.config.ssim_weight)
+        if self.config.scale_weight:
+            volume = mean_volume(decoded.scales, decoded.opacities)
+            loss = loss + self.config.scale_weight * volume
+        loss.backward()
+        if self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN:
+            self._count(view, visible, decoded, raster.info)
+        return float(loss.detach())
+
+    def _seen_from(self, view: TrainingView) -> Tensor:
+        """Camera centre for the viewing directions, shifted by chance if so configured. [3]"""
+        centre = camera_centre_tensor(view, self.model.device)
+        if self.config.direction_noise:
+            distance = float(np.linalg.norm(centre.cpu().numpy() - self._middle))
+            shift = self.noise_generator.normal(0.0, self.config.direction_noise * distance, 3)
+            centre = centre + torch.from_numpy(shift.astype(np.float32)).to(centre.device)
+        return centre
+
+    def _count(
+        self,
+        view: TrainingView,
+        visible: np.ndarray,
+        decoded: Decoded,
+        info: RasterInfo,
+    ) -> None:
+        assert info.means2d.grad is not None
+        if self.statistics is None:
+            self.statistics = DensityStatistics(len(self.model), self.model.layout.offsets)
+        self.statistics.update(
+            visible,
+            decoded.opacities.detach().cpu().numpy(),
+            info.radii[0].cpu().numpy(),
+            info.means2d.grad[0].cpu().numpy(),
+            view.width,
+            view.height,
+        )
+
+    def _densify_if_due(self, index: int, done: float) -> bool:
+        """Grow and prune; whether the rows of the anchors changed."""
+        config = self.config
+        if done >= config.density_until - _MARGIN:
+            self.statistics = None
+            return False
+        sign = 1.0 if config.first_round == "after" else -1.0
+        started = done > config.density_from + sign * _MARGIN
+        if not started or (index + 1) % config.density_interval or self.statistics is None:
+            return False
+        self._grow(self.statistics)
+        self._prune(self.statistics)
+        return True
+
+    def _grow(self, statistics: DensityStatistics) -> None:
+        model = self.model
+        names = ("anchors", "offsets", "log_scales", "features")
+        arrays = AnchorArrays(*(getattr(model, n).detach().cpu().numpy() for n in names))
+        new = grow(arrays, statistics, self.rules, self.growth_generator)
+        rows = {
+            "offsets": np.zeros((len(new), *model.offsets.shape[1:]), np.float32),
+            "features": new.features,
+            "log_scales": new.log_scales,
+        }
+        for name, array in rows.items():
+            self._resize(name, extend=torch.from_numpy(array).to(model.device))
+        positions = torch.from_numpy(new.positions).to(model.device)
+        model.anchors = torch.cat([model.anchors, positions])
+        statistics.extend(len(new))
+
+    def _prune(self, statistics: DensityStatistics) -> None:
+        """Drop anchors; bound the scales. A model is never left without any anchor."""
+        keep = prune_mask(statistics, self.rules)
+        if not keep.all() and keep.any():
+            mask = torch.from_numpy(keep).to(self.model.device)
+            for name in PER_ANCHOR:
+                self._resize(name, keep=mask)
+            self.model.anchors = self.model.anchors[mask]
+            statistics.keep(keep)
+        with torch.no_grad():
+            self.model.log_scales[:, 3:].clamp_(max=self.config.max_log_scale)
+
+    def _resize(
+        self, name: str, *, extend: Tensor | None = None, keep: Tensor | None = None
+    ) -> None:
+        """Change the rows of a tensor in model and optimiser alike."""
+        if name not in self.optimizer.params:  # of length 0, so nothing trains it
+            old: Tensor = getattr(self.model, name)
+            resized = torch.cat([old, extend]) if extend is not None else old[keep]
+        elif extend is not None:
+            resized = self.optimizer.extend(name, extend)
+        else:
+            assert keep is not None
+            resized = self.optimizer.keep(name, keep)
+        setattr(self.model, name, resized)
+
+    def _update(self, done: float, skip: tuple[str, ...]) -> None:
+        """Adam. After a round the anchors have new tensors without gradients: only MLPs and
+        global features move, as in the official code."""
+        rates = {name: log_linear(done, *rate) for name, rate in self.rates.items()}
+        self.optimizer.step(rates, skip=skip)
+        self._decay(rates, skip)
+        self.optimizer.zero_grad()
+
+    @torch.no_grad()
+    def _decay(self, rates: Mapping[str, float], skip: tuple[str, ...]) -> None:
+        """Decoupled weight decay; off unless configured."""
+        config = self.config
+        if config.feature_decay and "features" in rates and "features" not in skip:
+            self.model.features.mul_(1.0 - rates["features"] * config.feature_decay)
+        if config.head_decay:
+            for name, value in self.optimizer.params.items():
+                if name.endswith(".w1"):
+                    value.mul_(1.0 - rates[name] * config.head_decay)

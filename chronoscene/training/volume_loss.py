@@ -1,0 +1,83 @@
+"""Mean product of the scales of the Gaussians that are switched on: keeps them small.
+
+Source: the official code of Scaffold-GS and ChronoGS (the ChronoGS paper leaves the term out).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit, prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+_CHUNK = 4096
+"""Rows that are summed one after the other; fixed, so the sum does not depend on the threads."""
+
+
+def mean_volume(scales: Tensor, opacities: Tensor) -> Tensor:
+    """Mean over the Gaussians with an opacity above 0 of the product of their scales.
+
+    Args:
+        scales: [N, 3]
+        opacities: Only their sign counts; they get no gradient. [N]
+
+    Returns:
+        Scalar; 0 where no Gaussian is switched on.
+    """
+    if scales.is_cuda:
+        volumes = scales.prod(dim=1)[opacities > 0]
+        return volumes.mean() if len(volumes) else scales.sum() * 0.0
+    result: Tensor = _MeanVolume.apply(scales, opacities)
+    return result
+
+
+class _MeanVolume(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, scales: Tensor, opacities: Tensor) -> Tensor:
+        chunks = -(-len(scales) // _CHUNK)
+        sums, counts = np.zeros(chunks), np.zeros(chunks, np.int64)
+        values, active = scales.detach().numpy(), opacities.detach().numpy()
+        _sum_volumes(values, active, sums, counts)
+        ctx.save_for_backward(scales, opacities)
+        ctx.count = max(int(counts.sum()), 1)
+        return scales.new_tensor(sums.sum() / ctx.count)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        scales, opacities = ctx.saved_tensors
+        result = torch.empty_like(scales)
+        factor = scales.numpy().dtype.type(grads[0].item() / ctx.count)
+        _volume_gradients(scales.detach().numpy(), opacities.numpy(), factor, result.numpy())
+        return result, None
+
+
+@njit(cache=True, parallel=True)
+def _sum_volumes(
+    scales: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    sums: NDArray[np.float64],
+    counts: NDArray[np.int64],
+) -> None:
+    for c in prange(len(sums)):
+        total, count = 0.0, 0
+        for i in range(c * _CHUNK, min((c + 1) * _CHUNK, len(scales))):
+            if opacities[i] > 0.0:
+                total += scales[i, 0] * scales[i, 1] * scales[i, 2]
+                count += 1
+        sums[c], counts[c] = total, count
+
+
+@njit(cache=True, parallel=True)
+def _volume_gradients(
+    scales: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    factor: float,
+    result: NDArray[np.float32],
+) -> None:
+    for i in prange(len(scales)):
+        f = factor if opacities[i] > 0.0 else factor * 0.0
+        a, b, c = scales[i, 0], scales[i, 1], scales[i, 2]
+        result[i, 0], result[i, 1], result[i, 2] = f * b * c, f * a * c, f * a * b
