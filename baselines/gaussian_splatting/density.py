@@ -1,0 +1,148 @@
+"""Adding and removing Gaussians: clone, split, prune, opacity reset.
+
+Nothing here changes a tensor in place: a round says which rows stay and which are appended.
+
+Source: Kerbl et al. 2023, section 5, with the values of the released code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from baselines.gaussian_splatting.config import GaussianSplattingConfig
+from baselines.gaussian_splatting.gaussians import logit, opacities_of, scales_of
+from chronoscene.geometry import rotation_from_quaternion
+from chronoscene.rasterizer.types import RasterInfo
+
+PARTS = 2
+"""Gaussians that a split one becomes."""
+
+
+class GradientStatistics:
+    """Mean gradient of the projected centres over the views in which a Gaussian was seen."""
+
+    def __init__(self, count: int, device: str | torch.device) -> None:
+        self._sums = torch.zeros(count, device=device)
+        self._views = torch.zeros(count, device=device)
+
+    def add(self, info: RasterInfo, width: int, height: int) -> None:
+        """Count one view whose ``backward`` is done.
+
+        Args:
+            info: Of a call with one camera.
+            width: Of the image in pixels; the gradient is taken in half image sizes, so that it
+                does not depend on the resolution.
+            height: Likewise.
+        """
+        assert info.means2d.grad is not None
+        gradient = info.means2d.grad[0]
+        x, y = gradient[:, 0] * (0.5 * width), gradient[:, 1] * (0.5 * height)
+        seen = (info.radii[0] > 0).all(-1)
+        self._sums += torch.where(seen, (x * x + y * y).sqrt(), 0.0)
+        self._views += seen
+
+    def mean(self) -> Tensor:
+        """Mean norm; 0 for what was never seen. [N]"""
+        return self._sums / self._views.clamp_min(1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Round:
+    """What a round of densification decided. The new set is the kept rows, then the new ones."""
+
+    keep: Tensor
+    """Old rows that stay; a split Gaussian does not. bool [N]"""
+    new: dict[str, Tensor]
+    """Rows to append: clones, then first parts, then second parts. They have no moments yet."""
+
+
+def choose_growth(
+    gradient: Tensor, largest_scale: Tensor, extent: float, config: GaussianSplattingConfig
+) -> tuple[Tensor, Tensor]:
+    """Rows to clone and rows to split.
+
+    Args:
+        gradient: `GradientStatistics.mean`. [N]
+        largest_scale: Largest of the three scales. [N]
+        extent: `TrainingSet.camera_extent`.
+        config: Thresholds and the limit of the number.
+
+    Returns:
+        clone: bool [N]
+        split: bool [N]
+    """
+    grow = gradient >= config.gradient_threshold
+    # Either way the set grows by one per row.
+    room = max(config.max_gaussians - len(gradient), 0) if config.max_gaussians else len(gradient)
+    if int(grow.sum()) > room:
+        order = torch.where(grow, gradient, -1.0).argsort(descending=True, stable=True)
+        grow = torch.zeros_like(grow)
+        grow[order[:room]] = True
+    small = largest_scale <= config.clone_scale * extent
+    return grow & small, grow & ~small
+
+
+def densify(
+    parameters: dict[str, Tensor],
+    gradient: Tensor,
+    *,
+    extent: float,
+    prune_large: bool,
+    config: GaussianSplattingConfig,
+    generator: np.random.Generator,
+) -> Round:
+    """One round: clone, split, then prune old and new rows alike.
+
+    Args:
+        parameters: Groups as `gaussians.SHAPES` says; left as they are.
+        gradient: Mean gradient. [N]
+        extent: `TrainingSet.camera_extent`.
+        prune_large: Whether Gaussians may be too large.
+        config: Thresholds.
+        generator: Draws the centres of the parts.
+    """
+    largest = scales_of(parameters["log_scales"]).amax(-1)
+    clone, split = choose_growth(gradient, largest, extent, config)
+    parts = _split({name: rows[split] for name, rows in parameters.items()}, config, generator)
+    new = {name: torch.cat([rows[clone], parts[name]]) for name, rows in parameters.items()}
+    keep = ~split & ~_useless(parameters, extent, prune_large, config)
+    keep_new = ~_useless(new, extent, prune_large, config)
+    return Round(keep, {name: rows[keep_new] for name, rows in new.items()})
+
+
+def _split(
+    parents: dict[str, Tensor], config: GaussianSplattingConfig, generator: np.random.Generator
+) -> dict[str, Tensor]:
+    """Two smaller Gaussians for each, centred on samples of it."""
+    parts = {name: rows.repeat(PARTS, *(1,) * (rows.dim() - 1)) for name, rows in parents.items()}
+    quats = parts["quats"].cpu().double().numpy()
+    quats[np.linalg.norm(quats, axis=-1) == 0] = (1, 0, 0, 0)
+    scales = np.exp(parts["log_scales"].cpu().double().numpy())
+    samples = scales * generator.standard_normal(scales.shape)
+    moves = np.einsum("nij,nj->ni", rotation_from_quaternion(quats), samples)
+    parts["means"] += torch.from_numpy(moves.astype(np.float32)).to(parts["means"].device)
+    parts["log_scales"] -= float(np.log(config.split_factor))
+    return parts
+
+
+def _useless(
+    parameters: dict[str, Tensor],
+    extent: float,
+    prune_large: bool,
+    config: GaussianSplattingConfig,
+) -> Tensor:
+    """Rows that are too faint or too large. bool [N]"""
+    useless = opacities_of(parameters["logit_opacities"]) < config.min_opacity
+    if prune_large:
+        largest = scales_of(parameters["log_scales"]).amax(-1)
+        useless |= largest > config.max_scale * extent
+    return useless
+
+
+def reset_opacities(logit_opacities: Tensor, highest: float) -> Tensor:
+    """The same with no opacity above `highest`. [N]"""
+    return logit_opacities.clamp_max(logit(highest))
