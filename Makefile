@@ -1,0 +1,82 @@
+# make demo    a scene, its checks and a benchmark of three methods, from nothing, in 12 minutes
+# make test    lint, types and tests, from nothing
+# make lint    lint and types alone
+# make clean   remove what demo and tools wrote; distclean also removes the environment
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+# Without a GPU the CPU build is a quarter of the size. It is tried from the indexes that pip knows,
+# then from PyTorch's own; where there is none (macOS), the plain package is the CPU build.
+TORCH := torch==2.13.0
+TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+DEMO := demo
+DEMO_METHODS := chronogs,scaffold-gs,3dgs
+DEMO_BUDGET := 100s
+
+.PHONY: demo test lint clean distclean open3d-libraries
+
+demo: $(DEMO)/.scene
+	$(BIN)/chronoscene validate $(DEMO)/scene
+	$(BIN)/chronoscene stats $(DEMO)/scene
+	$(BIN)/chronoscene bench $(DEMO)/scene --method $(DEMO_METHODS) \
+		--budget $(DEMO_BUDGET) --out $(DEMO)/runs
+	@echo "The scene is in $(DEMO)/scene; tables, figures and predictions are in $(DEMO)/runs."
+
+# The mark stands beside the scene: nothing is ever written into a dataset folder. A scene without
+# its mark is what an interrupted run left behind.
+$(DEMO)/.scene: | $(READY)
+	rm -rf $(DEMO)/scene
+	mkdir -p $(DEMO)
+	$(BIN)/chronoscene synth $(DEMO)/scene --preset demo
+	touch $@
+
+test: lint
+	$(BIN)/python -m pytest -q -m "not slow"
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# A torch that is in the environment already, a CUDA build perhaps, is kept.
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+		echo "Python 3.11 or newer is needed; name one: make PYTHON=python3.11" >&2; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -c 'import torch' 2>/dev/null \
+		|| $(PIP) "$(TORCH)+cpu" 2>/dev/null \
+		|| $(PIP) "$(TORCH)" --index-url $(TORCH_CPU_INDEX) 2>/dev/null \
+		|| $(PIP) "$(TORCH)"
+	$(PIP) --constraint constraints.txt --editable '.[dev]'
+	@$(BIN)/python -c 'import open3d' 2>/dev/null || $(MAKE) --no-print-directory open3d-libraries
+	touch $@
+
+# The wheel of open3d leaves out a few libraries of the system, libusb first of all.
+OPEN3D_PACKAGES := libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6
+
+open3d-libraries:
+	@if command -v apt-get >/dev/null && [ "$$(id -u)" = 0 ]; then sudo=; \
+	elif command -v apt-get >/dev/null && sudo -n true 2>/dev/null; then sudo=sudo; \
+	else sudo=none; fi; \
+	if [ "$$sudo" != none ]; then \
+		$$sudo apt-get -qq install -y $(OPEN3D_PACKAGES) >/dev/null 2>&1 \
+		|| { $$sudo apt-get -qq update && $$sudo apt-get -qq install -y $(OPEN3D_PACKAGES); } \
+		>/dev/null || true; \
+	fi; \
+	$(BIN)/python -c 'import open3d' 2>/dev/null || { \
+		$(BIN)/python -c 'import open3d' 2>&1 | tail -n 1; \
+		echo "open3d does not load; chronoscene synth needs it. On Debian or Ubuntu, as root:"; \
+		echo "    apt-get install $(OPEN3D_PACKAGES)"; \
+		echo "then run make again."; exit 1; } >&2
+
+clean:
+	rm -rf $(DEMO) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+distclean: clean
+	rm -rf $(VENV)
