@@ -12,7 +12,7 @@ READY := $(VENV)/.ready
 # then from PyTorch's own; where there is none (macOS), the plain package is the CPU build.
 TORCH := torch==2.13.0
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 
 DEMO := demo
 DEMO_METHODS := chronogs,scaffold-gs,3dgs
