@@ -8,6 +8,7 @@ folder first.
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from chronoscene.colmap_records import PointRecords, check_cameras, read_keypoints, read_points
+from chronoscene.colmap_records import PointRecords, check_records, read_keypoints, read_points
 from chronoscene.errors import SceneError
 from chronoscene.geometry import pose_from_rotation_translation
 from chronoscene.scene import Camera, Frame, Points
@@ -73,7 +74,7 @@ def read_model(folder: Path) -> Model:
             todo="copy the model there",
         )
     if kind == "binary":
-        check_cameras(folder / "cameras.bin")
+        check_records(folder)
         keypoints, points = _read_records(folder)
         return _assemble(folder, read_reconstruction(folder), keypoints, points)
     reconstruction = read_reconstruction(folder)
@@ -98,7 +99,7 @@ def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
         raise SceneError(
             folder,
             expected="a model that COLMAP reads",
-            found=f"{type(error).__name__}: {message[-1]}",
+            found=re.sub(r"^\[[^]]*\] ", "", message[-1]),
             todo="write the model again with COLMAP",
         ) from error
     finally:

@@ -7,7 +7,10 @@ early. Every length is checked here against the size of the file before it is us
 Records are little endian; a count comes first (u64). Camera: i32 id, i32 model, u64 width, u64
 height, f64 parameters. Image: i32 id, f64 quaternion wxyz, f64 translation, i32 camera, name ended
 by a zero byte, u64 n, then n times (f64 x, f64 y, i64 point id or -1). Point: u64 id, f64 xyz, u8
-rgb, f64 error, u64 n, then n times (i32 image id, i32 keypoint index).
+rgb, f64 error, u64 n, then n times (i32 image id, i32 keypoint index). Rig: u32 id, u32 number
+of sensors, of the first its i32 type and u32 id, of each other one also u8 and, if that is set, a
+pose (7 f64). Frame: u32 id, u32 rig, 7 f64, u32 n, then n times (i32 sensor type, u32 sensor id,
+u64 image id).
 """
 
 from __future__ import annotations
@@ -33,6 +36,11 @@ _KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 _POINT_HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
 _POINT_BYTES = _POINT_HEAD.itemsize + _COUNT.size
 _TRACK_BYTES = 8
+_RIG_HEAD = struct.Struct("<II")
+_SENSOR = struct.Struct("<iI")
+_POSE_BYTES = 7 * 8
+_FRAME_HEAD = struct.Struct("<II7dI")
+_FRAME_IMAGE_BYTES = 16
 
 T = TypeVar("T")
 
@@ -67,9 +75,19 @@ def read_keypoints(path: Path) -> dict[int, NDArray[np.float64]]:
     return _guarded(path, _walk_images)
 
 
-def check_cameras(path: Path) -> None:
-    """Raise unless ``cameras.bin`` consists of whole records of known camera models."""
-    _guarded(path, _walk_cameras)
+def check_records(folder: Path) -> None:
+    """Check the small files of a model: ``cameras.bin``, and ``rigs.bin`` and ``frames.bin``.
+
+    The last two are absent in models written by COLMAP before 3.12.
+
+    Raises:
+        SceneError: If a file ends inside a record, or has a camera model that COLMAP does not know.
+    """
+    _guarded(folder / "cameras.bin", _walk_cameras)
+    for stem, walk in (("rigs", _walk_rigs), ("frames", _walk_frames)):
+        path = folder / f"{stem}.bin"
+        if path.exists():
+            _guarded(path, walk)
 
 
 class _DamagedError(Exception):
@@ -113,6 +131,30 @@ def _walk_cameras(data: bytes) -> None:
         if not 0 <= model < len(CAMERA_PARAMETERS):
             raise _DamagedError(f"camera {camera_id} with the unknown model id {model}")
         at += _CAMERA_HEAD.size + 8 * CAMERA_PARAMETERS[model]
+    _finish(data, at)
+
+
+def _walk_rigs(data: bytes) -> None:
+    at = _COUNT.size
+    for _ in range(_count(data, _RIG_HEAD.size)):
+        _rig_id, sensors = _RIG_HEAD.unpack_from(data, at)
+        at += _RIG_HEAD.size + (_SENSOR.size if sensors else 0)
+        if sensors * _SENSOR.size > len(data):
+            raise _DamagedError(f"a rig with {sensors} sensors, more than the file has")
+        for _ in range(sensors - 1):
+            at += _SENSOR.size
+            has_pose = data[at]
+            at += 1 + (_POSE_BYTES if has_pose else 0)
+    _finish(data, at)
+
+
+def _walk_frames(data: bytes) -> None:
+    at = _COUNT.size
+    for _ in range(_count(data, _FRAME_HEAD.size)):
+        (images,) = struct.unpack_from("<I", data, at + _FRAME_HEAD.size - 4)
+        at += _FRAME_HEAD.size + _FRAME_IMAGE_BYTES * images
+        if at > len(data):
+            raise _DamagedError(f"a frame with {images} images, more than the file has")
     _finish(data, at)
 
 
