@@ -12,8 +12,8 @@ from chronoscene.errors import ShapeError
 from chronoscene.training._adam_kernel import BLOCK
 from chronoscene.training.optimizer import Adam
 
-# float32, one step differs from torch by rounding of the ratio; 20 steps of rate 0.1 reach 4e-7.
-TOLERANCE = 2e-6
+# Worst of 1200 runs of 20 steps with rates up to 0.1: 1.7e-6, from rounding in another order.
+TOLERANCE = 5e-6
 
 
 def leaf(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> torch.Tensor:
