@@ -37,24 +37,26 @@ def initialise(train: TrainingSet, *, opacity: float) -> dict[str, Tensor]:
     Raises:
         SceneError: If the scene has no sparse points.
     """
-    count = len(train.points)
+    finite = np.isfinite(train.points).all(-1)
+    points, colors = train.points[finite], train.colors[finite]
+    count = len(points)
     if count == 0:
         raise SceneError(
             "points3D",
-            expected="sparse points to start the Gaussians from",
+            expected="finite sparse points to start the Gaussians from",
             found="none",
             todo="triangulate points for this scene",
         )
-    spacing = np.sqrt(np.maximum(mean_squared_spacing(train.points), SMALLEST_SQUARED_SPACING))
+    spacing = np.sqrt(np.maximum(mean_squared_spacing(points), SMALLEST_SQUARED_SPACING))
     log_scales = torch.from_numpy(np.log(spacing).astype(np.float32))
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1.0
     return {
-        "means": torch.from_numpy(np.array(train.points, dtype=np.float32)),
+        "means": torch.from_numpy(points.astype(np.float32)),
         "log_scales": log_scales[:, None].repeat(1, 3),
         "quats": quats,
         "logit_opacities": torch.full((count,), logit(opacity)),
-        "sh_dc": dc_from_rgb(torch.from_numpy(train.colors.astype(np.float32)) / 255),
+        "sh_dc": dc_from_rgb(torch.from_numpy(colors.astype(np.float32)) / 255),
         "sh_rest": torch.zeros(count, NUM_BASES - 1, 3),
     }
 

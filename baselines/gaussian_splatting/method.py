@@ -54,7 +54,7 @@ class GaussianSplatting:
         start = initialise(train, opacity=self.config.initial_opacity)
         self.parameters = {k: v.to(device).requires_grad_() for k, v in start.items()}
         self._optimizer = Adam(self.parameters)
-        self._statistics = GradientStatistics(len(train.points), device)
+        self._statistics = GradientStatistics(len(start["means"]), device)
         self._background = torch.from_numpy(np.array(train.background, np.float32)).to(device)
         self._training_from_world = train.training_from_world
         self._num_periods = train.num_periods
@@ -65,7 +65,8 @@ class GaussianSplatting:
         number = self._sampler.next()
         view = self._train.views[number]
         raster = self._rasterize(view)
-        target = torch.from_numpy(self._train.load_image(number)).to(self._background.device)
+        # A copy, as cached images are not ours to write to, which torch cannot promise.
+        target = torch.from_numpy(self._train.load_image(number).copy()).to(raster.image.device)
         loss = photometric_loss(raster.image[0], target, ssim_weight=self.config.ssim_weight)
         self._optimizer.zero_grad()
         loss.backward()

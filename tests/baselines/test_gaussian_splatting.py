@@ -192,8 +192,10 @@ def test_twins_and_lone_points_start_with_a_size():
     assert scales[0, 0] == pytest.approx(5.0)
 
 
-def test_no_points_is_an_error():
-    empty = replace(toy_scene(views=1), points=np.zeros((0, 3), np.float32))
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((60, 3), np.nan)])
+def test_no_points_is_an_error(points):
+    scene = toy_scene(views=1)
+    empty = replace(scene, points=points.astype(np.float32), colors=scene.colors[: len(points)])
     with pytest.raises(SceneError, match="sparse points"):
         initialise(empty, opacity=0.1)
 
