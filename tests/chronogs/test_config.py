@@ -1,0 +1,68 @@
+"""Presets and options."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from chronogs import SPEC
+from chronogs.config import ChronoGSConfig
+from chronoscene.errors import ConfigError
+from chronoscene.methods import build_config
+
+
+@pytest.mark.parametrize("preset", SPEC.presets)
+def test_every_preset_builds(preset: str) -> None:
+    config = build_config(SPEC, preset=preset)
+    assert isinstance(config, ChronoGSConfig)
+
+
+def test_the_paper_preset_is_what_the_official_code_does() -> None:
+    config = build_config(SPEC, preset="paper")
+    assert config == ChronoGSConfig()
+    assert (config.iterations, config.offsets_per_anchor) == (40_000, 10)
+    assert (config.base_dim, config.period_dim, config.global_dim) == (16, 16, 32)
+    assert (config.voxel_size, config.voxel_unit) == (0.001, "world")
+    assert (config.direction_noise, config.feature_decay, config.head_decay) == (0, 0, 0)
+    assert config.density_from * config.iterations == 1_500
+    assert config.statistics_from * config.iterations == 500
+
+
+def test_reading_the_specs_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, chronogs, baselines.scaffold_gs\n"
+        "heavy = {'torch', 'numba', 'scipy', 'open3d'} & set(sys.modules)\n"
+        "sys.exit(', '.join(sorted(heavy)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"fusion": "product"}, "fusion: expected one of concat, sum"),
+        ({"voxel_unit": "mile"}, "voxel_unit: expected one of spacing, training, world"),
+        ({"direction_heads": ("colour",)}, "direction_heads: .*did you mean 'color'"),
+        ({"period_dim": -1}, "period_dim, global_dim: expected 0 or more, found -1, 32"),
+        ({"iterations": 0}, "iterations: expected at least 1, found 0"),
+        ({"density_interval": 0}, "density_interval: expected at least 1"),
+    ],
+)
+def test_impossible_options_are_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ChronoGSConfig(**values)
+
+
+def test_options_from_the_command_line_take_the_type_of_the_default() -> None:
+    config = build_config(
+        SPEC,
+        preset="balanced",
+        overrides={"color_lr": "[0.01, 0.001]", "global_heads": '["color"]', "period_dim": "0"},
+    )
+    assert config.color_lr == (0.01, 0.001)
+    assert config.global_heads == ("color",)
+    assert config.period_dim == 0

@@ -1,0 +1,196 @@
+"""Schedules, repeatability, saving and loading."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from chronogs.config import ChronoGSConfig
+from chronogs.method import ChronoGS
+from chronoscene.errors import CheckpointError
+from chronoscene.methods import TrainingSet
+from chronoscene.threads import set_threads
+from chronoscene.training.density import DensityStatistics
+from chronoscene.training.schedule import log_linear
+
+Make = Callable[..., ChronoGS]
+GROWING = {
+    "iterations": 24,
+    "voxel_size": 0.02,
+    "voxel_unit": "training",
+    "statistics_from": 0.1,
+    "density_from": 0.2,
+    "density_until": 0.9,
+    "density_interval": 6,
+    "grad_threshold": 1e-5,
+    "success_threshold": 0.3,
+}
+
+
+def train(made: ChronoGS, steps: int) -> ChronoGS:
+    for index in range(steps):
+        made.step(index, index / steps)
+    return made
+
+
+def test_learning_rates_at_start_middle_and_end(method: Make) -> None:
+    made = method()
+    rates = made.rates(1.1)
+    at = {name: [log_linear(p, *rate) for p in (0.0, 0.5, 1.0)] for name, rate in rates.items()}
+    assert at["opacity.w1"] == pytest.approx([2e-3, 2e-4, 2e-5])
+    assert at["color.b2"] == pytest.approx([8e-3, (8e-3 * 5e-5) ** 0.5, 5e-5])
+    assert at["covariance.w2"] == pytest.approx([4e-3] * 3)
+    assert at["offsets"] == pytest.approx([0.011, 0.0011, 0.00011])
+    assert at["features"] == pytest.approx([0.0075] * 3)
+    assert at["log_scales"] == pytest.approx([0.007] * 3)
+    assert at["global_features"] == pytest.approx([0.05, 0.005, 0.0005])
+    trained = set(made.model.tensors()) - {"anchors"}
+    assert set(rates) == trained
+
+
+def rounds(config: ChronoGSConfig, train_set: TrainingSet, total: int) -> list[int]:
+    """Steps, counted from 1, after which anchors would grow, without doing the steps' work."""
+    made = ChronoGS(config)
+    made.setup(train_set, seed=0, device="cpu")
+    trainer = made._trainer
+    assert trainer is not None
+    trainer.statistics = object()  # type: ignore[assignment]
+    trainer._grow = lambda statistics: None  # type: ignore[method-assign]
+    trainer._prune = lambda statistics: None  # type: ignore[method-assign]
+    return [
+        index + 1
+        for index in range(total)
+        if trainer._densify_if_due(index, trainer._progress_after(index, index / total))
+    ]
+
+
+def test_rounds_of_the_official_schedule(noise_set: Callable[[int], TrainingSet]) -> None:
+    found = rounds(ChronoGSConfig(), noise_set(1), 40_000)
+    assert (found[0], found[-1], len(found)) == (1_600, 19_900, 184)
+    paper = rounds(ChronoGSConfig(first_round="at"), noise_set(1), 40_000)
+    assert (paper[0], paper[-1], len(paper)) == (1_500, 19_900, 185)
+
+
+def test_anchors_grow_and_only_mlps_move_in_that_step(
+    noise_set: Callable[[int], TrainingSet],
+) -> None:
+    made = ChronoGS(ChronoGSConfig(**GROWING))
+    made.setup(noise_set(2), seed=0, device="cpu")
+    for index in range(11):
+        made.step(index, index / 24)
+    start = len(made.model)
+    before = {n: t.detach().clone() for n, t in made.model.tensors().items()}
+    report = made.step(11, 11 / 24)
+    after = made.model.tensors()
+    assert report.primitives == len(made.model) > start
+    torch.testing.assert_close(after["offsets"][:start], before["offsets"], rtol=0, atol=0)
+    torch.testing.assert_close(after["features"][:start], before["features"], rtol=0, atol=0)
+    assert not torch.equal(after["opacity.w1"], before["opacity.w1"])
+    assert not after["offsets"][start:].any()
+    made.step(12, 12 / 24)
+    assert not torch.equal(made.model.offsets[:start], before["offsets"])
+
+
+def test_faint_anchors_go_but_never_all(noise_set: Callable[[int], TrainingSet]) -> None:
+    made = _set_up(ChronoGSConfig(**GROWING), noise_set(2))
+    made.step(0, 0.0)
+    trainer, before = made._trainer, made.model.anchors.clone()
+    assert trainer is not None
+    statistics = DensityStatistics(len(before), 10)
+    statistics.visits[:] = 100.0
+    statistics.opacity_sum[::2] = 50.0
+    with torch.no_grad():
+        made.model.log_scales[0] = 3.0
+    trainer._prune(statistics)
+    torch.testing.assert_close(made.model.anchors, before[::2], rtol=0, atol=0)
+    for name in ("offsets", "features", "log_scales"):
+        assert trainer.optimizer.params[name] is getattr(made.model, name)
+        assert len(getattr(made.model, name)) == len(before[::2]) == len(statistics.visits)
+    assert made.model.log_scales[0].tolist() == pytest.approx([3.0] * 3 + [0.05] * 3)
+    statistics.visits[:] = 100.0
+    statistics.opacity_sum[:] = 0.0
+    trainer._prune(statistics)
+    assert len(made.model) == len(before[::2])
+
+
+def _set_up(config: ChronoGSConfig, train_set: TrainingSet) -> ChronoGS:
+    made = ChronoGS(config)
+    made.setup(train_set, seed=3, device="cpu")
+    return made
+
+
+def _bytes_after_training(
+    folder: Path, train_set: TrainingSet, threads: int, seed: int = 3
+) -> bytes:
+    folder.mkdir()
+    set_threads(threads)
+    try:
+        noisy = GROWING | {"direction_noise": 0.1, "feature_decay": 0.1, "head_decay": 0.1}
+        made = ChronoGS(ChronoGSConfig(**noisy))
+        made.setup(train_set, seed=seed, device="cpu")
+        train(made, 24).save(folder)
+    finally:
+        set_threads()
+    return (folder / "model.safetensors").read_bytes()
+
+
+def test_a_seed_gives_the_same_bytes_for_any_number_of_threads(
+    noise_set: Callable[[int], TrainingSet], tmp_path: Path
+) -> None:
+    torch.manual_seed(0)
+    one = _bytes_after_training(tmp_path / "one", noise_set(2), threads=1)
+    torch.manual_seed(1)  # the global state must not matter
+    np.random.seed(1)
+    assert one == _bytes_after_training(tmp_path / "two", noise_set(2), threads=2)
+    other = _bytes_after_training(tmp_path / "other", noise_set(2), threads=1, seed=4)
+    assert one != other
+
+
+def test_a_loaded_model_gives_the_same_pixels(
+    noise_set: Callable[[int], TrainingSet], tmp_path: Path
+) -> None:
+    made = train(_set_up(ChronoGSConfig(**GROWING), noise_set(2)), 24)
+    made.save(tmp_path)
+    loaded = ChronoGS(ChronoGSConfig(base_dim=3))  # the stored layout counts
+    loaded.load(tmp_path, device="cpu")
+    for view in noise_set(2).views[:2]:
+        for period in (0, 0.3, 1):
+            ours, theirs = made.render(view, period), loaded.render(view, period)
+            for name in ("rgb", "alpha", "depth"):
+                np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    assert loaded.size() == made.size()
+    again = tmp_path / "again"
+    again.mkdir()
+    loaded.save(again)
+    assert (again / "model.safetensors").read_bytes() == (
+        tmp_path / "model.safetensors"
+    ).read_bytes()
+
+
+def test_a_model_of_another_layout_is_refused(method: Make, tmp_path: Path) -> None:
+    made = method()
+    made.save(tmp_path)
+    meta = json.loads((tmp_path / "model.json").read_text())
+    del meta["layout"]["fusion"]
+    (tmp_path / "model.json").write_text(json.dumps(meta))
+    with pytest.raises(CheckpointError, match=r"model.json: layout: expected the keys .*fusion"):
+        made.load(tmp_path, device="cpu")
+
+
+def test_a_view_that_sees_nothing_teaches_nothing(
+    noise_set: Callable[[int], TrainingSet], method: Make
+) -> None:
+    made = method()
+    with torch.no_grad():
+        made.model.anchors[:, 2] += 100.0  # behind every camera
+    before = {n: t.detach().clone() for n, t in made.model.tensors().items()}
+    made.step(0, 0.0)
+    for name, tensor in made.model.tensors().items():
+        torch.testing.assert_close(tensor, before[name], rtol=0, atol=0)
+    prediction = made.render(noise_set(3).views[0], 1)
+    np.testing.assert_allclose(prediction.rgb[0, 0], [0.1, 0.2, 0.3], atol=1e-7)
