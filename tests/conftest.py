@@ -1,0 +1,89 @@
+"""Small scene folders for tests, made by COLMAP's own generator rather than by our writer."""
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import chronoscene  # noqa: F401  (loads zlib before pycolmap)
+import pycolmap  # isort: skip
+
+FOUR_IMAGES = {"a/0001.png": 0, "a/0002.png": 0, "b/0001.png": 1, "b/0003.png": 1}
+"""Image name to period; file names alone are ambiguous."""
+
+
+def synthetic_model(names: list[str], *, points: int = 30) -> pycolmap.Reconstruction:
+    """A model of exact observations: one camera with fx != fy and the principal point off centre."""
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs = 1
+    options.num_cameras_per_rig = 1
+    options.num_frames_per_rig = len(names)
+    options.num_points3D = points
+    options.camera_model_id = pycolmap.CameraModelId.PINHOLE
+    options.camera_width, options.camera_height = 64, 48
+    options.camera_params = [50.0, 52.0, 30.0, 25.5]
+    pycolmap.set_random_seed(7)
+    model = pycolmap.synthesize_dataset(options)
+    for image_id, name in zip(sorted(model.images), names, strict=True):
+        model.images[image_id].name = name
+    for i, point_id in enumerate(sorted(model.points3D)):
+        model.points3D[point_id].color = np.array([i % 256, 10, 20], np.uint8)
+    return model
+
+
+def write_images(folder: Path, names: list[str], size: tuple[int, int] = (64, 48)) -> None:
+    """Random images, different for each name."""
+    for i, name in enumerate(names):
+        pixels = np.random.default_rng(i).integers(0, 256, (size[1], size[0], 3), np.uint8)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(pixels).save(folder / name)
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path, form: str) -> None:
+    """Write as ``binary`` (five files), ``old`` (the three files of before 3.12) or ``text``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if form == "text":
+        model.write_text(str(folder))
+    else:
+        model.write_binary(str(folder))
+    if form == "old":
+        (folder / "rigs.bin").unlink()
+        (folder / "frames.bin").unlink()
+
+
+@pytest.fixture
+def make_scene_folder(tmp_path: Path) -> Callable[..., Path]:
+    """Factory of scene folders in the ChronoScene format."""
+
+    def make(
+        periods: Mapping[str, int] = FOUR_IMAGES,
+        *,
+        name: str = "scene",
+        form: str = "binary",
+        tests: list[str] | None = None,
+        points: int = 30,
+    ) -> Path:
+        root = tmp_path / name
+        names = list(periods)
+        write_model(synthetic_model(names, points=points), root / "sparse" / "0", form)
+        write_images(root / "images", names)
+        lines = "".join(f"{image} {period}\n" for image, period in periods.items())
+        (root / "sparse" / "split.txt").write_text(lines)
+        if tests is not None:
+            (root / "sparse" / "0" / "test.txt").write_text("".join(f"{t}\n" for t in tests))
+        return root
+
+    return make
+
+
+@pytest.fixture
+def shared_data() -> Path:
+    """Folder with real and rendered scenes; skips where there is none."""
+    default = Path(__file__).parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("CHRONOSCENE_SHARED_DATA", default))
+    if not folder.is_dir():
+        pytest.skip("no data: set CHRONOSCENE_SHARED_DATA to a folder with scenes")
+    return folder
