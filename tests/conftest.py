@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 import chronoscene  # noqa: F401  (loads zlib before pycolmap)
+
 import pycolmap  # isort: skip
 
 FOUR_IMAGES = {"a/0001.png": 0, "a/0002.png": 0, "b/0001.png": 1, "b/0003.png": 1}
@@ -16,7 +17,7 @@ FOUR_IMAGES = {"a/0001.png": 0, "a/0002.png": 0, "b/0001.png": 1, "b/0003.png": 
 
 
 def synthetic_model(names: list[str], *, points: int = 30) -> pycolmap.Reconstruction:
-    """A model of exact observations: one camera with fx != fy and the principal point off centre."""
+    """A model of exact observations; the camera has fx != fy and is off centre."""
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs = 1
     options.num_cameras_per_rig = 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -185,7 +186,9 @@ def read_world(path: Path) -> WorldFrame:
     check_choice(f"{place}: unit", str(unit), ("metre", "unknown"), error=SceneError)
     if crs is not None and not isinstance(crs, str):
         raise _json_error(place, "a crs such as EPSG:32650, or null", repr(crs))
-    numbers = isinstance(offset, list) and all(type(x) in (int, float) for x in offset)
+    numbers = isinstance(offset, list) and all(
+        type(x) in (int, float) and math.isfinite(x) for x in offset
+    )
     if not numbers or len(offset) != 3:
         raise _json_error(place, "an offset of three numbers", repr(offset))
     return WorldFrame(unit, crs, (float(offset[0]), float(offset[1]), float(offset[2])))
@@ -194,7 +197,7 @@ def read_world(path: Path) -> WorldFrame:
 def _read_json(place: Path, kind: type) -> Any:
     try:
         data = json.loads(read_text(place))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise _json_error(place, "JSON", str(error)) from error
     if not isinstance(data, kind):
         raise _json_error(
@@ -230,6 +233,8 @@ def write(scene: Scene, out: Path, *, image_source: ImageSource = "copy") -> Pat
         raise SceneError(
             out, expected="a new or empty folder", found="one in use", todo="choose another folder"
         )
+    for frame in scene.frames:
+        _check_writable_name(out, frame)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
         staged = Path(temporary) / "scene"
@@ -242,6 +247,19 @@ def write(scene: Scene, out: Path, *, image_source: ImageSource = "copy") -> Pat
             out.rmdir()
         staged.rename(out)
     return out
+
+
+def _check_writable_name(place: Path, frame: Frame) -> None:
+    """Refuse a name that would leave the folder or that one line of text cannot hold."""
+    check_name(place, frame.name)
+    entries, _ = parse_split_text(format_split_text({frame.name: frame.period}))
+    if [(entry.name, entry.period) for entry in entries] != [(frame.name, frame.period)]:
+        raise SceneError(
+            place,
+            expected="image names without line breaks, and without blanks at their ends",
+            found=repr(frame.name),
+            todo="rename the image",
+        )
 
 
 def _write_texts(scene: Scene, root: Path) -> None:
