@@ -1,0 +1,557 @@
+"""Fillers of blocks: square, park, houses, slabs, tower, building site, renewal, suburb."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.synth import furniture as fur
+from chronoscene.synth import palettes as pal
+from chronoscene.synth import stages
+from chronoscene.synth.buildings import SLAB, Building, finished, foundation, frame, rubble
+from chronoscene.synth.ground import PARKING, pavement
+from chronoscene.synth.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.seeds import key_number, rng_for
+from chronoscene.synth.textures import PAVING
+from chronoscene.synth.vegetation import hedge, tree
+from chronoscene.synth.world import World
+
+Array = NDArray[np.float64]
+X, Y, Z = np.eye(3)
+RING = 3.0
+"""Width of pavements, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rect:
+    """Axis-aligned rectangle in metres."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    def inset(self, d: float) -> Rect:
+        return Rect(self.x0 + d, self.y0 + d, self.x1 - d, self.y1 - d)
+
+    @property
+    def size(self) -> tuple[float, float]:
+        return self.x1 - self.x0, self.y1 - self.y0
+
+    @property
+    def center(self) -> tuple[float, float]:
+        return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
+
+    def at(self, fx: float, fy: float, z: float = SLAB) -> Array:
+        """Point at fractions of the extents. [3]"""
+        dx, dy = self.size
+        return np.array([self.x0 + fx * dx, self.y0 + fy * dy, z])
+
+
+# ------------------------------------------------------------------ ground of a block
+
+
+def _pavement(world: World, name: str, rect: Rect, ring: float = RING) -> Rect:
+    low, high = np.array([rect.x0, rect.y0]), np.array([rect.x1, rect.y1])
+    world.always(f"{name}/pavement", "ground", lambda: pavement(name, low, high, ring, world.seed))
+    return rect.inset(ring)
+
+
+def _floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
+    """One rectangle of ground: ``lawn SEASON``, ``soil``, ``car_park``, ``slabs``, ``rings``."""
+    b = PartBuilder(key_number(name, "floor"))
+    kind, _, season = surface.partition(" ")
+    dx, dy = rect.size
+    if kind == "lawn":
+        style = pal.grass_style(b, season, 0.22)
+    elif kind == "mown":
+        style = pal.grass_style(b, season, 0.10, 0.22)
+    elif kind == "soil":
+        style = pal.soil_style(b, 0.10, 0.8)
+    elif kind == "car_park":
+        style = pal.asphalt_style(b, 3)
+    elif kind == "rings":
+        style = b.style(
+            PAVING, srgb(184, 160, 132), srgb(132, 92, 74), srgb(96, 84, 72),
+            (0.8, 0.8, 0.5, 2.0, 4.4),
+        )  # fmt: skip
+    elif kind == "bands":
+        style = b.style(
+            PAVING, srgb(176, 168, 154), srgb(118, 112, 108), srgb(84, 80, 76),
+            (0.6, 0.6, 0.0, 1.0, 4.8),
+        )  # fmt: skip
+    else:
+        style = b.style(
+            PAVING, srgb(168, 150, 128), srgb(150, 140, 128), srgb(92, 84, 74),
+            (0.4, 0.2, 0.5, 0.0, 1.0),
+        )  # fmt: skip
+    b.quads([rect.x0, rect.y0, z], dx * X, dy * Y, style)
+    return b.build()
+
+
+def _lawn(world: World, name: str, rect: Rect, kind: str = "lawn", z: float = SLAB) -> None:
+    states = [f"{kind} {light.season}" for light in world.lights]
+    world.add(f"{name}/lawn", "lawn", states, lambda s: _floor(name, rect, s, z))
+
+
+def _path(world: World, name: str, points: Array, width: float) -> None:
+    """Gravel path along a curve, a hand above the lawn's surface."""
+    way = np.gradient(points, axis=0)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    side = np.column_stack([-way[:, 1], way[:, 0]]) * width / 2
+
+    def make() -> Part:
+        b = PartBuilder(key_number(name))
+        style = pal.soil_style(b, 0.05, 0.0)
+        left = np.column_stack([points + side, np.full(len(points), SLAB + 0.02)])
+        right = np.column_stack([points - side, np.full(len(points), SLAB + 0.02)])
+        frame = (np.zeros(3), X, Y)
+        for i in range(len(points) - 1):
+            b.polygon([right[i], right[i + 1], left[i + 1], left[i]], style, frame=frame)
+        return b.build()
+
+    world.always(name, "ground", make)
+
+
+# ------------------------------------------------------------------ things on the ground
+
+
+def _tree(
+    world: World, name: str, at: Array, rng: np.random.Generator, size: float = 6.5
+) -> None:
+    """A tree that grows and changes with the seasons."""
+    heights = stages.tree_heights(rng, world.periods, float(rng.uniform(0.75, 1.25) * size))
+    states = [
+        None if h is None else (h, light.season)
+        for h, light in zip(heights, world.lights, strict=True)
+    ]
+    world.add(name, "tree", states, lambda s: tree(name, at, s[0], s[1], world.seed))
+
+
+def _hedge(world: World, name: str, low: Array, high: Array) -> None:
+    states = [light.season for light in world.lights]
+    world.add(name, "tree", states, lambda s: hedge(name, low, high, s, world.seed))
+
+
+def _visitor(
+    world: World,
+    name: str,
+    kind: str,
+    rng: np.random.Generator,
+    chance: float,
+    make: Callable[[], Part],
+) -> None:
+    """Something movable that is there in some periods only."""
+    here = stages.visits(rng, world.periods, chance)
+    if any(here):
+        world.add(name, kind, ["there" if h else None for h in here], lambda _: make())
+
+
+def _cars(
+    world: World, name: str, places: list[tuple[float, float, float, float]], chance: float
+) -> None:
+    """Parked cars: each place (x, y, z, heading) holds one car, another or none per period."""
+    rng = rng_for(world.seed, name, "cars")
+    for i, (x, y, z, turn) in enumerate(places):
+        stay = rng.random() < 0.2
+        draws = rng.random(world.periods)
+        if stay:
+            draws[:] = draws[0]
+        wobble = rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
+        for p in range(world.periods):
+            if draws[p] >= chance or (stay and p):
+                continue
+            label = f"{name}/car_{i}" if stay else f"{name}/car_{i}_{p}"
+            states = ["parked" if stay or q == p else None for q in range(world.periods)]
+            base = np.array([x, y, z])
+            world.add(
+                label, "car", states,
+                lambda _, n=label, b=base, t=turn + wobble: fur.car(n, b, t, world.seed),
+            )  # fmt: skip
+
+
+def _lamps(world: World, name: str, rect: Rect) -> None:
+    """Lamps along the kerb, arms over the road."""
+    r = rect.inset(0.8)
+    dx, dy = r.size
+    spots = [(f, 0.0, -np.pi / 2) for f in np.linspace(0.2, 0.8, max(1, int(dx // 18)))]
+    spots += [(f, 1.0, np.pi / 2) for f in np.linspace(0.2, 0.8, max(1, int(dx // 18)))]
+    spots += [(0.0, f, np.pi) for f in np.linspace(0.3, 0.7, max(1, int(dy // 22)))]
+    spots += [(1.0, f, 0.0) for f in np.linspace(0.3, 0.7, max(1, int(dy // 22)))]
+    for i, (fx, fy, turn) in enumerate(spots):
+        label, at = f"{name}/lamp_{i}", r.at(fx, fy)
+        world.always(label, "lamp", lambda n=label, a=at, t=turn: fur.lamp(n, a, t))
+
+
+def curb_side(world: World, name: str, rect: Rect, road: float) -> None:
+    """Cars in the parking lanes around a block, and lamps."""
+    places = []
+    off = PARKING / 2
+    step = 5.5
+    for k in range(int((rect.size[0] - 10) // step)):
+        x = rect.x0 + 8.0 + k * step
+        places += [(x, rect.y0 - off, 0.0, 0.0), (x, rect.y1 + off, 0.0, np.pi)]
+    for k in range(int((rect.size[1] - 10) // step)):
+        y = rect.y0 + 8.0 + k * step
+        places += [(rect.x0 - off, y, 0.0, np.pi / 2), (rect.x1 + off, y, 0.0, -np.pi / 2)]
+    _cars(world, name, places, 0.42)
+    _lamps(world, name, rect)
+
+
+def _house(
+    world: World, spec: Building, *, chance: float = 0.3, also: tuple[str, ...] = ()
+) -> None:
+    """A finished building, which may get another facade."""
+    rng = rng_for(world.seed, spec.name, "reclad")
+    states = stages.looks(rng, world.periods, chance)
+    walls = (spec.wall, str(rng.choice([w for w in ("plaster", "panel", "brick", *also)])))
+    world.add(
+        spec.name,
+        "facade",
+        [(walls[s], s) for s in states],
+        lambda s: finished(replace(spec, wall=s[0], look=s[1]), world.seed),
+    )
+
+
+# ------------------------------------------------------------------ fillers
+
+
+def square(world: World, name: str, rect: Rect) -> None:
+    """Paved square: fountain, trees, benches, kiosks and, at times, a market."""
+    rng = rng_for(world.seed, name)
+    inner = _pavement(world, name, rect)
+    pattern = str(rng.choice(["rings", "bands"]))
+    world.always(f"{name}/paving", "ground", lambda: _floor(name, inner, pattern))
+    mid = inner.at(0.5, 0.5)
+    radius = min(3.6, 0.13 * min(inner.size))
+    if rng.random() < 0.6:
+        world.always(f"{name}/fountain", "monument", lambda: fur.fountain(name, mid, radius))
+    else:
+        world.always(f"{name}/statue", "monument", lambda: fur.statue(name, mid))
+    for i, (fx, fy) in enumerate(((0.17, 0.17), (0.83, 0.17), (0.83, 0.83), (0.17, 0.83))):
+        c = inner.at(fx, fy)
+        w = 0.11 * min(inner.size)
+        bed = Rect(c[0] - w, c[1] - w, c[0] + w, c[1] + w)
+        _lawn(world, f"{name}/bed_{i}", bed, "mown", SLAB + 0.03)
+        for j in range(1 if w < 2.5 else 3):
+            at = bed.at(*rng.uniform(0.2, 0.8, 2)) if w >= 2.5 else bed.at(0.5, 0.5)
+            _tree(world, f"{name}/tree_{i}{j}", at, rng)
+        side = np.sign(0.5 - fx)
+        _bench(world, f"{name}/bench_{i}", c + [side * (w + 0.8), 0, 0], -side * np.pi / 2)
+    for i in range(max(2, int(min(inner.size) // 7))):
+        at = inner.at(*rng.uniform(0.3, 0.7, 2))
+        if np.linalg.norm((at - mid)[:2]) < radius + 3.5:
+            at = mid + _unit2(at - mid) * (radius + 4.5)
+        turn = float(rng.uniform(0, 6.28))
+        make = fur.stall if i % 2 else fur.kiosk
+        label = f"{name}/{'stall' if i % 2 else 'kiosk'}_{i}"
+        _visitor(world, label, "kiosk", rng, 0.5,
+                 lambda n=label, a=at, t=turn, m=make: m(n, a, t, world.seed))  # fmt: skip
+
+
+def park(world: World, name: str, rect: Rect) -> None:
+    """Lawn with paths, trees, hedges and benches."""
+    rng = rng_for(world.seed, name)
+    inner = _pavement(world, name, rect)
+    _lawn(world, name, inner)
+    t = np.linspace(0, 1, 25)
+    bend = rng.uniform(-0.16, 0.16, 2)
+    first = np.stack([t, 0.2 + 0.6 * t + bend[0] * np.sin(np.pi * t)], axis=1)
+    second = np.stack([0.75 - 0.5 * t + bend[1] * np.sin(2 * np.pi * t), t], axis=1)
+    low, size = np.array([inner.x0, inner.y0]), np.array(inner.size)
+    for i, curve in enumerate((first, second)):
+        _path(world, f"{name}/path_{i}", low + curve * size, 2.2)
+    curves = low + np.concatenate([first, second]) * size
+    _scatter_trees(world, name, inner, rng, int(np.prod(size) / 70), curves)
+    for i in range(4):
+        k = int(rng.integers(4, 20)) + 25 * (i % 2)
+        at = np.array([*(curves[k] + [1.6, 1.0]), SLAB])
+        _bench(world, f"{name}/bench_{i}", at, float(rng.uniform(0, 6.28)))
+    _hedge(world, f"{name}/hedge_s", inner.at(0.05, 0.03), inner.at(0.6, 0.03))
+    _hedge(world, f"{name}/hedge_e", inner.at(0.97, 0.3), inner.at(0.97, 0.95))
+
+
+def houses(world: World, name: str, rect: Rect) -> None:
+    """Rows of attached houses along two sides with a courtyard between them."""
+    rng = rng_for(world.seed, name)
+    inner = _pavement(world, name, rect)
+    dx, dy = inner.size
+    depth = min(11.0, 0.42 * dy) if dy > 20 else min(11.0, 0.75 * dy)
+    rows = [(inner.y0, inner.y0 + depth, 0)]
+    if dy - depth > 13:
+        rows.append((inner.y1 - depth, inner.y1, 2))
+    for r, (y0, y1, street) in enumerate(rows):
+        count = max(1, round(dx / rng.uniform(9.5, 13)))
+        cuts = inner.x0 + dx * np.concatenate(
+            [[0], (np.arange(1, count) + rng.uniform(-0.15, 0.15, count - 1)) / count, [1]]
+        )
+        shops = bool(rng.random() < 0.6)
+        for i in range(count):
+            spec = Building(
+                f"{name}/house_{r}{i}", cuts[i], y0, cuts[i + 1], y1,
+                int(rng.integers(2, 6)), str(rng.choice(["gable", "gable", "hip", "flat"])),
+                str(rng.choice(["plaster", "plaster", "brick"])),
+                blank=(False, i < count - 1, False, i > 0),
+                shops=(shops and street == 0, False, shops and street == 2, False),
+                balconies=bool(rng.random() < 0.3),
+                storey=float(rng.uniform(2.9, 3.3)), ground=float(rng.uniform(3.5, 4.2)),
+            )  # fmt: skip
+            spec = _fit_roof(spec)
+            _house(world, spec, chance=0.35)
+    y0, y1 = inner.y0 + depth, (rows[1][0] if len(rows) > 1 else inner.y1)
+    yard = Rect(inner.x0, y0, inner.x1, y1)
+    _lawn(world, name, yard)
+    back = Rect(inner.x0, inner.y0, inner.x1, y0)
+    world.always(f"{name}/floor_0", "ground", lambda: _floor(name, back, "slabs"))
+    if len(rows) > 1:
+        front = Rect(inner.x0, y1, inner.x1, inner.y1)
+        world.always(f"{name}/floor_1", "ground", lambda: _floor(name, front, "slabs"))
+    if y1 - y0 > 4:
+        _scatter_trees(world, name, yard.inset(1.5), rng, max(1, int(dx * (y1 - y0) / 130)))
+
+
+def _fit_roof(spec: Building) -> Building:
+    """Attached houses need their ridge along the street, so narrow ones get a flat roof."""
+    narrow = spec.x1 - spec.x0 <= spec.y1 - spec.y0
+    attached = spec.blank[1] or spec.blank[3]
+    if attached and (narrow or spec.roof == "hip"):
+        return replace(spec, roof="flat" if narrow else "gable")
+    return spec
+
+
+def slabs(world: World, name: str, rect: Rect) -> None:
+    """One or two long flat-roofed buildings on lawns, with a car park."""
+    rng = rng_for(world.seed, name)
+    inner = _pavement(world, name, rect)
+    dx, dy = inner.size
+    upper = Rect(inner.x0, inner.y0 + 0.55 * dy, inner.x1, inner.y1)
+    lower = Rect(inner.x0, inner.y0, inner.x1, inner.y0 + 0.55 * dy)
+    _lawn(world, f"{name}/north", upper)
+    wall = str(rng.choice(["panel", "concrete", "brick", "panel"]))
+    spec = Building(
+        f"{name}/slab", upper.x0 + 2, upper.y0 + 1.0, upper.x1 - 2,
+        upper.y0 + 1.0 + min(12.0, upper.size[1] - 3), int(rng.integers(4, 8)), "flat", wall,
+        balconies=bool(rng.random() < 0.7),
+    )  # fmt: skip
+    _house(world, spec, chance=0.5)
+    lot = Rect(lower.x0, lower.y0, lower.x1, lower.y0 + min(17.0, lower.size[1]))
+    world.always(f"{name}/car_park", "ground", lambda: _floor(name, lot, "car_park"))
+    places = []
+    for k in range(int((lot.size[0] - 1) // 2.6)):
+        x = lot.x0 + 1.35 + 2.6 * k
+        places += [(x, lot.y0 + 2.5, SLAB, np.pi / 2), (x, lot.y1 - 2.5, SLAB, np.pi / 2)]
+    _cars(world, f"{name}/lot", places if lot.size[1] > 11 else places[::2], 0.4)
+    if lot.y1 < lower.y1 - 0.5:
+        rest = Rect(lower.x0, lot.y1, lower.x1, lower.y1)
+        _lawn(world, f"{name}/strip", rest, "mown")
+        if rest.size[1] > 3:
+            _scatter_trees(world, name, rest.inset(1.2), rng, int(rest.size[0] // 8))
+
+
+def tower(world: World, name: str, rect: Rect) -> None:
+    """A high building with a low wing, on a paved and planted base."""
+    rng = rng_for(world.seed, name)
+    inner = _pavement(world, name, rect)
+    world.always(f"{name}/paving", "ground", lambda: _floor(name, inner, "bands"))
+    w = min(16.0, 0.5 * min(inner.size))
+    x0, y0 = inner.at(*rng.uniform(0.08, 0.3, 2))[:2]
+    spec = Building(
+        f"{name}/tower", x0, y0, x0 + w, y0 + w, int(rng.integers(8, 11)), "flat",
+        str(rng.choice(["panel", "concrete"])), blank=(False, False, False, False),
+    )  # fmt: skip
+    _house(world, spec, chance=0.6)
+    if inner.x1 - (x0 + w) > 7:
+        wing = Building(
+            f"{name}/wing", x0 + w, y0 + 0.2 * w, inner.x1 - 1.5, y0 + 0.85 * w, 2, "flat",
+            "panel", blank=(False, False, False, True), shops=(True, False, True, False),
+        )  # fmt: skip
+        _house(world, wing, chance=0.5)
+    free = Rect(inner.x0 + 1.5, y0 + w + 2.5, inner.x1 - 1.5, inner.y1 - 1.5)
+    if free.size[1] > 3:
+        bed = free.inset(0.5)
+        _lawn(world, name, bed, "mown", SLAB + 0.04)
+        _scatter_trees(world, name, bed.inset(0.8), rng, int(bed.size[0] * bed.size[1] / 45))
+
+
+def site(world: World, name: str, rect: Rect) -> None:
+    """A building site: empty lot, foundation, frame with crane, finished building."""
+    rng = rng_for(world.seed, name)
+    inner = _pavement(world, name, rect)
+    steps = stages.site_stages(world.periods)
+    spec = _site_building(name, inner, rng)
+    done = {p for p, s in enumerate(steps) if s == "finished"}
+    surfaces: list[str | None] = [
+        f"mown {light.season}" if p in done else "soil" for p, light in enumerate(world.lights)
+    ]
+    world.add(f"{name}/floor", "ground", surfaces, lambda s: _floor(name, inner, s))
+
+    def make(stage: str) -> Part:
+        if stage == "foundation":
+            return foundation(spec, world.seed)
+        if stage.startswith("frame"):
+            part = 0.5 if stage == "frame_low" else 0.85
+            return frame(spec, max(1, int(part * spec.storeys)), world.seed)
+        return finished(spec, world.seed)
+
+    world.add(spec.name, "building", [None if s == "lot" else s for s in steps], make)
+    _site_gear(world, name, inner, steps, spec)
+    for i in range(4):
+        after = [
+            (round(3.2 + 0.6 * p, 2), world.lights[p].season) if p in done else None
+            for p in range(world.periods)
+        ]
+        at = inner.at(0.12 + 0.25 * i, 0.93)
+        label = f"{name}/young_{i}"
+        if any(after):
+            world.add(label, "tree", after,
+                      lambda s, n=label, a=at: tree(n, a, s[0], s[1], world.seed))  # fmt: skip
+
+
+def _site_building(name: str, inner: Rect, rng: np.random.Generator) -> Building:
+    dx, dy = inner.size
+    low = inner.at(0.12, 0.16)
+    return Building(
+        f"{name}/hall", low[0], low[1], low[0] + 0.7 * dx, low[1] + 0.62 * dy,
+        int(rng.integers(4, 7)), "flat", str(rng.choice(["panel", "brick", "plaster"])),
+        shops=(True, False, False, False), storey=3.3,
+    )  # fmt: skip
+
+
+def _site_gear(
+    world: World, name: str, inner: Rect, steps: list[str], spec: Building
+) -> None:
+    """Fence, containers, crane and diggers while the work goes on."""
+    busy = [None if s == "finished" else "there" for s in steps]
+    high = ["there" if s.startswith("f") and s != "finished" else None for s in steps]
+    r = inner.inset(0.4)
+    corners = [(r.x0, r.y0), (r.x1, r.y0), (r.x1, r.y1), (r.x0, r.y1), (r.x0, r.y0)]
+    if any(busy):
+        world.add(f"{name}/fence", "fence", busy,
+                  lambda _: fur.fence(name, corners, SLAB))  # fmt: skip
+        for i in range(2):
+            label, at = f"{name}/container_{i}", inner.at(0.25 + 0.4 * i, 0.9)
+            world.add(label, "container", busy,
+                      lambda _, n=label, a=at: fur.container(n, a, 0.0, world.seed))  # fmt: skip
+    if any(high):
+        height = spec.wall_height + 9.0
+        at = np.array([spec.x1 + 0.08 * inner.size[0], (spec.y0 + spec.y1) / 2, SLAB])
+        turn = float(rng_for(world.seed, name, "crane").uniform(2.0, 4.2))
+        world.add(f"{name}/crane", "crane", high,
+                  lambda _: fur.crane(f"{name}/crane", at, turn, height))  # fmt: skip
+    lot = ["there" if s in ("lot", "foundation") and world.periods > 1 else None for s in steps]
+    if any(lot):
+        at2 = inner.at(0.86, 0.12)
+        world.add(f"{name}/digger", "digger", lot,
+                  lambda _: fur.digger(f"{name}/digger", at2, 2.3))  # fmt: skip
+
+
+def renewal(world: World, name: str, rect: Rect) -> None:
+    """An old building that is pulled down; a car park takes its place. Houses stand beside it."""
+    rng = rng_for(world.seed, name)
+    inner = _pavement(world, name, rect)
+    dx, dy = inner.size
+    left = Rect(inner.x0, inner.y0, inner.x0 + 0.6 * dx, inner.y1)
+    right = Rect(left.x1, inner.y0, inner.x1, inner.y1)
+    steps = stages.renewal_stages(world.periods)
+    spec = Building(
+        f"{name}/old", left.x0 + 1.5, left.y0 + 0.1 * dy, left.x1 - 1.5, left.y0 + 0.72 * dy,
+        int(rng.integers(3, 5)), "gable", "brick",
+    )  # fmt: skip
+
+    def make(stage: str) -> Part:
+        return finished(spec, world.seed) if stage == "house" else rubble(spec, world.seed)
+
+    world.add(spec.name, "building", [None if s == "park" else s for s in steps], make)
+    floors = {"house": "slabs", "rubble": "soil", "park": "car_park"}
+    world.add(f"{name}/floor", "ground", [floors[s] for s in steps],
+              lambda s: _floor(name, left, s))  # fmt: skip
+    for p, stage in enumerate(steps):
+        if stage == "park":
+            here = ["there" if q == p else None for q in range(world.periods)]
+            for k in range(int((left.size[0] - 1) // 2.6)):
+                if rng.random() < 0.55:
+                    at = np.array([left.x0 + 1.35 + 2.6 * k, left.y0 + 2.5, SLAB])
+                    label = f"{name}/visitor_{p}{k}"
+                    world.add(label, "car", here,
+                              lambda _, n=label, a=at: fur.car(n, a, np.pi / 2, world.seed))  # fmt: skip
+    _lawn(world, name, right)
+    house = Building(
+        f"{name}/house", right.x0 + 1.0, right.y0 + 0.3 * dy, right.x1 - 0.5, right.y1 - 1.0,
+        int(rng.integers(2, 5)), "hip", "plaster",
+    )  # fmt: skip
+    _house(world, house, chance=0.7)
+    _scatter_trees(world, name, Rect(right.x0 + 1, right.y0 + 1, right.x1 - 1,
+                                     right.y0 + 0.25 * dy), rng, 2)  # fmt: skip
+
+
+def suburb(world: World, name: str, rect: Rect) -> None:
+    """Detached houses in gardens, simpler than the core."""
+    rng = rng_for(world.seed, name)
+    inner = _pavement(world, name, rect, 2.0)
+    _lawn(world, name, inner)
+    dx, dy = inner.size
+    cols, rows = max(1, int(dx // 18)), max(1, int(dy // 18))
+    for i in range(cols):
+        for j in range(rows):
+            plot = Rect(inner.x0 + i * dx / cols, inner.y0 + j * dy / rows,
+                        inner.x0 + (i + 1) * dx / cols, inner.y0 + (j + 1) * dy / rows)  # fmt: skip
+            w, d = rng.uniform(0.42, 0.62, 2) * plot.size
+            x, y = plot.at(*rng.uniform(0.1, 0.3, 2))[:2]
+            spec = Building(
+                f"{name}/villa_{i}{j}", x, y, x + w, y + d, int(rng.integers(1, 4)),
+                str(rng.choice(["gable", "hip"])), str(rng.choice(["plaster", "brick"])),
+                ground=3.0, simple=True,
+            )  # fmt: skip
+            world.always(spec.name, "building", lambda s=spec: finished(s, world.seed))
+            at = plot.at(0.86, float(rng.uniform(0.2, 0.8)))
+            label = f"{name}/tree_{i}{j}"
+            size = float(rng.uniform(5, 9))
+            states = [light.season for light in world.lights]
+            world.add(label, "tree", states,
+                      lambda s, n=label, a=at, h=size: tree(n, a, h, s, world.seed, detail=1))  # fmt: skip
+
+
+def _scatter_trees(
+    world: World,
+    name: str,
+    rect: Rect,
+    rng: np.random.Generator,
+    count: int,
+    avoid: Array | None = None,
+) -> None:
+    """Trees at random places that keep apart from each other and from given points."""
+    taken: list[Array] = []
+    for i in range(count):
+        for _ in range(20):
+            at = rect.at(*rng.random(2))
+            near = [*taken, *([] if avoid is None else avoid)]
+            if all(np.hypot(at[0] - q[0], at[1] - q[1]) > 2.6 for q in near):
+                taken.append(at)
+                _tree(world, f"{name}/tree_{i}", at, rng)
+                break
+
+
+def _bench(world: World, name: str, at: Array, turn: float) -> None:
+    world.always(name, "bench", lambda: fur.bench(name, at, turn))
+
+
+def _unit2(v: Array) -> Array:
+    flat = np.array([v[0], v[1], 0.0])
+    norm = np.linalg.norm(flat)
+    return flat / norm if norm > 1e-6 else np.array([1.0, 0.0, 0.0])
+
+
+FILLERS: dict[str, Callable[[World, str, Rect], None]] = {
+    "square": square,
+    "park": park,
+    "houses": houses,
+    "slabs": slabs,
+    "tower": tower,
+    "site": site,
+    "renewal": renewal,
+    "suburb": suburb,
+}
+"""Block roles by name."""

@@ -1,0 +1,262 @@
+"""Triangles with painted patches: what objects are made of.
+
+A *patch* is a piece of surface with a texture frame (origin and two unit axes in metres, so that
+textures are written in metres) and a *style* (kind of texture, colours, numbers). Triangles refer
+to patches, patches to styles; both are plain tables, which the compiled shader reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Color = tuple[float, float, float]
+
+STYLE_WIDTH = 24
+"""Style row: kind, three colours (1..9), numbers (10..19), reflectance at 0 degrees (20), sharpness
+of reflection (21), translucency (22), unused (23)."""
+PATCH_WIDTH = 12
+"""Patch row: origin (0..2), u axis (3..5), v axis (6..8), extents along u and v (9, 10), free."""
+
+
+def srgb(red: float, green: float, blue: float) -> Color:
+    """Linear colour of an sRGB triple 0..255."""
+    c = np.array([red, green, blue]) / 255.0
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return (float(linear[0]), float(linear[1]), float(linear[2]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A finished piece of geometry with its own tables (T triangles, P patches, S styles)."""
+
+    vertices: NDArray[np.float32]
+    """World metres, counter-clockwise seen from outside. [T, 3, 3]"""
+    normals: NDArray[np.float32]
+    """Unit shading normals per corner. [T, 3, 3]"""
+    tri_patch: NDArray[np.int32]
+    """[T]"""
+    patches: NDArray[np.float64]
+    """[P, PATCH_WIDTH]"""
+    patch_style: NDArray[np.int32]
+    """[P]"""
+    patch_seed: NDArray[np.int32]
+    """[P]"""
+    styles: NDArray[np.float64]
+    """[S, STYLE_WIDTH]"""
+
+    @property
+    def bounds(self) -> Array:
+        """Lowest and highest corner. [2, 3]"""
+        flat = self.vertices.reshape(-1, 3).astype(np.float64)
+        return np.stack([flat.min(axis=0), flat.max(axis=0)])
+
+
+class PartBuilder:
+    """Collects quads, boxes and triangles into a `Part`.
+
+    Args:
+        seed: Base of the texture hashes of this part.
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self._seed = seed
+        self._vertices: list[Array] = []
+        self._normals: list[Array] = []
+        self._tri_patch: list[NDArray[np.int64]] = []
+        self._patches: list[Array] = []
+        self._patch_style: list[NDArray[np.int64]] = []
+        self._patch_seed: list[NDArray[np.int64]] = []
+        self._styles: list[Array] = []
+        self._style_index: dict[bytes, int] = {}
+        self._num_patches = 0
+
+    def style(
+        self,
+        kind: int,
+        c0: Color,
+        c1: Color | None = None,
+        c2: Color | None = None,
+        numbers: Sequence[float] = (),
+        *,
+        reflect: float = 0.0,
+        sharp: float = 0.0,
+        translucent: float = 0.0,
+    ) -> int:
+        """Index of a style, made once for equal arguments."""
+        row = np.zeros(STYLE_WIDTH)
+        row[0] = kind
+        row[1:10] = [*c0, *(c1 or c0), *(c2 or c0)]
+        row[10 : 10 + len(numbers)] = numbers
+        row[20:23] = reflect, sharp, translucent
+        key = row.tobytes()
+        if key not in self._style_index:
+            self._style_index[key] = len(self._styles)
+            self._styles.append(row)
+        return self._style_index[key]
+
+    def quads(
+        self,
+        corner: ArrayLike,
+        edge_u: ArrayLike,
+        edge_v: ArrayLike,
+        style: int,
+        *,
+        frame: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Add N parallelograms; the outside is where ``edge_u x edge_v`` points.
+
+        Args:
+            corner: First corners. [N, 3]
+            edge_u: First edges, or one for all. [N, 3] or [3]
+            edge_v: Second edges, or one for all. [N, 3] or [3]
+            style: Style index.
+            frame: Origin and two unit axes of one texture over all quads; each quad has its own
+                texture otherwise, starting at its corner.
+            seed: Varies the texture.
+        """
+        o, u, v = np.broadcast_arrays(
+            np.atleast_2d(np.asarray(corner, np.float64)), edge_u, edge_v
+        )
+        if len(o) == 0:
+            return
+        quad = np.stack([o, o + u, o + u + v, o + v], axis=1)
+        normal = np.cross(u, v)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        tris = quad[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
+        self._append(tris, np.repeat(normal, 2, axis=0)[:, None].repeat(3, axis=1))
+        if frame is None:
+            lengths = np.stack([np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)], axis=1)
+            axes = np.concatenate([o, u / lengths[:, :1], v / lengths[:, 1:], lengths], axis=1)
+            self._add_patches(axes, style, seed, per_patch=2, own_texture=True)
+        else:
+            self._add_patches(_frame_row(frame, quad), style, seed, per_patch=2 * len(o))
+
+    def boxes(
+        self,
+        corner: ArrayLike,
+        a: ArrayLike,
+        b: ArrayLike,
+        c: ArrayLike,
+        style: int,
+        *,
+        top: int | None = None,
+        seed: int = 0,
+        bottom: bool = True,
+    ) -> None:
+        """Add N parallelepipeds with right-handed edges a, b, c (c is usually up).
+
+        Args:
+            corner: Lowest corners. [N, 3]
+            a: First edges. [N, 3] or [3]
+            b: Second edges. [N, 3] or [3]
+            c: Third edges. [N, 3] or [3]
+            style: Style of the sides and the bottom.
+            top: Style of the face at ``+c``; ``style`` where absent.
+            seed: Varies the texture.
+            bottom: Whether to add the face at ``-c``.
+        """
+        o, a, b, c = np.broadcast_arrays(
+            np.atleast_2d(np.asarray(corner, np.float64)), a, b, c
+        )
+        self.quads(o, a, c, style, seed=seed)
+        self.quads(o + a, b, c, style, seed=seed + 1)
+        self.quads(o + a + b, -a, c, style, seed=seed + 2)
+        self.quads(o + b, -b, c, style, seed=seed + 3)
+        self.quads(o + c, a, b, style if top is None else top, seed=seed + 4)
+        if bottom:
+            self.quads(o + b, a, -b, style, seed=seed + 5)
+
+    def polygon(
+        self,
+        points: ArrayLike,
+        style: int,
+        *,
+        frame: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
+        seed: int = 0,
+    ) -> None:
+        """Add a convex polygon, counter-clockwise seen from outside. [K, 3]"""
+        p = np.asarray(points, np.float64)
+        tris = np.stack([np.stack([p[0], p[i], p[i + 1]]) for i in range(1, len(p) - 1)])
+        normal = np.cross(p[1] - p[0], p[2] - p[0])
+        normal /= np.linalg.norm(normal)
+        self._append(tris, np.broadcast_to(normal, tris.shape))
+        if frame is None:
+            u = (p[1] - p[0]) / np.linalg.norm(p[1] - p[0])
+            frame = (p[0], u, np.cross(normal, u))
+        self._add_patches(_frame_row(frame, p), style, seed, per_patch=len(tris))
+
+    def triangles(
+        self, vertices: Array, normals: Array, style: int, *, origin: ArrayLike, seed: int = 0
+    ) -> None:
+        """Add triangles of a curved surface as one patch; textures use world axes from origin.
+
+        Args:
+            vertices: [N, 3, 3]
+            normals: Unit shading normals. [N, 3, 3]
+            style: Style index.
+            origin: Origin of the texture. [3]
+            seed: Varies the texture.
+        """
+        self._append(vertices, normals)
+        frame = (origin, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+        row = _frame_row(frame, vertices.reshape(-1, 3))
+        self._add_patches(row, style, seed, per_patch=len(vertices))
+
+    def build(self) -> Part:
+        """The collected geometry."""
+        return Part(
+            vertices=np.concatenate(self._vertices).astype(np.float32),
+            normals=np.concatenate(self._normals).astype(np.float32),
+            tri_patch=np.concatenate(self._tri_patch).astype(np.int32),
+            patches=np.concatenate(self._patches),
+            patch_style=np.concatenate(self._patch_style).astype(np.int32),
+            patch_seed=np.concatenate(self._patch_seed).astype(np.int32),
+            styles=np.stack(self._styles),
+        )
+
+    def _append(self, vertices: Array, normals: Array) -> None:
+        self._vertices.append(vertices)
+        self._normals.append(np.asarray(normals))
+
+    def _add_patches(
+        self, rows: Array, style: int, seed: int, per_patch: int, own_texture: bool = False
+    ) -> None:
+        table = np.zeros((len(rows), PATCH_WIDTH))
+        table[:, : rows.shape[1]] = rows
+        self._patches.append(table)
+        self._patch_style.append(np.full(len(rows), style))
+        numbers = np.arange(self._num_patches, self._num_patches + len(rows))
+        # Pieces that share a frame are one texture, so they must share the seed as well.
+        vary = 31 * numbers if own_texture else 0 * numbers
+        self._patch_seed.append((self._seed + 7919 * (seed + 1) + vary) % 1_000_003)
+        self._tri_patch.append(np.repeat(numbers, per_patch))
+        self._num_patches += len(rows)
+
+
+def _frame_row(frame: tuple[ArrayLike, ArrayLike, ArrayLike], points: Array) -> Array:
+    """Patch row of a texture frame; the extents reach the farthest of the points."""
+    origin, u, v = (np.asarray(x, np.float64) for x in frame)
+    local = points.reshape(-1, 3) - origin
+    return np.concatenate([origin, u, v, [(local @ u).max(), (local @ v).max()]])[None]
+
+
+def merge(parts: Sequence[Part]) -> Part:
+    """One part of several, with shifted indices."""
+    patch_shift = np.cumsum([0, *(len(p.patches) for p in parts)])
+    style_shift = np.cumsum([0, *(len(p.styles) for p in parts)])
+    pairs = list(zip(parts, patch_shift, style_shift, strict=False))
+    return Part(
+        vertices=np.concatenate([p.vertices for p in parts]),
+        normals=np.concatenate([p.normals for p in parts]),
+        tri_patch=np.concatenate([p.tri_patch + np.int32(a) for p, a, _ in pairs]),
+        patches=np.concatenate([p.patches for p in parts]),
+        patch_style=np.concatenate([p.patch_style + np.int32(b) for p, _, b in pairs]),
+        patch_seed=np.concatenate([p.patch_seed for p in parts]),
+        styles=np.concatenate([p.styles for p in parts]),
+    )

@@ -1,0 +1,109 @@
+"""What to generate: sizes, number of periods, kind of flight."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
+
+KINDS = ("aerial", "street")
+
+
+@dataclass(frozen=True, slots=True)
+class SynthSettings:
+    """All inputs of a synthetic scene. Lengths are metres."""
+
+    preset: str = "custom"
+    """Name of the preset that this came from; informative."""
+    kind: str = "aerial"
+    """``aerial``: oblique orbits and grids. ``street``: walks along the roads."""
+    periods: int = 3
+    """Number of dates of capture, T."""
+    width: int = 320
+    """Pixels."""
+    height: int = 240
+    """Pixels."""
+    views: int = 33
+    """Mean number of images per period; the periods differ around it."""
+    points: int = 11_000
+    """Sparse points to aim for."""
+    seed: int = 0
+    """Another seed is another place."""
+    off_centre: bool = False
+    """Whether the principal point lies away from the image centre (and fx differs from fy)."""
+    blocks: int = 3
+    """Blocks of the city core per axis."""
+    block_size: float = 40.0
+    """Mean edge of a block."""
+    supersample: int = 2
+    """Rays per pixel and axis."""
+    probe_spacing: float = 3.0
+    """Grid step of the samples of indirect light."""
+    noise: float = 0.0
+    """Standard deviation of the noise on observed point positions, in pixels."""
+
+    def __post_init__(self) -> None:
+        check_choice("--kind", self.kind, KINDS)
+        for name, low, high in _RANGES:
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ConfigError(
+                    f"--{name}",
+                    expected=f"a value from {low} to {high}",
+                    found=str(value),
+                    todo="choose a value in this range",
+                )
+
+
+_RANGES: tuple[tuple[str, float, float], ...] = (
+    ("periods", 1, 50),
+    ("width", 16, 8192),
+    ("height", 16, 8192),
+    ("views", 4, 5000),
+    ("points", 0, 5_000_000),
+    ("seed", 0, 2**31 - 1),
+    ("blocks", 2, 9),
+    ("block_size", 15.0, 120.0),
+    ("supersample", 1, 8),
+    ("probe_spacing", 0.5, 50.0),
+    ("noise", 0.0, 100.0),
+)
+
+PRESETS: dict[str, SynthSettings] = {
+    "tiny": SynthSettings(
+        preset="tiny",
+        periods=2,
+        width=64,
+        height=48,
+        views=11,
+        points=1_500,
+        blocks=2,
+        block_size=22.0,
+        probe_spacing=4.0,
+    ),
+    "demo": SynthSettings(preset="demo", off_centre=True),
+    "city": SynthSettings(
+        preset="city",
+        periods=4,
+        width=640,
+        height=480,
+        views=66,
+        points=64_000,
+        off_centre=True,
+        blocks=4,
+        block_size=46.0,
+    ),
+}
+"""Sizes for tests, for a demonstration on a laptop and for a real benchmark."""
+
+
+def preset(name: str, **changes: Any) -> SynthSettings:
+    """Settings of a preset, with some fields changed.
+
+    Raises:
+        ConfigError: If the name is unknown or a value is out of range.
+    """
+    check_choice("--preset", name, PRESETS)
+    return replace(PRESETS[name], **changes)

@@ -1,0 +1,326 @@
+"""Compiled shading: camera rays, hit points, light, tone curve.
+
+All loops run over pixels or samples that do not touch each other, so the result does not depend
+on the number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from chronoscene.synth.light import sky_radiance
+from chronoscene.synth.textures import albedo
+
+Array = NDArray[np.float64]
+MISS = 0xFFFFFFFF
+"""Primitive id that the ray caster gives to rays that hit nothing."""
+
+
+class Tables(NamedTuple):
+    """Geometry of one period as flat arrays; see `chronoscene.synth.mesh`."""
+
+    corners: NDArray[np.float32]
+    """[T, 3, 3]"""
+    normals: NDArray[np.float32]
+    """[T, 3, 3]"""
+    tri_patch: NDArray[np.int32]
+    patches: Array
+    patch_style: NDArray[np.int32]
+    patch_seed: NDArray[np.int32]
+    styles: Array
+
+
+class Probes(NamedTuple):
+    """Indirect light on a grid: radiance of order 1 in spherical harmonics."""
+
+    origin: Array
+    step: Array
+    """[3]"""
+    values: NDArray[np.float32]
+    """Mean radiance and three slopes per colour. [X, Y, Z, 4, 3]"""
+    valid: NDArray[np.float32]
+    """0 inside of objects. [X, Y, Z]"""
+
+
+@njit(cache=True, parallel=True)
+def camera_rays(world_from_cam, k, width, row0, rows, ss):  # type: ignore[no-untyped-def]
+    """Rays with unit z in the camera, so that the hit parameter is z-depth. [n, 6]
+
+    Samples of a pixel are neighbours: index ((row * width + column) * ss + j) * ss + i.
+    """
+    rays = np.empty((rows * width * ss * ss, 6), np.float32)
+    for pixel in prange(rows * width):
+        row, column = row0 + pixel // width, pixel % width
+        for j in range(ss):
+            for i in range(ss):
+                x = (column + (i + 0.5) / ss - k[0, 2]) / k[0, 0]
+                y = (row + (j + 0.5) / ss - k[1, 2]) / k[1, 1]
+                n = (pixel * ss + j) * ss + i
+                for axis in range(3):
+                    m = world_from_cam[axis]
+                    rays[n, axis] = m[3]
+                    rays[n, 3 + axis] = m[0] * x + m[1] * y + m[2]
+    return rays
+
+
+@njit(cache=True)
+def _normals(tables, tri, u, v, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Flat and smooth unit normals of a hit, both turned towards the viewer."""
+    a, b, c = tables.corners[tri, 0], tables.corners[tri, 1], tables.corners[tri, 2]
+    e0, e1, e2 = float(b[0] - a[0]), float(b[1] - a[1]), float(b[2] - a[2])
+    f0, f1, f2 = float(c[0] - a[0]), float(c[1] - a[1]), float(c[2] - a[2])
+    gx, gy, gz = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
+    scale = 1.0 / max(1e-12, math.sqrt(gx * gx + gy * gy + gz * gz))
+    gx, gy, gz = gx * scale, gy * scale, gz * scale
+    n = tables.normals[tri]
+    w = 1.0 - u - v
+    sx = w * n[0, 0] + u * n[1, 0] + v * n[2, 0]
+    sy = w * n[0, 1] + u * n[1, 1] + v * n[2, 1]
+    sz = w * n[0, 2] + u * n[1, 2] + v * n[2, 2]
+    scale = 1.0 / max(1e-12, math.sqrt(sx * sx + sy * sy + sz * sz))
+    sx, sy, sz = sx * scale, sy * scale, sz * scale
+    if gx * dx + gy * dy + gz * dz > 0.0:
+        gx, gy, gz = -gx, -gy, -gz
+    return gx, gy, gz, sx, sy, sz
+
+
+@njit(cache=True, parallel=True)
+def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ignore[no-untyped-def]
+    """Rays to the sun for all samples; whether each is needed.
+
+    Sample i uses direction ``i % count`` of the sun's disc: the offsets are fixed in the world, so
+    views agree about the soft edges of shadows.
+    """
+    n = len(t)
+    out = np.zeros((n, 6), np.float32)
+    need = np.zeros(n, np.bool_)
+    for i in prange(n):
+        if tri[i] == MISS:
+            continue
+        r = rays[i]
+        gx, gy, gz, _, _, _ = _normals(tables, tri[i], uv[i, 0], uv[i, 1], r[3], r[4], r[5])
+        turn = 2.399963 * (i % count)
+        radius = spread * math.sqrt((i % count + 0.5) / count)
+        # Two axes across the sun's direction; the sun is never in the zenith.
+        ax, ay = -direction[1], direction[0]
+        norm = math.sqrt(ax * ax + ay * ay)
+        ax, ay = ax / norm, ay / norm
+        bx, by, bz = -direction[2] * ay, direction[2] * ax, direction[0] * ay - direction[1] * ax
+        ca, sa = radius * math.cos(turn), radius * math.sin(turn)
+        lx = direction[0] + ca * ax + sa * bx
+        ly = direction[1] + ca * ay + sa * by
+        lz = direction[2] + sa * bz
+        facing = gx * lx + gy * ly + gz * lz
+        style = tables.styles[tables.patch_style[tables.tri_patch[tri[i]]]]
+        if facing <= 0.0 and style[22] <= 0.0:
+            continue
+        need[i] = True
+        eps = 2e-3 + 2e-5 * t[i]
+        side = eps if facing > 0.0 else -eps
+        out[i, 0] = r[0] + t[i] * r[3] + side * gx
+        out[i, 1] = r[1] + t[i] * r[4] + side * gy
+        out[i, 2] = r[2] + t[i] * r[5] + side * gz
+        out[i, 3], out[i, 4], out[i, 5] = lx, ly, lz
+    return out, need
+
+
+@njit(cache=True)
+def _probe(probes, x, y, z, dx, dy, dz, slope):  # type: ignore[no-untyped-def]
+    """Indirect radiance around a point for a direction; ``slope`` 2/3 gives diffuse light."""
+    nx, ny, nz = probes.valid.shape
+    fx = min(max((x - probes.origin[0]) / probes.step[0], 0.0), nx - 1.001)
+    fy = min(max((y - probes.origin[1]) / probes.step[1], 0.0), ny - 1.001)
+    fz = min(max((z - probes.origin[2]) / probes.step[2], 0.0), nz - 1.001)
+    ix, iy, iz = int(fx), int(fy), int(fz)
+    r, g, b, total = 0.0, 0.0, 0.0, 0.0
+    for corner in range(8):
+        i, j, k = corner & 1, (corner >> 1) & 1, corner >> 2
+        wx = fx - ix if i else 1.0 - fx + ix
+        wy = fy - iy if j else 1.0 - fy + iy
+        wz = fz - iz if k else 1.0 - fz + iz
+        w = (wx * wy * wz + 1e-4) * probes.valid[ix + i, iy + j, iz + k]
+        p = probes.values[ix + i, iy + j, iz + k]
+        r += w * max(0.0, p[0, 0] + slope * (p[1, 0] * dx + p[2, 0] * dy + p[3, 0] * dz))
+        g += w * max(0.0, p[0, 1] + slope * (p[1, 1] * dx + p[2, 1] * dy + p[3, 1] * dz))
+        b += w * max(0.0, p[0, 2] + slope * (p[1, 2] * dx + p[2, 2] * dy + p[3, 2] * dz))
+        total += w
+    inverse = 1.0 / max(total, 1e-9)
+    return r * inverse, g * inverse, b * inverse
+
+
+@njit(cache=True)
+def surface_albedo(tables, tri, x, y, z, fw):  # type: ignore[no-untyped-def]
+    """Texture of a triangle at a world point seen with pixels of width ``fw``."""
+    patch = tables.tri_patch[tri]
+    p = tables.patches[patch]
+    dx, dy, dz = x - p[0], y - p[1], z - p[2]
+    u = dx * p[3] + dy * p[4] + dz * p[5]
+    v = dx * p[6] + dy * p[7] + dz * p[8]
+    style = tables.styles[tables.patch_style[patch]]
+    return albedo(style, u, v, x, y, z, p[9], p[10], tables.patch_seed[patch], fw)
+
+
+@njit(cache=True)
+def _reflected(x, y, z, n, d, style, facing, lit, sky, probes):  # type: ignore[no-untyped-def]
+    """Mirror-like part of the light: sky or surroundings, and the sun's highlight."""
+    k = 2.0 * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
+    mx, my, mz = d[0] - k * n[0], d[1] - k * n[1], d[2] - k * n[2]
+    grazing = (1.0 - min(1.0, abs(0.5 * k))) ** 5
+    strength = style[20] + (1.0 - style[20]) * grazing * 0.6 * style[21]
+    r, g, b = _probe(probes, x, y, z, mx, my, mz, 1.0)
+    if mz > 0.0:
+        sr, sg, sb = sky_radiance(mx, my, mz, sky, False)
+        r, g, b = 0.5 * (r + sr), 0.5 * (g + sg), 0.5 * (b + sb)
+    towards = mx * sky.direction[0] + my * sky.direction[1] + mz * sky.direction[2]
+    if facing > 0.0 and towards > 0.0:
+        spot = lit * 3.0 * towards ** (20.0 + 180.0 * style[21])
+        r, g, b = r + spot * sky.sun[0], g + spot * sky.sun[1], b + spot * sky.sun[2]
+    return strength * r, strength * g, strength * b, strength
+
+
+@njit(cache=True)
+def _sample(ray, t, tri, u, v, lit, tables, sky, probes, fw_unit):  # type: ignore[no-untyped-def]
+    """Radiance along one ray."""
+    length = math.sqrt(ray[3] ** 2 + ray[4] ** 2 + ray[5] ** 2)
+    d = (ray[3] / length, ray[4] / length, ray[5] / length)
+    if tri == MISS:
+        return sky_radiance(d[0], d[1], d[2], sky, True)
+    x, y, z = ray[0] + t * float(ray[3]), ray[1] + t * float(ray[4]), ray[2] + t * float(ray[5])
+    gx, gy, gz, sx, sy, sz = _normals(tables, tri, u, v, d[0], d[1], d[2])
+    distance = t * length
+    slant = max(0.25, abs(gx * d[0] + gy * d[1] + gz * d[2]))
+    fw = max(1e-4, fw_unit * distance / math.sqrt(slant))
+    base = surface_albedo(tables, tri, x, y, z, fw)
+    style = tables.styles[tables.patch_style[tables.tri_patch[tri]]]
+    if style[22] <= 0.0 and sx * gx + sy * gy + sz * gz < 0.0:
+        sx, sy, sz = -sx, -sy, -sz  # the back of an open sheet
+    facing = sx * sky.direction[0] + sy * sky.direction[1] + sz * sky.direction[2]
+    through = style[22]
+    flat = gx * sky.direction[0] + gy * sky.direction[1] + gz * sky.direction[2]
+    if through > 0.0:
+        # Leaves scatter forward as well: light wraps around the crown.
+        direct = lit * max(0.0, (facing + through) / (1.0 + through))
+    else:
+        direct = lit * max(0.0, facing) if flat > 0.0 else 0.0
+    ox, oy, oz = x + 0.8 * gx, y + 0.8 * gy, z + 0.8 * gz
+    er, eg, eb = _probe(probes, ox, oy, oz, sx, sy, sz, 2.0 / 3.0)
+    r = base[0] * (direct * sky.sun[0] + er)
+    g = base[1] * (direct * sky.sun[1] + eg)
+    b = base[2] * (direct * sky.sun[2] + eb)
+    if style[20] > 0.0:
+        mr, mg, mb, s = _reflected(ox, oy, oz, (gx, gy, gz), d, style, flat, lit, sky, probes)
+        r, g, b = r * (1.0 - s) + mr, g * (1.0 - s) + mg, b * (1.0 - s) + mb
+    air = math.exp(-sky.haze * distance)
+    hr, hg, hb = sky_radiance(d[0], d[1], 0.02, sky, False)
+    return r * air + hr * (1.0 - air), g * air + hg * (1.0 - air), b * air + hb * (1.0 - air)
+
+
+@njit(cache=True)
+def _tone(x):  # type: ignore[no-untyped-def]
+    """Filmic curve (a rational fit with toe and shoulder), then the sRGB transfer function."""
+    x = max(0.0, x)
+    y = x * (2.2 * x + 0.08) / (x * (2.1 * x + 0.95) + 0.20)
+    y = min(1.0, y)
+    return 12.92 * y if y <= 0.0031308 else 1.055 * y ** (1.0 / 2.4) - 0.055
+
+
+@njit(cache=True, parallel=True)
+def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # type: ignore[no-untyped-def]
+    """Displayed colours of pixels. [pixels, 3] uint8
+
+    Args:
+        rays: [n, 6]; the samples of a pixel follow each other.
+        t: Hit parameters. [n]
+        tri: Triangles, or `MISS`. [n]
+        uv: Barycentric coordinates. [n, 2]
+        lit: Whether the sun reaches the sample. [n]
+        tables: Geometry and styles.
+        sky: Light settings.
+        probes: Indirect light.
+        per_pixel: Samples per pixel.
+        fw_unit: Width of a sample's footprint at unit distance.
+    """
+    out = np.empty((len(t) // per_pixel, 3), np.uint8)
+    for pixel in prange(len(out)):
+        r, g, b = 0.0, 0.0, 0.0
+        for i in range(pixel * per_pixel, (pixel + 1) * per_pixel):
+            c = _sample(
+                rays[i], float(t[i]), tri[i], float(uv[i, 0]), float(uv[i, 1]),
+                1.0 if lit[i] else 0.0, tables, sky, probes, fw_unit,
+            )  # fmt: skip
+            # A cap keeps one bright sample from whitening an edge.
+            r, g, b = r + min(c[0], 6.0), g + min(c[1], 6.0), b + min(c[2], 6.0)
+        gain = sky.exposure / per_pixel
+        out[pixel, 0] = int(255.0 * _tone(r * gain * sky.white[0]) + 0.5)
+        out[pixel, 1] = int(255.0 * _tone(g * gain * sky.white[1]) + 0.5)
+        out[pixel, 2] = int(255.0 * _tone(b * gain * sky.white[2]) + 0.5)
+    return out
+
+
+@njit(cache=True, parallel=True)
+def albedo_at(points, tri, tables, fw):  # type: ignore[no-untyped-def]
+    """Albedo of hit points at given pixel widths; zero where nothing was hit. [n, 3]"""
+    out = np.zeros((len(points), 3))
+    for i in prange(len(points)):
+        if tri[i] != MISS:
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            c = surface_albedo(tables, tri[i], x, y, z, max(1e-4, fw[i]))
+            out[i, 0], out[i, 1], out[i, 2] = c[0], c[1], c[2]
+    return out
+
+
+@njit(cache=True, parallel=True)
+def probe_values(  # type: ignore[no-untyped-def]
+    rays, t, tri, uv, lit, tables, mean_albedo, sky, count
+):
+    """Radiance of order 1 around each probe from the rays that it sent.
+
+    Hits get sun and a constant sky; a probe that mostly sees backs of surfaces is inside.
+
+    Returns:
+        values: [P, 4, 3] float32
+        valid: [P] float32
+    """
+    number = len(t) // count
+    values = np.zeros((number, 4, 3), np.float32)
+    valid = np.ones(number, np.float32)
+    for p in prange(number):
+        acc = np.zeros((4, 3))
+        backs = 0
+        for i in range(p * count, (p + 1) * count):
+            dx, dy, dz = float(rays[i, 3]), float(rays[i, 4]), float(rays[i, 5])
+            if tri[i] == MISS:
+                c = sky_radiance(dx, dy, dz, sky, False)
+            else:
+                n = tables.normals[tri[i], 0]
+                style = tables.patch_style[tables.tri_patch[tri[i]]]
+                solid = tables.styles[style, 22] <= 0.0
+                if solid and n[0] * dx + n[1] * dy + n[2] * dz > 0.0:
+                    backs += 1
+                    continue
+                d = sky.direction
+                facing = max(0.0, n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
+                sun = facing if lit[i] else 0.0
+                m = mean_albedo[style]
+                c = (
+                    m[0] * (sun * sky.sun[0] + 0.4 * sky.horizon[0]),
+                    m[1] * (sun * sky.sun[1] + 0.4 * sky.horizon[1]),
+                    m[2] * (sun * sky.sun[2] + 0.4 * sky.horizon[2]),
+                )
+            for k in range(3):
+                acc[0, k] += c[k]
+                acc[1, k] += 3.0 * dx * c[k]
+                acc[2, k] += 3.0 * dy * c[k]
+                acc[3, k] += 3.0 * dz * c[k]
+        seen = max(1, count - backs)
+        if backs > 0.25 * count:
+            valid[p] = 0.0
+        for j in range(4):
+            for k in range(3):
+                values[p, j, k] = acc[j, k] / seen
+    return values, valid
