@@ -1,0 +1,192 @@
+"""Which blocks of which tiles a Gaussian touches, and the list of Gaussians of every tile.
+
+In the order of drawing, each thread writes (Gaussian, tile, blocks) pairs of its part to its own
+region of a list; a stable counting sort by tile then keeps the order of drawing in every tile,
+whatever the number of threads.
+"""
+
+# mypy: allow-untyped-defs
+# Numba infers the types of kernels.
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+from chronoscene.rasterizer.cpu import layout as lay
+from chronoscene.rasterizer.cpu.simd import (
+    FLAGS,
+    floor,
+    make_constant,
+    maximum,
+    minimum,
+    pack_bytes,
+    prefetch,
+    select,
+    sqrt,
+    to_int,
+)
+
+_FAST = set(FLAGS)
+# A pixel on the rim of the ellipse may pass the test of its alpha after rounding; the blocks must
+# include it. In units of log2(alpha).
+_SLACK = 1e-3
+_LEVEL_MIN = lay.LEVEL_MIN - _SLACK
+
+_block_rows = make_constant([4.0 * i + 0.5 for i in range(8)])  # first row of centres of each
+
+
+@njit(forceinline=True, fastmath=_FAST)
+def _columns(mx: Any, my: Any, tile_y: int, record: Any, at: int, width: int) -> Any:
+    """First and last block column that the ellipse covers in each block row of a tile row.
+
+    Over a strip of rows of pixel centres, the ellipse reaches farthest right at the height of its
+    rightmost point, or at the end of the strip nearest to it; likewise left. A strip that the
+    ellipse misses has no real solution there.
+    """
+    top = _block_rows() + np.float32(32 * tile_y - my)
+    bottom = top + 3.0
+    shear, half, rightmost = record[at + 9], record[at + 10], record[at + 11]
+    axis_yy, reach = record[at + 4], record[at + 5] - _LEVEL_MIN
+    yr = minimum(maximum(top, rightmost), bottom)
+    yl = minimum(maximum(top, -rightmost), bottom)
+    vr, vl = yr * axis_yy, yl * axis_yy
+    qr, ql = reach - vr * vr, reach - vl * vl
+    right = mx - np.float32(0.5) + (yr * shear + sqrt(maximum(qr, 0.0)) * half)
+    left = mx - np.float32(0.5) + (yl * shear - sqrt(maximum(ql, 0.0)) * half)
+    first = 0.0 - floor(0.0 - minimum(maximum(left, 0.0), np.float32(width)))
+    last = floor(minimum(maximum(right, -1.0), np.float32(width - 1)))
+    hit = (qr >= 0.0) & (ql >= 0.0) & (first <= last)
+    return to_int(first) >> 2, select(hit, to_int(last) >> 2, -1)
+
+
+@njit(forceinline=True)
+def _tile_blocks(first: Any, last: Any, tile_x: int) -> Any:
+    """Bits of the blocks between two columns in each row, within one tile."""
+    low = maximum(first - np.int32(8 * tile_x), 0)
+    high = minimum(last - np.int32(8 * tile_x), 7)
+    some = low <= high
+    low, high = select(some, low, 0), select(some, high, 0)
+    bits = (255 << low) & (255 >> (7 - high))
+    return pack_bytes(select(some, bits, 0))
+
+
+@njit(nogil=True)
+def _tile_count(records_int, at):
+    """Tiles of the rectangle around a Gaussian."""
+    return (records_int[at + lay.TILES_X] >> 16) * (records_int[at + lay.TILES_Y] >> 16)
+
+
+@njit(nogil=True, parallel=True, cache=True)
+def bound_pairs(threads, pairs, count, records_int, bounds):
+    """Upper bounds of the numbers of (Gaussian, tile) pairs of each part. ``bounds`` [threads]."""
+    for t in prange(threads):
+        total = 0
+        for i in range(count * t // threads, count * (t + 1) // threads):
+            total += _tile_count(records_int, lay.RECORD * (pairs[i] & 0xFFFFFFFF))
+        bounds[t] = total
+
+
+@njit(nogil=True, fastmath=_FAST)
+def _list_part(first, last, at, order, view, records, records_int, counts, listed):
+    """Pairs of the Gaussians first..last of the order of drawing. Returns the list's end."""
+    width, tiles_x = view
+    list_tile, list_gaussian, list_blocks = listed
+    counts[:] = 0
+    for i in range(first, last):
+        gaussian = order[i] & 0xFFFFFFFF
+        if i + 8 < last:
+            prefetch(records, lay.RECORD * (order[i + 8] & 0xFFFFFFFF))
+        base = lay.RECORD * gaussian
+        mx, my = records[base], records[base + 1]
+        xs, ys = records_int[base + lay.TILES_X], records_int[base + lay.TILES_Y]
+        start = at
+        for tile_y in range(ys & 0xFFFF, (ys & 0xFFFF) + (ys >> 16)):
+            left, right = _columns(mx, my, tile_y, records, base, width)
+            for tile_x in range(xs & 0xFFFF, (xs & 0xFFFF) + (xs >> 16)):
+                blocks = _tile_blocks(left, right, tile_x)
+                if blocks != 0:
+                    tile = tile_y * tiles_x + tile_x
+                    list_tile[at] = tile
+                    list_gaussian[at] = gaussian
+                    list_blocks[at] = blocks
+                    counts[tile] += 1
+                    at += 1
+        records_int[base + lay.ROWS_START] = start
+        records_int[base + lay.ROWS_COUNT] = at - start
+    return at
+
+
+@njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
+def list_pairs(
+    threads, order, count, starts, ends, width, tiles_x, records, records_int, counts, listed
+):
+    """List the pairs of each part and count them by tile.
+
+    Args:
+        threads: Number of parts.
+        order: Gaussians in the order of drawing, in the low 32 bits. int64
+        count: How many of them.
+        starts: Where each part may write. int64 [threads]
+        ends: Written: where it stopped. int64 [threads]
+        width: Of the image in pixels.
+        tiles_x: Tiles per row.
+        records, records_int: The records; the place of their pairs is written into them.
+        counts: Written: pairs by part and tile. int64 [threads, tiles]
+        listed: (tile int32, gaussian int32, blocks uint64) of each pair, written.
+    """
+    for t in prange(threads):
+        ends[t] = _list_part(
+            count * t // threads,
+            count * (t + 1) // threads,
+            starts[t],
+            order,
+            (width, tiles_x),
+            records,
+            records_int,
+            counts[t],
+            listed,
+        )
+
+
+@njit(nogil=True, cache=True)
+def tile_offsets(counts, tile_starts):
+    """Turn counts by part and tile into places: by tile, within a tile by part."""
+    total = 0
+    for tile in range(counts.shape[1]):
+        tile_starts[tile] = total
+        for t in range(counts.shape[0]):
+            count = counts[t, tile]
+            counts[t, tile] = total
+            total += count
+    tile_starts[counts.shape[1]] = total
+
+
+@njit(nogil=True)
+def _scatter_part(first, last, places, listed, entries):
+    list_tile, list_gaussian, list_blocks = listed
+    entry_gaussian, entry_blocks, positions = entries
+    for j in range(first, last):
+        tile = list_tile[j]
+        place = places[tile]
+        places[tile] = place + 1
+        entry_gaussian[place] = list_gaussian[j]
+        entry_blocks[place] = list_blocks[j]
+        positions[j] = place
+
+
+@njit(nogil=True, parallel=True, cache=True)
+def scatter_pairs(threads, starts, ends, places, listed, entries):
+    """Move the listed pairs to their tiles, keeping their order.
+
+    Args:
+        threads: Number of parts.
+        starts, ends: Of each part in the list.
+        places: Next free place by part and tile.
+        listed: From `list_pairs`.
+        entries: (gaussian int32, blocks uint64, place of each listed pair int32), written.
+    """
+    for t in prange(threads):
+        _scatter_part(starts[t], ends[t], places[t], listed, entries)

@@ -1,0 +1,257 @@
+"""One image, forward and backward: the kernels in order, on flat numpy arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.rasterizer.constants import CLAMP_MARGIN
+from chronoscene.rasterizer.cpu import layout as lay
+from chronoscene.rasterizer.cpu.bins import bound_pairs, list_pairs, scatter_pairs, tile_offsets
+from chronoscene.rasterizer.cpu.composite import composite, composite_backward
+from chronoscene.rasterizer.cpu.project import add_rows, project, project_backward
+from chronoscene.rasterizer.cpu.simd import LANES
+from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, sort_by_depth
+from chronoscene.rasterizer.cpu.workspace import Workspace
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Where one image is taken from."""
+
+    camera: Array
+    """`layout.CAMERA` numbers, float32."""
+    width: int
+    height: int
+
+    @property
+    def tiles_x(self) -> int:
+        return -(-self.width // lay.TILE)
+
+    @property
+    def tiles(self) -> int:
+        return self.tiles_x * -(-self.height // lay.TILE)
+
+
+@dataclass(frozen=True, slots=True)
+class Gaussians:
+    """Flat float32 arrays of at least `simd.LANES` Gaussians."""
+
+    means: Array
+    quats: Array
+    scales: Array
+    opacities: Array
+    colors: Array
+
+
+@dataclass(slots=True)
+class Binned:
+    """What the forward pass leaves for the backward pass, in a workspace."""
+
+    keys: Array
+    records: Array
+    records_int: Array
+    tile_starts: Array
+    tile_stops: Array
+    gaussians: Array
+    blocks: Array
+    positions: Array
+    planes: tuple[Array, Array]
+
+
+def make_view(
+    viewmat: Array, K: Array, width: int, height: int, near: float, far: float, eps2d: float
+) -> View:
+    """Numbers of a camera as the kernels want them."""
+    fx, fy, cx, cy = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    margin_x, margin_y = CLAMP_MARGIN * 0.5 * width / fx, CLAMP_MARGIN * 0.5 * height / fy
+    camera = np.zeros(lay.CAMERA, np.float32)
+    camera[lay.ROTATION : lay.ROTATION + 9] = viewmat[:3, :3].reshape(-1)
+    camera[lay.TRANSLATION : lay.TRANSLATION + 3] = viewmat[:3, 3]
+    camera[lay.FX], camera[lay.FY], camera[lay.CX], camera[lay.CY] = fx, fy, cx, cy
+    camera[lay.X_MIN], camera[lay.X_MAX] = -cx / fx - margin_x, (width - cx) / fx + margin_x
+    camera[lay.Y_MIN], camera[lay.Y_MAX] = -cy / fy - margin_y, (height - cy) / fy + margin_y
+    camera[lay.NEAR], camera[lay.FAR], camera[lay.BLUR] = near, far, eps2d
+    return View(camera, width, height)
+
+
+def _counter() -> Array:
+    return np.zeros(1, np.int64)
+
+
+def bin_gaussians(
+    workspace: Workspace, scene: Gaussians, view: View, visible: tuple[Array, Array, Array]
+) -> Binned:
+    """Project, sort and list by tile; ``visible`` receives means2d, radii (as bits), depths."""
+    threads, n, w = numba.get_num_threads(), scene.opacities.size, workspace.array
+    records, keys = w("records", n * lay.RECORD, np.float32), w("keys", n, np.int32)
+    records_int = records.view(np.int32)
+    project(
+        threads,
+        _counter(),
+        scene.means,
+        scene.quats,
+        scene.scales,
+        scene.opacities,
+        scene.colors,
+        view.camera,
+        view.width,
+        view.height,
+        records,
+        keys,
+        visible,
+    )
+    digits = w("digits", threads << DIGIT_BITS, np.int64).reshape(threads, -1)
+    pairs, spare = w("pairs", n, np.int64), w("spare", n, np.int64)
+    count, in_spare = sort_by_depth(threads, keys, digits, pairs, spare)
+    order = spare if in_spare else pairs
+
+    bounds = np.zeros(threads, np.int64)
+    bound_pairs(threads, order, count, records_int, bounds)
+    ends = np.cumsum(bounds)
+    starts, capacity = ends - bounds, int(ends[-1])
+    listed = (
+        w("list_tile", capacity, np.int32),
+        w("list_gaussian", capacity, np.int32),
+        w("list_blocks", capacity, np.uint64),
+    )
+    counts = w("counts", threads * view.tiles, np.int64).reshape(threads, -1)
+    list_pairs(
+        threads,
+        order,
+        count,
+        starts,
+        ends,
+        view.width,
+        view.tiles_x,
+        records,
+        records_int,
+        counts,
+        listed,
+    )
+    tile_starts = w("tile_starts", view.tiles + 1, np.int64)
+    tile_offsets(counts, tile_starts)
+    total = int(tile_starts[-1])
+    gaussians, blocks = w("gaussians", total + 16, np.int32), w("blocks", total, np.uint64)
+    gaussians[total:] = 0
+    positions = w("positions", capacity, np.int32)
+    scatter_pairs(threads, starts, ends, counts, listed, (gaussians, blocks, positions))
+    pixels = view.tiles * lay.TILE_PIXELS
+    planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
+    tile_stops = w("tile_stops", view.tiles, np.int64)
+    return Binned(
+        keys, records, records_int, tile_starts, tile_stops, gaussians, blocks, positions, planes
+    )
+
+
+def render(
+    workspace: Workspace, binned: Binned, view: View, background: Array, image: Array, alphas: Array
+) -> None:
+    """Composite the three channels in the records."""
+    threads = numba.get_num_threads()
+    scratch = workspace.array("colors", threads * 3 * lay.TILE_PIXELS, np.float32)
+    composite(
+        threads,
+        _counter(),
+        view.width,
+        view.height,
+        binned.tile_starts,
+        binned.tile_stops,
+        binned.gaussians,
+        binned.blocks,
+        binned.records,
+        binned.planes,
+        scratch.reshape(threads, -1),
+        background,
+        image,
+        alphas,
+    )
+
+
+def render_backward(
+    workspace: Workspace,
+    binned: Binned,
+    view: View,
+    background: Array,
+    image_grad: Array,
+    alpha_grad: Array,
+) -> tuple[Array, Array]:
+    """Sums over pixels by entry: (touched, rows)."""
+    threads, entries = numba.get_num_threads(), binned.blocks.size
+    scratch = workspace.array("backward", threads * 5 * lay.TILE_PIXELS, np.float32)
+    rows = workspace.array("rows", entries * lay.RECORD, np.float32)
+    touched = workspace.array("touched", entries, np.uint8)
+    composite_backward(
+        threads,
+        _counter(),
+        view.width,
+        view.height,
+        binned.tile_starts,
+        binned.tile_stops,
+        binned.gaussians,
+        binned.blocks,
+        binned.records,
+        binned.planes,
+        scratch.reshape(threads, -1),
+        background,
+        image_grad,
+        alpha_grad,
+        touched,
+        rows,
+    )
+    return touched, rows
+
+
+def sum_rows(binned: Binned, touched: Array, rows: Array, sums: Array) -> None:
+    """Add the rows to 16 numbers of each Gaussian."""
+    add_rows(
+        numba.get_num_threads(),
+        _counter(),
+        binned.records_int,
+        touched,
+        binned.positions,
+        rows,
+        sums,
+    )
+
+
+def gaussian_gradients(
+    binned: Binned,
+    scene: Gaussians,
+    view: View,
+    summed: tuple[Array, Array] | Array,
+    depth_gradients: Array,
+    grads: tuple[Array, ...],
+) -> None:
+    """Gradients of the inputs, written to ``grads``, from what was summed over pixels.
+
+    Args:
+        summed: (touched, rows) of one rendering, or 16 numbers of each Gaussian.
+        depth_gradients: d loss / d z-depth of each Gaussian.
+    """
+    threads = numba.get_num_threads()
+    if isinstance(summed, tuple):
+        touched, rows = summed
+        sums = np.zeros(threads * lay.RECORD * LANES, np.float32)
+    else:
+        touched, rows, sums = np.empty(0, np.uint8), np.empty(0, np.float32), summed
+    project_backward(
+        threads,
+        _counter(),
+        scene.means,
+        scene.quats,
+        scene.scales,
+        scene.opacities,
+        depth_gradients,
+        view.camera,
+        binned.keys,
+        (binned.records_int, touched, binned.positions, rows),
+        sums,
+        grads,
+    )
