@@ -213,7 +213,7 @@ def test_a_failed_write_leaves_nothing_behind(make_scene_folder, tmp_path):
     folder = make_scene_folder()
     scene = read_scene(folder)
     (folder / "images/b/0003.png").unlink()
-    with pytest.raises(SceneError, match="0003.png: expected an image"):
+    with pytest.raises(SceneError, match=r"0003\.png: expected an image"):
         write(scene, tmp_path / "target" / "out")
     assert list((tmp_path / "target").iterdir()) == []
 
@@ -263,7 +263,7 @@ def test_errors_name_what_was_looked_for(make_scene_folder, tmp_path):
     folder = make_scene_folder()
     with pytest.raises(SceneError, match="expected a scene folder, found a file"):
         detect_format(folder / "sparse/split.txt")
-    with pytest.raises(ConfigError, match="expected one of .*chronoscene.*'chronoscnee'; did you"):
+    with pytest.raises(ConfigError, match=r"expected one of .*chronoscene.*'chronoscnee'; did you"):
         read_scene(folder, format="chronoscnee")
     shutil.rmtree(folder / "sparse/0")
     with pytest.raises(SceneError, match="expected a COLMAP model"):
