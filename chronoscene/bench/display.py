@@ -1,0 +1,95 @@
+"""What a training shows: a live bar on a terminal, a line per probe elsewhere."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from chronoscene.bench.stopping import StopRule
+from chronoscene.methods import StepReport
+
+REFRESH = 0.1
+"""Seconds between two updates of the bar."""
+SMOOTHING = 0.95
+"""Weight of the past in the loss that is shown."""
+
+
+class ProgressDisplay:
+    """Shows iteration, loss, probe PSNR, speed and time left of one model after another."""
+
+    def __init__(self, label: str, console: Console | None = None) -> None:
+        self.label = label
+        self.console = console or Console(stderr=True)
+        self._live = self.console.is_terminal
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TextColumn("{task.fields[status]}"),
+            console=self.console,
+            transient=True,
+            disable=not self._live,
+        )
+        self._task: TaskID | None = None
+        self._stop = StopRule(1, None)
+        self._name = label
+        self._loss: float | None = None
+        self._psnr: float | None = None
+        self._shown = 0.0
+
+    def __enter__(self) -> ProgressDisplay:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def begin(self, part: str, stop: StopRule) -> None:
+        """Start over for the next model."""
+        self._name = self.label if part == "all" else f"{self.label} {part}"
+        self._stop, self._loss, self._psnr, self._shown = stop, None, None, 0.0
+        if self._task is not None:
+            self._bar.remove_task(self._task)
+        self._task = self._bar.add_task(self._name, total=1.0, status="setup")
+
+    def update(
+        self, iteration: int, seconds: float, report: StepReport, psnr: float | None
+    ) -> None:
+        """Take in one step; the observer of `training.train`."""
+        past = report.loss if self._loss is None else self._loss
+        self._loss = SMOOTHING * past + (1 - SMOOTHING) * report.loss
+        now, progress = time.monotonic(), self._stop.progress(iteration, seconds)
+        if self._live and self._task is not None and (now - self._shown > REFRESH or progress == 1):
+            self._shown = now
+            status = self.status(iteration, seconds, report.primitives, psnr)
+            self._bar.update(self._task, completed=progress, status=status)
+        elif not self._live and psnr is not None and psnr != self._psnr:
+            status = self.status(iteration, seconds, report.primitives, psnr)
+            self.console.print(f"{self._name}: {progress:4.0%} {status}", highlight=False)
+        self._psnr = psnr
+
+    def status(self, iteration: int, seconds: float, primitives: int, psnr: float | None) -> str:
+        """One line on the state of the training."""
+        left = self._stop.seconds_left(iteration, seconds)
+        pieces = [f"iteration {iteration}", f"loss {self._loss:.4f}"]
+        if psnr is not None:
+            pieces.append(f"PSNR {psnr:.2f} dB")
+        pieces += [f"{primitives} primitives", f"{iteration / max(seconds, 1e-9):.1f} it/s"]
+        if left is not None and left > 0:
+            pieces.append(f"{format_time(left)} left")
+        return ", ".join(pieces)
+
+
+def format_time(seconds: float) -> str:
+    """``m:ss`` or ``h:mm:ss``."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

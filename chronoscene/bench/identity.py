@@ -1,0 +1,134 @@
+"""What a number depends on: hashes of scene and config, the code, the machine."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, entry_points, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import chronoscene
+from chronoscene.errors import ImageError
+from chronoscene.methods import ENTRY_POINT_GROUP
+from chronoscene.scene import Scene
+
+
+def scene_hash(scene: Scene) -> str:
+    """SHA-256 over frames, cameras, poses, periods, split, points, tracks and image files.
+
+    Poses are rounded to nine digits: what pycolmap returns may differ in the last one.
+    """
+    digest = hashlib.sha256()
+    for frame in scene.frames:
+        camera = frame.camera
+        line = [frame.name, frame.period, frame.split, camera.model, camera.width, camera.height]
+        digest.update(json.dumps([*line, *camera.params, _file_hash(scene, frame.name)]).encode())
+        digest.update((np.round(frame.cam_from_world, 9) + 0.0).tobytes())
+    points = scene.points
+    for array in (points.xyz, points.rgb, points.track_start, points.track_frame):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _file_hash(scene: Scene, name: str) -> str:
+    path = scene.images_root / name
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise ImageError(
+            path,
+            expected="an image",
+            found=error.strerror or "a file that cannot be read",
+            todo="copy the image there, or take it out of the model",
+        ) from error
+
+
+def config_hash(config: dict[str, Any]) -> str:
+    """SHA-256 of a config in canonical JSON."""
+    return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
+
+
+def code_version() -> str:
+    """Commit of this code with ``-dirty`` where files differ from it, else the version."""
+    package = Path(chronoscene.__file__).resolve().parent
+    # A virtual environment may lie inside someone else's repository: ask for our own file.
+    if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
+        return f"version {chronoscene.__version__}"
+    commit = _git(package, "rev-parse", "HEAD")
+    dirty = _git(package, "status", "--porcelain", "--untracked-files=no")
+    return f"{commit}-dirty" if dirty else f"{commit}"
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=30
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def method_version(name: str) -> str:
+    """Version of the package that provides a method; ``unpackaged`` for ``module:SPEC``."""
+    for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
+        if entry.dist is not None:
+            return f"{entry.dist.name} {entry.dist.version}"
+    return "unpackaged"
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of what numbers may depend on."""
+    versions = {"python": platform.python_version()}
+    for name in ("numpy", "numba", "torch", "gsplat", "opencv-contrib-python-headless", "pillow"):
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return versions
+
+
+def describe_device(kind: str, threads: int) -> str:
+    """The device in words: kind, processor or GPU, threads."""
+    if kind == "cuda":
+        import torch
+
+        return f"cuda ({torch.cuda.get_device_name()})"
+    return f"cpu ({processor_name()}, {threads} thread{'s' if threads != 1 else ''})"
+
+
+def processor_name() -> str:
+    """Model of the processor as the system names it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def peak_memory_bytes() -> int:
+    """Largest resident memory of this process so far.
+
+    Linux carries ``ru_maxrss`` over from the parent across ``exec``, so a small worker of a big
+    parent would report the parent; VmHWM belongs to this program alone.
+    """
+    try:
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    import resource  # not on every system
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

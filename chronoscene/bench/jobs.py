@@ -1,0 +1,142 @@
+"""A job is one run as data: what the bench hands to a worker process, as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from chronoscene.bench.identity import config_hash
+from chronoscene.bench.images import safe_name
+from chronoscene.bench.results import Failure
+from chronoscene.bench.stopping import StopRule
+from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
+from chronoscene.methods import MethodSpec, build_config
+
+SHARING = ("total", "each")
+"""Under the strategy separate: all models share the iterations and the time, or get them each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One run. Paths are absolute."""
+
+    scene_root: str
+    scene: str
+    scene_hash: str
+    split_hash: str
+    method: str
+    """What `load_spec` takes: a name or ``module:SPEC``."""
+    method_name: str
+    strategy: str
+    preset: str
+    overrides: dict[str, str]
+    iterations: int | None
+    budget_seconds: float | None
+    separate_iterations: str
+    seed: int
+    max_width: int
+    threads: int | None
+    device: str
+    """``auto``, ``cpu`` or ``cuda``."""
+    runs: str
+    """Folder of all runs."""
+    lpips_weights: str | None
+    commit: str
+    notices: list[str] = field(default_factory=list)
+    staging: str = ""
+    """Where the worker writes; renamed to `folder` when it has ended."""
+    plugin_path: str | None = None
+    """Folder from which ``module:SPEC`` may be imported."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the finished run goes."""
+        name = f"{self.method_name}-{self.strategy}-{self.preset}"
+        return Path(self.runs) / safe_name(self.scene) / safe_name(name) / f"seed{self.seed}"
+
+    @property
+    def label(self) -> str:
+        """The run in words."""
+        return f"{self.scene}: {self.method_name} {self.strategy} {self.preset} seed {self.seed}"
+
+    def failure(self, reason: str) -> Failure:
+        """The record of a run that has no result."""
+        return Failure(
+            method=self.method_name,
+            strategy=self.strategy,
+            preset=self.preset,
+            scene=self.scene,
+            seed=self.seed,
+            reason=reason,
+        )
+
+    def stop_rule(self, spec: MethodSpec) -> StopRule:
+        """Number of iterations of the config, unless there is a time budget and no number."""
+        if self.budget_seconds is not None and self.iterations is None:
+            return StopRule(None, self.budget_seconds)
+        return StopRule(int(self.method_config(spec).iterations), self.budget_seconds)
+
+    def stop_rules(self, spec: MethodSpec, parts: int) -> tuple[StopRule, ...]:
+        """Stop rule of each model of the strategy."""
+        rule = self.stop_rule(spec)
+        return (rule,) * parts if self.separate_iterations == "each" else rule.split(parts)
+
+    def method_config(self, spec: MethodSpec) -> Any:
+        """The frozen config of the method."""
+        overrides: dict[str, Any] = dict(self.overrides)
+        if self.iterations is not None:
+            overrides["iterations"] = self.iterations
+        return build_config(spec, preset=self.preset, overrides=overrides)
+
+    def document(self, spec: MethodSpec) -> dict[str, Any]:
+        """Everything that decides the result, merged; written beside it as ``config.json``."""
+        method_config = dataclasses.asdict(self.method_config(spec))
+        config = {
+            "method": self.method_name,
+            "preset": self.preset,
+            "method_config": method_config,
+            "strategy": self.strategy,
+            "stop": dataclasses.asdict(self.stop_rule(spec)),
+            "separate_iterations": self.separate_iterations,
+            "max_width": self.max_width,
+        }
+        config = json.loads(json.dumps(config))
+        return {
+            "config": config,
+            "config_hash": config_hash(config),
+            "scene": self.scene,
+            "scene_hash": self.scene_hash,
+            "seed": self.seed,
+            "device": self.device,
+        }
+
+
+def check_job(job: Job, spec: MethodSpec) -> None:
+    """Find wrong settings before anything is trained.
+
+    Raises:
+        ConfigError: If a preset, key, value or device does not exist.
+    """
+    check_choice("--separate-iterations", job.separate_iterations, SHARING)
+    if job.device != "auto":
+        check_choice(f"{spec.name} --device", job.device, spec.devices)
+    config = job.method_config(spec)
+    if not isinstance(getattr(config, "iterations", None), int) or config.iterations < 1:
+        raise ConfigError(
+            f"{spec.name}: iterations",
+            expected="a positive number",
+            found=repr(getattr(config, "iterations", None)),
+            todo="correct --iterations",
+        )
+
+
+def write_job(path: Path, job: Job) -> None:
+    path.write_text(json.dumps(dataclasses.asdict(job)), encoding="utf-8")
+
+
+def read_job(path: Path) -> Job:
+    return Job(**json.loads(path.read_text(encoding="utf-8")))

@@ -1,0 +1,186 @@
+"""What a method gets to see: strategies, the training frame, training sets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import SceneError
+from chronoscene.geometry import Sim3, camera_centre
+from chronoscene.images import ImageStore
+from chronoscene.methods import MethodSpec, TrainingSet, TrainingView, View
+from chronoscene.scene import Frame, Scene
+
+STRATEGIES = ("joint", "pooled", "separate")
+"""``joint``: one model, told the period. ``pooled``: one model, the period hidden from it.
+``separate``: one model per period, which sees the images and points of that period alone."""
+
+EXTENT_MARGIN = 1.1
+"""Factor of 3DGS between the farthest camera and the camera extent."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """One model to train, and the test views that it answers for."""
+
+    name: str
+    """``all``, or ``period-<id>`` under the strategy separate."""
+    train: TrainingSet
+    test: tuple[Frame, ...]
+    store: ImageStore
+    hides_period: bool
+    """Whether the model is asked for period 0 whatever the view's period is."""
+
+    def view(self, frame: Frame) -> View:
+        """The camera of a frame at the evaluation size, in the training frame."""
+        camera = self.store.camera(frame)
+        pose = self.train.training_from_world.apply_to_pose(frame.cam_from_world)
+        return View(camera.K, camera.width, camera.height, pose)
+
+    def method_period(self, frame: Frame) -> float:
+        """The period to ask the model for to predict a frame."""
+        return 0.0 if self.hides_period else float(frame.period)
+
+
+def effective_strategy(spec: MethodSpec, strategy: str) -> tuple[str, str | None]:
+    """The strategy that a method can follow, and a notice where it is not the one asked for."""
+    check_choice("--strategy", strategy, STRATEGIES)
+    if strategy == "joint" and spec.period_input == "none":
+        notice = f"{spec.name} takes no period: joint is run and recorded as pooled"
+        return "pooled", notice
+    return strategy, None
+
+
+def make_parts(scene: Scene, store: ImageStore, strategy: str) -> tuple[Part, ...]:
+    """The training sets of a strategy.
+
+    The training frame comes from all training cameras of the scene under every strategy, so that
+    learning rates and voxel sizes mean the same length whatever the strategy.
+
+    Raises:
+        SceneError: If a camera is distorted, or images or points are missing that are needed.
+    """
+    check_choice("--strategy", strategy, STRATEGIES)
+    check_scene(scene)
+    to_training = training_frame(scene)
+    if strategy != "separate":
+        train = _training_set(scene, store, to_training, None, hide_period=strategy == "pooled")
+        return (Part("all", train, scene.select(split="test"), store, strategy == "pooled"),)
+    parts = []
+    for period in scene.periods:
+        test = scene.select(split="test", period=period.id)
+        train = _training_set(scene, store, to_training, period.id, hide_period=True)
+        parts.append(Part(f"period-{period.id}", train, test, store, True))
+    return tuple(parts)
+
+
+def check_scene(scene: Scene) -> None:
+    """Refuse what no method can train on or be tested on.
+
+    Raises:
+        SceneError: If a camera is distorted, or there is no training or no test image.
+    """
+    for frame in scene.frames:
+        if not frame.camera.is_pinhole:
+            raise SceneError(
+                f"{scene.root}: {frame.name}",
+                expected="a camera without distortion (SIMPLE_PINHOLE, PINHOLE)",
+                found=frame.camera.model,
+                todo="undistort the images first (colmap image_undistorter)",
+            )
+    for split in ("train", "test"):
+        if not any(f.split == split for f in scene.frames):
+            raise SceneError(
+                scene.root,
+                expected=f"at least one {split} image",
+                found=f"none ({scene.split_rule})",
+                todo="change the split",
+            )
+
+
+def training_frame(scene: Scene) -> Sim3:
+    """``training_from_world``: mean training camera at the origin, the farthest at distance 1.
+
+    Where all cameras stand at one place, the median distance of the points becomes 1 instead.
+    """
+    centres = _centres(scene.select(split="train"))
+    centre = centres.mean(axis=0)
+    radius = float(np.linalg.norm(centres - centre, axis=1).max())
+    if radius <= 1e-9 * max(1.0, float(np.abs(centre).max())):
+        distances = np.linalg.norm(scene.points.xyz - centre, axis=1)
+        radius = float(np.median(distances)) if distances.size else 1.0
+    scale = 1.0 / radius if radius > 0 else 1.0
+    return Sim3(scale, np.eye(3), -scale * centre)
+
+
+def _centres(frames: Sequence[Frame]) -> NDArray[np.float64]:
+    return camera_centre(np.stack([f.cam_from_world for f in frames]))
+
+
+def _training_set(
+    scene: Scene, store: ImageStore, to_training: Sim3, period: int | None, *, hide_period: bool
+) -> TrainingSet:
+    """Training set of all periods, or of one."""
+    frames = scene.select(split="train", period=period)
+    if not frames:
+        raise SceneError(
+            f"{scene.root}: period {period}",
+            expected="at least one training image",
+            found="none",
+            todo="move one from test to train, or use another strategy",
+        )
+    seen = training_point_periods(scene, frames)
+    kept = seen.any(axis=1)
+    if not kept.any():
+        raise SceneError(
+            scene.root if period is None else f"{scene.root}: period {period}",
+            expected="sparse points that a training image sees",
+            found="none",
+            todo="triangulate points with COLMAP",
+        )
+    return TrainingSet(
+        views=tuple(_training_view(f, store, to_training, hide_period) for f in frames),
+        num_periods=1 if hide_period else scene.num_periods,
+        points=to_training.apply(scene.points.xyz[kept]).astype(np.float32),
+        colors=scene.points.rgb[kept],
+        point_periods=np.ones((int(kept.sum()), 1), bool) if hide_period else seen[kept],
+        training_from_world=to_training,
+        camera_extent=_camera_extent(frames, to_training),
+        background=np.zeros(3, np.float32),
+        load_image=lambda i: store.load(frames[i]),
+    )
+
+
+def _training_view(
+    frame: Frame, store: ImageStore, to_training: Sim3, hide_period: bool
+) -> TrainingView:
+    camera = store.camera(frame)
+    pose = to_training.apply_to_pose(frame.cam_from_world)
+    period = 0 if hide_period else frame.period
+    return TrainingView(camera.K, camera.width, camera.height, pose, frame.name, period)
+
+
+def training_point_periods(scene: Scene, frames: Sequence[Frame]) -> NDArray[np.bool_]:
+    """Whether one of the given frames sees the point in the period. [P, T]"""
+    names = {f.name for f in frames}
+    chosen = np.array([f.name in names for f in scene.frames])
+    period = np.array([f.period for f in scene.frames])
+    rows = np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_start))
+    use = chosen[scene.points.track_frame]
+    seen = np.zeros((len(scene.points), scene.num_periods), bool)
+    seen[rows[use], period[scene.points.track_frame[use]]] = True
+    return seen
+
+
+def _camera_extent(frames: Sequence[Frame], to_training: Sim3) -> float:
+    """1.1 times the largest distance of a camera from their mean; that of the scene for one camera.
+
+    An extent of zero would turn learning rates that are tied to it into zero.
+    """
+    centres = to_training.apply(_centres(frames))
+    radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    return EXTENT_MARGIN * (radius if radius > 1e-6 else 1.0)

@@ -1,0 +1,234 @@
+"""What a finished run says, and the files that hold it.
+
+``RUNS/<scene>/<method>-<strategy>-<preset>/seed<k>/run.json`` belongs to one run,
+``RUNS/results.json`` is the list of all. Both are read back through `RunRecord`. Infinite values
+(PSNR of equal images) are the string ``"Infinity"`` in JSON and ``inf`` in CSV.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from chronoscene.bench.files import csv_text, write_text
+from chronoscene.errors import CheckpointError
+
+RUN_FILE = "run.json"
+CONFIG_FILE = "config.json"
+FAILURE_FILE = "failed.json"
+ROWS_FILE = "rows.csv"
+CURVE_FILE = "curve.csv"
+RESULTS_FILE = "results.json"
+CHECKPOINT = "checkpoint"
+PREDICTIONS = "predictions"
+GROUND_TRUTH = "ground_truth"
+FIGURES = "figures"
+
+Values = dict[str, float]
+
+
+class RunRecord(BaseModel):
+    """One run: one method, strategy, scene and seed."""
+
+    model_config = ConfigDict(extra="forbid", ser_json_inf_nan="strings")
+
+    method: str
+    """Name on the command line."""
+    strategy: str
+    """The one that was run, which may differ from the one asked for; see `notices`."""
+    scene: str
+    seed: int
+    aggregates: dict[str, Values]
+    """``macro`` (mean over periods), ``micro`` (mean over views), ``worst`` (worst period)."""
+    periods: dict[str, Values]
+    """Mean over the views of each period, by period id."""
+    seconds: float
+    """Training clock: setup and steps, without probes, rendering and scoring."""
+    iterations: int
+    primitives: int
+    checkpoint_bytes: int
+    peak_memory_bytes: int
+    """Largest resident memory of the process up to the end of rendering."""
+    device: str
+    commit: str
+    skipped: dict[str, str]
+    """Metric to the reason for its absence."""
+
+    title: str
+    """Name of the method in tables."""
+    preset: str
+    method_version: str
+    config_hash: str
+    """Of everything that decides the result but scene, seed, device and threads."""
+    scene_hash: str
+    split_hash: str
+    period_labels: dict[str, str]
+    parameters: int
+    """Numbers stored in the checkpoint."""
+    setup_seconds: float
+    """Share of `seconds` before the first step."""
+    render_seconds: float
+    """Mean time to render a test view."""
+    peak_device_memory_bytes: int | None
+    """Largest memory held on a GPU; None on a CPU."""
+    threads: int
+    max_width: int
+    libraries: dict[str, str]
+    started: str
+    """UTC, ISO 8601."""
+    notices: list[str]
+
+
+class Failure(BaseModel):
+    """Why a run ended without a result."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    method: str
+    strategy: str
+    preset: str
+    scene: str
+    seed: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One value of one view."""
+
+    view: str
+    camera_period: int
+    rendered_period: int
+    region: str
+    """``all``; parts of the image have their own names."""
+    metric: str
+    value: float
+
+
+RUN_COLUMNS = (
+    "scene",
+    "scene_hash",
+    "split_hash",
+    "method",
+    "method_version",
+    "strategy",
+    "preset",
+    "config_hash",
+    "seed",
+    "device",
+)
+ROW_COLUMNS = ("view", "camera_period", "rendered_period", "region", "metric", "value")
+
+
+def write_run(folder: Path, record: RunRecord, rows: Iterable[Row]) -> None:
+    """Write ``rows.csv`` and then ``run.json``, whose presence says that the run is complete."""
+    shared = [getattr(record, name) for name in RUN_COLUMNS]
+    table = [[*shared, *(getattr(row, name) for name in ROW_COLUMNS)] for row in rows]
+    write_text(folder / ROWS_FILE, csv_text((*RUN_COLUMNS, *ROW_COLUMNS), table))
+    write_text(folder / RUN_FILE, record.model_dump_json(indent=1) + "\n")
+
+
+def read_run(folder: Path) -> RunRecord:
+    """Read ``run.json``.
+
+    Raises:
+        CheckpointError: If it is missing or damaged.
+    """
+    path = folder / RUN_FILE
+    try:
+        return RunRecord.model_validate_json(path.read_bytes())
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            path, expected="a finished run", found="no such file", todo="run bench first"
+        ) from error
+    except ValidationError as error:
+        raise damaged(path, error) from error
+
+
+def read_rows(folder: Path) -> list[Row]:
+    """Read ``rows.csv`` of one run.
+
+    Raises:
+        CheckpointError: If it is missing or damaged.
+    """
+    path = folder / ROWS_FILE
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [_parse_row(line) for line in csv.DictReader(file)]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CheckpointError(
+            path,
+            expected="the rows of a run",
+            found=f"{type(error).__name__}: {error}",
+            todo="delete the run and bench again",
+        ) from error
+
+
+def _parse_row(line: Mapping[str, str]) -> Row:
+    return Row(
+        line["view"],
+        int(line["camera_period"]),
+        int(line["rendered_period"]),
+        line["region"],
+        line["metric"],
+        float(line["value"]),
+    )
+
+
+def damaged(path: Path, error: ValidationError) -> CheckpointError:
+    """The first problem of a file that does not hold what it should."""
+    first = error.errors()[0]
+    where = ".".join(map(str, first["loc"])) or "the file"
+    return CheckpointError(
+        path,
+        expected="what bench wrote",
+        found=f"{first['msg']} ({where})",
+        todo="delete the run and bench again",
+    )
+
+
+def run_folders(runs: Path) -> list[Path]:
+    """Folders of all finished runs, sorted by path."""
+    return sorted(p.parent for p in runs.glob(f"*/*/seed*/{RUN_FILE}") if _is_final(p.parent))
+
+
+def read_failures(runs: Path) -> list[Failure]:
+    """All runs that failed when they were last tried."""
+    folders = sorted(p.parent for p in runs.glob(f"*/*/seed*/{FAILURE_FILE}"))
+    return [f for p in folders if _is_final(p) and (f := read_failure(p)) is not None]
+
+
+def write_failure(folder: Path, failure: Failure) -> None:
+    """Write ``failed.json``."""
+    write_text(folder / FAILURE_FILE, failure.model_dump_json(indent=1) + "\n")
+
+
+def read_failure(folder: Path) -> Failure | None:
+    """Why the run in a folder failed; None if it did not."""
+    path = folder / FAILURE_FILE
+    try:
+        return Failure.model_validate_json(path.read_bytes()) if path.is_file() else None
+    except ValidationError as error:
+        raise damaged(path, error) from error
+
+
+def _is_final(folder: Path) -> bool:
+    return folder.name.removeprefix("seed").isdigit()
+
+
+def write_summary(runs: Path) -> list[RunRecord]:
+    """Write ``results.json`` and ``rows.csv`` of all finished runs below a folder."""
+    folders = run_folders(runs)
+    records = [read_run(folder) for folder in folders]
+    documents = [json.loads(record.model_dump_json()) for record in records]
+    write_text(runs / RESULTS_FILE, json.dumps(documents, indent=1, allow_nan=False) + "\n")
+    lines = [",".join((*RUN_COLUMNS, *ROW_COLUMNS)) + "\n"]
+    for folder in folders:
+        lines += (folder / ROWS_FILE).read_text(encoding="utf-8").splitlines(keepends=True)[1:]
+    write_text(runs / ROWS_FILE, "".join(lines))
+    return records

@@ -1,0 +1,129 @@
+"""Scores of a run, made from its prediction folder and the frozen ground truth alone."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.bench.images import ImageEntry, Manifest, load_image, read_manifest
+from chronoscene.bench.results import Row, Values
+from chronoscene.errors import CheckpointError, ShapeError
+from chronoscene.metrics.scorers import Scorers
+from chronoscene.metrics.table import METRICS
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """All values of a run."""
+
+    rows: tuple[Row, ...]
+    skipped: dict[str, str]
+    """Metric to the reason for its absence."""
+
+
+def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Scores:
+    """Score every predicted view that shows the period of its photo.
+
+    Raises:
+        CheckpointError: If a manifest or an image is damaged, or the two do not belong together.
+    """
+    predicted, truth = read_manifest(predictions), read_manifest(ground_truth)
+    pairs = match_views(predictions, predicted, truth)
+    rows: list[Row] = []
+    skipped = dict(scorers.skipped)
+    for entry, target in pairs:
+        image, reference = load_image(predictions, entry), load_image(ground_truth, target)
+        values, refused = score_pair(image, reference, scorers)
+        skipped |= {name: f"{entry.view}: {reason}" for name, reason in refused.items()}
+        rows += [_row(entry, name, value) for name, value in values.items()]
+    # A metric that fails on one view has no mean over the test set.
+    return Scores(tuple(row for row in rows if row.metric not in skipped), skipped)
+
+
+def score_pair(
+    image: NDArray[np.uint8], reference: NDArray[np.uint8], scorers: Scorers
+) -> tuple[Values, dict[str, str]]:
+    """Values of one view, and the reasons for those that its size does not allow. [H, W, 3]"""
+    values, refused = {}, {}
+    for name, function in scorers.functions.items():
+        try:
+            values[name] = function(image, reference)
+        except ShapeError as error:
+            refused[name] = str(error)
+    return values, refused
+
+
+def _row(entry: ImageEntry, metric: str, value: float) -> Row:
+    return Row(entry.view, entry.camera_period, entry.rendered_period, "all", metric, value)
+
+
+def match_views(
+    folder: Path, predicted: Manifest, truth: Manifest
+) -> list[tuple[ImageEntry, ImageEntry]]:
+    """Pair every test view with its prediction.
+
+    Raises:
+        CheckpointError: If the scene, a view or a size differs.
+    """
+    if predicted.scene_hash != truth.scene_hash:
+        raise _mismatch(folder, f"scene {truth.scene_hash[:12]}", predicted.scene_hash[:12])
+    by_view = {e.view: e for e in predicted.images if e.rendered_period == e.camera_period}
+    targets = {e.view: e for e in truth.images}
+    if missing := sorted(targets.keys() ^ by_view.keys()):
+        raise _mismatch(folder, "one prediction per test view", f"a difference at {missing[0]!r}")
+    for view, target in targets.items():
+        mine = by_view[view]
+        if (mine.width, mine.height) != (target.width, target.height):
+            size = f"{target.width} x {target.height} pixels for {view!r}"
+            raise _mismatch(folder, size, f"{mine.width} x {mine.height}")
+    return [(by_view[view], target) for view, target in targets.items()]
+
+
+def _mismatch(folder: Path, expected: str, found: str) -> CheckpointError:
+    return CheckpointError(
+        folder, expected=expected, found=found, todo="delete the run and bench again"
+    )
+
+
+def aggregate(rows: Iterable[Row]) -> tuple[dict[str, Values], dict[str, Values]]:
+    """Means of the rows of region ``all``.
+
+    Returns:
+        aggregates: ``macro`` (mean over periods of their means), ``micro`` (mean over views) and
+            ``worst`` (mean of the worst period), each metric to value.
+        periods: Period id as text to metric to mean over its views.
+    """
+    groups: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        if row.region == "all":
+            groups[row.metric][row.camera_period].append(row.value)
+    aggregates: dict[str, Values] = {"macro": {}, "micro": {}, "worst": {}}
+    periods: dict[str, Values] = {}
+    for metric, by_period in groups.items():
+        means = {period: float(np.mean(by_period[period])) for period in sorted(by_period)}
+        worst = min if METRICS[metric].higher_is_better else max
+        aggregates["macro"][metric] = float(np.mean(list(means.values())))
+        aggregates["micro"][metric] = float(np.mean([v for p in by_period.values() for v in p]))
+        aggregates["worst"][metric] = worst(means.values())
+        for period, mean in means.items():
+            periods.setdefault(str(period), {})[metric] = mean
+    return aggregates, dict(sorted(periods.items(), key=lambda item: int(item[0])))
+
+
+def changes(before: Mapping[str, Values], after: Mapping[str, Values]) -> list[str]:
+    """What differs between two sets of aggregates, in words, one line per metric."""
+    old, new = before.get("macro", {}), after.get("macro", {})
+    lines = []
+    for name in (n for n in METRICS if n in old or n in new):
+        if name not in old:
+            lines.append(f"{name} new: {new[name]:.6g}")
+        elif name not in new:
+            lines.append(f"{name} dropped, was {old[name]:.6g}")
+        elif any(before[kind][name] != after[kind][name] for kind in after):
+            lines.append(f"{name} {old[name]:.6g} -> {new[name]:.6g} (macro)")
+    return lines

@@ -1,0 +1,259 @@
+"""One run in a process of its own: ``python -m chronoscene.bench.worker JOB.json [PARENT]``.
+
+The process makes a crash harmless to the other runs and its peak memory that of this run alone.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import traceback
+from dataclasses import astuple, dataclass, fields
+from datetime import UTC, datetime
+from importlib.util import find_spec
+from json import dumps
+from pathlib import Path
+from typing import Any
+
+from chronoscene.bench import results
+from chronoscene.bench.display import ProgressDisplay
+from chronoscene.bench.files import csv_text, folder_bytes, write_text
+from chronoscene.bench.ground_truth import ground_truth_folder
+from chronoscene.bench.identity import (
+    describe_device,
+    library_versions,
+    method_version,
+    peak_memory_bytes,
+)
+from chronoscene.bench.images import ImageWriter, load_image, read_manifest
+from chronoscene.bench.jobs import Job, read_job
+from chronoscene.bench.protocol import Part, make_parts
+from chronoscene.bench.scoring import aggregate, score_folder
+from chronoscene.bench.stopping import StopRule
+from chronoscene.bench.training import (
+    CurvePoint,
+    Trained,
+    probe_frames,
+    render_bytes,
+    stop_if_orphaned,
+    train,
+)
+from chronoscene.errors import BackendError, ChronoSceneError
+from chronoscene.formats import read_scene
+from chronoscene.images import ImageStore
+from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
+from chronoscene.metrics.scorers import make_scorers
+from chronoscene.scene import Scene
+from chronoscene.threads import set_threads
+
+FAILED = 1
+"""Exit status after a failure that is written down in ``failed.json``."""
+
+
+@dataclass(frozen=True, slots=True)
+class PartOutcome:
+    """What training and rendering one model gave."""
+
+    trained: Trained
+    size: MethodSize
+    render_seconds: float
+    """For all its test views together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Where the run takes place."""
+
+    device: str
+    threads: int
+
+
+def run_job(job: Job, *, parent: int | None = None) -> None:
+    """Train, save, render and score; writes into ``job.staging`` only."""
+    started = datetime.now(UTC).isoformat(timespec="seconds")
+    spec, staging = load_spec(job.method), Path(job.staging)
+    machine = Machine(pick_device(job.device, spec), set_threads(job.threads))
+    write_text(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
+    scene = read_scene(job.scene_root)
+    parts = make_parts(scene, ImageStore(scene, max_width=job.max_width), job.strategy)
+    writer = ImageWriter(staging / results.PREDICTIONS)
+    outcomes = []
+    with ProgressDisplay(job.label) as display:
+        for part, stop in zip(parts, job.stop_rules(spec, len(parts)), strict=True):
+            display.begin(part.name, stop)
+            outcomes.append(_run_part(job, spec, part, stop, machine, writer, display, parent))
+    peaks = peak_memory_bytes(), _peak_device_memory(machine.device)
+    writer.close(
+        kind="predictions",
+        scene=scene.name,
+        scene_hash=job.scene_hash,
+        details={"method": spec.name, "strategy": job.strategy, "seed": job.seed},
+    )
+    _write_curve(staging, outcomes)
+    scorers = make_scorers(lpips_weights=Path(job.lpips_weights) if job.lpips_weights else None)
+    truth = ground_truth_folder(Path(job.runs), scene.name)
+    scores = score_folder(staging / results.PREDICTIONS, truth, scorers)
+    record = _record(job, spec, scene, machine, outcomes, peaks, started)
+    record.aggregates, record.periods = aggregate(scores.rows)
+    record.skipped = scores.skipped
+    results.write_run(staging, record, scores.rows)
+
+
+def pick_device(wanted: str, spec: MethodSpec) -> str:
+    """``cuda`` where asked for, or where it is usable and nothing was asked for; else ``cpu``.
+
+    Raises:
+        BackendError: If a GPU is asked for that is not there.
+    """
+    import torch
+
+    usable = torch.cuda.is_available()
+    if wanted == "cuda" and not usable:
+        raise BackendError(
+            "--device cuda",
+            expected="a CUDA device and a torch build for it",
+            found=f"torch {torch.__version__} without one",
+            todo="use --device cpu",
+        )
+    if wanted != "auto":
+        return wanted
+    ready = usable and find_spec("gsplat") is not None
+    return "cuda" if "cuda" in spec.devices and (ready or "cpu" not in spec.devices) else "cpu"
+
+
+def _run_part(
+    job: Job,
+    spec: MethodSpec,
+    part: Part,
+    stop: StopRule,
+    machine: Machine,
+    writer: ImageWriter,
+    display: ProgressDisplay,
+    parent: int | None,
+) -> PartOutcome:
+    """Train one model, save it, and render the test views that it answers for."""
+
+    def observe(iteration: int, seconds: float, *rest: Any) -> None:
+        stop_if_orphaned(parent)
+        display.update(iteration, seconds, *rest)
+
+    method: Method = import_object(spec.method)(job.method_config(spec))
+    trained = train(
+        method,
+        part,
+        stop,
+        _probe_truth(job, part),
+        seed=job.seed,
+        device=machine.device,
+        observer=observe,
+    )
+    _save(method, Path(job.staging) / results.CHECKPOINT, part)
+    before = time.perf_counter()
+    for frame in part.test:
+        stop_if_orphaned(parent)
+        image = render_bytes(method, part, frame)
+        writer.add(frame.name, image, camera_period=frame.period, rendered_period=frame.period)
+    return PartOutcome(trained, method.size(), time.perf_counter() - before)
+
+
+def _probe_truth(job: Job, part: Part) -> dict[str, Any]:
+    """Ground truth of the probe views, from the frozen images."""
+    folder = ground_truth_folder(Path(job.runs), job.scene)
+    names = {frame.name for frame in probe_frames(part)}
+    entries = [e for e in read_manifest(folder).images if e.view in names]
+    return {entry.view: load_image(folder, entry) for entry in entries}
+
+
+def _save(method: Method, checkpoint: Path, part: Part) -> None:
+    """Save into ``checkpoint``, or a folder below it for each of several models."""
+    target = checkpoint if part.name == "all" else checkpoint / part.name
+    partial = target.with_name(f"{target.name}.partial")
+    partial.mkdir(parents=True)
+    method.save(partial)
+    os.replace(partial, target)
+
+
+def _write_curve(folder: Path, outcomes: list[PartOutcome]) -> None:
+    columns = [f.name for f in fields(CurvePoint)]
+    points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
+    write_text(folder / results.CURVE_FILE, csv_text(columns, points))
+
+
+def _peak_device_memory(device: str) -> int | None:
+    if device != "cuda":
+        return None
+    import torch
+
+    return int(torch.cuda.max_memory_allocated())
+
+
+def _record(
+    job: Job,
+    spec: MethodSpec,
+    scene: Scene,
+    machine: Machine,
+    outcomes: list[PartOutcome],
+    peaks: tuple[int, int | None],
+    started: str,
+) -> results.RunRecord:
+    """The record of the run, without its scores."""
+    tests = len(scene.select(split="test"))
+    return results.RunRecord(
+        method=spec.name,
+        strategy=job.strategy,
+        scene=scene.name,
+        seed=job.seed,
+        aggregates={},
+        periods={},
+        seconds=sum(o.trained.seconds for o in outcomes),
+        iterations=sum(o.trained.iterations for o in outcomes),
+        primitives=sum(o.size.primitives for o in outcomes),
+        checkpoint_bytes=folder_bytes(Path(job.staging) / results.CHECKPOINT),
+        peak_memory_bytes=peaks[0],
+        device=describe_device(machine.device, machine.threads),
+        commit=job.commit,
+        skipped={},
+        title=spec.title,
+        preset=job.preset,
+        method_version=method_version(job.method),
+        config_hash=job.document(spec)["config_hash"],
+        scene_hash=job.scene_hash,
+        split_hash=job.split_hash,
+        period_labels={str(p.id): p.label for p in scene.periods},
+        parameters=sum(o.size.parameters for o in outcomes),
+        setup_seconds=sum(o.trained.setup_seconds for o in outcomes),
+        render_seconds=sum(o.render_seconds for o in outcomes) / tests,
+        peak_device_memory_bytes=peaks[1],
+        threads=machine.threads,
+        max_width=job.max_width,
+        libraries=library_versions(),
+        started=started,
+        notices=job.notices,
+    )
+
+
+def main(arguments: list[str]) -> int:
+    """Run one job; every failure ends in ``failed.json`` and status 1."""
+    job = read_job(Path(arguments[0]))
+    parent = int(arguments[1]) if len(arguments) > 1 else None
+    staging = Path(job.staging)
+    if job.plugin_path is not None:
+        sys.path.append(job.plugin_path)
+    try:
+        run_job(job, parent=parent)
+    except ChronoSceneError as error:
+        results.write_failure(staging, job.failure(str(error)))
+        return FAILED
+    except Exception as error:  # a fault in a method must not end the other runs
+        (staging / "error.log").write_text(traceback.format_exc(), encoding="utf-8")
+        reason = f"{type(error).__name__}: {error} (see error.log)"
+        results.write_failure(staging, job.failure(reason))
+        return FAILED
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

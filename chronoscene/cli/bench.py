@@ -1,0 +1,158 @@
+"""``chronoscene bench``: train methods on scenes, render the test views, score them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+from chronoscene.bench.protocol import STRATEGIES
+from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
+from chronoscene.bench.stopping import parse_duration
+from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
+from chronoscene.images import MAX_WIDTH
+
+SOME_FAILED = 1
+"""Exit status when a run failed; the others have their results."""
+
+FOLDER = click.Path(path_type=Path, file_okay=False)
+EXISTING = click.Path(path_type=Path, exists=True)
+
+
+@click.command("bench")
+@click.argument("scenes", metavar="DIR...", nargs=-1, required=True, type=FOLDER)
+@click.option("--method", "methods", required=True, help="NAME[,NAME...], or module:SPEC.")
+@click.option(
+    "--strategy",
+    "strategies",
+    default="joint",
+    show_default=True,
+    help=f"One or several of {', '.join(STRATEGIES)}.",
+)
+@click.option("--preset", default="balanced", show_default=True, help="Preset of the method.")
+@click.option("--budget", help="Stop by the training clock: 90s, 5m, 1h30m.")
+@click.option("--iterations", type=click.IntRange(min=1), help="Stop after this many iterations.")
+@click.option(
+    "--separate-iterations",
+    type=click.Choice(["total", "each"]),
+    default="total",
+    show_default=True,
+    help="Strategy separate: whether the models share iterations and budget or get them each.",
+)
+@click.option("--seeds", type=click.IntRange(min=1), default=1, help="Number of seeds.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="The first seed.")
+@click.option(
+    "--set", "assignments", multiple=True, help="KEY=VALUE or METHOD.KEY=VALUE of the config."
+)
+@click.option(
+    "--max-width",
+    type=click.IntRange(min=1),
+    default=MAX_WIDTH,
+    show_default=True,
+    help="Images wider than this are scaled down, for training and evaluation. [pixels]",
+)
+@click.option("--threads", type=click.IntRange(min=1), help="Threads; default: all processors.")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto")
+@click.option("--lpips-weights", type=EXISTING, help="Folder or file with the weights of LPIPS.")
+@click.option("--out", type=FOLDER, default=Path("runs"), show_default=True, help="Folder of runs.")
+@click.option("--overwrite", is_flag=True, help="Replace finished runs made with other settings.")
+def command(
+    scenes: tuple[Path, ...],
+    methods: str,
+    strategies: str,
+    preset: str,
+    budget: str | None,
+    iterations: int | None,
+    separate_iterations: str,
+    seeds: int,
+    seed: int,
+    assignments: tuple[str, ...],
+    max_width: int,
+    threads: int | None,
+    device: str,
+    lpips_weights: Path | None,
+    out: Path,
+    overwrite: bool,
+) -> None:
+    """Train, render and score methods on scenes.
+
+    Every run (method, strategy, scene, seed) gets a folder below --out with its checkpoint, its
+    predictions and its scores. Finished runs are kept, so the same command goes on after an
+    interruption.
+    """
+    names = split_list("--method", methods)
+    if any(":" in name for name in names) and str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))  # a plug-in under development, named module:SPEC
+    settings = BenchSettings(
+        scenes=scenes,
+        methods=names,
+        runs=out,
+        strategies=tuple(
+            check_choice("--strategy", s, STRATEGIES) for s in split_list("--strategy", strategies)
+        ),
+        preset=preset,
+        overrides=parse_assignments(assignments),
+        iterations=iterations,
+        budget_seconds=None if budget is None else parse_duration(budget),
+        separate_iterations=separate_iterations,
+        seeds=tuple(range(seed, seed + seeds)),
+        max_width=max_width,
+        threads=threads,
+        device=device,
+        lpips_weights=lpips_weights,
+        overwrite=overwrite,
+    )
+    outcome = run_bench(settings, lambda line: click.echo(line, err=True))
+    report(outcome, out)
+
+
+def split_list(option: str, text: str) -> tuple[str, ...]:
+    """Items of a comma-separated list, each once.
+
+    Raises:
+        ConfigError: If an item is empty.
+    """
+    items = [item.strip() for item in text.split(",")]
+    if not all(items):
+        raise ConfigError(
+            option, expected="names with commas between", found=repr(text), todo="correct the list"
+        )
+    return tuple(dict.fromkeys(items))
+
+
+def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
+    """``KEY=VALUE`` texts as a mapping.
+
+    Raises:
+        ConfigError: If one has no ``=``.
+    """
+    parsed = {}
+    for text in assignments:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(
+                "--set", expected="KEY=VALUE", found=repr(text), todo="write the key, =, the value"
+            )
+        parsed[key.strip()] = value.strip()
+    return parsed
+
+
+def report(outcome: BenchOutcome, out: Path) -> None:
+    """Print the tables of all runs in the folder and the files that were written."""
+    from chronoscene.bench.figures import draw_figures
+    from chronoscene.bench.results import RESULTS_FILE, ROWS_FILE, read_failures
+    from chronoscene.bench.table_formats import format_runs
+    from chronoscene.bench.tables import read_runs
+
+    if outcome.finished:
+        records, failures = read_runs([out])
+        click.echo(format_runs(records, failures, "table"))
+        paths = [out / RESULTS_FILE, out / ROWS_FILE, *draw_figures(out)]
+        click.echo("\n".join(str(path) for path in paths))
+    else:
+        for failure in read_failures(out):
+            click.echo(f"failed: {failure.scene}, {failure.method}: {failure.reason}", err=True)
+    if outcome.failures:
+        click.get_current_context().exit(SOME_FAILED)
