@@ -119,9 +119,7 @@ def _path(world: World, name: str, points: Array, width: float) -> None:
 # ------------------------------------------------------------------ things on the ground
 
 
-def _tree(
-    world: World, name: str, at: Array, rng: np.random.Generator, size: float = 6.5
-) -> None:
+def _tree(world: World, name: str, at: Array, rng: np.random.Generator, size: float = 6.5) -> None:
     """A tree that grows and changes with the seasons."""
     heights = stages.tree_heights(rng, world.periods, float(rng.uniform(0.75, 1.25) * size))
     states = [
@@ -420,9 +418,7 @@ def _site_building(name: str, inner: Rect, rng: np.random.Generator) -> Building
     )  # fmt: skip
 
 
-def _site_gear(
-    world: World, name: str, inner: Rect, steps: list[str], spec: Building
-) -> None:
+def _site_gear(world: World, name: str, inner: Rect, steps: list[str], spec: Building) -> None:
     """Fence, containers, crane and diggers while the work goes on."""
     busy = [None if s == "finished" else "there" for s in steps]
     high = ["there" if s.startswith("f") and s != "finished" else None for s in steps]

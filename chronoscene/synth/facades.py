@@ -165,9 +165,7 @@ def _row(
     u, n = wall.along, wall.out
     low, high = z0 + sill, z0 + sill + h
     if sill > 0:
-        b.quads(
-            wall.at(0, z0), wall.width * u, sill * Z, front.wall, frame=wall.frame
-        )
+        b.quads(wall.at(0, z0), wall.width * u, sill * Z, front.wall, frame=wall.frame)
     b.quads(wall.at(0, high), wall.width * u, (z1 - high) * Z, front.wall, frame=wall.frame)
     starts, ends = np.concatenate([[0.0], xs + w]), np.concatenate([xs, [wall.width]])
     piers = (ends - starts)[:, None] * u
@@ -184,9 +182,7 @@ def _ground_row(
 ) -> None:
     """Ground floor of a dwelling: windows, and a door in front of one of them."""
     w = min(front.window[0], pitch - 0.7)
-    _row(
-        b, front, wall, 0.0, front.ground, centres - w / 2, w, 1.1, front.window[1], front.glass
-    )
+    _row(b, front, wall, 0.0, front.ground, centres - w / 2, w, 1.1, front.window[1], front.glass)
     _sills(b, front, wall, centres - w / 2, w, 1.1)
     x = centres[door] - 0.8
     b.boxes(wall.at(x, 0.0), 1.6 * wall.along, -0.12 * wall.out, 3.0 * Z, front.trim)

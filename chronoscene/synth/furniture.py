@@ -220,7 +220,7 @@ def _lattice(p: Placed, low: Array, way: Array, wide: float, style: int) -> None
         for far in (0.0, wide - thin):
             o = start + far * w + steps
             diagonal = (wide - thin) * u + wide * along
-            p.b.boxes(o, thin * along if axis else thin * along, thin * w, diagonal, style)
+            p.b.boxes(o, thin * along, thin * w, diagonal, style)
             p.b.boxes(o, wide * u, thin * w, thin * along, style)
 
 

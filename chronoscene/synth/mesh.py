@@ -120,9 +120,7 @@ class PartBuilder:
                 texture otherwise, starting at its corner.
             seed: Varies the texture.
         """
-        o, u, v = np.broadcast_arrays(
-            np.atleast_2d(np.asarray(corner, np.float64)), edge_u, edge_v
-        )
+        o, u, v = np.broadcast_arrays(np.atleast_2d(np.asarray(corner, np.float64)), edge_u, edge_v)
         if len(o) == 0:
             return
         quad = np.stack([o, o + u, o + u + v, o + v], axis=1)
@@ -161,9 +159,7 @@ class PartBuilder:
             seed: Varies the texture.
             bottom: Whether to add the face at ``-c``.
         """
-        o, a, b, c = np.broadcast_arrays(
-            np.atleast_2d(np.asarray(corner, np.float64)), a, b, c
-        )
+        o, a, b, c = np.broadcast_arrays(np.atleast_2d(np.asarray(corner, np.float64)), a, b, c)
         self.quads(o, a, c, style, seed=seed)
         self.quads(o + a, b, c, style, seed=seed + 1)
         self.quads(o + a + b, -a, c, style, seed=seed + 2)

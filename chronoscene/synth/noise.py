@@ -28,7 +28,7 @@ def hash01(ix, iy, seed):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def value_noise(x, y, seed):  # type: ignore[no-untyped-def]
     """Smooth noise in -1..1 with features of size 1."""
-    ix, iy = int(math.floor(x)), int(math.floor(y))
+    ix, iy = math.floor(x), math.floor(y)
     fx, fy = x - ix, y - iy
     sx = fx * fx * fx * (fx * (fx * 6.0 - 15.0) + 10.0)
     sy = fy * fy * fy * (fy * (fy * 6.0 - 15.0) + 10.0)

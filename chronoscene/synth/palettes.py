@@ -133,9 +133,7 @@ def roof_tile_style(b: PartBuilder, rng: np.random.Generator) -> int:
     """Style of a pitched roof."""
     first, second = pick(rng, ROOFS)
     moss = float(rng.uniform(0.05, 0.35))
-    return b.style(
-        TILES, tint(rng, first), tint(rng, second), srgb(96, 100, 62), (0.3, 0.36, moss)
-    )
+    return b.style(TILES, tint(rng, first), tint(rng, second), srgb(96, 100, 62), (0.3, 0.36, moss))
 
 
 def flat_roof_style(b: PartBuilder, rng: np.random.Generator) -> int:

@@ -111,6 +111,13 @@ class PeriodRenderer:
         query = o3d.core.Tensor(np.asarray(points, np.float32))
         return np.asarray(self._scene.compute_distance(query).numpy(), np.float64)
 
+    def coarse_depth(self, camera: Camera, cam_from_world: Array) -> NDArray[np.float32]:
+        """z-depth along a coarse grid of the view; infinite for the sky. [n]"""
+        k = camera.K.copy()
+        k[0] *= 24 / camera.width
+        k[1] *= 18 / camera.height
+        return self.cast(camera_rays(np.linalg.inv(cam_from_world), k, 24, 0, 18, 1)).t
+
     def image(self, camera: Camera, cam_from_world: Array) -> NDArray[np.uint8]:
         """Photo of the period. [H, W, 3]"""
         world_from_cam = np.linalg.inv(cam_from_world)
@@ -137,10 +144,26 @@ class PeriodRenderer:
 
     def elements(self, hits: Hits) -> NDArray[np.int32]:
         """Identity of the object that each ray hit, -1 for a miss. [n]"""
-        hit = hits.tri != MISS
-        out = np.full(len(hits.tri), -1, np.int32)
-        out[hit] = self._element[hits.tri[hit]]
+        return self.elements_of(hits.tri)
+
+    def surface_near(self, points: Array) -> NDArray[np.uint32]:
+        """Triangles that pass through points, `MISS` where none is within a millimetre. [n]"""
+        query = o3d.core.Tensor(np.asarray(points, np.float32))
+        found = self._scene.compute_closest_points(query)
+        gap = np.linalg.norm(found["points"].numpy() - points, axis=1)
+        limit = 1e-3 + 2e-6 * np.abs(points).max(axis=1)
+        return np.where(gap < limit, found["primitive_ids"].numpy(), np.uint32(MISS))
+
+    def elements_of(self, tri: NDArray[np.uint32]) -> NDArray[np.int32]:
+        """Identity of the objects of triangles, -1 for `MISS`. [n]"""
+        out = np.full(len(tri), -1, np.int32)
+        hit = tri != MISS
+        out[hit] = self._element[tri[hit]]
         return out
+
+    def albedo_on(self, points: Array, tri: NDArray[np.uint32]) -> Array:
+        """Albedo in full detail at points on triangles. [n, 3]"""
+        return np.asarray(albedo_at(points, tri, self.tables, np.zeros(len(tri))))
 
     def albedo(self, rays: NDArray[np.float32], hits: Hits, fw: NDArray[np.floating]) -> Array:
         """Linear albedo at hits, seen with pixels of the given widths in metres. [n, 3]"""

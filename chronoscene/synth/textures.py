@@ -58,9 +58,9 @@ def _brick(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Running bond; c0 and c1 bricks, c2 mortar. Numbers: length, height, band period."""
     c0, c1, c2 = _colors(s)
     length, height = s[10], s[11]
-    row = int(math.floor(v / height))
+    row = math.floor(v / height)
     shifted = u + 0.5 * length * (row & 1)
-    col = int(math.floor(shifted / length))
+    col = math.floor(shifted / length)
     pick = hash01(col, row, seed) - 0.5
     near = fade(height, fw)
     color = mix(c0, c1, 0.5 + near * pick + 0.35 * fbm(u, v, 2.2, 4, seed + 5, fw))
@@ -76,7 +76,7 @@ def _brick(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 def _panel(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Cladding panels with dark joints (c2). Numbers: width, height, share of c1, gloss bands."""
     c0, c1, c2 = _colors(s)
-    col, row = int(math.floor(u / s[10])), int(math.floor(v / s[11]))
+    col, row = math.floor(u / s[10]), math.floor(v / s[11])
     seen = fade(min(s[10], s[11]), fw)
     color = mix(c0, c1, 1.0 if hash01(col, row, seed + 3) < s[12] else 0.0)
     color = scaled(color, 1.0 + 0.22 * seen * (hash01(col, row, seed) - 0.5))
@@ -89,7 +89,7 @@ def _panel(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 def _concrete(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Cast concrete. Numbers: formwork width, height."""
     c0, c1, _ = _colors(s)
-    col, row = int(math.floor(u / s[10])), int(math.floor(v / s[11]))
+    col, row = math.floor(u / s[10]), math.floor(v / s[11])
     color = scaled(c0, 1.0 + 0.16 * (hash01(col, row, seed) - 0.5))
     color = mix(color, c1, 0.5 * smooth(0.0, 0.7, fbm(u * 2.0, v * 0.5, 1.3, 4, seed + 2, fw)))
     joint = max(pulse(u + 0.01, s[10], 0.03, fw), pulse(v + 0.01, s[11], 0.03, fw))
@@ -103,9 +103,9 @@ def _tiles(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Roof tiles, v up the slope; c0 and c1 tiles, c2 moss. Numbers: width, height, moss."""
     c0, c1, c2 = _colors(s)
     width, height = s[10], s[11]
-    row = int(math.floor(v / height))
+    row = math.floor(v / height)
     shifted = u + 0.5 * width * (row & 1)
-    col = int(math.floor(shifted / width))
+    col = math.floor(shifted / width)
     near = fade(width, fw)
     pick = hash01(col, row, seed) - 0.5
     color = mix(c0, c1, 0.5 + near * pick + 0.4 * fbm(u, v, 1.6, 4, seed + 4, fw))
@@ -115,7 +115,7 @@ def _tiles(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     color = scaled(color, 1.0 + near * (shade - 0.95))
     # Courses stay visible from farther away than single tiles.
     color = scaled(color, 1.0 - 0.5 * pulse(v, height, 0.05, fw))
-    patch = hash01(int(math.floor(u / (7 * width))), int(math.floor(v / (5 * height))), seed + 9)
+    patch = hash01(math.floor(u / (7 * width)), math.floor(v / (5 * height)), seed + 9)
     color = scaled(color, 0.9 + 0.22 * patch)
     moss = smooth(0.75 - s[12], 1.05 - s[12], fbm(u, v, 1.9, 5, seed + 6, fw) + 0.35)
     return mix(color, c2, 0.7 * moss)
@@ -125,7 +125,7 @@ def _tiles(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 def _flat_roof(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Bitumen sheets or gravel. Numbers: sheet width, gravel (0 or 1)."""
     c0, c1, c2 = _colors(s)
-    sheet = int(math.floor(u / s[10]))
+    sheet = math.floor(u / s[10])
     color = scaled(c0, 1.0 + 0.28 * (hash01(sheet, 0, seed) - 0.5))
     cut = 3.0 + 4.0 * hash01(sheet, 1, seed)
     seam = max(pulse(u, s[10], 0.07, fw), pulse(v + 2.0 * hash01(sheet, 2, seed), cut, 0.07, fw))
@@ -146,7 +146,7 @@ def _asphalt(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     color = mix(c0, c1, smooth(-0.5, 0.6, fbm(u, v, 3.5, 6, seed, fw)))
     color = scaled(color, 1.0 + 0.25 * fbm(u, v, 0.12, 2, seed + 1, fw))
     # Repairs: rectangles of newer asphalt, and cracks along a line of the noise.
-    cu, cv = int(math.floor(u / 5.3)), int(math.floor(v / 2.9))
+    cu, cv = math.floor(u / 5.3), math.floor(v / 2.9)
     if hash01(cu, cv, seed + 2) < 0.28:
         a, b = 0.6 + 1.5 * hash01(cu, cv, seed + 3), 0.4 + 0.7 * hash01(cu, cv, seed + 4)
         inside = span(u - 5.3 * cu, a, a + 2.4, fw) * span(v - 2.9 * cv, b, b + 1.1, fw)
@@ -188,9 +188,9 @@ def _paving(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Slabs. Numbers: length, height, bond shift, pattern (0 plain, 1 bands, 2 rings), scale."""
     c0, c1, c2 = _colors(s)
     length, height = s[10], s[11]
-    row = int(math.floor(v / height))
+    row = math.floor(v / height)
     shifted = u + s[12] * length * (row & 1)
-    col = int(math.floor(shifted / length))
+    col = math.floor(shifted / length)
     light = 0.0
     if s[13] == 1.0:
         light = max(pulse(u, s[14], 0.18 * s[14], fw), pulse(v, s[14], 0.18 * s[14], fw))
@@ -203,7 +203,7 @@ def _paving(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     color = mix(c0, c1, light)
     near = fade(min(length, height), fw)
     color = scaled(color, 1.0 + 0.42 * near * (hash01(col, row, seed) - 0.5))
-    group = hash01(int(math.floor(u / 2.7)), int(math.floor(v / 2.3)), seed + 8)
+    group = hash01(math.floor(u / 2.7), math.floor(v / 2.3), seed + 8)
     color = scaled(color, 0.94 + 0.12 * group)
     joint = max(pulse(v, height, 0.025, fw), pulse(shifted, length, 0.025, fw))
     color = mix(color, c2, 0.75 * joint)
@@ -224,7 +224,7 @@ def _grass(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
         color = scaled(color, 1.0 + s[12] * (pulse(x + 0.3 * y, 3.0, 1.5, fw) - 0.5))
     bare = smooth(0.62 - s[10], 0.85 - s[10], fbm(x, y, 3.1, 5, seed + 2, fw) + 0.25)
     color = mix(color, scaled(c2, 1.0 + 0.4 * tuft), 0.85 * bare)
-    ix, iy = int(math.floor(x / 0.35)), int(math.floor(y / 0.35))
+    ix, iy = math.floor(x / 0.35), math.floor(y / 0.35)
     pick = hash01(ix, iy, seed + 3)
     cluster = 0.5 + 0.5 * fbm(x, y, 2.2, 3, seed + 4, fw)
     if pick < s[11] * cluster:  # fallen leaves, or flowers
@@ -239,7 +239,7 @@ def _soil(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     c0, c1, c2 = _colors(s)
     color = mix(c0, c1, smooth(-0.5, 0.5, fbm(u, v, 4.0, 6, seed, fw)))
     color = scaled(color, 1.0 + 0.4 * fbm(u, v, 0.5, 3, seed + 1, fw))
-    ix, iy = int(math.floor(u / 0.3)), int(math.floor(v / 0.3))
+    ix, iy = math.floor(u / 0.3), math.floor(v / 0.3)
     if hash01(ix, iy, seed + 2) < s[10]:
         color = mix(color, scaled(c2, 0.6 + 0.8 * hash01(ix, iy, seed + 3)), fade(0.3, 0.7 * fw))
     wave = v + 0.8 * fbm(u, 0.3 * v, 9.0, 2, seed + 4, fw)
@@ -254,8 +254,8 @@ def _leaves(s, x, y, z, seed, fw):  # type: ignore[no-untyped-def]
     a, b = x + 0.7 * z, y - 0.6 * z
     size = s[10]
     clump = fbm(a, b, 5.5 * size, 3, seed, fw)
-    ix, iy = int(math.floor(a / size)), int(math.floor(b / size))
-    iz = int(math.floor((x - 0.5 * y + z) / size))
+    ix, iy = math.floor(a / size), math.floor(b / size)
+    iz = math.floor((x - 0.5 * y + z) / size)
     pick = hash01(ix + 57 * iz, iy, seed + 1)
     near = fade(size, 0.8 * fw)
     color = mix(c0, c1, min(1.0, max(0.0, 0.5 + 0.8 * clump + 0.5 * near * (pick - 0.5))))
@@ -269,7 +269,7 @@ def _leaves(s, x, y, z, seed, fw):  # type: ignore[no-untyped-def]
 def _wood(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Boards along u. Numbers: board width, gap."""
     c0, c1, _ = _colors(s)
-    board = int(math.floor(v / s[10]))
+    board = math.floor(v / s[10])
     color = mix(c0, c1, 0.3 + 0.5 * hash01(board, 0, seed))
     color = scaled(color, 1.0 + 0.35 * fbm(u * 0.4, v * 5.0, 0.5, 3, seed + 1, fw))
     return scaled(color, 1.0 - 0.75 * pulse(v, s[10], s[11], fw))
@@ -294,7 +294,7 @@ def _corrugated(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     rib = pulse(u, s[10], 0.5 * s[10], fw) - 0.5
     color = scaled(c0, 1.0 + 0.5 * rib)
     if s[12] > 0.0:
-        iu = int(math.floor(u / 0.45))
+        iu = math.floor(u / 0.45)
         letter = span(v, 0.45 * sv, 0.7 * sv, fw) * pulse(u, 0.45, 0.3, fw)
         inside = 1.0 if 0.2 * su < u < 0.75 * su and hash01(iu, 3, seed) < 0.8 else 0.0
         color = mix(color, c2, letter * inside * fade(0.3, 0.7 * fw))
@@ -308,9 +308,9 @@ def _fields(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     c0, c1, c2 = _colors(s)
     wx = x + 9.0 * fbm(x, y, 60.0, 2, seed + 1, 0.01)
     wy = y + 9.0 * fbm(y, x, 60.0, 2, seed + 2, 0.01)
-    row = int(math.floor(wy / 58.0))
+    row = math.floor(wy / 58.0)
     shifted = wx + 37.0 * hash01(row, 5, seed)
-    col = int(math.floor(shifted / 83.0))
+    col = math.floor(shifted / 83.0)
     pick, tone = hash01(col, row, seed + 3), hash01(col, row, seed + 4)
     color = mix(c0, c1, pick)
     if tone > 0.7:
@@ -359,7 +359,7 @@ def _sign(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     count = int((0.76 * su) / pitch)
     color = c0
     if pitch > 1e-6 and count > 0:
-        i = int(math.floor((u - first) / pitch))
+        i = math.floor((u - first) / pitch)
         if 0 <= i < count and hash01(i, 9, seed) < 0.88:
             a = (u - first) / pitch - i
             b = (v - 0.22 * sv) / height
@@ -370,8 +370,10 @@ def _sign(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
                 at = 0.12 + 0.33 * (stroke % 3)
                 if h < 0.6:
                     if stroke < 3:
-                        ink = max(ink, span(b, at * 1.25 - 0.07, at * 1.25 + 0.07, w)
-                                  * span(a, 0.1, 0.8, w))
+                        ink = max(
+                            ink,
+                            span(b, at * 1.25 - 0.07, at * 1.25 + 0.07, w) * span(a, 0.1, 0.8, w),
+                        )
                     else:
                         side = 0.12 + 0.56 * (stroke - 3)
                         ink = max(ink, span(a, side - 0.07, side + 0.07, w) * span(b, 0.0, 1.0, w))

@@ -103,9 +103,7 @@ def trunk(b: PartBuilder, base: Array, top: Array, radius: float, style: int) ->
     b.triangles(tris, normals, style, origin=base)
 
 
-def tree(
-    name: str, base: Array, height: float, season: str, seed: int, *, detail: int = 2
-) -> Part:
+def tree(name: str, base: Array, height: float, season: str, seed: int, *, detail: int = 2) -> Part:
     """A tree; name and seed fix species and shape, height and season change with time.
 
     Args:
