@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -75,13 +75,13 @@ def read_model(folder: Path) -> Model:
         )
     if kind == "binary":
         check_records(folder)
-        keypoints, points = _read_records(folder)
-        return _assemble(folder, read_reconstruction(folder), keypoints, points)
+        records = _read_records(folder)
+        return _assemble(folder, read_reconstruction(folder), records)
     reconstruction = read_reconstruction(folder)
     with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
         reconstruction.write_binary(temporary)
-        keypoints, points = _read_records(Path(temporary))
-    return _assemble(folder, reconstruction, keypoints, points)
+        records = _read_records(Path(temporary))
+    return _assemble(folder, reconstruction, records)
 
 
 def read_reconstruction(folder: Path) -> pycolmap.Reconstruction:
@@ -154,28 +154,61 @@ def from_pycolmap(camera: pycolmap.Camera) -> Camera:
     )
 
 
-def _read_records(folder: Path) -> tuple[dict[int, NDArray[np.float64]], PointRecords]:
-    return read_keypoints(folder / "images.bin"), read_points(folder / "points3D.bin")
+@dataclass(frozen=True, slots=True, eq=False)
+class _Records:
+    """Observations of a binary model, checked against its images."""
+
+    points: PointRecords
+    image_ids: NDArray[np.int64]
+    """All images of the model, registered or not, sorted. [I]"""
+    slot: NDArray[np.int64]
+    """Index into ``image_ids`` of every observation. [M]"""
+    xy: NDArray[np.float64]
+    """Pixel position of every observation. [M, 2]"""
 
 
-def _assemble(
-    folder: Path,
-    reconstruction: pycolmap.Reconstruction,
-    keypoints: Mapping[int, NDArray[np.float64]],
-    records: PointRecords,
-) -> Model:
+def _read_records(folder: Path) -> _Records:
+    """Read points and keypoints; refuse tracks over images or keypoints that do not exist."""
+    keypoints = read_keypoints(folder / "images.bin")
+    points = read_points(folder / "points3D.bin")
+    image, keypoint = points.tracks[:, 0], points.tracks[:, 1].astype(np.int64)
+    known = np.array(sorted(keypoints), np.int64)
+    slot = np.searchsorted(known, image)
+    if lost := sorted(set(image[~np.isin(image, known)].tolist())):
+        raise _model_error(
+            folder, "tracks over images of the model", f"image {lost[0]}, which it lacks"
+        )
+    lengths = np.array([len(keypoints[i]) for i in known.tolist()], np.int64)
+    wrong = (keypoint < 0) | (keypoint >= lengths[slot])
+    if wrong.any():
+        i = int(np.flatnonzero(wrong)[0])
+        raise _model_error(
+            folder,
+            "tracks over keypoints of the images",
+            f"keypoint {keypoint[i]} of image {image[i]}, which has {lengths[slot[i]]}",
+        )
+    first = np.concatenate([[0], np.cumsum(lengths)])
+    every = np.concatenate([np.zeros((0, 2)), *(keypoints[i] for i in known.tolist())])
+    return _Records(points, known, slot, every[first[slot] + keypoint])
+
+
+def _assemble(folder: Path, reconstruction: pycolmap.Reconstruction, records: _Records) -> Model:
     images = _posed_images(folder, reconstruction)
     index = {image.image_id: i for i, image in enumerate(images)}
-    frame, xy = _observations(folder, records, index, keypoints)
-    heads = records.heads
+    frame_of = np.array([index.get(i, -1) for i in records.image_ids.tolist()], np.int32)
+    frame = frame_of[records.slot]
+    if (frame < 0).any():
+        lost = records.image_ids[records.slot[frame < 0][0]]
+        raise _model_error(folder, "tracks over registered images", f"image {lost} without a pose")
+    heads = records.points.heads
     points = Points(
         ids=heads["id"].astype(np.int64),
         xyz=np.ascontiguousarray(heads["xyz"]),
         rgb=np.ascontiguousarray(heads["rgb"]),
         error=np.ascontiguousarray(heads["error"]),
-        track_start=records.track_start,
+        track_start=records.points.track_start,
         track_frame=frame,
-        track_xy=xy,
+        track_xy=records.xy,
     )
     return Model(images, points)
 
@@ -196,32 +229,6 @@ def _posed_images(folder: Path, model: pycolmap.Reconstruction) -> tuple[PosedIm
             raise _model_error(folder, "one image of each name", f"{name!r} twice")
         images[name] = PosedImage(int(image_id), name, cameras[image.camera_id], pose)
     return tuple(images[name] for name in sorted(images))
-
-
-def _observations(
-    folder: Path,
-    records: PointRecords,
-    index: Mapping[int, int],
-    keypoints: Mapping[int, NDArray[np.float64]],
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Frame index [M] and pixel position [M, 2] of every observation."""
-    image_ids, keypoint = records.tracks[:, 0], records.tracks[:, 1]
-    known = np.array(sorted(index.keys() & keypoints.keys()), np.int64)
-    slot = np.minimum(np.searchsorted(known, image_ids), max(len(known) - 1, 0))
-    if len(image_ids) and (not len(known) or (known[slot] != image_ids).any()):
-        lost = image_ids[known[slot] != image_ids][0] if len(known) else image_ids[0]
-        raise _model_error(folder, "tracks over registered images", f"image id {lost} in a track")
-    if not len(image_ids):
-        return np.zeros(0, np.int32), np.zeros((0, 2))
-    lengths = np.array([len(keypoints[i]) for i in known.tolist()])
-    if ((keypoint < 0) | (keypoint >= lengths[slot])).any():
-        raise _model_error(
-            folder, "tracks over existing keypoints", "a keypoint index that its image lacks"
-        )
-    first = np.concatenate([[0], np.cumsum(lengths)])
-    xy = np.concatenate([keypoints[i] for i in known.tolist()])[first[slot] + keypoint]
-    frame = np.array([index[i] for i in known.tolist()], np.int32)[slot]
-    return frame, xy
 
 
 def _model_error(folder: Path, expected: str, found: str) -> SceneError:

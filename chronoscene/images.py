@@ -62,6 +62,7 @@ _DECODE_ERRORS = (
     EOFError,
     MemoryError,
     OverflowError,
+    RuntimeError,  # from the AVIF decoder
     struct.error,
     zlib.error,
     Image.DecompressionBombError,
