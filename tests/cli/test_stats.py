@@ -1,0 +1,124 @@
+"""``chronoscene stats`` from the outside."""
+
+import csv
+import hashlib
+import io
+import json
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from chronoscene.cli import cli
+from chronoscene.stats import WRITERS
+
+
+def run(*args: object):
+    return CliRunner().invoke(cli, ["stats", *map(str, args)])
+
+
+def test_a_scene(make_scene_folder):
+    result = run(make_scene_folder())
+    assert result.exit_code == 0, result.output
+    (row,) = [line for line in result.output.splitlines() if line.lstrip().startswith("scene ")]
+    images_0, points_0, images_1, points_1, images, points = map(int, row.split()[1:])
+    assert (images_0, images_1, images, points) == (2, 2, 4, 30)
+    assert points_0 + points_1 == 30
+
+
+def test_a_folder_of_scenes_and_several_folders(make_scene_folder, tmp_path):
+    make_scene_folder(name="set/b")
+    make_scene_folder({"1.png": 0, "2.png": 1, "3.png": 2}, name="set/a")
+    single = make_scene_folder(name="single")
+    result = run(tmp_path / "set", single, "--format", "csv")
+    rows = list(csv.DictReader(io.StringIO(result.output)))
+    assert [row["scene"] for row in rows] == ["a", "b", "single", "Total"]
+    assert [row["period_2_images"] for row in rows] == ["1", "", "", "1"]
+    assert [row["total_images"] for row in rows] == ["3", "4", "4", "11"]
+
+
+@pytest.mark.parametrize("output_format", WRITERS)
+def test_out_holds_what_would_be_printed(make_scene_folder, tmp_path, output_format):
+    folder = make_scene_folder()
+    printed = run(folder, "--format", output_format)
+    out = tmp_path / "counts"
+    written = run(folder, "--format", output_format, "--out", out)
+    assert (written.exit_code, written.output) == (0, "")
+    assert out.read_text(encoding="utf-8") == printed.output
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["counts", "scene"]
+
+
+def test_seen_counts_more(make_scene_folder):
+    folder = make_scene_folder()
+
+    def points(*args: object) -> list[int]:
+        data = json.loads(run(folder, "--format", "json", *args).output)
+        return [p["points"] for p in data["scenes"][0]["periods"]]
+
+    assert sum(points()) == 30
+    assert sum(points("--count", "seen")) > 30
+
+
+def test_the_scene_folder_stays_as_it_is(make_scene_folder):
+    folder = make_scene_folder()
+
+    def state():
+        return {
+            p: (p.stat().st_mtime_ns, p.is_file() and hashlib.sha256(p.read_bytes()).hexdigest())
+            for p in folder.rglob("*")
+        }
+
+    before = state()
+    run(folder)
+    assert state() == before
+
+
+def test_points_that_no_image_sees_are_mentioned(make_scene_folder):
+    folder = make_scene_folder(form="text")
+    with (folder / "sparse/0/points3D.txt").open("a") as file:
+        file.write("99 1 2 3 4 5 6 0.5\n")
+    result = run(folder)
+    assert "scene: 1 points are seen by no image" in result.stderr
+    assert "seen by" not in result.stdout
+
+
+def shell(*args: object) -> subprocess.CompletedProcess[str]:
+    code = "from chronoscene.cli import main; main()"
+    command = [sys.executable, "-c", code, "stats", *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_errors_are_one_line_with_status_2(make_scene_folder, tmp_path):
+    done = shell(tmp_path)
+    assert done.returncode == 2
+    assert "expected a scene of a known format (" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    folder = make_scene_folder()
+    (folder / "sparse/split.txt").write_text("a/0001.png\n")
+    done = shell(folder)
+    assert done.returncode == 2
+    assert 'split.txt:1: expected "<image name> <period id>"' in done.stderr
+    assert "Traceback" not in done.stderr and done.stdout == ""
+
+
+def test_out_in_a_missing_folder_is_an_error(make_scene_folder, tmp_path):
+    result = run(make_scene_folder(), "--out", tmp_path / "no" / "file.txt")
+    assert "expected a file that can be written" in str(result.exception)
+
+
+def test_help_states_the_rule():
+    text = " ".join(run("--help").output.split())
+    assert "the paper does not say how its table splits it" in text
+    assert "the earliest of several" in text
+
+
+def test_torch_is_not_needed(make_scene_folder):
+    code = (
+        "import sys; sys.modules.update(dict.fromkeys(('torch', 'open3d', 'numba', 'pandas')))\n"
+        "from chronoscene.cli import main; main()"
+    )
+    command = [sys.executable, "-c", code, "stats", str(make_scene_folder())]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "Total" in done.stdout
