@@ -73,7 +73,8 @@ class ProgressDisplay:
             self._bar.update(self._task, completed=progress, status=status)
         elif not self._live and psnr is not None and psnr != self._psnr:
             status = self.status(iteration, seconds, report.primitives, psnr)
-            self.console.print(f"{self._name}: {progress:4.0%} {status}", highlight=False)
+            line = f"{self._name}: {progress:4.0%} {status}"
+            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
         self._psnr = psnr
 
     def status(self, iteration: int, seconds: float, primitives: int, psnr: float | None) -> str:

@@ -30,8 +30,9 @@ COSTS = (
     Cost("seconds", "training [s]", 1.0, 1),
     Cost("iterations", "iterations", 1.0, 0),
     Cost("primitives", "primitives", 1.0, 0),
-    Cost("checkpoint_bytes", "checkpoint [MB]", 1e-6, 2),
+    Cost("checkpoint_bytes", "checkpoint [MB]", 1e-6, 3),
     Cost("peak_memory_bytes", "peak memory [MB]", 1e-6, 0),
+    Cost("peak_device_memory_bytes", "peak GPU memory [MB]", 1e-6, 0),
 )
 
 
@@ -172,9 +173,10 @@ def statistic(group: Group, metric: str, column: str) -> Statistic | None:
     return Statistic.of(values) if len(values) == len(group.runs) else None
 
 
-def cost(group: Group, name: str) -> Statistic:
-    """Mean over seeds of a cost."""
-    return Statistic.of([float(getattr(run, name)) for run in group.runs])
+def cost(group: Group, name: str) -> Statistic | None:
+    """Mean over seeds of a cost; None where a run does not know it."""
+    values = [getattr(run, name) for run in group.runs]
+    return None if None in values else Statistic.of([float(value) for value in values])
 
 
 def entries(records: Sequence[RunRecord], wanted: Sequence[str] = ()) -> list[Entry]:
@@ -186,7 +188,8 @@ def entries(records: Sequence[RunRecord], wanted: Sequence[str] = ()) -> list[En
             for metric in metric_names(group.runs, wanted):
                 values = [(column, statistic(group, metric, column)) for column in columns]
                 found += [_entry(group, metric, c, v) for c, v in values if v is not None]
-            found += [_entry(group, c.name, "", cost(group, c.name)) for c in COSTS]
+            costs = [(c.name, cost(group, c.name)) for c in COSTS]
+            found += [_entry(group, name, "", v) for name, v in costs if v is not None]
     return found
 
 
@@ -227,10 +230,11 @@ def quality_grid(scene: str, groups: Sequence[Group], metric: str) -> Grid:
     labels = groups[0].first.period_labels
     columns = [f"period {i}" for i in ids] + list(AGGREGATES)
     values = [[statistic(group, metric, column) for column in columns] for group in groups]
-    header = ("method", *(_period_title(i, labels) for i in ids), *AGGREGATES)
+    header = ("method", *(_period_title(i, labels) for i in ids), *AGGREGATES, "n")
     arrow = "higher" if info.higher_is_better else "lower"
     title = f"{scene}: {info.title} ({metric}), {arrow} is better"
-    cells = format_columns(values, info.decimals, 1.0, info.higher_is_better)
+    cells = format_columns(values, info.decimals, info.higher_is_better)
+    cells = [[*row, Cell(str(len(g.runs)))] for row, g in zip(cells, groups, strict=True)]
     return Grid(title, header, _with_labels([g.label for g in groups], cells))
 
 
@@ -241,14 +245,13 @@ def _period_title(period: str, labels: dict[str, str]) -> str:
 
 def cost_grid(scene: str, groups: Sequence[Group]) -> Grid:
     """What the runs on one scene cost."""
-    columns = [
-        format_columns([[cost(group, c.name)] for group in groups], c.decimals, c.factor, None)
-        for c in COSTS
+    shown = [c for c in COSTS if any(cost(group, c.name) is not None for group in groups)]
+    cells = [
+        [Cell(format_statistic(cost(group, c.name), c.decimals, c.factor)) for c in shown]
+        + [Cell(" ".join(str(run.seed) for run in group.runs))]
+        for group in groups
     ]
-    cells = [[column[row][0] for column in columns] for row in range(len(groups))]
-    seeds = [Cell(" ".join(str(run.seed) for run in group.runs)) for group in groups]
-    cells = [[*row, seed] for row, seed in zip(cells, seeds, strict=True)]
-    header = ("method", *(c.title for c in COSTS), "seeds")
+    header = ("method", *(c.title for c in shown), "seeds")
     return Grid(f"{scene}: cost", header, _with_labels([g.label for g in groups], cells))
 
 
@@ -266,7 +269,7 @@ def summary_grid(scenes: dict[str, list[Group]], metric: str) -> Grid:
         complete = len(known) == len(scenes)
         values.append([*row, Statistic(mean(known), None, 1) if complete else None])
     header = ("method", *scenes, "mean of scenes")
-    cells = format_columns(values, info.decimals, 1.0, info.higher_is_better)
+    cells = format_columns(values, info.decimals, info.higher_is_better)
     return Grid(f"all scenes: {info.title} ({metric}), macro", header, _with_labels(labels, cells))
 
 
@@ -277,34 +280,35 @@ def _with_labels(labels: Sequence[str], cells: list[list[Cell]]) -> tuple[tuple[
 def format_columns(
     values: Sequence[Sequence[Statistic | None]],
     decimals: int,
-    factor: float,
-    higher_is_better: bool | None,
+    higher_is_better: bool,
 ) -> list[list[Cell]]:
-    """Format rows of numbers; where a direction is given, mark the best of each column."""
-    texts = [[format_statistic(v, decimals, factor) for v in row] for row in values]
-    best: list[float | None] = [None] * len(texts[0])
-    if higher_is_better is not None and len(values) > 1:
+    """Format rows of numbers and mark the best of each column, if there is a choice."""
+    best: list[float | None] = [None] * len(values[0])
+    if len(values) > 1:
         pick = max if higher_is_better else min
         for i in range(len(best)):
-            known = [row[i] for row in values]
-            best[i] = pick((v.mean for v in known if v is not None), default=None)
+            known = (row[i] for row in values)
+            best[i] = pick((round(v.mean, decimals) for v in known if v is not None), default=None)
     return [
         [
-            Cell(text, value is not None and value.mean == best[i])
-            for i, (text, value) in enumerate(zip(text_row, row, strict=True))
+            # What reads the same in the table is marked alike.
+            Cell(
+                format_statistic(v, decimals), v is not None and round(v.mean, decimals) == best[i]
+            )
+            for i, v in enumerate(row)
         ]
-        for text_row, row in zip(texts, values, strict=True)
+        for row in values
     ]
 
 
 def format_statistic(value: Statistic | None, decimals: int, factor: float = 1.0) -> str:
-    """``mean`` or ``mean ± sd (n)``; a dash where there is no number."""
+    """``mean`` or ``mean ± sd``; a dash where there is no number."""
     if value is None:
         return "-"
     text = f"{value.mean * factor:.{decimals}f}"
     if value.sd is None:
         return text
-    return f"{text} ± {value.sd * factor:.{decimals}f} (n={value.n})"
+    return f"{text} ± {value.sd * factor:.{decimals}f}"
 
 
 def footnotes(
@@ -313,19 +317,22 @@ def footnotes(
     """What a reader must know: aggregates, spread, device, code, what is absent and why."""
     notes = ["macro: mean over periods; micro: mean over test views; worst: the worst period"]
     if any(len(g.runs) > 1 for groups in group_runs(records).values() for g in groups):
-        notes.append("± is the sample standard deviation over n seeds")
+        notes.append("±: sample standard deviation over n seeds")
     for name, title in (("device", "device"), ("commit", "code")):
         values = dict.fromkeys(str(getattr(run, name)) for run in records)
         if values:
             notes.append(f"{title}: {'; '.join(values)}")
-    skipped: dict[str, None] = {}
+    absent: dict[str, list[str]] = {}
     for run in records:
         for metric, reason in run.skipped.items():
-            if not wanted or metric in wanted:
-                skipped[f"{metric} is absent: {reason}"] = None
+            names = absent.setdefault(reason, [])
+            if metric not in names and (not wanted or metric in wanted):
+                names.append(metric)
+    notes += [f"absent: {', '.join(names)}: {reason}" for reason, names in absent.items() if names]
     notices = dict.fromkeys(notice for run in records for notice in run.notices)
-    failed = [
-        f"failed: {f.scene}, {f.method} ({f.strategy}, {f.preset}), seed {f.seed}: {f.reason}"
-        for f in failures
-    ]
-    return [*notes, *skipped, *notices, *failed]
+    seeds: dict[tuple[str, str], list[str]] = {}
+    for f in failures:
+        name = f"{f.scene}, {f.method} ({f.strategy}, {f.preset})"
+        seeds.setdefault((name, f.reason), []).append(str(f.seed))
+    failed = [f"failed: {n}, seed {', '.join(s)}: {reason}" for (n, reason), s in seeds.items()]
+    return [*notes, *notices, *failed]

@@ -11,6 +11,7 @@ from chronoscene.bench.protocol import STRATEGIES
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.stopping import parse_duration
 from chronoscene.checks import check_choice
+from chronoscene.cli.table import split_list
 from chronoscene.errors import ConfigError
 from chronoscene.images import MAX_WIDTH
 
@@ -106,20 +107,6 @@ def command(
     )
     outcome = run_bench(settings, lambda line: click.echo(line, err=True))
     report(outcome, out)
-
-
-def split_list(option: str, text: str) -> tuple[str, ...]:
-    """Items of a comma-separated list, each once.
-
-    Raises:
-        ConfigError: If an item is empty.
-    """
-    items = [item.strip() for item in text.split(",")]
-    if not all(items):
-        raise ConfigError(
-            option, expected="names with commas between", found=repr(text), todo="correct the list"
-        )
-    return tuple(dict.fromkeys(items))
 
 
 def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:

@@ -9,7 +9,7 @@ import click
 from chronoscene.bench.files import write_text
 from chronoscene.bench.table_formats import FORMATS, format_runs
 from chronoscene.bench.tables import read_runs
-from chronoscene.cli.bench import split_list
+from chronoscene.errors import ConfigError
 from chronoscene.metrics.table import metric_info
 
 
@@ -41,3 +41,17 @@ def command(
     out.parent.mkdir(parents=True, exist_ok=True)
     write_text(out, text)
     click.echo(str(out))
+
+
+def split_list(option: str, text: str) -> tuple[str, ...]:
+    """Items of a comma-separated list, each once.
+
+    Raises:
+        ConfigError: If an item is empty.
+    """
+    items = [item.strip() for item in text.split(",")]
+    if not all(items):
+        raise ConfigError(
+            option, expected="names with commas between", found=repr(text), todo="correct the list"
+        )
+    return tuple(dict.fromkeys(items))

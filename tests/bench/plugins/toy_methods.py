@@ -1,0 +1,103 @@
+"""Methods small enough to predict by hand, found as ``toy_methods:NAME``. No torch."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from chronoscene.methods import MethodSize, MethodSpec, Prediction, StepReport
+
+
+@dataclass(frozen=True)
+class Config:
+    iterations: int = 20
+    rate: float = 0.5
+    sleep: float = 0.0
+    ballast: int = 0
+
+
+class MeanColour:
+    """One colour per period, moved towards the mean of one image after another."""
+
+    def __init__(self, config):
+        self.config = config
+
+    def setup(self, train, *, seed, device):
+        self.train = train
+        self.colors = np.full((train.num_periods, 3), 0.5)
+        self.ballast = np.ones(self.config.ballast, np.uint8)
+
+    def step(self, index, progress):
+        time.sleep(self.config.sleep)
+        i = index % len(self.train.views)
+        target = self.train.load_image(i).reshape(-1, 3).mean(axis=0) / 255.0
+        color = self.colors[self.train.views[i].period]
+        loss = float(np.abs(color - target).mean())
+        color += self.config.rate * (target - color)
+        return StepReport(loss, len(self.colors))
+
+    def render(self, view, period):
+        rgb = np.empty((view.height, view.width, 3), np.float32)
+        rgb[:] = self.colors[int(period)]
+        return Prediction(rgb)
+
+    def save(self, folder):
+        (folder / "model.json").write_text(json.dumps({"colors": self.colors.tolist()}))
+
+    def load(self, folder, *, device):
+        self.colors = np.array(json.loads((folder / "model.json").read_text())["colors"])
+
+    def size(self):
+        return MethodSize(len(self.colors), self.colors.size)
+
+
+class Raises(MeanColour):
+    def step(self, index, progress):
+        if index == 3:
+            raise RuntimeError("the toy is broken")
+        return super().step(index, progress)
+
+
+class NotFinite(MeanColour):
+    def step(self, index, progress):
+        report = super().step(index, progress)
+        return StepReport(float("nan"), 1) if index == 5 else report
+
+
+class BadImage(MeanColour):
+    def render(self, view, period):
+        return Prediction(np.full((view.height, view.width, 3), np.nan, np.float32))
+
+
+class Killed(MeanColour):
+    def step(self, index, progress):
+        os.kill(os.getpid(), signal.SIGKILL)
+        raise AssertionError
+
+
+def spec(name, cls, period_input="label"):
+    return MethodSpec(
+        name=name,
+        title=name.title(),
+        paper="none",
+        licence="Apache-2.0",
+        period_input=period_input,
+        outputs=("rgb",),
+        devices=("cpu",),
+        method=f"toy_methods:{cls.__name__}",
+        config="toy_methods:Config",
+        presets={"balanced": {}, "slow": {"iterations": 100_000, "sleep": 0.01}},
+    )
+
+
+MEAN = spec("mean", MeanColour)
+BLIND = spec("blind", MeanColour, period_input="none")
+RAISES = spec("raises", Raises)
+NOT_FINITE = spec("not-finite", NotFinite)
+BAD_IMAGE = spec("bad-image", BadImage)
+KILLED = spec("killed", Killed)
