@@ -73,36 +73,26 @@ def _tile_blocks(first: Any, last: Any, tile_x: int) -> Any:
     return pack_bytes(select(some, bits, 0))
 
 
-@njit(nogil=True)
-def _tile_count(records_int, at):
-    """Tiles of the rectangle around a Gaussian."""
-    return (records_int[at + lay.TILES_X] >> 16) * (records_int[at + lay.TILES_Y] >> 16)
-
-
-@njit(nogil=True, parallel=True, cache=True)
-def bound_pairs(threads, pairs, count, records_int, bounds):
-    """Upper bounds of the numbers of (Gaussian, tile) pairs of each part. ``bounds`` [threads]."""
-    for t in prange(threads):
-        total = 0
-        for i in range(count * t // threads, count * (t + 1) // threads):
-            total += _tile_count(records_int, lay.RECORD * (pairs[i] & 0xFFFFFFFF))
-        bounds[t] = total
-
-
 @njit(nogil=True, fastmath=_FAST)
-def _list_part(first, last, at, order, view, records, records_int, counts, listed):
-    """Pairs of the Gaussians first..last of the order of drawing. Returns the list's end."""
+def _list_part(first, last, at, limit, order, view, scene, counts, listed):
+    """Pairs of the Gaussians first..last of the order of drawing. Returns the list's end.
+
+    If the list is too short for them, its end is beyond ``limit``.
+    """
     width, tiles_x = view
-    list_tile, list_gaussian, list_blocks = listed
+    records, records_int, row_bases = scene
+    list_tile, list_gaussian, list_blocks, list_row = listed
     counts[:] = 0
     for i in range(first, last):
         gaussian = order[i] & 0xFFFFFFFF
         if i + 8 < last:
             prefetch(records, lay.RECORD * (order[i + 8] & 0xFFFFFFFF))
         base = lay.RECORD * gaussian
-        mx, my = records[base], records[base + 1]
         xs, ys = records_int[base + lay.TILES_X], records_int[base + lay.TILES_Y]
-        start = at
+        row = row_bases[gaussian // lay.CHUNK] + records_int[base + lay.ROW]
+        if at + (xs >> 16) * (ys >> 16) > limit:
+            return limit + 1
+        mx, my = records[base], records[base + 1]
         for tile_y in range(ys & 0xFFFF, (ys & 0xFFFF) + (ys >> 16)):
             left, right = _columns(mx, my, tile_y, records, base, width)
             for tile_x in range(xs & 0xFFFF, (xs & 0xFFFF) + (xs >> 16)):
@@ -112,43 +102,52 @@ def _list_part(first, last, at, order, view, records, records_int, counts, liste
                     list_tile[at] = tile
                     list_gaussian[at] = gaussian
                     list_blocks[at] = blocks
+                    list_row[at] = row
                     counts[tile] += 1
                     at += 1
-        records_int[base + lay.ROWS_START] = start
-        records_int[base + lay.ROWS_COUNT] = at - start
+                    row += 1
     return at
 
 
 @njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
-def list_pairs(
-    threads, order, count, starts, ends, width, tiles_x, records, records_int, counts, listed
-):
+def list_pairs(threads, order, count, starts, ends, view, scene, counts, listed):
     """List the pairs of each part and count them by tile.
 
     Args:
         threads: Number of parts.
         order: Gaussians in the order of drawing, in the low 32 bits. int64
         count: How many of them.
-        starts: Where each part may write. int64 [threads]
-        ends: Written: where it stopped. int64 [threads]
-        width: Of the image in pixels.
-        tiles_x: Tiles per row.
-        records, records_int: The records; the place of their pairs is written into them.
+        starts: Where each part may write, and the end of the last. int64 [threads + 1]
+        ends: Written: where it stopped; beyond its room if that was too little. int64 [threads]
+        view: (width of the image in pixels, tiles per row).
+        scene: (records, records as int32, first row of each chunk of Gaussians).
         counts: Written: pairs by part and tile. int64 [threads, tiles]
-        listed: (tile int32, gaussian int32, blocks uint64) of each pair, written.
+        listed: (tile, gaussian, blocks uint64, row) of each pair, written. int32
     """
     for t in prange(threads):
         ends[t] = _list_part(
             count * t // threads,
             count * (t + 1) // threads,
             starts[t],
+            starts[t + 1],
             order,
-            (width, tiles_x),
-            records,
-            records_int,
+            view,
+            scene,
             counts[t],
             listed,
         )
+
+
+@njit(nogil=True, parallel=True, cache=True)
+def bound_pairs(threads, order, count, records_int, bounds):
+    """Upper bound of the number of pairs of each part: tiles of rectangles. int64 [threads]"""
+    for t in prange(threads):
+        total = 0
+        for i in range(count * t // threads, count * (t + 1) // threads):
+            base = lay.RECORD * (order[i] & 0xFFFFFFFF)
+            xs, ys = records_int[base + lay.TILES_X], records_int[base + lay.TILES_Y]
+            total += (xs >> 16) * (ys >> 16)
+        bounds[t] = total
 
 
 @njit(nogil=True, cache=True)
@@ -166,15 +165,15 @@ def tile_offsets(counts, tile_starts):
 
 @njit(nogil=True)
 def _scatter_part(first, last, places, listed, entries):
-    list_tile, list_gaussian, list_blocks = listed
-    entry_gaussian, entry_blocks, positions = entries
+    list_tile, list_gaussian, list_blocks, list_row = listed
+    entry_gaussian, entry_blocks, entry_row = entries
     for j in range(first, last):
         tile = list_tile[j]
         place = places[tile]
         places[tile] = place + 1
         entry_gaussian[place] = list_gaussian[j]
         entry_blocks[place] = list_blocks[j]
-        positions[j] = place
+        entry_row[place] = list_row[j]
 
 
 @njit(nogil=True, parallel=True, cache=True)
@@ -186,7 +185,7 @@ def scatter_pairs(threads, starts, ends, places, listed, entries):
         starts, ends: Of each part in the list.
         places: Next free place by part and tile.
         listed: From `list_pairs`.
-        entries: (gaussian int32, blocks uint64, place of each listed pair int32), written.
+        entries: (gaussian int32, blocks uint64, row int32), written.
     """
     for t in prange(threads):
         _scatter_part(starts[t], ends[t], places[t], listed, entries)

@@ -19,12 +19,17 @@ from chronoscene.rasterizer.cpu import layout as lay
 from chronoscene.rasterizer.cpu.simd import (
     FLAGS,
     LANES,
+    absolute,
     any_lane,
+    as_float,
+    as_int,
     fetch_add,
     load,
+    load_pixels,
     make_constant,
     minimum,
     prefetch,
+    prefetch_write,
     select,
     splat,
     splat_int,
@@ -41,6 +46,8 @@ _AHEAD = 6  # entries by which records are asked for in advance
 _PARTS = 16 // LANES  # vectors per block
 _PART_ROWS = LANES // 4
 _PIXELS = lay.TILE_PIXELS
+_STATE = 64  # numbers per block going forward: light, red, green, blue
+_BACK = 96  # going backward: light, behind, gradient of red, green, blue, end of what counts
 _LEVEL_MIN = lay.LEVEL_MIN
 
 _lane_x = make_constant([i % 4 + 0.5 for i in range(LANES)])
@@ -59,38 +66,44 @@ def _whitened(records: Any, at: int, left: Any, top: Any) -> Any:
     return axis_xx, axis_xy, axis_yy, level, axis_xx * dx + axis_xy * dy, axis_yy * dy
 
 
-@njit(nogil=True, fastmath=_FAST)
-def _start_tile(left, top, width, height, transmittance, last, at, end):
+@njit(nogil=True)
+def _start_tile(left, top, width, height, state, last, plane, end):
     """Light everywhere, pixels outside the image dead. Returns the blocks inside."""
     live = np.uint64(0)
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
+        at = _STATE * block
+        state[at + 16 : at + 64] = np.float32(0.0)
+        last[plane + 16 * block : plane + 16 * block + 16] = end
+        if x + 4 <= width and y + 4 <= height:
+            state[at : at + 16] = np.float32(1.0)
+            live |= np.uint64(1) << np.uint64(block)
+            continue
+        state[at : at + 16] = np.float32(-1.0)
         if x < width and y < height:
             live |= np.uint64(1) << np.uint64(block)
-        for i in range(16):
-            inside = x + i % 4 < width and y + i // 4 < height
-            transmittance[at + 16 * block + i] = np.float32(1.0 if inside else -1.0)
-            last[at + 16 * block + i] = end
+            for row in range(min(4, height - y)):
+                for column in range(min(4, width - x)):
+                    state[at + 4 * row + column] = np.float32(1.0)
     return live
 
 
-@njit(nogil=True, fastmath=_FAST)
-def _any_light(transmittance, at):
+@njit(nogil=True)
+def _any_light(state, at):
     """Whether any pixel of a block is alive."""
-    best = np.float32(0.0)
-    for i in range(16):
-        best = max(best, transmittance[at + i])
-    return best > 0.0
+    alive = False
+    for part in range(_PARTS):
+        alive |= any_lane(load(state, at + LANES * part) > 0.0)
+    return alive
 
 
 @njit(nogil=True, fastmath=_FAST)
-def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records, planes, colors):
+def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records, last, state):
     """Composite the entries of a tile. Returns where it stopped.
 
     Dead pixels are marked by a negative transmittance. The blocks of each entry are cut down to
     those that were alive, for the backward pass.
     """
-    transmittance, last = planes
     for entry in range(start, end):
         bits = blocks[entry] & live
         blocks[entry] = bits
@@ -99,69 +112,71 @@ def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records
             if live == 0:
                 return entry
             continue
-        at = lay.RECORD * gaussians[entry]
-        axis_xx, axis_xy, axis_yy, level, u0, v0 = _whitened(records, at, left, top)
-        red, green, blue = splat(records[at + 6]), splat(records[at + 7]), splat(records[at + 8])
+        record = lay.RECORD * gaussians[entry]
+        axis_xx, axis_xy, axis_yy, level, u0, v0 = _whitened(records, record, left, top)
+        red, green = splat(records[record + 6]), splat(records[record + 7])
+        blue = splat(records[record + 8])
         while bits != 0:
             block = trailing_zeros(bits)
             bits &= bits - np.uint64(1)
             for part in range(_PARTS):
-                i = 16 * block + LANES * part
+                at = _STATE * block + LANES * part
                 y = _BLOCK_Y[block] + np.float32(_PART_ROWS * part)
                 u = axis_xx * _BLOCK_X[block] + (axis_xy * y + u0)
                 v = axis_yy * y + v0
                 power = level - v * v - u * u
                 alpha = minimum(exp2(power), ALPHA_MAX)
-                light = load(transmittance, plane + i)
+                light = load(state, at)
                 weight = select(power >= _LEVEL_MIN, alpha * light, 0.0)
                 after = light - weight
                 alive = after > TRANSMITTANCE_MIN
                 weight = select(alive, weight, 0.0)
-                store(colors, i, load(colors, i) + weight * red)
-                store(colors, _PIXELS + i, load(colors, _PIXELS + i) + weight * green)
-                store(colors, 2 * _PIXELS + i, load(colors, 2 * _PIXELS + i) + weight * blue)
                 dying = (light > 0.0) & (after <= TRANSMITTANCE_MIN)
-                light_after = select(alive, after, light)
-                store(transmittance, plane + i, light_after)
+                store(state, at + 16, load(state, at + 16) + weight * red)
+                store(state, at + 32, load(state, at + 32) + weight * green)
+                store(state, at + 48, load(state, at + 48) + weight * blue)
+                after = select(alive, after, light)
+                store(state, at, after)
                 if any_lane(dying):
-                    store(transmittance, plane + i, select(dying, 0.0 - light, light_after))
-                    store_where(last, plane + i, dying, splat_int(entry))
-                    if not _any_light(transmittance, plane + 16 * block):
+                    store(state, at, select(dying, 0.0 - light, after))
+                    store_where(last, plane + 16 * block + LANES * part, dying, splat_int(entry))
+                    if not _any_light(state, _STATE * block):
                         live &= ~(np.uint64(1) << np.uint64(block))
     return end
 
 
 @njit(nogil=True, fastmath=_FAST)
-def _write_tile(left, top, width, height, plane, transmittance, colors, background, image, alphas):
-    """Colours over the background, and opacity, from planes to the image."""
+def _write_tile(left, top, width, height, plane, state, transmittance, background, image, alphas):
+    """Colours over the background, and opacity, from a tile's state to the image."""
     red, green, blue = background
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
-        if x >= width or y >= height:
-            continue
-        i = 16 * block
+        at = _STATE * block
+        for part in range(_PARTS):
+            i = at + LANES * part
+            light = absolute(load(state, i))
+            store(state, i, light)
+            store(transmittance, plane + 16 * block + LANES * part, light)
+            store(state, i + 16, load(state, i + 16) + light * red)
+            store(state, i + 32, load(state, i + 32) + light * green)
+            store(state, i + 48, load(state, i + 48) + light * blue)
         if x + 4 <= width and y + 4 <= height:
             for part in range(_PARTS):
-                k = i + LANES * part
-                raw = load(transmittance, plane + k)
-                light = select(raw < 0.0, 0.0 - raw, raw)
+                i, pixel = at + LANES * part, (y + _PART_ROWS * part) * width + x
                 store_pixels(
                     image,
-                    3 * ((y + _PART_ROWS * part) * width + x),
+                    3 * pixel,
                     3 * width,
-                    load(colors, k) + light * red,
-                    load(colors, _PIXELS + k) + light * green,
-                    load(colors, 2 * _PIXELS + k) + light * blue,
+                    (load(state, i + 16), load(state, i + 32), load(state, i + 48)),
                 )
-        for k in range(16):
-            px, py = x + k % 4, y + k // 4
-            if px < width and py < height:
-                light = abs(transmittance[plane + i + k])
-                pixel = py * width + px
-                alphas[pixel] = np.float32(1.0) - light
-                image[3 * pixel] = colors[i + k] + light * red
-                image[3 * pixel + 1] = colors[_PIXELS + i + k] + light * green
-                image[3 * pixel + 2] = colors[2 * _PIXELS + i + k] + light * blue
+                store_pixels(alphas, pixel, width, (1.0 - load(state, i),))
+        else:
+            for k in range(16):
+                if x + k % 4 < width and y + k // 4 < height:
+                    pixel = (y + k // 4) * width + x + k % 4
+                    alphas[pixel] = np.float32(1.0) - state[at + k]
+                    for c in range(3):
+                        image[3 * pixel + c] = state[at + 16 + 16 * c + k]
 
 
 @njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
@@ -176,7 +191,7 @@ def composite(
     blocks,
     records,
     planes,
-    colors,
+    states,
     background,
     image,
     alphas,
@@ -192,7 +207,7 @@ def composite(
         blocks: Blocks of each entry; cut down to those that were alive. uint64
         records: See `layout`.
         planes: (transmittance, end of the entries that count), by tile, written.
-        colors: Scratch, 3 planes of one tile per thread.
+        states: Scratch, `64 * 64` per thread.
         background: Three numbers.
         image, alphas: Written. [H * W * 3], [H * W]
     """
@@ -200,15 +215,14 @@ def composite(
     tiles = tile_stops.size
     transmittance, last = planes
     for t in prange(threads):
-        scratch = colors[t]
+        state = states[t]
         while True:
             tile = fetch_add(counter, 1)
             if tile >= tiles:
                 break
             left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
             plane, start, end = _PIXELS * tile, tile_starts[tile], tile_starts[tile + 1]
-            scratch[:] = np.float32(0.0)
-            live = _start_tile(left, top, width, height, transmittance, last, plane, end)
+            live = _start_tile(left, top, width, height, state, last, plane, end)
             tile_stops[tile] = _forward_tile(
                 start,
                 end,
@@ -219,8 +233,8 @@ def composite(
                 gaussians,
                 blocks,
                 records,
-                planes,
-                scratch,
+                last,
+                state,
             )
             _write_tile(
                 left,
@@ -228,8 +242,8 @@ def composite(
                 width,
                 height,
                 plane,
+                state,
                 transmittance,
-                scratch,
                 (background[0], background[1], background[2]),
                 image,
                 alphas,
@@ -238,73 +252,82 @@ def composite(
 
 @njit(nogil=True, fastmath=_FAST)
 def _start_backward(
-    left, top, width, height, plane, transmittance, image_grad, alpha_grad, background, scratch
+    left, top, width, height, plane, planes, image_grad, alpha_grad, background, state
 ):
-    """Planes of a tile: light, what lies behind, and the three channels of the gradient."""
+    """State of a tile: final light, the background behind it, gradients of the channels."""
+    transmittance, last = planes
     red, green, blue = background
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
-        for k in range(16):
-            i = 16 * block + k
-            px, py = x + k % 4, y + k // 4
-            r = g = b = behind = np.float32(0.0)
-            if px < width and py < height:
-                pixel = py * width + px
-                r, g, b = (
-                    image_grad[3 * pixel],
-                    image_grad[3 * pixel + 1],
-                    image_grad[3 * pixel + 2],
-                )
-                behind = red * r + green * g + blue * b - alpha_grad[pixel]
-            scratch[i] = abs(transmittance[plane + i])
-            scratch[_PIXELS + i] = behind
-            scratch[2 * _PIXELS + i] = r
-            scratch[3 * _PIXELS + i] = g
-            scratch[4 * _PIXELS + i] = b
+        at = _BACK * block
+        if x >= width or y >= height:
+            continue
+        if x + 4 <= width and y + 4 <= height:
+            for part in range(_PARTS):
+                i, pixel = at + LANES * part, (y + _PART_ROWS * part) * width + x
+                r, g, b = load_pixels(image_grad, 3 * pixel, 3 * width, 3)
+                store(state, i + 32, r)
+                store(state, i + 48, g)
+                store(state, i + 64, b)
+                (a,) = load_pixels(alpha_grad, pixel, width, 1)
+                store(state, i + 16, r * red + (g * green + (b * blue - a)))
+        else:
+            for k in range(16):
+                r = g = b = a = np.float32(0.0)
+                if x + k % 4 < width and y + k // 4 < height:
+                    pixel = (y + k // 4) * width + x + k % 4
+                    r, g = image_grad[3 * pixel], image_grad[3 * pixel + 1]
+                    b, a = image_grad[3 * pixel + 2], alpha_grad[pixel]
+                state[at + 32 + k], state[at + 48 + k], state[at + 64 + k] = r, g, b
+                state[at + 16 + k] = r * red + g * green + b * blue - a
+        for part in range(_PARTS):
+            i, k = at + LANES * part, plane + 16 * block + LANES * part
+            store(state, i, load(transmittance, k))
+            store(state, i + 80, as_float(load(last, k)))
 
 
 @njit(nogil=True, fastmath=_FAST)
-def _backward_tile(
-    start, stop, left, top, plane, gaussians, blocks, records, last, touched, rows, scratch
-):
+def _backward_tile(start, stop, left, top, entries, records, touched, rows, state):
     """Rows of the entries of a tile, from the last to the first.
 
     With T the light before a Gaussian and B the gradient-weighted colour behind it as seen with
     unit light: d loss / d alpha = T (c . grad - B); behind the next one in front,
     B' = B + alpha (c . grad - B).
     """
+    gaussians, blocks, places = entries
     for k in range(stop - start):
         entry = stop - 1 - k
         bits = blocks[entry]
-        touched[entry] = bits != 0
-        prefetch(records, lay.RECORD * gaussians[max(entry - _AHEAD, 0)])
+        ahead = max(entry - _AHEAD, 0)
+        prefetch(records, lay.RECORD * gaussians[ahead])
+        prefetch_write(rows, lay.RECORD * places[ahead])
         if bits == 0:
             continue
-        at = lay.RECORD * gaussians[entry]
-        axis_xx, axis_xy, axis_yy, level, u0, v0 = _whitened(records, at, left, top)
-        red, green, blue = splat(records[at + 6]), splat(records[at + 7]), splat(records[at + 8])
+        record = lay.RECORD * gaussians[entry]
+        axis_xx, axis_xy, axis_yy, level, u0, v0 = _whitened(records, record, left, top)
+        red, green = splat(records[record + 6]), splat(records[record + 7])
+        blue = splat(records[record + 8])
         s = su = sv = suu = suv = svv = sr = sg = sb = splat(np.float32(0.0))
         number = splat_int(entry)
         while bits != 0:
             block = trailing_zeros(bits)
             bits &= bits - np.uint64(1)
             for part in range(_PARTS):
-                i = 16 * block + LANES * part
+                at = _BACK * block + LANES * part
                 y = _BLOCK_Y[block] + np.float32(_PART_ROWS * part)
                 u = axis_xx * _BLOCK_X[block] + (axis_xy * y + u0)
                 v = axis_yy * y + v0
                 power = level - v * v - u * u
                 raw = exp2(power)
-                counts = (power >= _LEVEL_MIN) & (number < load(last, plane + i))
+                counts = (power >= _LEVEL_MIN) & (number < as_int(load(state, at + 80)))
                 alpha = select(counts, minimum(raw, ALPHA_MAX), 0.0)
-                light = load(scratch, i) / (1.0 - alpha)
-                behind = load(scratch, _PIXELS + i)
-                gr, gg = load(scratch, 2 * _PIXELS + i), load(scratch, 3 * _PIXELS + i)
-                gb = load(scratch, 4 * _PIXELS + i)
+                light = load(state, at) / (1.0 - alpha)
+                behind = load(state, at + 16)
+                gr, gg, gb = load(state, at + 32), load(state, at + 48), load(state, at + 64)
                 difference = gr * red + (gg * green + (gb * blue - behind))
                 weight = alpha * light
-                store(scratch, i, light)
-                store(scratch, _PIXELS + i, alpha * difference + behind)
+                store(state, at, light)
+                store(state, at + 16, alpha * difference + behind)
                 sr = sr + weight * gr
                 sg = sg + weight * gg
                 sb = sb + weight * gb
@@ -316,7 +339,9 @@ def _backward_tile(
                 suu = suu + gu * u
                 suv = suv + gu * v
                 svv = svv + gv * v
-        store_sums(rows, lay.RECORD * entry, (s, su, sv, suu, suv, svv, sr, sg, sb))
+        place = places[entry]
+        touched[place] = 1
+        store_sums(rows, lay.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
 
 
 @njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
@@ -327,11 +352,10 @@ def composite_backward(
     height,
     tile_starts,
     tile_stops,
-    gaussians,
-    blocks,
+    entries,
     records,
     planes,
-    scratch,
+    states,
     background,
     image_grad,
     alpha_grad,
@@ -341,25 +365,25 @@ def composite_backward(
     """Sums over pixels of every entry, from the gradients of image and opacity.
 
     Args:
-        threads .. planes: As `composite` left them.
-        scratch: 5 planes of one tile per thread.
+        threads, counter, width, height, tile_starts, tile_stops: As `composite` left them.
+        entries: (gaussian, blocks, place of its row) of each entry; as `composite` left them.
+        records, planes: As `composite` left them.
+        states: Scratch, `64 * 96` per thread.
         background: Three numbers.
         image_grad, alpha_grad: [H * W * 3], [H * W]
-        touched: Written: whether the entry's row was written. uint8
+        touched: Zeros; 1 is written where a row is. uint8
         rows: Written, 16 numbers per entry; see `layout`.
     """
     tiles_x = (width + lay.TILE - 1) // lay.TILE
     tiles = tile_stops.size
-    transmittance, last = planes
     for t in prange(threads):
-        mine = scratch[t]
+        state = states[t]
         while True:
             tile = fetch_add(counter, 1)
             if tile >= tiles:
                 break
             left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
-            plane, start, stop = _PIXELS * tile, tile_starts[tile], tile_stops[tile]
-            touched[stop : tile_starts[tile + 1]] = 0
+            start, stop = tile_starts[tile], tile_stops[tile]
             if stop == start:
                 continue
             _start_backward(
@@ -367,24 +391,21 @@ def composite_backward(
                 top,
                 width,
                 height,
-                plane,
-                transmittance,
+                _PIXELS * tile,
+                planes,
                 image_grad,
                 alpha_grad,
                 (background[0], background[1], background[2]),
-                mine,
+                state,
             )
             _backward_tile(
                 start,
                 stop,
                 np.float32(left),
                 np.float32(top),
-                plane,
-                gaussians,
-                blocks,
+                entries,
                 records,
-                last,
                 touched,
                 rows,
-                mine,
+                state,
             )

@@ -25,7 +25,7 @@ AXIS_XX, AXIS_XY, AXIS_YY, LEVEL = 2, 3, 4, 5
 COLOR = 6  # three numbers
 SHEAR, HALF_WIDTH, RIGHTMOST = 9, 10, 11  # see bins.py
 TILES_X, TILES_Y = 12, 13  # int: first tile + (number of tiles << 16), per axis
-ROWS_START, ROWS_COUNT = 14, 15  # int: where bins.py put the (Gaussian, tile) pairs
+ROW = 14  # int: first row of sums in the backward pass, counted from that of the chunk
 
 # One row of sums of a (Gaussian, tile) pair in the backward pass, over pixels, with
 # g = d loss / d log(alpha) / ln(2)-free, in the order of `composite.backward_tile`.

@@ -20,6 +20,9 @@ from chronoscene.rasterizer.cpu.workspace import Workspace
 
 Array = NDArray[Any]
 
+_MARGIN = 16
+"""Entries that may be read past the end, to fetch records ahead."""
+
 
 @dataclass(frozen=True, slots=True)
 class View:
@@ -56,12 +59,12 @@ class Binned:
 
     keys: Array
     records: Array
-    records_int: Array
+    numbering: tuple[Array, Array]
+    """First row of each Gaussian in its chunk, first row of each chunk and the end of all."""
     tile_starts: Array
     tile_stops: Array
-    gaussians: Array
-    blocks: Array
-    positions: Array
+    entries: tuple[Array, Array, Array]
+    """Gaussian, blocks and row of each (Gaussian, tile) pair, by tile, then by depth."""
     planes: tuple[Array, Array]
 
 
@@ -91,7 +94,7 @@ def bin_gaussians(
     """Project, sort and list by tile; ``visible`` receives means2d, radii (as bits), depths."""
     threads, n, w = numba.get_num_threads(), scene.opacities.size, workspace.array
     records, keys = w("records", n * lay.RECORD, np.float32), w("keys", n, np.int32)
-    records_int = records.view(np.int32)
+    row_starts, chunk_rows = w("row_starts", n, np.int32), np.empty(-(-n // lay.CHUNK), np.int64)
     project(
         threads,
         _counter(),
@@ -104,50 +107,67 @@ def bin_gaussians(
         view.width,
         view.height,
         records,
+        records.view(np.int32),
         keys,
+        (row_starts, chunk_rows),
         visible,
     )
+    numbering = (row_starts, np.concatenate([[0], np.cumsum(chunk_rows)]))
     digits = w("digits", threads << DIGIT_BITS, np.int64).reshape(threads, -1)
     pairs, spare = w("pairs", n, np.int64), w("spare", n, np.int64)
     count, in_spare = sort_by_depth(threads, keys, digits, pairs, spare)
-    order = spare if in_spare else pairs
-
-    bounds = np.zeros(threads, np.int64)
-    bound_pairs(threads, order, count, records_int, bounds)
-    ends = np.cumsum(bounds)
-    starts, capacity = ends - bounds, int(ends[-1])
-    listed = (
-        w("list_tile", capacity, np.int32),
-        w("list_gaussian", capacity, np.int32),
-        w("list_blocks", capacity, np.uint64),
-    )
-    counts = w("counts", threads * view.tiles, np.int64).reshape(threads, -1)
-    list_pairs(
-        threads,
-        order,
-        count,
-        starts,
-        ends,
-        view.width,
-        view.tiles_x,
-        records,
-        records_int,
-        counts,
-        listed,
-    )
-    tile_starts = w("tile_starts", view.tiles + 1, np.int64)
-    tile_offsets(counts, tile_starts)
-    total = int(tile_starts[-1])
-    gaussians, blocks = w("gaussians", total + 16, np.int32), w("blocks", total, np.uint64)
-    gaussians[total:] = 0
-    positions = w("positions", capacity, np.int32)
-    scatter_pairs(threads, starts, ends, counts, listed, (gaussians, blocks, positions))
+    order = (spare if in_spare else pairs)[:count]
+    tile_starts, entries = _bin_pairs(workspace, view, order, records, numbering[1])
     pixels = view.tiles * lay.TILE_PIXELS
     planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
     tile_stops = w("tile_stops", view.tiles, np.int64)
-    return Binned(
-        keys, records, records_int, tile_starts, tile_stops, gaussians, blocks, positions, planes
+    return Binned(keys, records, numbering, tile_starts, tile_stops, entries, planes)
+
+
+def _bin_pairs(
+    workspace: Workspace, view: View, order: Array, records: Array, row_bases: Array
+) -> tuple[Array, tuple[Array, Array, Array]]:
+    """Start of each tile, and its entries, from the Gaussians in the order of drawing."""
+    threads, w = numba.get_num_threads(), workspace.array
+    counts = w("counts", threads * view.tiles, np.int64).reshape(threads, -1)
+    scene = (records, records.view(np.int32), row_bases)
+    # Most rectangles have one or two tiles; exact bounds cost another pass over the records.
+    room = np.full(threads, 3 * (order.size // threads + 1), np.int64)
+    while True:
+        starts = np.concatenate([[0], np.cumsum(room)])
+        names = (
+            ("tile", np.int32),
+            ("gaussian", np.int32),
+            ("blocks", np.uint64),
+            ("row", np.int32),
+        )
+        listed = tuple(w("list_" + name, int(starts[-1]), kind) for name, kind in names)
+        ends = np.empty(threads, np.int64)
+        list_pairs(
+            threads,
+            order,
+            order.size,
+            starts,
+            ends,
+            (view.width, view.tiles_x),
+            scene,
+            counts,
+            listed,
+        )
+        if (ends <= starts[1:]).all():
+            break
+        bound_pairs(threads, order, order.size, scene[1], room)
+    tile_starts = w("tile_starts", view.tiles + 1, np.int64)
+    tile_offsets(counts, tile_starts)
+    total = int(tile_starts[-1])
+    entries = (
+        w("entry_gaussian", total + _MARGIN, np.int32),
+        w("entry_blocks", total, np.uint64),
+        w("entry_row", total, np.int32),
     )
+    entries[0][total:] = 0
+    scatter_pairs(threads, starts, ends, counts, listed, entries)
+    return tile_starts, entries
 
 
 def render(
@@ -155,7 +175,7 @@ def render(
 ) -> None:
     """Composite the three channels in the records."""
     threads = numba.get_num_threads()
-    scratch = workspace.array("colors", threads * 3 * lay.TILE_PIXELS, np.float32)
+    states = workspace.array("forward", threads * 4 * lay.TILE_PIXELS, np.float32)
     composite(
         threads,
         _counter(),
@@ -163,11 +183,11 @@ def render(
         view.height,
         binned.tile_starts,
         binned.tile_stops,
-        binned.gaussians,
-        binned.blocks,
+        binned.entries[0],
+        binned.entries[1],
         binned.records,
         binned.planes,
-        scratch.reshape(threads, -1),
+        states.reshape(threads, -1),
         background,
         image,
         alphas,
@@ -183,10 +203,11 @@ def render_backward(
     alpha_grad: Array,
 ) -> tuple[Array, Array]:
     """Sums over pixels by entry: (touched, rows)."""
-    threads, entries = numba.get_num_threads(), binned.blocks.size
-    scratch = workspace.array("backward", threads * 5 * lay.TILE_PIXELS, np.float32)
-    rows = workspace.array("rows", entries * lay.RECORD, np.float32)
-    touched = workspace.array("touched", entries, np.uint8)
+    threads, count = numba.get_num_threads(), int(binned.numbering[1][-1])
+    states = workspace.array("backward", threads * 6 * lay.TILE_PIXELS, np.float32)
+    rows = workspace.array("rows", max(1, count) * lay.RECORD, np.float32)
+    touched = workspace.array("touched", max(1, count), np.uint8)
+    touched[:] = 0
     composite_backward(
         threads,
         _counter(),
@@ -194,11 +215,10 @@ def render_backward(
         view.height,
         binned.tile_starts,
         binned.tile_stops,
-        binned.gaussians,
-        binned.blocks,
+        binned.entries,
         binned.records,
         binned.planes,
-        scratch.reshape(threads, -1),
+        states.reshape(threads, -1),
         background,
         image_grad,
         alpha_grad,
@@ -213,9 +233,8 @@ def sum_rows(binned: Binned, touched: Array, rows: Array, sums: Array) -> None:
     add_rows(
         numba.get_num_threads(),
         _counter(),
-        binned.records_int,
+        binned.numbering,
         touched,
-        binned.positions,
         rows,
         sums,
     )
@@ -251,7 +270,9 @@ def gaussian_gradients(
         depth_gradients,
         view.camera,
         binned.keys,
-        (binned.records_int, touched, binned.positions, rows),
+        binned.numbering,
+        touched,
+        rows,
         sums,
         grads,
     )

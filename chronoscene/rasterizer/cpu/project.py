@@ -202,6 +202,17 @@ def _project_group(
     store(depths, at, select(visible, pz, 0.0))
 
 
+@njit(nogil=True)
+def _number_rows(at, i, row, records_int, row_starts):
+    """Give the Gaussians i..at+LANES one row for each tile of their rectangle."""
+    for gaussian in range(i, at + LANES):
+        base = lay.RECORD * gaussian
+        records_int[base + lay.ROW] = row
+        row_starts[gaussian] = row
+        row += (records_int[base + lay.TILES_X] >> 16) * (records_int[base + lay.TILES_Y] >> 16)
+    return row
+
+
 @njit(nogil=True, parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
 def project(
     threads,
@@ -215,7 +226,9 @@ def project(
     width,
     height,
     records,
+    records_int,
     keys,
+    rows,
     out,
 ):
     """Project all Gaussians. At least `LANES` of them; arrays are flat.
@@ -228,16 +241,20 @@ def project(
         means, quats, scales, opacities, colors: Flat float32.
         camera: `layout.CAMERA` numbers.
         width, height: Of the image in pixels.
-        records: Written, `layout.RECORD` numbers each.
+        records, records_int: Written, `layout.RECORD` numbers each; the same memory.
         keys: Written, int32: the bits of the depth, -1 if there is nothing to draw.
+        rows: (first row of each Gaussian in its chunk, rows of each chunk), written: as many as
+            the rectangle around it has tiles. int32, int64
         out: (means2d, radii as float bits, depths), written, zero where culled.
     """
     n = opacities.size
+    row_starts, chunk_rows = rows
     for _ in prange(threads):
         while True:
             first = fetch_add(counter, lay.CHUNK)
             if first >= n:
                 break
+            row = 0
             for i in range(first, min(n, first + lay.CHUNK), LANES):
                 at = min(i, n - LANES)
                 _project_group(
@@ -254,23 +271,34 @@ def project(
                     keys,
                     out,
                 )
+                row = _number_rows(at, i, row, records_int, row_starts)
+            chunk_rows[first // lay.CHUNK] = row
 
 
 @njit(nogil=True, fastmath=_FAST)
-def _add_rows(gaussian, records_int, touched, positions, rows, sums, at):
-    """Add the rows of a Gaussian, in the order of its tiles, to 16 numbers at ``sums[at]``."""
-    start = records_int[lay.RECORD * gaussian + lay.ROWS_START]
-    count = records_int[lay.RECORD * gaussian + lay.ROWS_COUNT]
+def _add_rows(row, end, touched, rows, sums, at):
+    """Add rows row..end, in this order, to 16 numbers at ``sums[at]``."""
     total = load16(sums, at)
-    for j in range(start, start + count):
-        entry = positions[j]
-        if touched[entry] != 0:
-            total = total + load16(rows, lay.RECORD * entry)
+    for r in range(row, end):
+        if touched[r] != 0:
+            total = total + load16(rows, lay.RECORD * r)
     store(sums, at, total)
 
 
+@njit(nogil=True)
+def _rows_of(gaussian, n, numbering):
+    """First row of a Gaussian and the end of its rows."""
+    row_starts, row_bases = numbering
+    chunk = gaussian // lay.CHUNK
+    base = row_bases[chunk]
+    end = row_bases[chunk + 1]
+    if gaussian + 1 < n and (gaussian + 1) // lay.CHUNK == chunk:
+        end = base + row_starts[gaussian + 1]
+    return base + row_starts[gaussian], end
+
+
 @njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
-def add_rows(threads, counter, records_int, touched, positions, rows, sums):
+def add_rows(threads, counter, numbering, touched, rows, sums):
     """Add the rows of each Gaussian to its 16 numbers in ``sums``; see `project_backward`."""
     n = sums.size // lay.RECORD
     for _ in prange(threads):
@@ -279,7 +307,8 @@ def add_rows(threads, counter, records_int, touched, positions, rows, sums):
             if first >= n:
                 break
             for i in range(first, min(n, first + lay.CHUNK)):
-                _add_rows(i, records_int, touched, positions, rows, sums, lay.RECORD * i)
+                row, end = _rows_of(i, n, numbering)
+                _add_rows(row, end, touched, rows, sums, lay.RECORD * i)
 
 
 @njit(nogil=True, parallel=True, cache=True)
@@ -448,7 +477,9 @@ def project_backward(
     depth_gradients,
     camera,
     keys,
-    reduction,
+    numbering,
+    touched,
+    rows,
     sums,
     grads,
 ):
@@ -457,13 +488,13 @@ def project_backward(
     Args:
         threads, counter, means, quats, scales, opacities, camera, keys: As in `project`.
         depth_gradients: d loss / d z-depth that did not come through the projection.
-        reduction: (records as int32, whether an entry's row was written, entry of each listed
-            pair, rows). Without rows, the sums are taken as they are.
+        numbering: (first row of each Gaussian in its chunk, first row of each chunk and the end).
+        touched: Whether a row was written.
+        rows: Sums over the pixels of a tile. Without any, ``sums`` are taken as they are.
         sums: Scratch, 16 * LANES per thread; without rows, 16 for each Gaussian.
         grads: (means, quats, scales, opacities, colors, means2d), written.
     """
     n = opacities.size
-    records_int, touched, positions, rows = reduction
     for t in prange(threads):
         while True:
             first = fetch_add(counter, lay.CHUNK)
@@ -476,15 +507,8 @@ def project_backward(
                     place = lay.RECORD * LANES * t
                     sums[place : place + lay.RECORD * LANES] = np.float32(0.0)
                     for lane in range(LANES):
-                        _add_rows(
-                            at + lane,
-                            records_int,
-                            touched,
-                            positions,
-                            rows,
-                            sums,
-                            place + lay.RECORD * lane,
-                        )
+                        row, end = _rows_of(at + lane, n, numbering)
+                        _add_rows(row, end, touched, rows, sums, place + lay.RECORD * lane)
                 _backward_group(
                     at,
                     sums,

@@ -452,23 +452,32 @@ def trailing_zeros(typingctx: Any, bits: Any) -> Any:
     return types.intp(types.uint64), codegen
 
 
-@intrinsic
-def prefetch(typingctx: Any, array: Any, offset: Any) -> Any:
-    """Ask for the cache line of an element."""
+def _make_prefetch(write: int) -> Callable:
+    @intrinsic
+    def prefetch(typingctx: Any, array: Any, offset: Any) -> Any:
+        """Ask for the cache line of an element."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = _address(context, builder, sig.args[0], *args)
-        address = builder.bitcast(address, ir.IntType(8).as_pointer())
-        name = "llvm.prefetch.p0"
-        function = builder.module.globals.get(name)
-        if function is None:
-            kinds = [address.type, _I32, _I32, _I32]
-            function = ir.Function(builder.module, ir.FunctionType(ir.VoidType(), kinds), name=name)
-        read, keep, data = (ir.Constant(_I32, v) for v in (0, 3, 1))
-        builder.call(function, [address, read, keep, data])
-        return context.get_dummy_value()
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            address = _address(context, builder, sig.args[0], *args)
+            address = builder.bitcast(address, ir.IntType(8).as_pointer())
+            name = "llvm.prefetch.p0"
+            function = builder.module.globals.get(name)
+            if function is None:
+                kinds = [address.type, _I32, _I32, _I32]
+                function = ir.Function(
+                    builder.module, ir.FunctionType(ir.VoidType(), kinds), name=name
+                )
+            # Write or read, keep in all caches, data.
+            builder.call(function, [address, *(ir.Constant(_I32, v) for v in (write, 3, 1))])
+            return context.get_dummy_value()
 
-    return types.void(array, types.intp), codegen
+        return types.void(array, types.intp), codegen
+
+    return prefetch
+
+
+prefetch = _make_prefetch(0)
+prefetch_write = _make_prefetch(1)
 
 
 @intrinsic
@@ -654,43 +663,54 @@ def store_sums(typingctx: Any, array: Any, offset: Any, vectors: Any) -> Any:
 
 
 @intrinsic
-def store_pixels(
-    typingctx: Any, array: Any, offset: Any, stride: Any, r: Any, g: Any, b: Any
-) -> Any:
-    """Write rows of four RGB pixels, ``stride`` numbers apart."""
+def store_pixels(typingctx: Any, array: Any, offset: Any, stride: Any, channels: Any) -> Any:
+    """Write rows of four pixels, ``stride`` numbers apart, with interleaved channels."""
+    count = len(channels)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        at = args[1]
+        from numba.core import cgutils
+
+        vectors, at = cgutils.unpack_tuple(builder, args[3], count), args[1]
         for row in range(LANES // 4):
-            for first, width in ((0, 8), (8, 4)):
-                flat = range(first, first + width)
-                pixels = _pick(builder, list(args[3:]), [(k % 3, 4 * row + k // 3) for k in flat])
+            for first in range(0, count, 2):
+                flat = range(4 * first, 4 * min(first + 2, count))
+                picks = [(k % count, 4 * row + k // count) for k in flat]
                 address = _vector_address(
-                    context, builder, sig.args[0], args[0], _offset(builder, at, first), width
+                    context,
+                    builder,
+                    sig.args[0],
+                    args[0],
+                    _offset(builder, at, 4 * first),
+                    len(flat),
                 )
-                builder.store(pixels, address, align=4)
+                builder.store(_pick(builder, vectors, picks), address, align=4)
             at = builder.add(at, args[2])
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, types.intp, r, g, b), codegen
+    return types.void(array, types.intp, types.intp, channels), codegen
 
 
-@intrinsic
-def load_pixels(typingctx: Any, array: Any, offset: Any, stride: Any) -> Any:
-    """Channels of rows of four RGB pixels, ``stride`` numbers apart."""
-    result = types.UniTuple(Vector("f32", LANES), 3)
+@intrinsic(prefer_literal=True)
+def load_pixels(typingctx: Any, array: Any, offset: Any, stride: Any, channels: Any) -> Any:
+    """Channels, 1 or 3, of rows of four pixels, ``stride`` numbers apart."""
+    count = channels.literal_value
+    result = types.UniTuple(Vector("f32", LANES), count)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         at, parts = args[1], []
         for _ in range(LANES // 4):
-            parts.append(_load(context, builder, sig.args[0], args[0], at, 8))
-            rest = _load(context, builder, sig.args[0], args[0], _offset(builder, at, 8), 4)
-            parts.append(_shuffle(builder, rest, rest, [0, 1, 2, 3, None, None, None, None]))
+            for first in range(count):
+                four = _load(
+                    context, builder, sig.args[0], args[0], _offset(builder, at, 4 * first), 4
+                )
+                parts.append(four)
             at = builder.add(at, args[2])
-        channels = []
-        for c in range(3):
-            flat = [(lane // 4, 3 * (lane % 4) + c) for lane in range(LANES)]
-            channels.append(_pick(builder, parts, [(2 * row + k // 8, k % 8) for row, k in flat]))
-        return context.make_tuple(builder, sig.return_type, channels)
+        vectors = []
+        for c in range(count):
+            flat = [(lane // 4, count * (lane % 4) + c) for lane in range(LANES)]
+            vectors.append(
+                _pick(builder, parts, [(count * row + k // 4, k % 4) for row, k in flat])
+            )
+        return context.make_tuple(builder, sig.return_type, vectors)
 
-    return result(array, types.intp, types.intp), codegen
+    return result(array, types.intp, types.intp, channels), codegen
