@@ -66,13 +66,59 @@ def read_points(path: Path) -> PointRecords:
     return _guarded(path, _walk_points)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraRecord:
+    """One record of ``cameras.bin``."""
+
+    camera_id: int
+    model_id: int
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageRecord:
+    """One record of ``images.bin``, whatever it says."""
+
+    image_id: int
+    quaternion: tuple[float, float, float, float]
+    """wxyz as stored: may be anything."""
+    translation: tuple[float, float, float]
+    camera_id: int
+    name: bytes
+    """As stored: may be no UTF-8."""
+    xy: NDArray[np.float64]
+    """Keypoints in pixels. [n, 2]"""
+    point_ids: NDArray[np.int64]
+    """Point of each keypoint, -1 for none. [n]"""
+
+
+def read_cameras(path: Path) -> list[CameraRecord]:
+    """Read ``cameras.bin``.
+
+    Raises:
+        SceneError: If the file cannot be read, ends inside a record, or has an unknown model.
+    """
+    return _guarded(path, _walk_cameras)
+
+
+def read_images(path: Path) -> list[ImageRecord]:
+    """Read ``images.bin`` without judging names and poses.
+
+    Raises:
+        SceneError: If the file cannot be read or ends inside a record.
+    """
+    return _guarded(path, _walk_images)
+
+
 def read_keypoints(path: Path) -> dict[int, NDArray[np.float64]]:
     """Read the pixel positions in ``images.bin``: image id to keypoints [n, 2].
 
     Raises:
         SceneError: If the file cannot be read or ends inside a record.
     """
-    return _guarded(path, _walk_images)
+    return {image.image_id: image.xy for image in read_images(path)}
 
 
 def check_records(folder: Path) -> None:
@@ -124,14 +170,19 @@ def _finish(data: bytes, at: int) -> None:
         raise _DamagedError(f"{len(data) - at} bytes after the last record")
 
 
-def _walk_cameras(data: bytes) -> None:
+def _walk_cameras(data: bytes) -> list[CameraRecord]:
+    cameras = []
     at = _COUNT.size
     for _ in range(_count(data, _CAMERA_HEAD.size)):
-        camera_id, model, _width, _height = _CAMERA_HEAD.unpack_from(data, at)
+        camera_id, model, width, height = _CAMERA_HEAD.unpack_from(data, at)
         if not 0 <= model < len(CAMERA_PARAMETERS):
             raise _DamagedError(f"camera {camera_id} with the unknown model id {model}")
-        at += _CAMERA_HEAD.size + 8 * CAMERA_PARAMETERS[model]
+        at += _CAMERA_HEAD.size
+        params = struct.unpack_from(f"<{CAMERA_PARAMETERS[model]}d", data, at)
+        cameras.append(CameraRecord(camera_id, model, width, height, params))
+        at += 8 * len(params)
     _finish(data, at)
+    return cameras
 
 
 def _walk_rigs(data: bytes) -> None:
@@ -158,23 +209,33 @@ def _walk_frames(data: bytes) -> None:
     _finish(data, at)
 
 
-def _walk_images(data: bytes) -> dict[int, NDArray[np.float64]]:
-    keypoints = {}
+def _walk_images(data: bytes) -> list[ImageRecord]:
+    images: dict[int, ImageRecord] = {}
     at = _COUNT.size
     for _ in range(_count(data, _IMAGE_HEAD.size + 1 + _COUNT.size)):
-        image_id = _IMAGE_HEAD.unpack_from(data, at)[0]
-        at = data.index(0, at + _IMAGE_HEAD.size) + 1
+        image_id, qw, qx, qy, qz, tx, ty, tz, camera_id = _IMAGE_HEAD.unpack_from(data, at)
+        end = data.index(0, at + _IMAGE_HEAD.size)
+        name = data[at + _IMAGE_HEAD.size : end]
+        at = end + 1
         (length,) = _COUNT.unpack_from(data, at)
         at += _COUNT.size
         if length * _KEYPOINT.itemsize > len(data) - at:
             raise _DamagedError(f"image {image_id} with {length} keypoints, more than the file has")
-        if image_id in keypoints:
+        if image_id in images:
             raise _DamagedError(f"image id {image_id} twice")
         records = np.frombuffer(data, _KEYPOINT, count=length, offset=at)
-        keypoints[image_id] = np.ascontiguousarray(records["xy"])
+        images[image_id] = ImageRecord(
+            image_id=image_id,
+            quaternion=(qw, qx, qy, qz),
+            translation=(tx, ty, tz),
+            camera_id=camera_id,
+            name=name,
+            xy=np.ascontiguousarray(records["xy"]),
+            point_ids=np.ascontiguousarray(records["point_id"]),
+        )
         at += length * _KEYPOINT.itemsize
     _finish(data, at)
-    return keypoints
+    return list(images.values())
 
 
 def _walk_points(data: bytes) -> PointRecords:
