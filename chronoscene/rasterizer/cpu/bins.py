@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit, prange
 
 from chronoscene.rasterizer.cpu import layout as lay
+from chronoscene.rasterizer.cpu.project import chunk_of
 from chronoscene.rasterizer.cpu.simd import (
     FLAGS,
     floor,
@@ -89,7 +90,7 @@ def _list_part(first, last, at, limit, order, view, scene, counts, listed):
             prefetch(records, lay.RECORD * (order[i + 8] & 0xFFFFFFFF))
         base = lay.RECORD * gaussian
         xs, ys = records_int[base + lay.TILES_X], records_int[base + lay.TILES_Y]
-        row = row_bases[gaussian // lay.CHUNK] + records_int[base + lay.ROW]
+        row = row_bases[chunk_of(gaussian, row_bases.size - 1)] + records_int[base + lay.ROW]
         if at + (xs >> 16) * (ys >> 16) > limit:
             return limit + 1
         mx, my = records[base], records[base + 1]

@@ -94,7 +94,10 @@ def bin_gaussians(
     """Project, sort and list by tile; ``visible`` receives means2d, radii (as bits), depths."""
     threads, n, w = numba.get_num_threads(), scene.opacities.size, workspace.array
     records, keys = w("records", n * lay.RECORD, np.float32), w("keys", n, np.int32)
-    row_starts, chunk_rows = w("row_starts", n, np.int32), np.empty(-(-n // lay.CHUNK), np.int64)
+    row_starts, chunk_rows = (
+        w("row_starts", n, np.int32),
+        np.empty(max(1, n // lay.CHUNK), np.int64),
+    )
     project(
         threads,
         _counter(),

@@ -203,9 +203,24 @@ def _project_group(
 
 
 @njit(nogil=True)
-def _number_rows(at, i, row, records_int, row_starts):
-    """Give the Gaussians i..at+LANES one row for each tile of their rectangle."""
-    for gaussian in range(i, at + LANES):
+def chunk_of(gaussian, chunks):
+    """Number of the chunk of a Gaussian."""
+    return min(gaussian // lay.CHUNK, chunks - 1)
+
+
+@njit(nogil=True)
+def _chunk_range(chunk, chunks, n):
+    """First Gaussian of a chunk and the end. The last one takes what is left of the division,
+    so that none of several is shorter than a vector."""
+    first = chunk * lay.CHUNK
+    return first, n if chunk == chunks - 1 else first + lay.CHUNK
+
+
+@njit(nogil=True)
+def _number_rows(first, last, records_int, row_starts):
+    """Give each Gaussian one row for each tile of its rectangle. Returns the number of rows."""
+    row = 0
+    for gaussian in range(first, last):
         base = lay.RECORD * gaussian
         records_int[base + lay.ROW] = row
         row_starts[gaussian] = row
@@ -249,14 +264,15 @@ def project(
     """
     n = opacities.size
     row_starts, chunk_rows = rows
+    chunks = chunk_rows.size
     for _ in prange(threads):
         while True:
-            first = fetch_add(counter, lay.CHUNK)
-            if first >= n:
+            chunk = fetch_add(counter, 1)
+            if chunk >= chunks:
                 break
-            row = 0
-            for i in range(first, min(n, first + lay.CHUNK), LANES):
-                at = min(i, n - LANES)
+            first, last = _chunk_range(chunk, chunks, n)
+            for i in range(first, last, LANES):
+                at = min(i, last - LANES)
                 _project_group(
                     at,
                     means,
@@ -271,8 +287,7 @@ def project(
                     keys,
                     out,
                 )
-                row = _number_rows(at, i, row, records_int, row_starts)
-            chunk_rows[first // lay.CHUNK] = row
+            chunk_rows[chunk] = _number_rows(first, last, records_int, row_starts)
 
 
 @njit(nogil=True, fastmath=_FAST)
@@ -286,13 +301,11 @@ def _add_rows(row, end, touched, rows, sums, at):
 
 
 @njit(nogil=True)
-def _rows_of(gaussian, n, numbering):
-    """First row of a Gaussian and the end of its rows."""
+def _rows_of(gaussian, last, chunk, numbering):
+    """First row of a Gaussian and the end of its rows, in a chunk that ends before ``last``."""
     row_starts, row_bases = numbering
-    chunk = gaussian // lay.CHUNK
-    base = row_bases[chunk]
-    end = row_bases[chunk + 1]
-    if gaussian + 1 < n and (gaussian + 1) // lay.CHUNK == chunk:
+    base, end = row_bases[chunk], row_bases[chunk + 1]
+    if gaussian + 1 < last:
         end = base + row_starts[gaussian + 1]
     return base + row_starts[gaussian], end
 
@@ -300,14 +313,15 @@ def _rows_of(gaussian, n, numbering):
 @njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
 def add_rows(threads, counter, numbering, touched, rows, sums):
     """Add the rows of each Gaussian to its 16 numbers in ``sums``; see `project_backward`."""
-    n = sums.size // lay.RECORD
+    n, chunks = sums.size // lay.RECORD, numbering[1].size - 1
     for _ in prange(threads):
         while True:
-            first = fetch_add(counter, lay.CHUNK)
-            if first >= n:
+            chunk = fetch_add(counter, 1)
+            if chunk >= chunks:
                 break
-            for i in range(first, min(n, first + lay.CHUNK)):
-                row, end = _rows_of(i, n, numbering)
+            first, last = _chunk_range(chunk, chunks, n)
+            for i in range(first, last):
+                row, end = _rows_of(i, last, chunk, numbering)
                 _add_rows(row, end, touched, rows, sums, lay.RECORD * i)
 
 
@@ -494,20 +508,21 @@ def project_backward(
         sums: Scratch, 16 * LANES per thread; without rows, 16 for each Gaussian.
         grads: (means, quats, scales, opacities, colors, means2d), written.
     """
-    n = opacities.size
+    n, chunks = opacities.size, numbering[1].size - 1
     for t in prange(threads):
         while True:
-            first = fetch_add(counter, lay.CHUNK)
-            if first >= n:
+            chunk = fetch_add(counter, 1)
+            if chunk >= chunks:
                 break
-            for i in range(first, min(n, first + lay.CHUNK), LANES):
-                at = min(i, n - LANES)
+            first, last = _chunk_range(chunk, chunks, n)
+            for i in range(first, last, LANES):
+                at = min(i, last - LANES)
                 place = lay.RECORD * at
                 if rows.size > 0:
                     place = lay.RECORD * LANES * t
                     sums[place : place + lay.RECORD * LANES] = np.float32(0.0)
                     for lane in range(LANES):
-                        row, end = _rows_of(at + lane, n, numbering)
+                        row, end = _rows_of(at + lane, last, chunk, numbering)
                         _add_rows(row, end, touched, rows, sums, place + lay.RECORD * lane)
                 _backward_group(
                     at,
