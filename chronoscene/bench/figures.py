@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,15 +92,16 @@ def _draw(
     from matplotlib.figure import Figure
 
     aspect = float(np.mean([entry.height / entry.width for entry in rows]))
-    # Room for the titles above, a caption under each image, and the colour bar below.
+    # Room for a caption under each image, the titles above and the colour bar below; what is left
+    # over is cut off when the figure is saved.
     size = (CELL_WIDTH * (1 + len(columns)), (CELL_WIDTH * aspect + 0.3) * len(rows) + 1.2)
-    figure = Figure(figsize=size, layout="constrained", dpi=150)
+    figure = Figure(figsize=size, layout="compressed", dpi=150)
     FigureCanvasAgg(figure)
     axes: Any = figure.subplots(len(rows), 1 + len(columns), squeeze=False)
     image = None
     for row, entry in zip(axes, rows, strict=True):
         image = _draw_row(row, truth, entry, columns, labels, errors=errors)
-    for axis, title in zip(axes[0], ["photo", *(c.title for c in columns)], strict=True):
+    for axis, title in zip(axes[0], ["ground truth", *(c.title for c in columns)], strict=True):
         axis.set_title(title, fontsize=10)
     if errors and image is not None:
         bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.4, aspect=40, pad=0.01)
@@ -107,7 +109,9 @@ def _draw(
     what = "error of the test views" if errors else "test views"
     figure.suptitle(f"{scene}: {what}", fontsize=12)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    partial = path.with_name(f".{path.name}.partial")
+    figure.savefig(partial, format="png", bbox_inches="tight", pad_inches=0.1)
+    os.replace(partial, path)
 
 
 def _draw_row(

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from chronoscene.bench.identity import config_hash
@@ -64,14 +65,14 @@ class Job:
         return f"{self.scene}: {self.method_name} {self.strategy} {self.preset} seed {self.seed}"
 
     def failure(self, reason: str) -> Failure:
-        """The record of a run that has no result."""
+        """The record of a run that has no result; the reason becomes one line."""
         return Failure(
             method=self.method_name,
             strategy=self.strategy,
             preset=self.preset,
             scene=self.scene,
             seed=self.seed,
-            reason=reason,
+            reason=shorten(reason, 500, placeholder=" ..."),
         )
 
     def stop_rule(self, spec: MethodSpec) -> StopRule:

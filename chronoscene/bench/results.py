@@ -53,7 +53,7 @@ class RunRecord(BaseModel):
     primitives: int
     checkpoint_bytes: int
     peak_memory_bytes: int
-    """Largest resident memory of the process up to the end of rendering."""
+    """Largest resident memory of the process from the start of training to the end of rendering."""
     device: str
     commit: str
     skipped: dict[str, str]
@@ -70,6 +70,8 @@ class RunRecord(BaseModel):
     period_labels: dict[str, str]
     parameters: int
     """Numbers stored in the checkpoint."""
+    warmup_seconds: float
+    """Compiling and loading of kernels before the clock starts; not part of `seconds`."""
     setup_seconds: float
     """Share of `seconds` before the first step."""
     render_seconds: float

@@ -39,6 +39,7 @@ from chronoscene.bench.training import (
     stop_if_orphaned,
     train,
 )
+from chronoscene.bench.warmup import forget_peak_memory, warm_up
 from chronoscene.errors import BackendError, ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.images import ImageStore
@@ -78,6 +79,12 @@ def run_job(job: Job, *, parent: int | None = None) -> None:
     scene = read_scene(job.scene_root)
     parts = make_parts(scene, ImageStore(scene, max_width=job.max_width), job.strategy)
     writer = ImageWriter(staging / results.PREDICTIONS)
+    before = time.perf_counter()
+    periods = parts[0].train.num_periods
+    config = job.method_config(spec)
+    notice = warm_up(spec, config, num_periods=periods, device=machine.device)
+    forget_peak_memory()
+    warmup_seconds = time.perf_counter() - before
     outcomes = []
     with ProgressDisplay(job.label) as display:
         for part, stop in zip(parts, job.stop_rules(spec, len(parts)), strict=True):
@@ -97,6 +104,8 @@ def run_job(job: Job, *, parent: int | None = None) -> None:
     record = _record(job, spec, scene, machine, outcomes, peaks, started)
     record.aggregates, record.periods = aggregate(scores.rows)
     record.skipped = scores.skipped
+    record.warmup_seconds = warmup_seconds
+    record.notices = [*job.notices, *([notice] if notice else [])]
     results.write_run(staging, record, scores.rows)
 
 
@@ -222,6 +231,7 @@ def _record(
         split_hash=job.split_hash,
         period_labels={str(p.id): p.label for p in scene.periods},
         parameters=sum(o.size.parameters for o in outcomes),
+        warmup_seconds=0.0,
         setup_seconds=sum(o.trained.setup_seconds for o in outcomes),
         render_seconds=sum(o.render_seconds for o in outcomes) / tests,
         peak_device_memory_bytes=peaks[1],
@@ -229,7 +239,7 @@ def _record(
         max_width=job.max_width,
         libraries=library_versions(),
         started=started,
-        notices=job.notices,
+        notices=[],
     )
 
 
