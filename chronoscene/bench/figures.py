@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -126,8 +127,7 @@ def _draw_row(
     """One view: the photo, then each method with its PSNR. Returns the last error map."""
     photo = load_image(truth, entry)
     axes[0].imshow(photo)
-    label = labels.get(str(entry.camera_period), str(entry.camera_period))
-    axes[0].set_ylabel(f"period {label}", fontsize=10)
+    axes[0].set_ylabel(shorten(period_title(entry.camera_period, labels), 26), fontsize=10)
     axes[0].set_xlabel(entry.view, fontsize=8)
     shown = None
     for axis, column in zip(axes[1:], columns, strict=True):
@@ -142,6 +142,12 @@ def _draw_row(
         axis.set_xticks([])
         axis.set_yticks([])
     return shown
+
+
+def period_title(period: int, labels: dict[str, str]) -> str:
+    """The label of a period, or its number where it has none."""
+    label = labels.get(str(period), str(period))
+    return f"period {label}" if label == str(period) else label
 
 
 def mean_error(image: NDArray[np.uint8], photo: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -1,0 +1,121 @@
+"""Aggregates by hand, views matched with care, metrics that fail are absent with a reason."""
+
+import math
+
+import numpy as np
+import pytest
+
+from chronoscene.bench.images import ImageWriter
+from chronoscene.bench.results import Row
+from chronoscene.bench.scoring import aggregate, changes, score_folder
+from chronoscene.errors import CheckpointError
+from chronoscene.metrics.scorers import make_scorers
+
+
+def rows(metric, values):
+    return [Row(f"{i}.png", p, p, "all", metric, v) for i, (p, v) in enumerate(values)]
+
+
+def test_macro_micro_and_worst_by_hand():
+    aggregates, periods = aggregate(
+        [
+            *rows("psnr", [(0, 10.0), (0, 20.0), (0, 30.0), (1, 40.0), (2, 12.0)]),
+            *rows("lpips_vgg", [(0, 0.1), (0, 0.3), (1, 0.5), (2, 0.2)]),
+        ]
+    )
+    assert periods == {
+        "0": {"psnr": 20.0, "lpips_vgg": 0.2},
+        "1": {"psnr": 40.0, "lpips_vgg": 0.5},
+        "2": {"psnr": 12.0, "lpips_vgg": 0.2},
+    }
+    assert aggregates["macro"] == {"psnr": 24.0, "lpips_vgg": pytest.approx(0.3)}
+    assert aggregates["micro"] == {"psnr": 22.4, "lpips_vgg": pytest.approx(0.275)}
+    assert aggregates["worst"] == {"psnr": 12.0, "lpips_vgg": 0.5}
+
+
+def test_periods_are_in_order_of_their_numbers():
+    _, periods = aggregate(rows("psnr", [(10, 1.0), (2, 2.0), (0, 3.0)]))
+    assert list(periods) == ["0", "2", "10"]
+
+
+def test_infinite_values_stay_infinite():
+    aggregates, _ = aggregate(rows("psnr", [(0, math.inf), (1, 30.0)]))
+    assert aggregates["macro"]["psnr"] == math.inf
+    assert aggregates["worst"]["psnr"] == 30.0
+
+
+def test_parts_of_the_image_do_not_enter_the_means():
+    part = Row("0.png", 0, 0, "changed", "psnr", 1.0)
+    assert aggregate([*rows("psnr", [(0, 9.0)]), part])[0]["micro"]["psnr"] == 9.0
+
+
+def write(folder, images, *, scene_hash="h", periods=None):
+    writer = ImageWriter(folder)
+    for view, image in images.items():
+        period = (periods or {}).get(view, 0)
+        writer.add(view, image, camera_period=period, rendered_period=period)
+    writer.close(kind="predictions", scene="s", scene_hash=scene_hash, details={})
+    return folder
+
+
+def noise(seed, shape=(12, 13, 3)):
+    return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
+
+
+def test_scores_are_those_of_the_metrics(tmp_path):
+    periods = {"a.png": 0, "b.png": 1}
+    truth = {"a.png": noise(0), "b.png": noise(1)}
+    guess = {"a.png": noise(2), "b.png": noise(3)}
+    scorers = make_scorers(["psnr", "ssim"])
+    scores = score_folder(
+        write(tmp_path / "p", guess, periods=periods),
+        write(tmp_path / "t", truth, periods=periods),
+        scorers,
+    )
+    found = {(r.view, r.camera_period, r.metric): r.value for r in scores.rows}
+    assert found == {
+        (view, periods[view], name): function(guess[view], truth[view])
+        for view in truth
+        for name, function in scorers.functions.items()
+    }
+    assert {r.region for r in scores.rows} == {"all"} and scores.skipped == {}
+
+
+def test_a_metric_that_one_view_does_not_allow_is_absent_with_a_reason(tmp_path):
+    images = {"a.png": noise(0), "b.png": noise(1, (8, 13, 3))}
+    scores = score_folder(
+        write(tmp_path / "p", images),
+        write(tmp_path / "t", images),
+        make_scorers(["ssim", "ssim_valid"]),
+    )
+    assert {r.metric for r in scores.rows} == {"ssim"}
+    assert "b.png" in scores.skipped["ssim_valid"] and "11 x 11" in scores.skipped["ssim_valid"]
+
+
+@pytest.mark.parametrize(
+    ("guess", "scene_hash", "message"),
+    [
+        ({"a.png": noise(0)}, "h", "a difference at 'b.png'"),
+        ({"a.png": noise(0), "b.png": noise(1), "c.png": noise(1)}, "h", "difference at 'c.png'"),
+        ({"a.png": noise(0), "b.png": noise(1, (9, 9, 3))}, "h", "expected 13 x 12 pixels"),
+        ({"a.png": noise(0), "b.png": noise(1)}, "other", "expected scene h"),
+    ],
+)
+def test_folders_that_do_not_belong_together(tmp_path, guess, scene_hash, message):
+    truth = write(tmp_path / "t", {"a.png": noise(0), "b.png": noise(1)})
+    predictions = write(tmp_path / "p", guess, scene_hash=scene_hash)
+    with pytest.raises(CheckpointError, match=message):
+        score_folder(predictions, truth, make_scorers(["psnr"]))
+
+
+def test_changes_are_told_in_words():
+    def kinds(**values):
+        return {kind: dict(values) for kind in ("macro", "micro", "worst")}
+
+    before, after = kinds(psnr=20.0, ssim=0.5, lpips_vgg=0.1), kinds(psnr=21.0, ssim=0.5)
+    assert changes(before, after) == ["psnr 20 -> 21 (macro)", "lpips_vgg dropped, was 0.1"]
+    assert changes(after, before)[-1] == "lpips_vgg new: 0.1"
+    assert changes(before, before) == []
+    after = kinds(psnr=20.0, ssim=0.5, lpips_vgg=0.1)
+    after["worst"]["ssim"] = 0.4
+    assert changes(before, after) == ["ssim 0.5 -> 0.5 (macro)"]

@@ -1,0 +1,73 @@
+"""Budgets are parsed, progress never leaves 0..1, shares add up, the clock can be held."""
+
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chronoscene.bench.stopping import StopRule, Stopwatch, parse_duration
+from chronoscene.errors import ConfigError
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"),
+    [("90s", 90), ("5m", 300), ("1.5h", 5400), ("1h30m", 5400), ("2m3.5s", 123.5)],
+)
+def test_durations(text, seconds):
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "5", "m", "0s", "-5m", "5 m", "5min", "1e3s", "5m!"])
+def test_other_texts_are_refused(text):
+    with pytest.raises(ConfigError, match="--budget: expected a positive time such as 90s"):
+        parse_duration(text)
+
+
+@given(
+    st.one_of(st.none(), st.integers(1, 10**6)),
+    st.one_of(st.none(), st.floats(0.01, 1e5)),
+    st.integers(0, 10**7),
+    st.floats(0, 1e6),
+)
+def test_progress_is_a_share(iterations, budget, done, seconds):
+    rule = StopRule(iterations, budget)
+    progress = rule.progress(done, seconds)
+    assert 0 <= progress <= 1
+    assert rule.progress(done + 1, seconds + 1) >= progress
+
+
+def test_progress_by_hand():
+    assert StopRule(200, None).progress(50, 1e9) == 0.25
+    assert StopRule(None, 10.0).progress(10**9, 2.5) == 0.25
+    assert StopRule(200, 10.0).progress(50, 9.0) == 0.9
+    assert StopRule(200, 10.0).progress(190, 1.0) == 0.95
+    assert StopRule(200, None).progress(200, 0.0) == 1.0
+
+
+@given(st.integers(1, 10**5), st.integers(1, 60))
+def test_shares_add_up(iterations, parts):
+    shares = [rule.iterations for rule in StopRule(iterations, None).split(parts)]
+    assert sum(shares) == iterations
+    assert max(shares) - min(shares) <= 1
+
+
+def test_budgets_are_shared():
+    assert StopRule(None, 9.0).split(3) == (StopRule(None, 3.0),) * 3
+    assert StopRule(7, 9.0).split(3) == (StopRule(3, 3.0), StopRule(2, 3.0), StopRule(2, 3.0))
+
+
+def test_time_left_follows_the_pace():
+    assert StopRule(100, None).seconds_left(25, 5.0) == pytest.approx(15.0)
+    assert StopRule(None, 60.0).seconds_left(3, 20.0) == pytest.approx(40.0)
+    assert StopRule(100, None).seconds_left(0, 0.0) is None
+
+
+def test_the_stopwatch_counts_inside_only():
+    watch = Stopwatch()
+    with watch:
+        time.sleep(0.02)
+    time.sleep(0.05)
+    with watch:
+        time.sleep(0.02)
+    assert 0.04 <= watch.seconds < 0.065
