@@ -5,7 +5,11 @@ So `Vector` is one machine register (16 lanes with AVX-512, 8 with AVX2, else 4)
 loads and stores that become single instructions, and `tile_product` is the inner loop of a matrix
 product. Without a fused multiply-add in hardware the same code multiplies and adds.
 
-None of these check bounds.
+Memory is a flat float32 array or, as an integer, an address. Loops over rows want addresses: Numba
+counts the references to an array whenever it is passed on, and threads that do so with the same
+array wait for each other. The caller keeps the memory alive.
+
+None of these check bounds. Functions named ``emit_`` write LLVM code and are for other intrinsics.
 """
 
 from __future__ import annotations
@@ -47,11 +51,10 @@ LANES = _lanes(_host_features())
 MANY_REGISTERS = LANES == 16 or platform.machine() in ("aarch64", "arm64")
 """32 vector registers, else 16."""
 
-_FLOAT = ir.FloatType()
-_INT = ir.IntType(32)
-_FLOATS = ir.VectorType(_FLOAT, LANES)
-_INTS = ir.VectorType(_INT, LANES)
-_MASK = ir.VectorType(ir.IntType(1), LANES)
+FLOAT = ir.FloatType()
+INT = ir.IntType(32)
+FLOATS = ir.VectorType(FLOAT, LANES)
+INTS = ir.VectorType(INT, LANES)
 
 
 class VectorType(types.Type):
@@ -67,41 +70,42 @@ Vector = VectorType()
 @register_model(VectorType)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, _FLOATS)
+        super().__init__(dmm, fe_type, FLOATS)
 
 
-def _splat(builder: Any, scalar: Any) -> Any:
-    single = builder.insert_element(ir.Constant(_FLOATS, ir.Undefined), scalar, _INT(0))
+def emit_splat(builder: Any, scalar: Any) -> Any:
+    single = builder.insert_element(ir.Constant(FLOATS, ir.Undefined), scalar, INT(0))
     return builder.shuffle_vector(
-        single, ir.Constant(_FLOATS, ir.Undefined), ir.Constant(_INTS, [0] * LANES)
+        single, ir.Constant(FLOATS, ir.Undefined), ir.Constant(INTS, [0] * LANES)
     )
 
 
-def _constant(value: float) -> Any:
-    return ir.Constant(_FLOATS, [float(float32(value))] * LANES)
+def emit_constant(value: float) -> Any:
+    return ir.Constant(FLOATS, [float(float32(value))] * LANES)
 
 
-def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
+def emit_multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
     # fmuladd fuses where the processor can; fma would call a slow library function where not.
-    kind = ir.FunctionType(_FLOATS, [_FLOATS] * 3)
+    kind = ir.FunctionType(FLOATS, [FLOATS] * 3)
     name = f"llvm.fmuladd.v{LANES}f32"
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [a, b, c])
 
 
-def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.gep(data, [index])
+def emit_address(context: Any, builder: Any, kind: Any, memory: Any, index: Any) -> Any:
+    if isinstance(kind, types.Integer):
+        return builder.gep(builder.inttoptr(memory, FLOAT.as_pointer()), [index])
+    return builder.gep(context.make_array(kind)(context, builder, memory).data, [index])
 
 
-def _load(builder: Any, address: Any) -> Any:
-    pointer = builder.bitcast(address, _FLOATS.as_pointer())
-    value = builder.load(pointer, typ=_FLOATS)
+def emit_load(builder: Any, address: Any) -> Any:
+    pointer = builder.bitcast(address, FLOATS.as_pointer())
+    value = builder.load(pointer, typ=FLOATS)
     value.align = 4
     return value
 
 
-def _store(builder: Any, value: Any, address: Any) -> None:
-    builder.store(value, builder.bitcast(address, _FLOATS.as_pointer())).align = 4
+def emit_store(builder: Any, value: Any, address: Any) -> None:
+    builder.store(value, builder.bitcast(address, FLOATS.as_pointer())).align = 4
 
 
 def _define_operator(symbol: Callable[..., Any], instruction: str) -> None:
@@ -118,7 +122,7 @@ def _define_operator(symbol: Callable[..., Any], instruction: str) -> None:
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         a, b = (
-            value if kind == Vector else _splat(builder, value)
+            value if kind == Vector else emit_splat(builder, value)
             for value, kind in zip(args, signature.args, strict=True)
         )
         return getattr(builder, instruction)(a, b, flags=FLAGS)
@@ -134,47 +138,71 @@ _define_operator(operator.truediv, "fdiv")
 
 
 @intrinsic
-def load(typing: Any, array: Any, index: Any) -> Any:
-    """Read LANES numbers of a flat float32 array from ``index`` on."""
+def load(typing: Any, memory: Any, index: Any) -> Any:
+    """Read LANES numbers from ``index`` on."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _load(builder, _address(context, builder, signature.args[0], *args))
+        return emit_load(builder, emit_address(context, builder, signature.args[0], *args))
 
-    return Vector(array, types.intp), generate
+    return Vector(memory, types.intp), generate
 
 
 @intrinsic
-def store(typing: Any, array: Any, index: Any, value: Any) -> Any:
-    """Write LANES numbers into a flat float32 array from ``index`` on."""
+def store(typing: Any, memory: Any, index: Any, value: Any) -> Any:
+    """Write LANES numbers from ``index`` on."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = _address(context, builder, signature.args[0], *args[:2])
-        _store(builder, args[2], address)
+        address = emit_address(context, builder, signature.args[0], *args[:2])
+        emit_store(builder, args[2], address)
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, Vector), generate
+    return types.void(memory, types.intp, Vector), generate
+
+
+def emit_first_lanes(builder: Any, count: Any) -> Any:
+    """Mask of the lanes below ``count``, any integer."""
+    wide = count.type
+    clipped = builder.select(builder.icmp_signed("<", count, wide(LANES)), count, wide(LANES))
+    single = builder.insert_element(
+        ir.Constant(INTS, ir.Undefined), builder.trunc(clipped, INT), INT(0)
+    )
+    counts = builder.shuffle_vector(
+        single, ir.Constant(INTS, ir.Undefined), ir.Constant(INTS, [0] * LANES)
+    )
+    return builder.icmp_signed("<", ir.Constant(INTS, list(range(LANES))), counts)
 
 
 @intrinsic
-def store_first(typing: Any, array: Any, index: Any, value: Any, count: Any) -> Any:
-    """Write the first ``count`` lanes; at most LANES."""
+def load_first(typing: Any, memory: Any, index: Any, count: Any) -> Any:
+    """Read the first ``count`` lanes, and nothing beyond; the others are 0."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = _address(context, builder, signature.args[0], *args[:2])
-        count = builder.trunc(args[3], _INT)
-        counts = builder.insert_element(ir.Constant(_INTS, ir.Undefined), count, _INT(0))
-        counts = builder.shuffle_vector(
-            counts, ir.Constant(_INTS, ir.Undefined), ir.Constant(_INTS, [0] * LANES)
-        )
-        mask = builder.icmp_signed("<", ir.Constant(_INTS, list(range(LANES))), counts)
-        pointer = builder.bitcast(address, _FLOATS.as_pointer())
-        kind = ir.FunctionType(ir.VoidType(), [_FLOATS, pointer.type, _INT, _MASK])
+        address = emit_address(context, builder, signature.args[0], *args[:2])
+        pointer = builder.bitcast(address, FLOATS.as_pointer())
+        mask = emit_first_lanes(builder, args[2])
+        kind = ir.FunctionType(FLOATS, [pointer.type, INT, mask.type, FLOATS])
+        name = f"llvm.masked.load.v{LANES}f32.p0"
+        function = cgutils.get_or_insert_function(builder.module, kind, name)
+        return builder.call(function, [pointer, INT(4), mask, emit_constant(0.0)])
+
+    return Vector(memory, types.intp, types.intp), generate
+
+
+@intrinsic
+def store_first(typing: Any, memory: Any, index: Any, value: Any, count: Any) -> Any:
+    """Write the first ``count`` lanes and nothing beyond."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        address = emit_address(context, builder, signature.args[0], *args[:2])
+        pointer = builder.bitcast(address, FLOATS.as_pointer())
+        mask = emit_first_lanes(builder, args[3])
+        kind = ir.FunctionType(ir.VoidType(), [FLOATS, pointer.type, INT, mask.type])
         name = f"llvm.masked.store.v{LANES}f32.p0"
         function = cgutils.get_or_insert_function(builder.module, kind, name)
-        builder.call(function, [args[2], pointer, _INT(4), mask])
+        builder.call(function, [args[2], pointer, INT(4), mask])
         return context.get_dummy_value()
 
-    return types.void(array, types.intp, Vector, types.intp), generate
+    return types.void(memory, types.intp, Vector, types.intp), generate
 
 
 @intrinsic
@@ -182,7 +210,7 @@ def splat(typing: Any, value: Any) -> Any:
     """The same number in all lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _splat(builder, args[0])
+        return emit_splat(builder, args[0])
 
     return Vector(types.float32), generate
 
@@ -192,7 +220,7 @@ def multiply_add(typing: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c, rounded once where the processor can."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _multiply_add(builder, *args)
+        return emit_multiply_add(builder, *args)
 
     return Vector(Vector, Vector, Vector), generate
 
@@ -208,28 +236,45 @@ def select_less(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 
 @intrinsic
-def square_root(typing: Any, value: Any) -> Any:
-    """Root of every lane."""
+def read(typing: Any, memory: Any, index: Any) -> Any:
+    """One float32."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(_FLOATS, [_FLOATS])
-        name = f"llvm.sqrt.v{LANES}f32"
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
+        return builder.load(emit_address(context, builder, signature.args[0], *args))
 
-    return Vector(Vector), generate
+    return types.float32(memory, types.intp), generate
 
 
 @intrinsic
-def lane_sum(typing: Any, value: Any) -> Any:
-    """Sum of all lanes, halves added to halves: the order is fixed."""
+def write(typing: Any, memory: Any, index: Any, value: Any) -> Any:
+    """Set one float32."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        total, half = args[0], LANES // 2
-        while half:
-            order = [(i + half) % LANES for i in range(LANES)]
-            turned = builder.shuffle_vector(total, total, ir.Constant(_INTS, order))
-            total = builder.fadd(total, turned)
-            half //= 2
-        return builder.extract_element(total, _INT(0))
+        builder.store(args[2], emit_address(context, builder, signature.args[0], *args[:2]))
+        return context.get_dummy_value()
 
-    return types.float32(Vector), generate
+    return types.void(memory, types.intp, types.float32), generate
+
+
+@intrinsic
+def read_index(typing: Any, address: Any, index: Any) -> Any:
+    """One int64 of those at an address."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        wide = ir.IntType(64)
+        pointer = builder.inttoptr(args[0], wide.as_pointer())
+        return builder.load(builder.gep(pointer, [args[1]]))
+
+    return types.int64(types.intp, types.intp), generate
+
+
+@intrinsic
+def write_index(typing: Any, address: Any, index: Any, value: Any) -> Any:
+    """Set one int64 of those at an address."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
+        builder.store(args[2], builder.gep(pointer, [args[1]]))
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.intp, types.int64), generate

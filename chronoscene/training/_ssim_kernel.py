@@ -30,7 +30,6 @@ from numpy import float32
 
 from chronoscene.training._simd import (
     LANES,
-    lane_sum,
     load,
     multiply_add,
     select_less,
@@ -38,6 +37,7 @@ from chronoscene.training._simd import (
     store,
     store_first,
 )
+from chronoscene.training._vector_math import lane_sum
 
 RADIUS = 5
 SIGMA = 1.5

@@ -1,21 +1,50 @@
 """Decode anchors into Gaussians: the small MLPs of ChronoGS and Scaffold-GS.
 
-`decode_reference` is the definition, in plain torch.
+`decode_reference` is the definition, in plain torch; `decode` is the compiled form of it.
 
 Source: ChronoGS (arXiv 2511.18794), section 3, and Scaffold-GS, whose anchors it extends.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numba import get_num_threads
 from torch import Tensor
 
 from chronoscene.checks import check_shape
+from chronoscene.errors import ShapeError
+from chronoscene.training._decode_backward import (
+    AnchorGradients,
+    OutputGradients,
+    decode_backward,
+)
+from chronoscene.training._decode_forward import Anchors, Outputs, decode_forward
+from chronoscene.training._decode_layout import (
+    CHUNK,
+    Gradients,
+    Head,
+    Weights,
+    Work,
+    gradient_sizes,
+    make_layout,
+    pack,
+    place,
+    unpack_gradients,
+    weight_sizes,
+    work_sizes,
+)
 
+MIN_DISTANCE = 1e-12
+"""Of an anchor from the camera, in world units; nearer, it has no direction."""
 MIN_QUAT_NORM = 1e-12
 """Shorter quaternions carry no direction: they become the identity and get no gradient."""
+
+
+LIMITS = np.array([MIN_DISTANCE, MIN_QUAT_NORM**2], dtype=np.float32)
 
 
 class HeadWeights(NamedTuple):
@@ -99,11 +128,12 @@ def decode_reference(
     centres = anchors[visible].detach()
     directions = centres - camera_centre.detach()
     lengths = directions.norm(dim=-1, keepdim=True)
+    directions = torch.where(lengths > MIN_DISTANCE, directions / lengths, 0)
     inputs = torch.cat(
         (
             rows[:, :base_dim],
             torch.einsum("t,mtv->mv", period_weights, periods),
-            directions / lengths.clamp_min(torch.finfo(lengths.dtype).tiny),
+            directions,
             (period_weights @ global_features).expand(len(visible), -1),
         ),
         dim=-1,
@@ -117,6 +147,183 @@ def decode_reference(
         opacities=torch.tanh(_mlp(inputs, opacity_head)).reshape(-1),
         colors=torch.sigmoid(_mlp(inputs, color_head)).reshape(-1, 3),
     )
+
+
+def decode(
+    anchors: Tensor,
+    offsets: Tensor,
+    features: Tensor,
+    log_scales: Tensor,
+    global_features: Tensor,
+    period_weights: Tensor,
+    opacity_head: HeadWeights,
+    covariance_head: HeadWeights,
+    color_head: HeadWeights,
+    camera_centre: Tensor,
+    visible: Tensor,
+    *,
+    base_dim: int,
+    period_dim: int,
+) -> Decoded:
+    """Decode the visible anchors: `decode_reference`, compiled for float32 on a CPU.
+
+    Only rows of visible anchors are read. Gradients of per-anchor tensors are dense, zero in other
+    rows and in the blocks of periods of weight 0. Values and gradients are equal bit by bit for any
+    number of threads. Other types and devices go through `decode_reference`.
+
+    Raises:
+        ShapeError: If the sizes do not fit together.
+    """
+    tensors = (offsets, features, log_scales, global_features)
+    heads = (opacity_head, covariance_head, color_head)
+    _check(anchors, tensors, period_weights, heads, camera_centre, visible, base_dim, period_dim)
+    if anchors.device.type != "cpu" or features.dtype != torch.float32:
+        return decode_reference(
+            anchors, *tensors, period_weights, *heads, camera_centre, visible,
+            base_dim=base_dim, period_dim=period_dim,
+        )  # fmt: skip
+    fixed = (anchors, period_weights, camera_centre, visible)
+    weights = (weight for head in heads for weight in head)
+    return Decoded(*_Decode.apply((base_dim, period_dim), fixed, *tensors, *weights))
+
+
+class _Decode(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, dims: tuple[int, int], fixed: tuple[Tensor, ...], *tensors: Tensor
+    ) -> tuple[Tensor, ...]:
+        job = _Job(dims, fixed, tensors)
+        count = job.source.num_visible * job.layout.offsets
+        shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3), (count,))
+        outputs = [torch.empty(shape) for shape in shapes]
+        addresses = Outputs(*(tensor.data_ptr() for tensor in outputs))
+        decode_forward(job.layout, job.weights, job.source, LIMITS, addresses, *job.work)
+        ctx.save_for_backward(*fixed, *tensors, *outputs)
+        ctx.dims = dims
+        return tuple(outputs[:5])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
+        fixed, tensors, outputs = saved[:4], saved[4:20], saved[20:]
+        job = _Job(ctx.dims, fixed, tensors)
+        grads = tuple(grad.contiguous() for grad in grads)
+        out = [torch.zeros(tensor.shape) for tensor in tensors]
+        sizes = gradient_sizes(job.layout)
+        chunks = max(1, -(-job.source.num_visible // CHUNK))
+        partials = torch.empty(chunks, sum(sizes))
+        partial = Gradients(*place(sizes, partials.data_ptr()))
+        decode_backward(
+            job.layout,
+            job.weights,
+            job.source,
+            LIMITS,
+            Outputs(*(tensor.data_ptr() for tensor in outputs)),
+            OutputGradients(*(grad.data_ptr() for grad in grads)),
+            AnchorGradients(*(tensor.data_ptr() for tensor in out[:3])),
+            partial,
+            sum(sizes),
+            *job.work,
+        )
+        shared = torch.zeros_like(job.shared)
+        ends = (job.shared.data_ptr(), _heads(out[4:]), shared.data_ptr())
+        unpack_gradients(job.layout, partial, job.heads, *ends)
+        out[3] = fixed[1].detach()[:, None] * shared
+        return None, None, *out
+
+
+class _Job:
+    """Arguments of the kernels, and the memory behind them."""
+
+    def __init__(
+        self, dims: tuple[int, int], fixed: Sequence[Tensor], tensors: Sequence[Tensor]
+    ) -> None:
+        anchors, weights, centre, visible = (_plain(tensor) for tensor in fixed)
+        offsets, features, log_scales, global_features, *heads = (_plain(t) for t in tensors)
+        self.layout = make_layout(
+            base=dims[0],
+            period=dims[1],
+            shared=global_features.shape[1],
+            hidden=heads[0].shape[0],
+            offsets=offsets.shape[1],
+            row=features.shape[1],
+        )
+        periods = weights.nonzero()[:, 0]
+        weights = weights[periods]
+        self.shared = (weights[:, None] * global_features[periods]).sum(0)
+        self.heads = _heads(heads)
+        self.source = Anchors(
+            anchors=anchors.data_ptr(),
+            offsets=offsets.data_ptr(),
+            features=features.data_ptr(),
+            log_scales=log_scales.data_ptr(),
+            centre=centre.data_ptr(),
+            visible=visible.data_ptr(),
+            num_visible=len(visible),
+            periods=periods.data_ptr(),
+            weights=weights.data_ptr(),
+            num_periods=len(periods),
+        )
+        sizes = weight_sizes(self.layout)
+        packed = torch.zeros(sum(sizes))
+        self.weights = Weights(*place(sizes, packed.data_ptr()))
+        pack(self.layout, self.heads, self.shared.data_ptr(), self.weights)
+        sizes, tasks = work_sizes(self.layout), get_num_threads()
+        memory = torch.zeros(tasks * sum(sizes))
+        self.work = (Work(*place(sizes, memory.data_ptr())), sum(sizes), tasks)
+        # The kernels know addresses only, so this object keeps alive what is there.
+        self._alive = (
+            *(anchors, weights, centre, visible, offsets, features, log_scales, periods),
+            *(*heads, packed, memory),
+        )
+
+
+def _plain(tensor: Tensor) -> Tensor:
+    return tensor.detach().contiguous()
+
+
+def _heads(tensors: Sequence[Tensor]) -> tuple[Head, Head, Head]:
+    one, two, three = (
+        Head(*(tensor.data_ptr() for tensor in tensors[first : first + 4])) for first in (0, 4, 8)
+    )
+    return one, two, three
+
+
+def _check(
+    anchors: Tensor,
+    tensors: Sequence[Tensor],
+    period_weights: Tensor,
+    heads: Sequence[HeadWeights],
+    camera_centre: Tensor,
+    visible: Tensor,
+    base_dim: int,
+    period_dim: int,
+) -> None:
+    """Check all sizes: the kernels do not."""
+    offsets, features, log_scales, global_features = tensors
+    rows, periods = anchors.shape[0], period_weights.shape[0]
+    hidden, count = heads[0].w1.shape[0], heads[0].b2.shape[0]
+    check_shape("anchors", anchors, (rows, 3))
+    check_shape("offsets", offsets, (rows, count, 3))
+    check_shape("features", features, (rows, base_dim + periods * period_dim))
+    check_shape("log_scales", log_scales, (rows, 6))
+    check_shape("global_features", global_features, (periods, None))
+    check_shape("camera_centre", camera_centre, (3,))
+    check_shape("visible", visible, (None,))
+    inputs = base_dim + period_dim + 3 + global_features.shape[1]
+    for name, head, width in zip(("opacity", "covariance", "color"), heads, (1, 7, 3), strict=True):
+        check_shape(f"{name} head w1", head.w1, (hidden, inputs))
+        check_shape(f"{name} head b1", head.b1, (hidden,))
+        check_shape(f"{name} head w2", head.w2, (width * count, hidden))
+        check_shape(f"{name} head b2", head.b2, (width * count,))
+    low, high = (int(end) for end in visible.aminmax()) if len(visible) else (0, -1)
+    if low < 0 or high >= rows:
+        raise ShapeError(
+            "visible",
+            expected=f"indices of {rows} anchors",
+            found=f"{low} to {high}",
+            todo="pass indices of rows that exist",
+        )
 
 
 def _mlp(inputs: Tensor, head: HeadWeights) -> Tensor:

@@ -1,0 +1,271 @@
+"""How the decode kernels lay out weights, and the sizes that follow from it.
+
+The three heads become one: their first layers side by side (they share the input), their second
+layers in one matrix whose blocks act on the hidden units of one head each. The global feature is
+equal for all anchors, so its share of the first layer goes into the bias. Lengths are padded with
+zeros to `PADDING`.
+
+Outputs are grouped by kind: opacities, scales, quaternions, colours; each offset by offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from numba import njit
+
+from chronoscene.training._matmul import PADDING
+from chronoscene.training._simd import LANES, read, write
+
+BLOCK = 64
+"""Anchors whose rows go through the matrix products together; multiple of every ROW_TILE. What a
+task works in stays in the second-level cache."""
+CHUNK = 512
+"""Anchors per partial sum of weight gradients. Fixed, so that sums do not depend on the number of
+threads."""
+CYCLE = 3 * LANES
+"""Three numbers in turn look the same every so many lanes."""
+
+
+class Layout(NamedTuple):
+    """Sizes; names ending in ``_pad`` are padded."""
+
+    base: int
+    period: int
+    shared: int
+    """G, of the global feature."""
+    features: int
+    """Base and period feature."""
+    inputs: int
+    """Those and the direction."""
+    hidden: int
+    """Per head."""
+    offsets: int
+    """k"""
+    features_pad: int
+    inputs_pad: int
+    hidden_pad: int
+    hiddens: int
+    """3 hidden_pad"""
+    scales_at: int
+    """Column of the first scale among the outputs; opacities are at 0."""
+    quats_at: int
+    colors_at: int
+    outputs_pad: int
+    row: int
+    """Numbers in a row of ``features`` of an anchor, all periods."""
+
+
+def make_layout(
+    *, base: int, period: int, shared: int, hidden: int, offsets: int, row: int
+) -> Layout:
+    """Derive all sizes."""
+
+    def padded(count: int) -> int:
+        return -(-count // PADDING) * PADDING
+
+    scales_at = padded(offsets)
+    quats_at = scales_at + padded(3 * offsets)
+    colors_at = quats_at + padded(4 * offsets)
+    return Layout(
+        base=base,
+        period=period,
+        shared=shared,
+        features=base + period,
+        inputs=base + period + 3,
+        hidden=hidden,
+        offsets=offsets,
+        features_pad=padded(base + period),
+        inputs_pad=padded(base + period + 3),
+        hidden_pad=padded(hidden),
+        hiddens=3 * padded(hidden),
+        scales_at=scales_at,
+        quats_at=quats_at,
+        colors_at=colors_at,
+        outputs_pad=colors_at + padded(3 * offsets),
+        row=row,
+    )
+
+
+class Weights(NamedTuple):
+    """Addresses of the joined weights."""
+
+    w1: int
+    """[hiddens, features_pad]"""
+    w1_t: int
+    """[inputs_pad, hiddens]"""
+    b1: int
+    """[hiddens]"""
+    w2: int
+    """[outputs_pad, hidden_pad]"""
+    w2_t: int
+    """[hidden_pad, outputs_pad]"""
+    b2: int
+    """[outputs_pad]"""
+    zeros: int
+    """As many as the longest row."""
+
+
+class Gradients(NamedTuple):
+    """Addresses of the gradients of the joined weights, in the same shapes."""
+
+    w1_t: int
+    b1: int
+    w2: int
+    b2: int
+
+
+class Work(NamedTuple):
+    """Addresses of what one task works in."""
+
+    rows: int
+    """Anchors of the block. int64 [BLOCK]"""
+    x: int
+    """Inputs. [BLOCK, inputs_pad], and some more"""
+    hidden: int
+    """[BLOCK, hiddens]"""
+    raw: int
+    """Outputs before activation, or their gradients. [BLOCK, outputs_pad]"""
+    d_hidden: int
+    """[BLOCK, hiddens]"""
+    d_x: int
+    """[BLOCK, features_pad]"""
+    cycles: int
+    """Patterns of one row. [5 CYCLE]"""
+
+
+def weight_sizes(layout: Layout) -> tuple[int, ...]:
+    """Numbers in each of `Weights`."""
+    first, second = layout.hiddens, layout.outputs_pad * layout.hidden_pad
+    return (
+        first * layout.features_pad,
+        layout.inputs_pad * first,
+        first,
+        second,
+        second,
+        layout.outputs_pad,
+        max(layout.hidden_pad, layout.features_pad),
+    )
+
+
+def gradient_sizes(layout: Layout) -> tuple[int, ...]:
+    """Numbers in each of `Gradients`."""
+    first, second = layout.hiddens, layout.outputs_pad
+    return (layout.inputs_pad * first, first, second * layout.hidden_pad, second)
+
+
+def work_sizes(layout: Layout) -> tuple[int, ...]:
+    """Numbers in each of `Work`."""
+    return (
+        2 * BLOCK,
+        BLOCK * layout.inputs_pad + 2 * LANES,
+        BLOCK * layout.hiddens,
+        BLOCK * layout.outputs_pad,
+        BLOCK * layout.hiddens,
+        BLOCK * layout.features_pad,
+        5 * CYCLE,
+    )
+
+
+def place(sizes: Sequence[int], address: int) -> list[int]:
+    """Addresses of arrays of float32 that lie one after the other."""
+    return [address + 4 * sum(sizes[:i]) for i in range(len(sizes))]
+
+
+class Head(NamedTuple):
+    """Addresses of the weights of one head, or of their gradients."""
+
+    w1: int
+    """[hidden, inputs + shared]"""
+    b1: int
+    w2: int
+    """[outputs, hidden]"""
+    b2: int
+
+
+@njit(nogil=True, error_model="numpy")
+def _output_column(layout, head, output):  # type: ignore[no-untyped-def]
+    """Column among the joined outputs of an output of head 0, 1, 2."""
+    if head == 0:
+        return output
+    if head == 2:
+        return layout.colors_at + output
+    offset, part = output // 7, output % 7
+    if part < 3:
+        return layout.scales_at + 3 * offset + part
+    return layout.quats_at + 4 * offset + part - 3
+
+
+@njit(nogil=True, error_model="numpy")
+def _num_outputs(layout, head):  # type: ignore[no-untyped-def]
+    return layout.offsets * (1 if head == 0 else 7 if head == 1 else 3)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def pack(layout, heads, shared, out):  # type: ignore[no-untyped-def]
+    """Join three heads.
+
+    Args:
+        layout: `Layout`.
+        heads: Three `Head`.
+        shared: Address of the mixed global feature. [G]
+        out: `Weights`, zeros at first.
+    """
+    width = layout.inputs + layout.shared
+    for head in range(3):
+        source = heads[head]
+        for h in range(layout.hidden):
+            at = head * layout.hidden_pad + h
+            bias = read(source.b1, h)
+            for g in range(layout.shared):
+                bias += read(source.w1, h * width + layout.inputs + g) * read(shared, g)
+            write(out.b1, at, bias)
+            for i in range(layout.inputs):
+                value = read(source.w1, h * width + i)
+                write(out.w1_t, i * layout.hiddens + at, value)
+                if i < layout.features:
+                    write(out.w1, at * layout.features_pad + i, value)
+        for o in range(_num_outputs(layout, head)):
+            column = _output_column(layout, head, o)
+            write(out.b2, column, read(source.b2, o))
+            for h in range(layout.hidden):
+                value = read(source.w2, o * layout.hidden + h)
+                write(out.w2, column * layout.hidden_pad + h, value)
+                write(out.w2_t, h * layout.outputs_pad + column, value)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def unpack_gradients(layout, grads, heads, shared, out, shared_out):  # type: ignore[no-untyped-def]
+    """Spread the gradients of the joined weights over the heads and what they share.
+
+    Args:
+        layout: `Layout`.
+        grads: `Gradients`.
+        heads: Three `Head`.
+        shared: Address of the mixed global feature. [G]
+        out: Three `Head`, written.
+        shared_out: Address of zeros, to which the gradient of ``shared`` is added. [G]
+    """
+    width = layout.inputs + layout.shared
+    for head in range(3):
+        source, target = heads[head], out[head]
+        for h in range(layout.hidden):
+            at = head * layout.hidden_pad + h
+            bias = read(grads.b1, at)
+            write(target.b1, h, bias)
+            for i in range(layout.inputs):
+                grad = read(grads.w1_t, i * layout.hiddens + at)
+                write(target.w1, h * width + i, grad)
+            # The bias stood for b1 + w1[:, inputs:] @ shared.
+            for g in range(layout.shared):
+                column = h * width + layout.inputs + g
+                write(target.w1, column, bias * read(shared, g))
+                total = read(shared_out, g) + bias * read(source.w1, column)
+                write(shared_out, g, total)
+        for o in range(_num_outputs(layout, head)):
+            column = _output_column(layout, head, o)
+            write(target.b2, o, read(grads.b2, column))
+            for h in range(layout.hidden):
+                grad = read(grads.w2, column * layout.hidden_pad + h)
+                write(target.w2, o * layout.hidden + h, grad)
