@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from chronoscene.synth.ground import PARKING, pavement
 from chronoscene.synth.mesh import Part, PartBuilder, srgb
 from chronoscene.synth.seeds import key_number, rng_for
 from chronoscene.synth.textures import PAVING
-from chronoscene.synth.vegetation import hedge, tree
+from chronoscene.synth.vegetation import grown, hedge
 from chronoscene.synth.world import World
 
 Array = NDArray[np.float64]
@@ -93,7 +95,7 @@ def _floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
 
 
 def _lawn(world: World, name: str, rect: Rect, kind: str = "lawn", z: float = SLAB) -> None:
-    states = [f"{kind} {light.season}" for light in world.lights]
+    states = [f"{kind} {season}" for season in world.seasons]
     world.add(f"{name}/lawn", "lawn", states, lambda s: _floor(name, rect, s, z))
 
 
@@ -123,29 +125,13 @@ def _tree(world: World, name: str, at: Array, rng: np.random.Generator, size: fl
     """A tree that grows and changes with the seasons."""
     heights = stages.tree_heights(rng, world.periods, float(rng.uniform(0.75, 1.25) * size))
     states = [
-        None if h is None else (h, light.season)
-        for h, light in zip(heights, world.lights, strict=True)
+        None if h is None else (h, season) for h, season in zip(heights, world.seasons, strict=True)
     ]
-    world.add(name, "tree", states, lambda s: tree(name, at, s[0], s[1], world.seed))
+    world.add(name, "tree", states, partial(grown, name, at, world.seed, 2))
 
 
 def _hedge(world: World, name: str, low: Array, high: Array) -> None:
-    states = [light.season for light in world.lights]
-    world.add(name, "tree", states, lambda s: hedge(name, low, high, s, world.seed))
-
-
-def _visitor(
-    world: World,
-    name: str,
-    kind: str,
-    rng: np.random.Generator,
-    chance: float,
-    make: Callable[[], Part],
-) -> None:
-    """Something movable that is there in some periods only."""
-    here = stages.visits(rng, world.periods, chance)
-    if any(here):
-        world.add(name, kind, ["there" if h else None for h in here], lambda _: make())
+    world.add(name, "tree", world.seasons, partial(hedge, name, low, high, world.seed))
 
 
 def _cars(
@@ -155,20 +141,15 @@ def _cars(
     rng = rng_for(world.seed, name, "cars")
     for i, (x, y, z, turn) in enumerate(places):
         stay = rng.random() < 0.2
-        draws = rng.random(world.periods)
-        if stay:
-            draws[:] = draws[0]
-        wobble = rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
-        for p in range(world.periods):
-            if draws[p] >= chance or (stay and p):
-                continue
-            label = f"{name}/car_{i}" if stay else f"{name}/car_{i}_{p}"
-            states = ["parked" if stay or q == p else None for q in range(world.periods)]
-            base = np.array([x, y, z])
-            world.add(
-                label, "car", states,
-                lambda _, n=label, b=base, t=turn + wobble: fur.car(n, b, t, world.seed),
-            )  # fmt: skip
+        here = rng.random(world.periods) < chance
+        heading = turn + rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
+        base = np.array([x, y, z])
+        every = range(world.periods)
+        groups = [list(every)] if stay else [[p] for p in every]
+        for k, group in enumerate(groups):
+            label = f"{name}/car_{i}_{k}"
+            present = [p in group and bool(here[group[0]]) for p in every]
+            world.place(label, "car", present, partial(fur.car, label, base, heading, world.seed))
 
 
 def _lamps(world: World, name: str, rect: Rect) -> None:
@@ -181,7 +162,7 @@ def _lamps(world: World, name: str, rect: Rect) -> None:
     spots += [(1.0, f, 0.0) for f in np.linspace(0.3, 0.7, max(1, int(dy // 22)))]
     for i, (fx, fy, turn) in enumerate(spots):
         label, at = f"{name}/lamp_{i}", r.at(fx, fy)
-        world.always(label, "lamp", lambda n=label, a=at, t=turn: fur.lamp(n, a, t))
+        world.always(label, "lamp", partial(fur.lamp, label, at, turn))
 
 
 def curb_side(world: World, name: str, rect: Rect, road: float) -> None:
@@ -197,6 +178,25 @@ def curb_side(world: World, name: str, rect: Rect, road: float) -> None:
         places += [(rect.x0 - off, y, 0.0, np.pi / 2), (rect.x1 + off, y, 0.0, -np.pi / 2)]
     _cars(world, name, places, 0.42)
     _lamps(world, name, rect)
+    _avenue(world, name, rect)
+
+
+def _avenue(world: World, name: str, rect: Rect) -> None:
+    """Street trees in pits along some sides of a block."""
+    rng = rng_for(world.seed, name, "avenue")
+    r = rect.inset(1.0)
+    ends = [r.at(0, 0), r.at(1, 0), r.at(1, 1), r.at(0, 1), r.at(0, 0)]
+    for side, (a, b) in enumerate(pairwise(ends)):
+        if rng.random() < 0.45:
+            continue
+        length = float(np.linalg.norm(b - a))
+        for i in range(int((length - 10) // 9.5)):
+            at = a + (8.0 + 9.5 * i + rng.uniform(-0.5, 0.5)) / length * (b - a)
+            label = f"{name}/avenue_{side}{i}"
+            pit = Rect(at[0] - 0.6, at[1] - 0.6, at[0] + 0.6, at[1] + 0.6)
+            world.always(f"{label}/pit", "ground",
+                         partial(_floor, label, pit, "soil", SLAB + 0.015))  # fmt: skip
+            _tree(world, label, at, rng, 5.6)
 
 
 def _house(
@@ -205,7 +205,7 @@ def _house(
     """A finished building, which may get another facade."""
     rng = rng_for(world.seed, spec.name, "reclad")
     states = stages.looks(rng, world.periods, chance)
-    walls = (spec.wall, str(rng.choice([w for w in ("plaster", "panel", "brick", *also)])))
+    walls = (spec.wall, str(rng.choice(["plaster", "panel", "brick"])))
     world.add(
         spec.name,
         "facade",
@@ -238,7 +238,7 @@ def square(world: World, name: str, rect: Rect) -> None:
             at = bed.at(*rng.uniform(0.2, 0.8, 2)) if w >= 2.5 else bed.at(0.5, 0.5)
             _tree(world, f"{name}/tree_{i}{j}", at, rng)
         side = np.sign(0.5 - fx)
-        _bench(world, f"{name}/bench_{i}", c + [side * (w + 0.8), 0, 0], -side * np.pi / 2)
+        _bench(world, f"{name}/bench_{i}", c + side * (w + 0.8) * X, -side * np.pi / 2)
     for i in range(max(2, int(min(inner.size) // 7))):
         at = inner.at(*rng.uniform(0.3, 0.7, 2))
         if np.linalg.norm((at - mid)[:2]) < radius + 3.5:
@@ -246,8 +246,8 @@ def square(world: World, name: str, rect: Rect) -> None:
         turn = float(rng.uniform(0, 6.28))
         make = fur.stall if i % 2 else fur.kiosk
         label = f"{name}/{'stall' if i % 2 else 'kiosk'}_{i}"
-        _visitor(world, label, "kiosk", rng, 0.5,
-                 lambda n=label, a=at, t=turn, m=make: m(n, a, t, world.seed))  # fmt: skip
+        here = stages.visits(rng, world.periods, 0.5)
+        world.place(label, "kiosk", here, partial(make, label, at, turn, world.seed))
 
 
 def park(world: World, name: str, rect: Rect) -> None:
@@ -324,7 +324,7 @@ def slabs(world: World, name: str, rect: Rect) -> None:
     """One or two long flat-roofed buildings on lawns, with a car park."""
     rng = rng_for(world.seed, name)
     inner = _pavement(world, name, rect)
-    dx, dy = inner.size
+    dy = inner.size[1]
     upper = Rect(inner.x0, inner.y0 + 0.55 * dy, inner.x1, inner.y1)
     lower = Rect(inner.x0, inner.y0, inner.x1, inner.y0 + 0.55 * dy)
     _lawn(world, f"{name}/north", upper)
@@ -397,15 +397,12 @@ def site(world: World, name: str, rect: Rect) -> None:
     world.add(spec.name, "building", [None if s == "lot" else s for s in steps], make)
     _site_gear(world, name, inner, steps, spec)
     for i in range(4):
-        after = [
-            (round(3.2 + 0.6 * p, 2), world.lights[p].season) if p in done else None
-            for p in range(world.periods)
+        young = [
+            (round(3.2 + 0.6 * p, 2), season) if p in done else None
+            for p, season in enumerate(world.seasons)
         ]
-        at = inner.at(0.12 + 0.25 * i, 0.93)
-        label = f"{name}/young_{i}"
-        if any(after):
-            world.add(label, "tree", after,
-                      lambda s, n=label, a=at: tree(n, a, s[0], s[1], world.seed))  # fmt: skip
+        at, label = inner.at(0.12 + 0.25 * i, 0.93), f"{name}/young_{i}"
+        world.add(label, "tree", young, partial(grown, label, at, world.seed, 2))
 
 
 def _site_building(name: str, inner: Rect, rng: np.random.Generator) -> Building:
@@ -420,28 +417,22 @@ def _site_building(name: str, inner: Rect, rng: np.random.Generator) -> Building
 
 def _site_gear(world: World, name: str, inner: Rect, steps: list[str], spec: Building) -> None:
     """Fence, containers, crane and diggers while the work goes on."""
-    busy = [None if s == "finished" else "there" for s in steps]
-    high = ["there" if s.startswith("f") and s != "finished" else None for s in steps]
+    busy = [s != "finished" for s in steps]
+    high = [s.startswith("f") and s != "finished" for s in steps]
+    early = [s in ("lot", "foundation") for s in steps]
     r = inner.inset(0.4)
     corners = [(r.x0, r.y0), (r.x1, r.y0), (r.x1, r.y1), (r.x0, r.y1), (r.x0, r.y0)]
-    if any(busy):
-        world.add(f"{name}/fence", "fence", busy,
-                  lambda _: fur.fence(name, corners, SLAB))  # fmt: skip
-        for i in range(2):
-            label, at = f"{name}/container_{i}", inner.at(0.25 + 0.4 * i, 0.9)
-            world.add(label, "container", busy,
-                      lambda _, n=label, a=at: fur.container(n, a, 0.0, world.seed))  # fmt: skip
-    if any(high):
-        height = spec.wall_height + 9.0
-        at = np.array([spec.x1 + 0.08 * inner.size[0], (spec.y0 + spec.y1) / 2, SLAB])
-        turn = float(rng_for(world.seed, name, "crane").uniform(2.0, 4.2))
-        world.add(f"{name}/crane", "crane", high,
-                  lambda _: fur.crane(f"{name}/crane", at, turn, height))  # fmt: skip
-    lot = ["there" if s in ("lot", "foundation") and world.periods > 1 else None for s in steps]
-    if any(lot):
-        at2 = inner.at(0.86, 0.12)
-        world.add(f"{name}/digger", "digger", lot,
-                  lambda _: fur.digger(f"{name}/digger", at2, 2.3))  # fmt: skip
+    world.place(f"{name}/fence", "fence", busy,
+                partial(fur.fence, f"{name}/fence", corners, SLAB))  # fmt: skip
+    for i in range(2):
+        label, at = f"{name}/container_{i}", inner.at(0.25 + 0.4 * i, 0.9)
+        world.place(label, "container", busy, partial(fur.container, label, at, 0.0, world.seed))
+    at = np.array([spec.x1 + 0.08 * inner.size[0], (spec.y0 + spec.y1) / 2, SLAB])
+    turn = float(rng_for(world.seed, name, "crane").uniform(2.0, 4.2))
+    label = f"{name}/crane"
+    world.place(label, "crane", high, partial(fur.crane, label, at, turn, spec.wall_height + 9.0))
+    label, at = f"{name}/digger", inner.at(0.86, 0.12)
+    world.place(label, "digger", early, partial(fur.digger, label, at, 2.3))
 
 
 def renewal(world: World, name: str, rect: Rect) -> None:
@@ -464,15 +455,12 @@ def renewal(world: World, name: str, rect: Rect) -> None:
     floors = {"house": "slabs", "rubble": "soil", "park": "car_park"}
     world.add(f"{name}/floor", "ground", [floors[s] for s in steps],
               lambda s: _floor(name, left, s))  # fmt: skip
-    for p, stage in enumerate(steps):
-        if stage == "park":
-            here = ["there" if q == p else None for q in range(world.periods)]
-            for k in range(int((left.size[0] - 1) // 2.6)):
-                if rng.random() < 0.55:
-                    at = np.array([left.x0 + 1.35 + 2.6 * k, left.y0 + 2.5, SLAB])
-                    label = f"{name}/visitor_{p}{k}"
-                    world.add(label, "car", here,
-                              lambda _, n=label, a=at: fur.car(n, a, np.pi / 2, world.seed))  # fmt: skip
+    parked = [s == "park" for s in steps]
+    for k in range(int((left.size[0] - 1) // 2.6)):
+        here = [p and bool(rng.random() < 0.55) for p in parked]
+        at = np.array([left.x0 + 1.35 + 2.6 * k, left.y0 + 2.5, SLAB])
+        label = f"{name}/visitor_{k}"
+        world.place(label, "car", here, partial(fur.car, label, at, np.pi / 2, world.seed))
     _lawn(world, name, right)
     house = Building(
         f"{name}/house", right.x0 + 1.0, right.y0 + 0.3 * dy, right.x1 - 0.5, right.y1 - 1.0,
@@ -499,15 +487,15 @@ def suburb(world: World, name: str, rect: Rect) -> None:
             spec = Building(
                 f"{name}/villa_{i}{j}", x, y, x + w, y + d, int(rng.integers(1, 4)),
                 str(rng.choice(["gable", "hip"])), str(rng.choice(["plaster", "brick"])),
-                ground=3.0, simple=True,
+                ground=3.0, simple=not world.near,
             )  # fmt: skip
-            world.always(spec.name, "building", lambda s=spec: finished(s, world.seed))
-            at = plot.at(0.86, float(rng.uniform(0.2, 0.8)))
-            label = f"{name}/tree_{i}{j}"
-            size = float(rng.uniform(5, 9))
-            states = [light.season for light in world.lights]
-            world.add(label, "tree", states,
-                      lambda s, n=label, a=at, h=size: tree(n, a, h, s, world.seed, detail=1))  # fmt: skip
+            world.always(spec.name, "building", partial(finished, spec, world.seed))
+            at, label = plot.at(0.86, float(rng.uniform(0.2, 0.8))), f"{name}/tree_{i}{j}"
+            height = float(rng.uniform(5, 9))
+            world.add(
+                label, "tree", [(height, season) for season in world.seasons],
+                partial(grown, label, at, world.seed, 2 if world.near else 1),
+            )  # fmt: skip
 
 
 def _scatter_trees(
@@ -531,7 +519,7 @@ def _scatter_trees(
 
 
 def _bench(world: World, name: str, at: Array, turn: float) -> None:
-    world.always(name, "bench", lambda: fur.bench(name, at, turn))
+    world.always(name, "bench", partial(fur.bench, name, at, turn))
 
 
 def _unit2(v: Array) -> Array:

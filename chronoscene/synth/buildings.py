@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +106,7 @@ def frame(spec: Building, storeys: int, seed: int) -> Part:
     xs = np.linspace(spec.x0 + 0.4, spec.x1 - 0.8, max(3, round(dx / 5)))
     ys = np.linspace(spec.y0 + 0.4, spec.y1 - 0.8, max(3, round(dy / 5)))
     grid = np.stack(np.meshgrid(xs, ys, indexing="ij"), -1).reshape(-1, 2)
-    for low, high in zip(levels[:-1], levels[1:], strict=True):
+    for low, high in pairwise(levels):
         base = np.column_stack([grid, np.full(len(grid), low + 0.02)])
         b.boxes(base, [0.4, 0, 0], [0, 0.4, 0], (high - low - 0.32) * Z, concrete)
     core = [spec.x0 + 0.42 * dx, spec.y0 + 0.38 * dy, SLAB + 0.3]

@@ -16,7 +16,7 @@ from chronoscene.synth.settings import SynthSettings
 from chronoscene.synth.world import World
 
 Array = NDArray[np.float64]
-ROAD = 11.0
+ROAD = 9.6
 """Width of roads with parked cars on both sides, metres."""
 
 
@@ -54,6 +54,7 @@ def make_world(settings: SynthSettings) -> World:
     n = settings.blocks
     core = np.array([[plan.x[1, 0], plan.y[1, 0]], [plan.x[n, 1], plan.y[n, 1]]])
     world = World(settings.seed, make_lights(settings.seed, settings.periods), core)
+    world.near = settings.kind == "street"
     road_network(world, plan.x, plan.y, ROAD)
     for (column, row), role in _roles(settings).items():
         name = f"block_{column}{row}"

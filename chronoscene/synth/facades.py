@@ -127,7 +127,7 @@ def facade(
         b.quads(wall.at(0, 0), width * along, height * Z, front.wall, frame=wall.frame)
         return
     pitch = width / bays
-    centres = (np.arange(bays) + 0.5) * pitch
+    centres = np.linspace(0.5 * pitch, width - 0.5 * pitch, bays)
     if simple:
         b.quads(wall.at(0, 0), width * along, height * Z, front.wall, frame=wall.frame)
         _flat_windows(b, front, wall, centres, storeys, pitch)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,12 +83,12 @@ def _held_out(count: int, rng: np.random.Generator) -> set[int]:
     """One random view in each of equal parts of a flight."""
     number = max(1, round(TEST_SHARE * count))
     cuts = np.linspace(0, count, number + 1)
-    return {int(rng.integers(np.ceil(a), np.ceil(b))) for a, b in zip(cuts, cuts[1:], strict=False)}
+    return {int(rng.integers(np.ceil(a), np.ceil(b))) for a, b in pairwise(cuts)}
 
 
 def _flight(world: World, count: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
     """Two orbits at different heights and an oblique grid."""
-    half = np.abs(world.core).max()
+    half = float(np.abs(world.core).max())
     shares = [round(0.42 * count), round(0.24 * count)]
     high = rng.uniform(0.66, 0.84) * half
     low = rng.uniform(0.46, 0.58) * half
@@ -134,7 +135,7 @@ def _grid(
         heading = turn + (np.pi if row % 2 else 0) + rng.uniform(-0.5, 0.5)
         # Away from the edge: what lies outside of the core is seen by few.
         toward = -f * 1.1 + 0.25 * np.array([np.cos(heading), np.sin(heading)])
-        toward = toward / max(np.linalg.norm(toward), 1e-6)
+        toward = toward / max(float(np.linalg.norm(toward)), 1e-6)
         z = height * rng.uniform(0.92, 1.08)
         ahead = z * rng.uniform(0.45, 0.95)
         eye = np.array([*place, max(9.0, z)])

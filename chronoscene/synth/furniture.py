@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -172,7 +174,7 @@ def fence(name: str, points: list[tuple[float, float]], z: float) -> Part:
     b = PartBuilder(key_number(name))
     post = pal.plain_style(b, srgb(120, 120, 118))
     board = pal.sheet_style(b, srgb(196, 198, 194), 0.25, False)
-    for (x0, y0), (x1, y1) in zip(points[:-1], points[1:], strict=True):
+    for (x0, y0), (x1, y1) in pairwise(points):
         start, along = np.array([x0, y0, z]), np.array([x1 - x0, y1 - y0, 0.0])
         length = float(np.linalg.norm(along))
         u = along / length

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -10,12 +12,12 @@ from chronoscene.synth.buildings import SLAB, Building, finished
 from chronoscene.synth.mesh import Part, PartBuilder, srgb
 from chronoscene.synth.seeds import key_number, rng_for
 from chronoscene.synth.textures import FIELDS, PAVING
-from chronoscene.synth.vegetation import tree
+from chronoscene.synth.vegetation import grown
 from chronoscene.synth.world import World
 
 Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
-PARKING = 2.1
+PARKING = 2.0
 """Width of the parking lane at each side of a road."""
 FAR = 900.0
 """Half the extent of the countryside."""
@@ -67,7 +69,7 @@ def pavement(name: str, low: Array, high: Array, ring: float, seed: int) -> Part
     edge = 0.18
     up = SLAB * Z
     o = np.array([low[0], low[1], 0.0])
-    for corner, along in ((o, dx * X), (o + dx * X, dy * Y), (o + [dx, dy, 0], -dx * X),
+    for corner, along in ((o, dx * X), (o + dx * X, dy * Y), (o + dx * X + dy * Y, -dx * X),
                           (o + dy * Y, -dy * Y)):  # fmt: skip
         u = along / np.linalg.norm(along)
         inwards = np.cross(Z, u)
@@ -98,13 +100,9 @@ def surroundings(world: World, xs: Array, ys: Array) -> None:
         else:
             base = np.array([*at, z - 0.3])
             height = float(rng.uniform(7, 15))
-            states = [light.season for light in world.lights]
-            world.add(
-                f"far_tree_{i}", "tree", states,
-                lambda s, i=i, base=base, h=height: tree(
-                    f"far_tree_{i}", base, h, s, world.seed, detail=0
-                ),
-            )  # fmt: skip
+            states = [(height, season) for season in world.seasons]
+            label = f"far_tree_{i}"
+            world.add(label, "tree", states, partial(grown, label, base, world.seed, 0))
 
 
 def _farm(world: World, name: str, at: Array, z: float, rng: np.random.Generator) -> None:
@@ -149,8 +147,9 @@ def _terrain(hills: _Hills) -> Part:
     flat = xy.reshape(-1, 2)
     z = hills.height(flat)
     e = 2.0
-    sx = (hills.height(flat + [e, 0]) - hills.height(flat - [e, 0])) / (2 * e)
-    sy = (hills.height(flat + [0, e]) - hills.height(flat - [0, e])) / (2 * e)
+    east, north = np.array([e, 0]), np.array([0, e])
+    sx = (hills.height(flat + east) - hills.height(flat - east)) / (2 * e)
+    sy = (hills.height(flat + north) - hills.height(flat - north)) / (2 * e)
     normals = np.stack([-sx, -sy, np.ones_like(sx)], axis=1)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = np.column_stack([flat, z])

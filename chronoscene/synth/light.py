@@ -39,6 +39,8 @@ class Light:
     exposure: float
     white: Color
     """Factors of the camera's white balance."""
+    sky_seed: int = 0
+    """Other clouds."""
 
     @property
     def direction(self) -> Array:
@@ -49,28 +51,28 @@ class Light:
 
 MOODS: tuple[Light, ...] = (
     Light(
-        "summer noon", "summer", -60.0, 54.0, (1.95, 1.85, 1.65), (0.16, 0.30, 0.62),
-        (0.50, 0.60, 0.70), 0.30, 1 / 2600, 0.80, (1.0, 1.0, 1.0),
+        "summer noon", "summer", -60.0, 54.0, (1.95, 1.86, 1.68), (0.13, 0.27, 0.60),
+        (0.50, 0.61, 0.72), 0.45, 1 / 2600, 0.74, (1.0, 1.0, 1.0),
     ),
     Light(
-        "warm evening", "summer", -158.0, 21.0, (2.25, 1.20, 0.50), (0.12, 0.17, 0.34),
-        (0.62, 0.42, 0.27), 0.35, 1 / 1000, 0.92, (1.05, 0.98, 0.86),
+        "warm evening", "summer", -158.0, 20.0, (2.60, 1.45, 0.62), (0.11, 0.17, 0.36),
+        (0.66, 0.47, 0.33), 0.55, 1 / 1500, 1.08, (1.05, 0.98, 0.86),
     ),
     Light(
-        "cool autumn morning", "autumn", 25.0, 27.0, (1.10, 1.15, 1.25), (0.20, 0.29, 0.45),
-        (0.45, 0.52, 0.60), 0.55, 1 / 1100, 0.62, (0.90, 0.99, 1.14),
+        "cool autumn morning", "autumn", 25.0, 27.0, (1.35, 1.38, 1.45), (0.24, 0.34, 0.52),
+        (0.52, 0.60, 0.68), 0.65, 1 / 1300, 0.86, (0.91, 0.99, 1.13),
     ),
     Light(
         "overcast spring", "spring", 95.0, 48.0, (0.35, 0.34, 0.33), (0.62, 0.66, 0.70),
-        (0.58, 0.61, 0.64), 0.95, 1 / 900, 0.98, (0.97, 1.0, 1.03),
+        (0.58, 0.61, 0.64), 0.95, 1 / 900, 1.10, (0.97, 1.0, 1.03),
     ),
     Light(
-        "winter noon", "winter", -95.0, 19.0, (1.75, 1.50, 1.15), (0.16, 0.26, 0.50),
-        (0.50, 0.55, 0.62), 0.20, 1 / 1600, 1.05, (0.98, 1.0, 1.05),
+        "winter noon", "winter", -95.0, 19.0, (1.95, 1.66, 1.28), (0.16, 0.26, 0.50),
+        (0.50, 0.55, 0.62), 0.35, 1 / 1600, 1.10, (0.98, 1.0, 1.05),
     ),
     Light(
-        "spring morning", "spring", 40.0, 37.0, (1.95, 1.70, 1.35), (0.16, 0.28, 0.56),
-        (0.52, 0.58, 0.62), 0.45, 1 / 1700, 0.72, (1.02, 1.0, 0.97),
+        "spring morning", "spring", 40.0, 37.0, (1.95, 1.70, 1.35), (0.15, 0.28, 0.58),
+        (0.52, 0.58, 0.64), 0.50, 1 / 1700, 0.76, (1.02, 1.0, 0.97),
     ),
 )  # fmt: skip
 """Moods in the order that periods take them: neighbours differ in every respect."""
@@ -99,6 +101,7 @@ def make_lights(seed: int, periods: int) -> list[Light]:
                 mood.haze,
                 round(mood.exposure * float(rng.uniform(0.94, 1.06)), 3),
                 mood.white,
+                100 * (p + 1) + seed % 89,
             )
         )
     return lights
@@ -115,6 +118,7 @@ class SkyArgs(NamedTuple):
     haze: float
     exposure: float
     white: Array
+    sky_seed: int
 
 
 def sky_args(light: Light) -> SkyArgs:
@@ -128,6 +132,7 @@ def sky_args(light: Light) -> SkyArgs:
         light.haze,
         light.exposure,
         np.array(light.white),
+        light.sky_seed,
     )
 
 
@@ -135,24 +140,25 @@ def sky_args(light: Light) -> SkyArgs:
 def sky_radiance(dx, dy, dz, a, detail):  # type: ignore[no-untyped-def]
     """Radiance of the sky in a unit direction; ``detail`` False leaves the clouds out."""
     up = max(dz, 0.0)
-    t = 1.0 - math.exp(-3.2 * up)
+    t = 1.0 - math.exp(-4.5 * up)
     r = a.horizon[0] + (a.zenith[0] - a.horizon[0]) * t
     g = a.horizon[1] + (a.zenith[1] - a.horizon[1]) * t
     b = a.horizon[2] + (a.zenith[2] - a.horizon[2]) * t
-    towards = dx * a.direction[0] + dy * a.direction[1] + dz * a.direction[2]
-    glow = 0.22 * max(towards, 0.0) ** 6 + 0.35 * max(towards, 0.0) ** 60
+    towards = max(0.0, dx * a.direction[0] + dy * a.direction[1] + dz * a.direction[2])
+    sharp = towards * towards * towards
+    sharp *= sharp
+    wide, sharp = 0.10 * sharp, 0.30 * sharp**8
+    glow = wide + sharp
     r, g, b = r + glow * a.sun[0], g + glow * a.sun[1], b + glow * a.sun[2]
-    cover = 0.55 * a.cloud
-    if detail and up > 0.015:
+    # Below the clouds of a grey day little of the blue is left.
+    cover, white = 0.6 * a.cloud * a.cloud, 0.62
+    if detail and up > 0.01:
         px, py = dx / (up + 0.12), dy / (up + 0.12)
-        n = fbm(px, py, 0.9, 5, 77, 0.004) + 0.35 * fbm(px, py, 3.1, 2, 78, 0.01)
-        edge = 0.75 - 1.1 * a.cloud
-        cover = smooth(edge, edge + 0.55, n) * smooth(0.015, 0.12, up) * 0.85
-        white = 0.42 + 0.22 * n
-    else:
-        white = 0.45
-    lum = 0.30 * a.horizon[0] + 0.6 * a.horizon[1] + 0.1 * a.horizon[2]
-    cr = white * (0.38 * a.sun[0] + 0.55 * a.horizon[0] + 0.5 * lum)
-    cg = white * (0.38 * a.sun[1] + 0.55 * a.horizon[1] + 0.5 * lum)
-    cb = white * (0.38 * a.sun[2] + 0.55 * a.horizon[2] + 0.5 * lum)
+        n = fbm(px, py, 1.1, 6, a.sky_seed, 0.004) + 0.3 * fbm(px, py, 3.3, 2, a.sky_seed + 7, 0.01)
+        edge = 0.42 - 0.95 * a.cloud
+        cover = smooth(edge, edge + 0.45, n) * smooth(0.01, 0.10, up) * 0.9
+        white = 0.80 - 0.45 * smooth(edge + 0.2, edge + 0.8, n)
+    cr = white * (0.36 * a.sun[0] + 0.75 * a.horizon[0])
+    cg = white * (0.36 * a.sun[1] + 0.75 * a.horizon[1])
+    cb = white * (0.36 * a.sun[2] + 0.75 * a.horizon[2])
     return r + (cr - r) * cover, g + (cg - g) * cover, b + (cb - b) * cover

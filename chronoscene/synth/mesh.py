@@ -23,6 +23,14 @@ PATCH_WIDTH = 12
 """Patch row: origin (0..2), u axis (3..5), v axis (6..8), extents along u and v (9, 10), free."""
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Cross product along the last axis; numpy's own spends its time on general axes."""
+    x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    z = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return np.stack([x, y, z], axis=-1)
+
+
 def srgb(red: float, green: float, blue: float) -> Color:
     """Linear colour of an sRGB triple 0..255."""
     c = np.array([red, green, blue]) / 255.0
@@ -120,16 +128,18 @@ class PartBuilder:
                 texture otherwise, starting at its corner.
             seed: Varies the texture.
         """
-        o, u, v = np.broadcast_arrays(np.atleast_2d(np.asarray(corner, np.float64)), edge_u, edge_v)
+        o = np.atleast_2d(np.asarray(corner, np.float64))
+        u = np.broadcast_to(np.asarray(edge_u, np.float64), o.shape)
+        v = np.broadcast_to(np.asarray(edge_v, np.float64), o.shape)
         if len(o) == 0:
             return
         quad = np.stack([o, o + u, o + u + v, o + v], axis=1)
-        normal = np.cross(u, v)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        normal = cross(u, v)
+        normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
         tris = quad[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
         self._append(tris, np.repeat(normal, 2, axis=0)[:, None].repeat(3, axis=1))
         if frame is None:
-            lengths = np.stack([np.linalg.norm(u, axis=1), np.linalg.norm(v, axis=1)], axis=1)
+            lengths = np.sqrt(np.stack([(u * u).sum(axis=1), (v * v).sum(axis=1)], axis=1))
             axes = np.concatenate([o, u / lengths[:, :1], v / lengths[:, 1:], lengths], axis=1)
             self._add_patches(axes, style, seed, per_patch=2, own_texture=True)
         else:
@@ -179,12 +189,12 @@ class PartBuilder:
         """Add a convex polygon, counter-clockwise seen from outside. [K, 3]"""
         p = np.asarray(points, np.float64)
         tris = np.stack([np.stack([p[0], p[i], p[i + 1]]) for i in range(1, len(p) - 1)])
-        normal = np.cross(p[1] - p[0], p[2] - p[0])
+        normal = cross(p[1] - p[0], p[2] - p[0])
         normal /= np.linalg.norm(normal)
         self._append(tris, np.broadcast_to(normal, tris.shape))
         if frame is None:
             u = (p[1] - p[0]) / np.linalg.norm(p[1] - p[0])
-            frame = (p[0], u, np.cross(normal, u))
+            frame = (p[0], u, cross(normal, u))
         self._add_patches(_frame_row(frame, p), style, seed, per_patch=len(tris))
 
     def triangles(

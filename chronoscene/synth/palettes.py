@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TypeVar
+
 import numpy as np
 
 from chronoscene.synth.mesh import Color, PartBuilder, srgb
@@ -22,6 +25,8 @@ from chronoscene.synth.textures import (
     TILES,
     WOOD,
 )
+
+T = TypeVar("T")
 
 PLASTERS = (
     srgb(214, 186, 132), srgb(226, 212, 178), srgb(196, 205, 178), srgb(222, 176, 158),
@@ -85,9 +90,9 @@ DARK = srgb(34, 34, 36)
 WHITE = srgb(232, 230, 224)
 
 
-def pick(rng: np.random.Generator, options: tuple) -> tuple:  # type: ignore[type-arg]
+def pick(rng: np.random.Generator, options: Sequence[T]) -> T:
     """One of the options."""
-    return options[int(rng.integers(len(options)))]  # type: ignore[no-any-return]
+    return options[int(rng.integers(len(options)))]
 
 
 def tint(rng: np.random.Generator, color: Color, amount: float = 0.08) -> Color:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -93,22 +94,22 @@ class PeriodRenderer:
         self._scene = o3d.t.geometry.RaycastingScene()
         corners = np.ascontiguousarray(part.vertices.reshape(-1, 3))
         index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-        self._scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(index))
+        self._scene.add_triangles(_tensor(corners), _tensor(index))
 
     def cast(self, rays: NDArray[np.float32]) -> Hits:
         """First hits of rays (origin, direction). [n, 6]"""
-        found = self._scene.cast_rays(o3d.core.Tensor(rays))
+        found = self._scene.cast_rays(_tensor(rays))
         return Hits(
             found["t_hit"].numpy(), found["primitive_ids"].numpy(), found["primitive_uvs"].numpy()
         )
 
     def occluded(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Whether rays hit anything. [n]"""
-        return np.asarray(self._scene.test_occlusions(o3d.core.Tensor(rays)).numpy(), bool)
+        return np.asarray(self._scene.test_occlusions(_tensor(rays)).numpy(), np.bool_)
 
     def clearance(self, points: Array) -> Array:
         """Distance from points [n, 3] to the nearest surface. [n]"""
-        query = o3d.core.Tensor(np.asarray(points, np.float32))
+        query = _tensor(np.asarray(points, np.float32))
         return np.asarray(self._scene.compute_distance(query).numpy(), np.float64)
 
     def coarse_depth(self, camera: Camera, cam_from_world: Array) -> NDArray[np.float32]:
@@ -148,7 +149,7 @@ class PeriodRenderer:
 
     def surface_near(self, points: Array) -> NDArray[np.uint32]:
         """Triangles that pass through points, `MISS` where none is within a millimetre. [n]"""
-        query = o3d.core.Tensor(np.asarray(points, np.float32))
+        query = _tensor(np.asarray(points, np.float32))
         found = self._scene.compute_closest_points(query)
         gap = np.linalg.norm(found["points"].numpy() - points, axis=1)
         limit = 1e-3 + 2e-6 * np.abs(points).max(axis=1)
@@ -202,7 +203,7 @@ class PeriodRenderer:
         hits = self.cast(rays)
         lit = self._lit(rays, hits, 1)
         means = _mean_albedo(self.tables.styles)
-        return probe_values(  # type: ignore[no-any-return]
+        return probe_values(
             rays, hits.t, hits.tri, hits.uv, lit, self.tables, means, self._sky, PROBE_RAYS
         )
 
@@ -211,7 +212,7 @@ class PeriodRenderer:
         towards, need = shadow_rays(
             rays, hits.t, hits.tri, hits.uv, self.tables, self._sky.direction, SUN_SPREAD, count
         )
-        lit = np.zeros(len(need), bool)
+        lit = np.zeros(len(need), np.bool_)
         lit[need] = ~self.occluded(np.ascontiguousarray(towards[need]))
         return lit
 
@@ -220,10 +221,15 @@ class PeriodRenderer:
     ) -> NDArray[np.uint8]:
         hits = self.cast(rays)
         lit = self._lit(rays, hits, per_pixel)
-        return shade(  # type: ignore[no-any-return]
+        return shade(
             rays, hits.t, hits.tri, hits.uv, lit, self.tables, self._sky, self.probes, per_pixel,
             fw_unit,
         )  # fmt: skip
+
+
+def _tensor(array: Any) -> o3d.core.Tensor:
+
+    return o3d.core.Tensor(np.ascontiguousarray(array))  # type: ignore[call-overload]
 
 
 def _sphere(count: int) -> NDArray[np.float32]:

@@ -36,7 +36,7 @@ def flat_roof(
     roof = pal.flat_roof_style(b, rng)
     coping = pal.plain_style(b, srgb(170, 164, 154))
     h, t = float(rng.uniform(0.4, 0.9)), 0.3
-    inner = corner + [t, t, 0.05]
+    inner = corner + t * (X + Y) + 0.05 * Z
     b.quads(inner, (dx - 2 * t) * X, (dy - 2 * t) * Y, roof)
     rails = [
         (corner, dx * X, t * Y),
@@ -64,7 +64,7 @@ def _roof_boxes(
     cx, cy = dx / cols, dy / rows
     for i in range(cols):
         for j in range(rows):
-            o = corner + [i * cx + 0.7, j * cy + 0.7, 0]
+            o = corner + (i * cx + 0.7) * X + (j * cy + 0.7) * Y
             w, d, kind = cx - 1.4, cy - 1.4, rng.random()
             if kind < 0.12:
                 b.boxes(o, w * X, d * Y, 2.5 * Z, house, top=cover, bottom=False, seed=i + 9 * j)
@@ -72,12 +72,12 @@ def _roof_boxes(
                 s = rng.uniform(0.8, 1.6, 3)
                 b.boxes(o, min(w, s[0]) * X, min(d, s[1]) * Y, s[2] * Z, metal, seed=i + 9 * j)
                 fan = pal.plain_style(b, srgb(52, 54, 56))
-                b.boxes(o + [0.2, 0.2, s[2]], 0.5 * X, 0.5 * Y, 0.12 * Z, fan)
+                b.boxes(o + 0.2 * (X + Y) + s[2] * Z, 0.5 * X, 0.5 * Y, 0.12 * Z, fan)
             elif kind < 0.56:
                 up = 0.35 * d * Z
                 b.quads(o + 0.25 * Z, w * X, d * Y + up, solar, seed=i + 9 * j)
                 b.quads(o + 0.2 * Z, d * Y + up, w * X, metal, seed=i + 9 * j)
-                b.quads(o + [w, d, 0], -w * X, up + 0.2 * Z, metal)
+                b.quads(o + w * X + d * Y, -w * X, up + 0.2 * Z, metal)
             elif kind < 0.64:
                 b.boxes(o, 0.5 * X, 0.5 * Y, 1.3 * Z, house, bottom=False)
 

@@ -184,23 +184,29 @@ def _reflected(x, y, z, n, d, style, facing, lit, sky, probes):  # type: ignore[
 
 
 @njit(cache=True)
-def _sample(ray, t, tri, u, v, lit, tables, sky, probes, fw_unit):  # type: ignore[no-untyped-def]
-    """Radiance along one ray."""
-    length = math.sqrt(ray[3] ** 2 + ray[4] ** 2 + ray[5] ** 2)
-    d = (ray[3] / length, ray[4] / length, ray[5] / length)
-    if tri == MISS:
-        return sky_radiance(d[0], d[1], d[2], sky, True)
-    x, y, z = ray[0] + t * float(ray[3]), ray[1] + t * float(ray[4]), ray[2] + t * float(ray[5])
-    gx, gy, gz, sx, sy, sz = _normals(tables, tri, u, v, d[0], d[1], d[2])
-    distance = t * length
-    slant = max(0.25, abs(gx * d[0] + gy * d[1] + gz * d[2]))
-    fw = max(1e-4, fw_unit * distance / math.sqrt(slant))
-    base = surface_albedo(tables, tri, x, y, z, fw)
+def _base(ray, t, tri, u, v, tables, fw_unit):  # type: ignore[no-untyped-def]
+    """Albedo of a hit for samples of the given width at unit distance."""
+    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    gx, gy, gz, _, _, _ = _normals(tables, tri, u, v, dx, dy, dz)
+    slant = max(0.25, abs(gx * dx + gy * dy + gz * dz) / length)
+    fw = max(1e-4, fw_unit * t * length / math.sqrt(slant))
+    return surface_albedo(tables, tri, ray[0] + t * dx, ray[1] + t * dy, ray[2] + t * dz, fw)
+
+
+@njit(cache=True)
+def _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes):  # type: ignore[no-untyped-def]
+    """Radiance along a ray that hit a surface of albedo ``base``; ``lit`` is 0..1."""
+    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    d = (dx / length, dy / length, dz / length)
+    x, y, z = ray[0] + t * dx, ray[1] + t * dy, ray[2] + t * dz
+    gx, gy, gz, sx, sy, sz = _normals(tables, tri, u, v, dx, dy, dz)
     style = tables.styles[tables.patch_style[tables.tri_patch[tri]]]
-    if style[22] <= 0.0 and sx * gx + sy * gy + sz * gz < 0.0:
+    through = style[22]
+    if through <= 0.0 and sx * gx + sy * gy + sz * gz < 0.0:
         sx, sy, sz = -sx, -sy, -sz  # the back of an open sheet
     facing = sx * sky.direction[0] + sy * sky.direction[1] + sz * sky.direction[2]
-    through = style[22]
     flat = gx * sky.direction[0] + gy * sky.direction[1] + gz * sky.direction[2]
     if through > 0.0:
         # Leaves scatter forward as well: light wraps around the crown.
@@ -215,9 +221,34 @@ def _sample(ray, t, tri, u, v, lit, tables, sky, probes, fw_unit):  # type: igno
     if style[20] > 0.0:
         mr, mg, mb, s = _reflected(ox, oy, oz, (gx, gy, gz), d, style, flat, lit, sky, probes)
         r, g, b = r * (1.0 - s) + mr, g * (1.0 - s) + mg, b * (1.0 - s) + mb
-    air = math.exp(-sky.haze * distance)
+    air = math.exp(-sky.haze * t * length)
     hr, hg, hb = sky_radiance(d[0], d[1], 0.02, sky, False)
     return r * air + hr * (1.0 - air), g * air + hg * (1.0 - air), b * air + hb * (1.0 - air)
+
+
+@njit(cache=True)
+def _sample(ray, t, tri, u, v, lit, tables, sky, probes, fw_unit):  # type: ignore[no-untyped-def]
+    """Radiance along one ray."""
+    if tri == MISS:
+        dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        return sky_radiance(dx / length, dy / length, dz / length, sky, True)
+    base = _base(ray, t, tri, u, v, tables, fw_unit)
+    return _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes)
+
+
+@njit(cache=True)
+def _uniform(tri, first, end, tables):  # type: ignore[no-untyped-def]
+    """Whether all samples of a pixel lie on one opaque patch."""
+    if tri[first] == MISS:
+        return False
+    patch = tables.tri_patch[tri[first]]
+    if tables.styles[tables.patch_style[patch], 22] > 0.0:
+        return False
+    for i in range(first + 1, end):
+        if tri[i] == MISS or tables.tri_patch[tri[i]] != patch:
+            return False
+    return True
 
 
 @njit(cache=True)
@@ -248,13 +279,34 @@ def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # ty
     out = np.empty((len(t) // per_pixel, 3), np.uint8)
     for pixel in prange(len(out)):
         r, g, b = 0.0, 0.0, 0.0
-        for i in range(pixel * per_pixel, (pixel + 1) * per_pixel):
-            c = _sample(
-                rays[i], float(t[i]), tri[i], float(uv[i, 0]), float(uv[i, 1]),
-                1.0 if lit[i] else 0.0, tables, sky, probes, fw_unit,
+        first, end = pixel * per_pixel, (pixel + 1) * per_pixel
+        if per_pixel > 1 and _uniform(tri, first, end, tables):
+            # Textures are filtered, so two samples on a diagonal are enough on one patch.
+            last, sun = end - 1, 0.0
+            for i in range(first, end):
+                sun += 1.0 if lit[i] else 0.0
+            u0, v0, u1, v1 = uv[first, 0], uv[first, 1], uv[last, 0], uv[last, 1]
+            wide = fw_unit * math.sqrt(0.5 * per_pixel)
+            a0 = _base(rays[first], float(t[first]), tri[first], u0, v0, tables, wide)
+            a1 = _base(rays[last], float(t[last]), tri[last], u1, v1, tables, wide)
+            base = (0.5 * (a0[0] + a1[0]), 0.5 * (a0[1] + a1[1]), 0.5 * (a0[2] + a1[2]))
+            c = _radiance(
+                rays[first], float(t[first]), tri[first], u0, v0, sun / per_pixel, base, tables,
+                sky, probes,
             )  # fmt: skip
-            # A cap keeps one bright sample from whitening an edge.
-            r, g, b = r + min(c[0], 6.0), g + min(c[1], 6.0), b + min(c[2], 6.0)
+            r, g, b = (
+                per_pixel * min(c[0], 6.0),
+                per_pixel * min(c[1], 6.0),
+                per_pixel * min(c[2], 6.0),
+            )
+        else:
+            for i in range(first, end):
+                c = _sample(
+                    rays[i], float(t[i]), tri[i], uv[i, 0], uv[i, 1],
+                    1.0 if lit[i] else 0.0, tables, sky, probes, fw_unit,
+                )  # fmt: skip
+                # A cap keeps one bright sample from whitening an edge.
+                r, g, b = r + min(c[0], 6.0), g + min(c[1], 6.0), b + min(c[2], 6.0)
         gain = sky.exposure / per_pixel
         out[pixel, 0] = int(255.0 * _tone(r * gain * sky.white[0]) + 0.5)
         out[pixel, 1] = int(255.0 * _tone(g * gain * sky.white[1]) + 0.5)

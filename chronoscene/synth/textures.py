@@ -43,8 +43,8 @@ def _plaster(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Plaster with a dirty base and spots where it came off (c1). Numbers: wear, storey, rows."""
     c0, c1, c2 = _colors(s)
     color = _weather(c0, u, v, seed, fw, 0.22)
-    worn = smooth(0.62 - 0.5 * s[10], 0.68 - 0.5 * s[10], fbm(u, v, 1.7, 4, seed + 21, fw) + 0.25)
-    color = mix(color, c1, 0.75 * worn)
+    worn = smooth(0.72 - 0.4 * s[10], 0.84 - 0.4 * s[10], fbm(u, v, 1.3, 5, seed + 21, fw) + 0.25)
+    color = mix(color, c1, 0.6 * worn)
     base = math.exp(-max(v, 0.0) / 0.5) * (0.8 + 0.5 * fbm(u, v, 0.9, 3, seed + 22, fw))
     color = mix(color, c2, min(0.55, max(0.0, 0.5 * base)))
     if s[11] > 0.0:  # a painted line under each storey
@@ -78,7 +78,8 @@ def _panel(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     c0, c1, c2 = _colors(s)
     col, row = math.floor(u / s[10]), math.floor(v / s[11])
     seen = fade(min(s[10], s[11]), fw)
-    color = mix(c0, c1, 1.0 if hash01(col, row, seed + 3) < s[12] else 0.0)
+    accent = hash01(0, row // 2, seed + 3) < s[12] or hash01(col, 0, seed + 4) < 0.4 * s[12]
+    color = mix(c0, c1, 1.0 if accent else 0.0)
     color = scaled(color, 1.0 + 0.22 * seen * (hash01(col, row, seed) - 0.5))
     joint = max(pulse(u + 0.015, s[10], 0.05, fw), pulse(v + 0.015, s[11], 0.05, fw))
     color = mix(color, c2, joint)
@@ -145,6 +146,8 @@ def _asphalt(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     c0, c1, paint = _colors(s)
     color = mix(c0, c1, smooth(-0.5, 0.6, fbm(u, v, 3.5, 6, seed, fw)))
     color = scaled(color, 1.0 + 0.25 * fbm(u, v, 0.12, 2, seed + 1, fw))
+    grain = hash01(math.floor(u / 0.025), math.floor(v / 0.025), seed + 8) - 0.5
+    color = scaled(color, 1.0 + 0.3 * grain * fade(0.03, fw))
     # Repairs: rectangles of newer asphalt, and cracks along a line of the noise.
     cu, cv = math.floor(u / 5.3), math.floor(v / 2.9)
     if hash01(cu, cv, seed + 2) < 0.28:

@@ -8,17 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.synth import palettes as pal
-from chronoscene.synth.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.mesh import Part, PartBuilder, cross, srgb
 from chronoscene.synth.seeds import key_number, rng_for
 
 Array = NDArray[np.float64]
+Z = np.array([0.0, 0.0, 1.0])
 
 
 @cache
 def icosphere(level: int) -> tuple[Array, NDArray[np.int64]]:
     """Unit sphere of 20 * 4**level triangles. [V, 3], [F, 3]"""
     g = (1 + 5**0.5) / 2
-    v = [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g)]
+    v: list[tuple[float, float, float]] = [
+        (-1, g, 0),
+        (1, g, 0),
+        (-1, -g, 0),
+        (1, -g, 0),
+        (0, -1, g),
+        (0, 1, g),
+    ]
     v += [(0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)]
     f = [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4)]
     f += [(11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8)]
@@ -76,7 +84,7 @@ def leaves(
     out = _unit(rng.normal(0, 1, (count, 3)))
     at = center + radii * out * rng.uniform(0.9, 1.18, (count, 1))
     e = _unit(rng.normal(0, 1, (count, 3)) + 0.4 * out)
-    side = _unit(np.cross(e, rng.normal(0, 1, (count, 3))))
+    side = _unit(cross(e, rng.normal(0, 1, (count, 3))))
     s = size * rng.uniform(0.6, 1.4, (count, 1))
     tris = np.stack([at - 0.5 * s * e, at + 0.5 * s * e, at + 0.8 * s * side], axis=1)
     normals = _unit(0.8 * _unit(at - heart) + 0.4 * out + rng.normal(0, 0.2, out.shape))
@@ -120,8 +128,8 @@ def tree(name: str, base: Array, height: float, season: str, seed: int, *, detai
     bark = pal.plain_style(b, srgb(96, 78, 60), 0.5, 0.2)
     leaf = pal.leaf_style(b, season, species, 0.24 if detail == 2 else 0.5)
     lean = rng.normal(0, 0.03, 2) * height
-    top = base + [lean[0], lean[1], 0.75 * height]
-    trunk(b, base, top, 0.03 * height + 0.05, bark)
+    top = base + np.array([lean[0], lean[1], 0.75 * height])
+    trunk(b, base, top, 0.022 * height + 0.05, bark)
     if species == 2:
         _conifer(b, base, height, leaf, rng, detail)
     else:
@@ -134,10 +142,10 @@ def _conifer(
 ) -> None:
     """Tiers that get smaller towards the top."""
     tiers = (3, 5, 6)[detail]
-    heart = base + [0, 0, 0.4 * height]
+    heart = base + 0.4 * height * Z
     for i in range(tiers):
         f = i / tiers
-        center = base + [0, 0, height * (0.24 + 0.7 * f)]
+        center = base + height * (0.24 + 0.7 * f) * Z
         r = 0.24 * height * (1.05 - f)
         radii = np.array([r, r, 0.13 * height * (1.2 - 0.5 * f)])
         blob(b, center, radii, leaf, rng, level=min(detail, 2), heart=heart, rough=0.28)
@@ -157,22 +165,27 @@ def _broadleaf(
     slim: bool,
 ) -> None:
     """Blobs scattered in an ellipsoid around the upper stem."""
-    wide = (0.15 if slim else 0.27) * height
-    tall = (0.36 if slim else 0.27) * height
-    heart = base + [*(top - base)[:2], height - tall]
-    count = (3, 6, 11)[detail]
+    wide = (0.17 if slim else 0.36) * height
+    tall = (0.40 if slim else 0.35) * height
+    heart = np.array([top[0], top[1], base[2] + height - tall])
+    count = (3, 7, 13)[detail]
     for i in range(count):
-        out = _unit(rng.normal(0, 1, 3)) * rng.uniform(0.35, 0.72)
+        out = _unit(rng.normal(0, 1, 3)) * rng.uniform(0.5, 0.75)
         center = heart + out * [wide, wide, tall] if i else heart
         r = (0.62 if i == 0 else rng.uniform(0.36, 0.5)) * np.array([wide, wide, 0.85 * tall])
         r = np.maximum(r, 0.3 * wide)
         blob(b, center, r, leaf, rng, level=min(detail, 2), heart=heart)
         if detail == 2:
-            number = int(30 + 22 * min(4.0, r[0]))
+            number = int(40 + 30 * min(4.0, r[0]))
             leaves(b, center, r, leaf, rng, count=number, size=0.42, heart=heart)
 
 
-def hedge(name: str, low: Array, high: Array, season: str, seed: int) -> Part:
+def grown(name: str, base: Array, seed: int, detail: int, state: tuple[float, str]) -> Part:
+    """A tree in a state: height and season."""
+    return tree(name, base, state[0], state[1], seed, detail=detail)
+
+
+def hedge(name: str, low: Array, high: Array, seed: int, season: str) -> Part:
     """A row of blobs between two corners of a flat box."""
     rng = rng_for(seed, name, "hedge")
     b = PartBuilder(key_number(name))
@@ -183,11 +196,11 @@ def hedge(name: str, low: Array, high: Array, season: str, seed: int) -> Part:
         f = (i + 0.5) / count
         c = low + f * (high - low)
         c = np.array([c[0], c[1], low[2] + 0.45 + rng.uniform(-0.05, 0.08)])
-        blob(b, c, np.array([0.62, 0.62, 0.6]), leaf, rng, level=2, heart=c - [0, 0, 0.5])
+        blob(b, c, np.array([0.62, 0.62, 0.6]), leaf, rng, level=2, heart=c - 0.5 * Z)
         leaves(b, c, np.full(3, 0.62), leaf, rng, count=24, size=0.3, heart=c)
     return b.build()
 
 
 def _unit(v: Array) -> Array:
-    unit: Array = v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
+    unit: Array = v / np.sqrt(np.maximum((v * v).sum(axis=-1, keepdims=True), 1e-18))
     return unit

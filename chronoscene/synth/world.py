@@ -60,6 +60,8 @@ class World:
     lights: list[Light]
     core: Array
     """Rectangle of the city core: lowest and highest corner. [2, 2]"""
+    near: bool = False
+    """Whether cameras come close to the suburbs, which then need more detail."""
     roads: list[tuple[Array, Array]] = field(default_factory=list)
     """Centre lines of the core's roads, for walks. Each end [2]."""
     focus: list[Array] = field(default_factory=list)
@@ -105,9 +107,21 @@ class World:
                 known = [parts[s] for s in (before, after) if s is not None]
                 self.edits.append(_edit(p, name, kind, before, after, known))
 
+    def place(
+        self, name: str, kind: str, present: Sequence[bool], make: Callable[[], Part]
+    ) -> None:
+        """Add an object that looks the same in all periods in which it is there."""
+        if any(present):
+            self.add(name, kind, ["there" if p else None for p in present], lambda _: make())
+
     def always(self, name: str, kind: str, make: Callable[[], Part]) -> None:
         """Add an object that never changes."""
-        self.add(name, kind, ["same"] * self.periods, lambda _: make())
+        self.place(name, kind, [True] * self.periods, make)
+
+    @property
+    def seasons(self) -> list[str]:
+        """Season of each period."""
+        return [light.season for light in self.lights]
 
     def geometry(self, period: int) -> tuple[Part, NDArray[np.int32]]:
         """All geometry of a period and the identity number of each triangle's object."""
