@@ -1,0 +1,112 @@
+"""``chronoscene validate``: every problem of a scene folder."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import click
+
+from chronoscene.errors import ConfigError
+from chronoscene.validation.report import counts
+from chronoscene.validation.report_json import write_json
+from chronoscene.validation.report_text import write_text
+from chronoscene.validation.rule import choose_rules
+from chronoscene.validation.run import find_folders, validate_scene
+
+WRITERS = {"text": write_text, "json": write_json}
+
+NOT_VALID = 1
+"""Exit status when there are errors."""
+
+T = TypeVar("T")
+
+
+@click.command("validate")
+@click.argument("folder", type=click.Path(path_type=Path), metavar="DIR")
+@click.option(
+    "--format",
+    "output_format",
+    type=click.Choice(sorted(WRITERS)),
+    default="text",
+    show_default=True,
+    help="What to write.",
+)
+@click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead.")
+@click.option(
+    "--select", multiple=True, metavar="CODES", help="Run these rules only: CS201,CS3,split-line."
+)
+@click.option("--ignore", multiple=True, metavar="CODES", help="Leave these rules out.")
+@click.option("--strict", is_flag=True, help="Warnings make a scene not valid, too.")
+@click.option(
+    "--decode/--no-decode",
+    default=False,
+    show_default=True,
+    help="Decode all images: finds damaged pixels and copied images. Takes time.",
+)
+@click.pass_context
+def command(
+    context: click.Context,
+    folder: Path,
+    output_format: str,
+    out: Path | None,
+    select: tuple[str, ...],
+    ignore: tuple[str, ...],
+    strict: bool,
+    decode: bool,
+) -> None:
+    """Check a scene, or every scene in a folder, and report all problems.
+
+    Exit status: 0 valid, 1 there are errors (with --strict: or warnings), 2 there is no scene, or
+    wrong usage. DATASET.md lists the rules. Nothing is written into the scene.
+    """
+    rules = choose_rules(_codes(select), _codes(ignore))
+    reports = [
+        validate_scene(path, rules=rules, decode=decode, track=_progress)
+        for path in find_folders(folder)
+    ]
+    text = WRITERS[output_format](reports, strict=strict)
+    if out is None:
+        encoding = sys.stdout.encoding or "utf-8"
+        click.echo(text.encode(encoding, "backslashreplace").decode(encoding), nl=False)
+    else:
+        _write(out, click.unstyle(text))
+    total = counts(reports)
+    if total["error"] or (strict and total["warning"]):
+        context.exit(NOT_VALID)
+
+
+def _codes(values: Iterable[str]) -> list[str]:
+    """Options may be repeated, and each may have several codes with commas."""
+    return [code for value in values for code in value.split(",")]
+
+
+def _progress(items: Sequence[T], description: str) -> Iterator[T]:
+    """A bar on stderr, on a terminal only."""
+    if not sys.stderr.isatty() or not items:
+        yield from items
+        return
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    yield from track(items, description, console=console, transient=True)
+
+
+def _write(out: Path, text: str) -> None:
+    """Write under a temporary name and rename."""
+    temporary = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.replace(out)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise ConfigError(
+            f"--out {out}",
+            expected="a file that can be written",
+            found=error.strerror or "an error",
+            todo="choose another place",
+        ) from error

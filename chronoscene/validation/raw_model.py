@@ -1,0 +1,189 @@
+"""A COLMAP model as its files say it, with nothing checked or repaired.
+
+Unlike `chronoscene.colmap` this keeps what contradicts itself (two images of one name, tracks over
+missing images, poses that are not numbers), and reads each file by itself, so that one damaged
+file does not hide the problems in the others. No length in a file is trusted before it was compared
+with the size of the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.colmap import MODEL_FILES
+from chronoscene.colmap_records import check_records, read_points
+from chronoscene.errors import SceneError
+from chronoscene.scene import Camera
+
+FORMS = (".bin", ".txt")
+"""Suffixes of model files."""
+
+CAMERA_MODELS = (
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "EUCM",
+    "EQUIRECTANGULAR",
+)
+"""Names of COLMAP's camera models by their id."""
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Why a file of the model, or a line of it, cannot be read."""
+
+    file: str
+    """Name of the file, with a line number for text (``cameras.txt:3``)."""
+    expected: str
+    found: str
+
+
+class DamagedError(Exception):
+    """Carries damages out of a reader."""
+
+    def __init__(self, *damages: Damage) -> None:
+        super().__init__("; ".join(f"{d.file}: {d.found}" for d in damages))
+        self.damages = damages
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawImages:
+    """Registered images in the order of the file (I images, K keypoints)."""
+
+    ids: NDArray[np.int64]
+    """[I]"""
+    names: tuple[str, ...]
+    """Bytes that are not UTF-8 as lone surrogates, as Python has them in file names."""
+    quaternions: NDArray[np.float64]
+    """wxyz, as stored. [I, 4]"""
+    translations: NDArray[np.float64]
+    """[I, 3]"""
+    camera_ids: NDArray[np.int64]
+    """[I]"""
+    keypoint_start: NDArray[np.int64]
+    """Keypoints of image i are ``keypoint_start[i]:keypoint_start[i + 1]``. [I + 1]"""
+    keypoint_xy: NDArray[np.float64]
+    """Pixels. [K, 2]"""
+    keypoint_point: NDArray[np.int64]
+    """Point id, negative for none. [K]"""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawPoints:
+    """Sparse points sorted by id (P points, M observations)."""
+
+    ids: NDArray[np.int64]
+    """[P]"""
+    xyz: NDArray[np.float64]
+    """World units. [P, 3]"""
+    track_start: NDArray[np.int64]
+    """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
+    track_image: NDArray[np.int64]
+    """Image id. [M]"""
+    track_keypoint: NDArray[np.int64]
+    """Index among the keypoints of the image. [M]"""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True)
+class RawModel:
+    """The parts of a model; None for a part that is absent or damaged."""
+
+    folder: Path
+    files: dict[str, str]
+    """Stem to name of the file that counts, ``cameras`` to ``cameras.bin``; absent ones not."""
+    cameras: tuple[Camera, ...] | None
+    images: RawImages | None
+    points: RawPoints | None
+    damages: tuple[Damage, ...]
+
+
+def model_files(folder: Path) -> dict[str, str]:
+    """Which file counts for each stem. A complete binary model wins, then a complete text one."""
+    binary, text = (
+        {stem: stem + form for stem in MODEL_FILES if (folder / (stem + form)).is_file()}
+        for form in FORMS
+    )
+    for files in (binary, text):
+        if len(files) == len(MODEL_FILES):
+            return files
+    return {**text, **binary}
+
+
+def read_raw_model(folder: Path) -> RawModel:
+    """Read what can be read; never raises for what is in the files."""
+    from chronoscene.validation import raw_binary, raw_text  # they import this module
+
+    files = model_files(folder)
+    readers: dict[str, Callable[[Path], Any]] = {
+        "cameras.bin": raw_binary.read_cameras,
+        "images.bin": raw_binary.read_images,
+        "points3D.bin": _read_points,
+        "cameras.txt": raw_text.read_cameras,
+        "images.txt": raw_text.read_images,
+        "points3D.txt": raw_text.read_points,
+    }
+    parts: dict[str, Any] = {}
+    damages: list[Damage] = []
+    for stem, file in files.items():
+        try:
+            parts[stem] = readers[file](folder / file)
+        except DamagedError as error:
+            damages.extend(error.damages)
+        except (OSError, SceneError) as error:
+            damages.append(_damage(file, error))
+    damages.extend(_rig_damages(folder, files, damages))
+    cameras, images, points = (parts.get(stem) for stem in MODEL_FILES)
+    return RawModel(folder, files, cameras, images, points, tuple(damages))
+
+
+def _damage(file: str, error: OSError | SceneError) -> Damage:
+    if isinstance(error, SceneError):
+        return Damage(file, error.expected, error.found)
+    return Damage(file, "a file that can be read", error.strerror or "an error")
+
+
+def _read_points(path: Path) -> RawPoints:
+    records = read_points(path)
+    return RawPoints(
+        ids=records.heads["id"].astype(np.int64),
+        xyz=np.ascontiguousarray(records.heads["xyz"]),
+        track_start=records.track_start,
+        track_image=records.tracks[:, 0].astype(np.int64),
+        track_keypoint=records.tracks[:, 1].astype(np.int64),
+    )
+
+
+def _rig_damages(folder: Path, files: dict[str, str], damages: list[Damage]) -> list[Damage]:
+    """Damages of ``rigs.bin`` and ``frames.bin``, which binary models have since COLMAP 3.12."""
+    if files.get("cameras") != "cameras.bin" or any(d.file == "cameras.bin" for d in damages):
+        return []
+    try:
+        check_records(folder)
+    except SceneError as error:
+        return [_damage(Path(error.place).name, error)]
+    return []

@@ -1,0 +1,303 @@
+"""A scene folder as it lies on disk: read lazily, part by part, with nothing repaired.
+
+A part that cannot be had is None, and `RawScene.reason` says why; rules that need it are skipped
+with that reason. Nothing here raises for what is on the disk.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.colmap import MODEL_FILES
+from chronoscene.errors import SceneError
+from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name
+from chronoscene.scene import Camera
+from chronoscene.splits import (
+    IMAGE_SUFFIXES,
+    NameEntry,
+    Problem,
+    SplitEntry,
+    assign_periods,
+    assign_tests,
+    decode_text,
+    default_tests,
+    parse_split_text,
+    parse_test_text,
+)
+from chronoscene.validation.observations import Observations, observe
+from chronoscene.validation.pixels import (
+    Header,
+    Pixels,
+    hash_files,
+    read_headers,
+    read_pixels,
+)
+from chronoscene.validation.raw_model import FORMS, RawImages, RawModel, RawPoints, read_raw_model
+
+T = TypeVar("T")
+Track = Callable[[Sequence[T], str], Iterable[T]]
+"""Passes items on and shows how far it is, under a description."""
+
+MODEL_PLACES = (MODEL, "sparse", "colmap/sparse/0", "dense/sparse", "dense/0/sparse", "")
+"""Where a model is looked for; only the first is right."""
+
+LARGEST_SIDE = 10**6
+"""Pixels; a camera that claims more is a damaged record."""
+
+_REASONS = {
+    "model": f"there is no COLMAP model in {MODEL}",
+    "cameras": "the cameras of the model cannot be read",
+    "images": "the images of the model cannot be read",
+    "points": "the points of the model cannot be read",
+    "observations": "the images or the points of the model cannot be read",
+    "split": f"{SPLIT} cannot be read",
+    "split_text": f"{SPLIT} cannot be read",
+    "periods": f"{SPLIT} or the images of the model cannot be read",
+    "test": "sparse/0/test.txt is absent or cannot be read",
+    "tests": f"{SPLIT}, test.txt or the images of the model cannot be read",
+    "pixels": "pixels are decoded with --decode only",
+}
+
+
+def no_progress(items: Sequence[T], description: str) -> Iterable[T]:
+    """A `Track` that shows nothing."""
+    return items
+
+
+@dataclass(frozen=True, slots=True)
+class TextFile:
+    """A small text file."""
+
+    data: bytes
+    text: str
+
+
+class RawScene:
+    """One scene folder. Every attribute is read when it is first used, then kept."""
+
+    def __init__(self, root: Path, *, decode: bool = False, track: Track = no_progress) -> None:
+        """Read nothing yet.
+
+        Args:
+            root: The scene folder.
+            decode: Whether rules may decode all images.
+            track: Shows the progress of what takes long.
+        """
+        self.root = root
+        self.decode = decode
+        self._track = track
+
+    def reason(self, attribute: str) -> str:
+        """Why an attribute is None."""
+        return _REASONS[attribute]
+
+    @cached_property
+    def name(self) -> str:
+        return self.root.resolve().name
+
+    # The model.
+
+    @cached_property
+    def model_place(self) -> str | None:
+        """Where the model is, relative to the scene folder; None if there is none."""
+        for place in MODEL_PLACES:
+            if any((self.root / place / f"{s}{e}").is_file() for s in MODEL_FILES for e in FORMS):
+                return place
+        return None
+
+    @cached_property
+    def model(self) -> RawModel | None:
+        place = self.model_place
+        return None if place is None else read_raw_model(self.root / place)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...] | None:
+        return self.model.cameras if self.model else None
+
+    @property
+    def images(self) -> RawImages | None:
+        return self.model.images if self.model else None
+
+    @property
+    def points(self) -> RawPoints | None:
+        return self.model.points if self.model else None
+
+    def model_file(self, stem: str) -> str:
+        """Name of a model file for messages, relative to the scene folder."""
+        file = self.model.files.get(stem, f"{stem}.bin") if self.model else f"{stem}.bin"
+        return os.path.join(self.model_place or "", file)
+
+    def image_place(self, name: str) -> str:
+        """Place of an image of the model in messages."""
+        return f"{self.model_file('images')} ({name})"
+
+    @cached_property
+    def usable_cameras(self) -> dict[int, Camera]:
+        """Cameras by id, those with a size and focal lengths that mean something."""
+        return {c.camera_id: c for c in self.cameras or () if is_usable(c)}
+
+    @cached_property
+    def observations(self) -> Observations | None:
+        if self.images is None or self.points is None:
+            return None
+        return observe(self.images, self.points)
+
+    # Periods and split.
+
+    @cached_property
+    def split_text(self) -> TextFile | None:
+        return self._text(SPLIT)
+
+    @cached_property
+    def _parsed_split(self) -> tuple[list[SplitEntry], list[Problem]]:
+        return parse_split_text(self.split_text.text) if self.split_text else ([], [])
+
+    @property
+    def split(self) -> list[SplitEntry] | None:
+        """Readable lines of ``split.txt``."""
+        return self._parsed_split[0] if self.split_text else None
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of the registered images that stay below ``images/``, sorted, each once."""
+        return sorted({n for n in self.images.names if is_safe(n)}) if self.images else []
+
+    @cached_property
+    def _assigned(self) -> tuple[dict[str, int], list[Problem]]:
+        return assign_periods(self.names, self.split or [])
+
+    @property
+    def split_problems(self) -> list[Problem]:
+        """All problems of ``split.txt``; those of names only if the images can be read."""
+        found = list(self._parsed_split[1])
+        return found + (self._assigned[1] if self.periods is not None else [])
+
+    @property
+    def periods(self) -> dict[str, int] | None:
+        """Period by image name, for the images that have exactly one."""
+        if self.split is None or self.images is None:
+            return None
+        return self._assigned[0]
+
+    @cached_property
+    def test_text(self) -> TextFile | None:
+        return self._text(TEST)
+
+    @cached_property
+    def test(self) -> list[NameEntry] | None:
+        """Lines of ``test.txt``."""
+        return parse_test_text(self.test_text.text) if self.test_text else None
+
+    @cached_property
+    def _tested(self) -> tuple[set[str], list[Problem]]:
+        return assign_tests(self.names, self.test or [])
+
+    @property
+    def test_problems(self) -> list[Problem]:
+        return self._tested[1]
+
+    @cached_property
+    def tests(self) -> set[str] | None:
+        """Names of the test images, by ``test.txt`` or the default split."""
+        if self.periods is None:
+            return None
+        if self.test is not None:
+            return self._tested[0]
+        return None if os.path.lexists(self.root / TEST) else default_tests(self.periods)
+
+    @cached_property
+    def image_periods(self) -> NDArray[np.int64]:
+        """Index of the period of each image into `period_ids`, -1 for none. [I]"""
+        periods = self.periods or {}
+        index = {period: i for i, period in enumerate(self.period_ids)}
+        names = self.images.names if self.images else ()
+        return np.array([index[periods[n]] if n in periods else -1 for n in names], np.int64)
+
+    @cached_property
+    def period_ids(self) -> list[int]:
+        """Ids of the periods that have images, sorted; there may be gaps."""
+        return sorted(set((self.periods or {}).values()))
+
+    # Files.
+
+    @cached_property
+    def files(self) -> list[str]:
+        """Image files below ``images/`` by their suffix, as relative names, sorted."""
+        found = []
+        top = self.root / "images"
+        for folder, _, files in os.walk(top):
+            below = Path(folder).relative_to(top)
+            found += [
+                (below / file).as_posix()
+                for file in files
+                if file.lower().endswith(IMAGE_SUFFIXES) and not file.startswith("._")
+            ]
+        return sorted(found)
+
+    def image_path(self, name: str) -> Path:
+        return self.root / "images" / name
+
+    @cached_property
+    def present(self) -> list[str]:
+        """Registered images with a file."""
+        return [n for n in self.names if os.path.isfile(self.image_path(n))]
+
+    @cached_property
+    def headers(self) -> dict[str, Header]:
+        """Headers of the present images."""
+        tracked = self._track(self.present, "image headers")
+        return read_headers(self.root / "images", tracked)
+
+    @cached_property
+    def readable(self) -> list[str]:
+        """Present images with a good header."""
+        return [name for name, header in self.headers.items() if header.problem is None]
+
+    @cached_property
+    def digests(self) -> dict[str, bytes]:
+        """SHA-256 of those present files that have the size of another; others are unique."""
+        return hash_files(self.root / "images", self.present, self._track)
+
+    @cached_property
+    def pixels(self) -> dict[str, Pixels] | None:
+        """Digests and thumbnails of the readable images, if they may be decoded."""
+        if not self.decode:
+            return None
+        return read_pixels(self.root / "images", self.readable, self._track)
+
+    def _text(self, place: str) -> TextFile | None:
+        path = self.root / place
+        try:
+            if not path.is_file():  # a pipe would block
+                return None
+            data = path.read_bytes()
+            return TextFile(data, decode_text(data))
+        except (OSError, UnicodeDecodeError):
+            return None
+
+
+def is_safe(name: str) -> bool:
+    """Whether an image name stays below ``images/``."""
+    try:
+        check_name(Path(), name)
+    except SceneError:
+        return False
+    return True
+
+
+def is_usable(camera: Camera) -> bool:
+    """Whether a camera has a size and focal lengths that a projection can use."""
+    if not (1 <= camera.width <= LARGEST_SIDE and 1 <= camera.height <= LARGEST_SIDE):
+        return False
+    if camera.model == "EQUIRECTANGULAR" or not np.isfinite(camera.params).all():
+        return False
+    K = camera.K
+    return bool(K[0, 0] > 0 and K[1, 1] > 0)

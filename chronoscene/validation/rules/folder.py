@@ -1,0 +1,121 @@
+"""CS0: the folder as a whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from itertools import count
+
+from chronoscene.errors import ChronoSceneError
+from chronoscene.formats import chronoscene as our_format
+from chronoscene.validation.finding import Hit, shown
+from chronoscene.validation.raw_model import model_files
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rule import rule
+
+
+@rule(
+    "CS001",
+    "no-images-folder",
+    "error",
+    what="There is no folder `images/`.",
+    remedy="put the images into images/, below the scene folder",
+    bad="photos in `photos/`",
+)
+def no_images_folder(scene: RawScene) -> Iterator[Hit]:
+    if not (scene.root / "images").is_dir():
+        inside = sorted(p.name for p in scene.root.iterdir() if p.is_dir())
+        found = f"the folders {shown(inside, 5)}" if inside else "no folder at all"
+        yield Hit("images", "a folder with the images", found)
+
+
+@rule(
+    "CS002",
+    "model-misplaced",
+    "error",
+    what="The COLMAP model is not in `sparse/0/`, where all readers look for it.",
+    remedy="move the model files to sparse/0/",
+    bad="`sparse/cameras.bin`, as COLMAP's undistorter writes it",
+)
+def model_misplaced(scene: RawScene) -> Iterator[Hit]:
+    place = scene.model_place
+    if place is not None and place != our_format.MODEL:
+        found = f"one in {place}/" if place else "one at the top of the folder"
+        yield Hit(our_format.MODEL, "the model", found)
+
+
+@rule(
+    "CS003",
+    "several-models",
+    "warning",
+    what="COLMAP made several models that it could not join; only `sparse/0/` is read.",
+    remedy="match images across the models and map again, or delete the models that are not meant",
+    bad="`sparse/0/` and `sparse/1/`, a period in each",
+)
+def several_models(scene: RawScene) -> Iterator[Hit]:
+    names = (str(i) for i in count(1))
+    others = []
+    for name in names:
+        if not (scene.root / "sparse" / name).is_dir():
+            break
+        if model_files(scene.root / "sparse" / name):
+            others.append(f"sparse/{name}")
+    if others:
+        yield Hit("sparse", "one model, sparse/0", f"{shown(others)} too", count=len(others))
+
+
+@rule(
+    "CS004",
+    "bad-periods-json",
+    "error",
+    what="`sparse/periods.json` is there and is not right.",
+    remedy="correct the file, or delete it: it only gives labels",
+    bad='`[{"id": 1}]` in a scene of two periods',
+    needs=("periods",),
+)
+def bad_periods_json(scene: RawScene) -> Iterator[Hit]:
+    try:
+        our_format.read_periods(scene.root, max(scene.period_ids, default=-1) + 1)
+    except ChronoSceneError as error:
+        yield _hit(scene, error, our_format.PERIODS)
+    except MemoryError:  # an absurd period id, which has its own rule
+        return
+
+
+@rule(
+    "CS005",
+    "bad-world-json",
+    "error",
+    what="`sparse/world.json` is there and is not right.",
+    remedy="correct the file, or delete it",
+    bad='`{"unit": "feet"}`',
+)
+def bad_world_json(scene: RawScene) -> Iterator[Hit]:
+    try:
+        our_format.read_world(scene.root)
+    except ChronoSceneError as error:
+        yield _hit(scene, error, our_format.WORLD)
+
+
+@rule(
+    "CS009",
+    "reader-refuses",
+    "error",
+    what="Nothing else is wrong, but the reader (or COLMAP itself) refuses the scene.",
+    remedy="do as the message says; if it makes no sense to you, report it",
+    bad="a model that COLMAP does not open although its records are complete",
+    needs=("cameras", "images", "points"),
+    last=True,
+)
+def reader_refuses(scene: RawScene) -> Iterator[Hit]:
+    try:
+        our_format.read(scene.root)
+    except ChronoSceneError as error:
+        yield _hit(scene, error, "scene")
+
+
+def _hit(scene: RawScene, error: ChronoSceneError, place: str) -> Hit:
+    """The same message with a place relative to the scene folder."""
+    root = os.path.join(scene.root, "")
+    where = error.place.removeprefix(root) if error.place.startswith(root) else place
+    return Hit(where, error.expected, error.found, error.todo)

@@ -1,0 +1,169 @@
+"""CS2: image files."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Iterator
+from pathlib import PurePosixPath
+
+from chronoscene.scene import Camera
+from chronoscene.validation.finding import Hit, quote
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rule import rule
+
+GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "I;16B", "I;16L", "I;16N")
+"""Pillow's modes without colour."""
+
+
+@rule(
+    "CS201",
+    "image-missing",
+    "error",
+    what="A registered image has no file.",
+    remedy="copy the image there, or remove it from the model",
+    bad="`images.bin` names `a.jpg`, there is only `images/a.JPG`",
+    needs=("images",),
+)
+def image_missing(scene: RawScene) -> Iterator[Hit]:
+    if not (scene.root / "images").is_dir():
+        return  # one finding says it for all
+    present = set(scene.present)
+    spellings: dict[str, str] = {}
+    for file in scene.files:
+        for key in (_spelling(PurePosixPath(file).name), _spelling(file)):
+            spellings[key] = file
+    for name in scene.names:
+        if name not in present:
+            near = spellings.get(_spelling(name)) or spellings.get(
+                _spelling(PurePosixPath(name).name)
+            )
+            found = "nothing" + (f"; there is {quote(near)}" if near else "")
+            yield Hit(_place(name), "an image", found)
+
+
+@rule(
+    "CS202",
+    "image-unregistered",
+    "info",
+    what="A file in `images/` is not in the model, so it is not used.",
+    remedy="nothing to do, unless the image should have been registered",
+    bad="`images/b.jpg` that COLMAP could not place",
+    needs=("images",),
+)
+def image_unregistered(scene: RawScene) -> Iterator[Hit]:
+    registered = set(scene.names)
+    for file in scene.files:
+        if file not in registered:
+            yield Hit(_place(file), "a registered image", "one that the model does not have")
+
+
+@rule(
+    "CS203",
+    "image-unreadable",
+    "error",
+    what="An image file is empty, or does not begin like an image.",
+    remedy="copy the file again, or convert it to JPEG or PNG",
+    bad="a file of zero bytes; a text file named `a.jpg`",
+    needs=("images",),
+)
+def image_unreadable(scene: RawScene) -> Iterator[Hit]:
+    for name, header in scene.headers.items():
+        if header.problem is not None:
+            yield Hit(_place(name), "an image", header.problem)
+        elif header.mode == "F":
+            yield Hit(_place(name), "8 or 16 bit pixels", "floating point pixels")
+
+
+@rule(
+    "CS204",
+    "image-shape",
+    "error",
+    what="An image has another shape than its camera, so pixels and rays do not match.",
+    remedy="use the images that the model was made from, not cropped, turned or padded ones",
+    bad="a camera of 4000 x 3000 and a file of 3000 x 4000, turned by its orientation tag",
+    needs=("cameras", "images"),
+)
+def image_shape(scene: RawScene) -> Iterator[Hit]:
+    for name, size, camera in _sizes(scene):
+        if not _same_shape(size, camera):
+            turned = _same_shape(size[::-1], camera)
+            found = f"{size[0]} x {size[1]}" + (", turned by 90 degrees" if turned else "")
+            yield Hit(_place(name), _expected(camera), found)
+
+
+@rule(
+    "CS205",
+    "image-size",
+    "warning",
+    what="An image has the shape of its camera, but another size.",
+    remedy="scale the camera to the files, or use files of the camera's size",
+    bad="a camera of 4000 x 3000 and a file of 1000 x 750",
+    needs=("cameras", "images"),
+)
+def image_size(scene: RawScene) -> Iterator[Hit]:
+    for name, size, camera in _sizes(scene):
+        if size != (camera.width, camera.height) and _same_shape(size, camera):
+            yield Hit(_place(name), _expected(camera), f"{size[0]} x {size[1]}")
+
+
+@rule(
+    "CS206",
+    "image-damaged",
+    "error",
+    what="An image begins well, but its pixels cannot be decoded (needs `--decode`).",
+    remedy="copy the file again from its source",
+    bad="a JPEG that a broken transfer cut off",
+    needs=("images", "pixels"),
+)
+def image_damaged(scene: RawScene) -> Iterator[Hit]:
+    assert scene.pixels is not None
+    for name, pixels in scene.pixels.items():
+        if pixels.problem is not None and scene.headers[name].mode != "F":
+            yield Hit(_place(name), "an image that can be decoded", pixels.problem)
+
+
+@rule(
+    "CS207",
+    "orientation-tag",
+    "info",
+    what="An image has an orientation tag. It is ignored here and in COLMAP, but viewers turn the "
+    "image.",
+    remedy="remove the tag (the pixels must stay as they are: the poses refer to them)",
+    bad="a phone photo in portrait with EXIF orientation 6",
+    needs=("images",),
+)
+def orientation_tag(scene: RawScene) -> Iterator[Hit]:
+    for name, header in scene.headers.items():
+        if header.problem is None and header.orientation in range(2, 9):
+            yield Hit(_place(name), "no orientation tag", f"orientation {header.orientation}")
+
+
+def _sizes(scene: RawScene) -> Iterator[tuple[str, tuple[int, int], Camera]]:
+    """Name, size of the file, and camera of the images that have both."""
+    assert scene.images is not None
+    cameras = scene.usable_cameras
+    for name, camera_id in zip(scene.images.names, scene.images.camera_ids.tolist(), strict=True):
+        header = scene.headers.get(name)
+        if header is not None and header.problem is None and camera_id in cameras:
+            yield name, header.size, cameras[camera_id]
+
+
+def _same_shape(size: tuple[int, ...], camera: Camera) -> bool:
+    """Whether the sizes have one ratio, but for the rounding of one side to whole pixels."""
+    width, height = size
+    exact_height = width * camera.height / camera.width
+    exact_width = height * camera.width / camera.height
+    return abs(height - exact_height) <= 1 or abs(width - exact_width) <= 1
+
+
+def _expected(camera: Camera) -> str:
+    return f"{camera.width} x {camera.height} as in camera {camera.camera_id}"
+
+
+def _spelling(name: str) -> str:
+    """A key that ignores case and the two Unicode spellings of accented letters."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _place(name: str) -> str:
+    return f"images/{name}"

@@ -1,0 +1,204 @@
+"""CS50: sparse points, their tracks and their periods."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.validation.finding import NOTHING, Hit, counted, shown
+from chronoscene.validation.raw_model import RawPoints
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rule import rule
+
+
+@rule(
+    "CS501",
+    "no-points",
+    "warning",
+    what="The model has no points, from which methods start.",
+    remedy="triangulate points (colmap point_triangulator)",
+    bad="an empty `points3D.txt`",
+    needs=("points",),
+)
+def no_points(scene: RawScene) -> Iterator[Hit]:
+    assert scene.points is not None
+    if not len(scene.points):
+        yield Hit(scene.model_file("points3D"), "sparse points", "none")
+
+
+@rule(
+    "CS502",
+    "point-not-finite",
+    "error",
+    what="A point has NaN or infinite coordinates.",
+    remedy="remove the points from the model",
+    bad="`nan` in `points3D.txt`",
+    needs=("points",),
+)
+def point_not_finite(scene: RawScene) -> Iterator[Hit]:
+    points = scene.points
+    assert points is not None
+    bad = ~np.isfinite(points.xyz).all(axis=1)
+    yield from _some_points(scene, points, bad, "finite coordinates", "NaN or infinity")
+
+
+@rule(
+    "CS503",
+    "short-track",
+    "warning",
+    what="A point is seen by no image or by one, so its position is not a measurement.",
+    remedy="filter the points, or write the tracks with the points",
+    bad="points from a laser scan, without tracks",
+    needs=("points",),
+)
+def short_track(scene: RawScene) -> Iterator[Hit]:
+    points = scene.points
+    assert points is not None
+    lengths = np.diff(points.track_start)
+    for number, found in ((0, "no observation"), (1, "one observation")):
+        yield from _some_points(scene, points, lengths == number, "two or more", found)
+
+
+@rule(
+    "CS504",
+    "broken-track",
+    "error",
+    what="A track refers to an image, or a keypoint of an image, that does not exist.",
+    remedy="write images and points again together, from one model",
+    bad="`images.bin` and `points3D.bin` of two different runs",
+    needs=("observations",),
+)
+def broken_track(scene: RawScene) -> Iterator[Hit]:
+    seen, points = scene.observations, scene.points
+    assert seen is not None and points is not None
+    place = scene.model_file("points3D")
+    if lost := int(np.count_nonzero(seen.image < 0)):
+        ids = np.unique(points.track_image[seen.image < 0])
+        named = ", ".join(map(str, ids[:3])) + (" ..." if len(ids) > 3 else "")
+        found = f"{counted(lost, 'observation')} in image ids {named}"
+        yield Hit(place, "tracks over registered images", found, count=lost)
+    if lost := int(np.count_nonzero((seen.image >= 0) & ~seen.valid)):
+        found = f"{counted(lost, 'observation')} with an index beyond the keypoints of the image"
+        yield Hit(place, "tracks over existing keypoints", found, count=lost)
+
+
+@rule(
+    "CS505",
+    "track-disagrees",
+    "error",
+    what="Images and points disagree on which keypoint belongs to which point.",
+    remedy="write images and points again together, from one model",
+    bad="a keypoint says point 5, the track of point 5 does not have it",
+    needs=("observations",),
+)
+def track_disagrees(scene: RawScene) -> Iterator[Hit]:
+    seen, points, images = scene.observations, scene.points, scene.images
+    assert seen is not None and points is not None and images is not None
+    rows = np.flatnonzero(seen.valid)
+    keypoints = seen.keypoint[rows]
+    agree = images.keypoint_point[keypoints] == points.ids[seen.point[rows]]
+    if wrong := int(np.count_nonzero(~agree)):
+        found = f"{counted(wrong, 'observation')} whose keypoint names another point or none"
+        yield Hit(scene.model_file("points3D"), "keypoints that agree", found, count=wrong)
+    claimed = int(np.count_nonzero(images.keypoint_point >= 0))
+    if lost := claimed - len(np.unique(keypoints[agree])):
+        found = f"{counted(lost, 'keypoint')} of points whose track does not have them"
+        yield Hit(scene.model_file("images"), "tracks that agree", found, count=lost)
+
+
+@rule(
+    "CS506",
+    "period-without-points",
+    "warning",
+    what="No point is seen by any image of a period.",
+    remedy="triangulate points with the images of this period",
+    bad="points of period 0 only; the images of period 1 were added later",
+    needs=("observations", "periods"),
+)
+def period_without_points(scene: RawScene) -> Iterator[Hit]:
+    total = len(seen := _seen(scene))
+    for column, period in enumerate(scene.period_ids):
+        if total and not seen[:, column].any():
+            yield Hit(f"period {period}", "points that its images see", f"0 of {total}")
+
+
+@rule(
+    "CS507",
+    "points-of-one-period",
+    "info",
+    what="How many points are seen in one period only, and how many in several.",
+    remedy=NOTHING,
+    bad="(tells numbers)",
+    needs=("observations", "periods"),
+)
+def points_of_one_period(scene: RawScene) -> Iterator[Hit]:
+    seen = _seen(scene)
+    if not len(seen) or seen.shape[1] < 2:
+        return
+    number = seen.sum(axis=1)
+    alone = [int(np.count_nonzero(seen[:, i] & (number == 1))) for i in range(seen.shape[1])]
+    each = ", ".join(f"period {p} {n}" for p, n in zip(scene.period_ids, alone, strict=True))
+    share = 100 * sum(alone) / len(seen)
+    found = f"{sum(alone)} of {len(seen)} in one only ({share:.1f} %): {each}"
+    yield Hit(scene.model_file("points3D"), "points of several periods", found)
+
+
+@rule(
+    "CS508",
+    "period-unconnected",
+    "warning",
+    what="A period shares no point with any other, so nothing shows that they are in one frame.",
+    remedy="match images across the periods; if they were aligned otherwise, ignore this rule",
+    bad="two models merged by hand",
+    needs=("observations", "periods"),
+)
+def period_unconnected(scene: RawScene) -> Iterator[Hit]:
+    seen = _seen(scene)
+    shared = seen.sum(axis=1) > 1
+    for column, period in enumerate(scene.period_ids):
+        if seen.shape[1] > 1 and seen[:, column].any() and not seen[shared, column].any():
+            found = f"0 of {np.count_nonzero(seen[:, column])}"
+            yield Hit(f"period {period}", "points shared with another period", found)
+
+
+@rule(
+    "CS509",
+    "image-without-points",
+    "info",
+    what="An image sees no point of the model, so no point confirms its pose.",
+    remedy="nothing to do, if the poses are known otherwise",
+    bad="test images that were added with known poses",
+    needs=("observations",),
+)
+def image_without_points(scene: RawScene) -> Iterator[Hit]:
+    seen, images = scene.observations, scene.images
+    assert seen is not None and images is not None
+    counts = np.bincount(seen.image[seen.valid], minlength=len(images))
+    names = [images.names[i] for i in np.flatnonzero(counts == 0)]
+    if names:
+        found = f"{counted(len(names), 'image')} without any: {shown(sorted(names))}"
+        yield Hit(scene.model_file("images"), "points in every image", found, count=len(names))
+
+
+def _seen(scene: RawScene) -> NDArray[np.bool_]:
+    """Whether an image of a period sees the point; columns as `RawScene.period_ids`. [P, T]"""
+    seen, points = scene.observations, scene.points
+    assert seen is not None and points is not None
+    table = np.zeros((len(points), len(scene.period_ids)), bool)
+    rows = seen.valid
+    period = scene.image_periods[seen.image[rows]]
+    table[seen.point[rows][period >= 0], period[period >= 0]] = True
+    return table
+
+
+def _some_points(
+    scene: RawScene, points: RawPoints, bad: Any, expected: str, found: str
+) -> Iterator[Hit]:
+    """One finding for all bad points, with the first ids."""
+    if number := int(np.count_nonzero(bad)):
+        ids = ", ".join(map(str, points.ids[bad][:3])) + (" ..." if number > 3 else "")
+        text = f"{found} for {number} of {len(points)} points (ids {ids})"
+        yield Hit(scene.model_file("points3D"), expected, text, count=number)

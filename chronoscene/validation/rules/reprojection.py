@@ -1,0 +1,128 @@
+"""CS51: whether points, poses and cameras fit each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.geometry import rotation_from_quaternion
+from chronoscene.scene import PINHOLE_MODELS
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.observations import Observations
+from chronoscene.validation.raw_model import RawImages
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rule import rule
+from chronoscene.validation.rules.poses import good_poses
+
+MOST_OUTSIDE = 0.05
+"""Share of observations outside of the image; undistortion leaves a few there."""
+
+MOST_BEHIND = 0.5
+"""Share of observations behind their camera. In a model that belongs together there are none."""
+
+ERROR_SHARE, LEAST_ERROR = 0.01, 4.0
+"""Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
+pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
+
+FEWEST = 10
+"""Observations of an image from which the median of its errors means something."""
+
+
+@rule(
+    "CS511",
+    "observations-outside",
+    "warning",
+    what=f"More than {MOST_OUTSIDE:.0%} of a camera's observations are outside of its image.",
+    remedy="give the camera the size at which the keypoints were found",
+    bad="a camera scaled to half the size, keypoints still at full size",
+    needs=("cameras", "observations"),
+)
+def observations_outside(scene: RawScene) -> Iterator[Hit]:
+    seen, images = scene.observations, scene.images
+    assert seen is not None and images is not None
+    xy = images.keypoint_xy[seen.keypoint[seen.valid]]
+    camera_ids = images.camera_ids[seen.image[seen.valid]]
+    for camera in scene.usable_cameras.values():
+        mine = xy[camera_ids == camera.camera_id]
+        inside = ((mine >= 0) & (mine <= [camera.width, camera.height])).all(axis=1)
+        outside = int(np.count_nonzero(~inside))
+        if outside > MOST_OUTSIDE * len(mine):
+            place = f"{scene.model_file('cameras')} (camera {camera.camera_id})"
+            expected = f"observations within {camera.width} x {camera.height}"
+            yield Hit(place, expected, f"{outside} of {len(mine)} outside", count=outside)
+
+
+@rule(
+    "CS512",
+    "points-behind-cameras",
+    "error",
+    what="Most points are behind the cameras that see them: the poses are in another convention.",
+    remedy="store world-to-camera poses with +x right, +y down, +z forward (negate the y and z "
+    "axes of OpenGL cameras; invert camera-to-world poses)",
+    bad="poses with OpenGL axes",
+    needs=("cameras", "observations"),
+)
+def points_behind_cameras(scene: RawScene) -> Iterator[Hit]:
+    total = behind = 0
+    for _, depth, _ in _reprojections(scene):
+        total += len(depth)
+        behind += int(np.count_nonzero(~(depth > 0)))
+    if behind > MOST_BEHIND * total:
+        found = f"{behind} of {total} observations behind the camera"
+        yield Hit(scene.model_file("images"), "points in front of the cameras", found)
+
+
+@rule(
+    "CS513",
+    "pose-disagrees",
+    "warning",
+    what="The points that an image sees do not project to where it sees them.",
+    remedy="check pose, camera and image size of this image, or register it again",
+    bad="a camera-to-world pose; a focal length of another image size",
+    needs=("cameras", "observations"),
+)
+def pose_disagrees(scene: RawScene) -> Iterator[Hit]:
+    assert scene.images is not None
+    for image, depth, error in _reprojections(scene):
+        camera = scene.usable_cameras[int(scene.images.camera_ids[image])]
+        if camera.model not in PINHOLE_MODELS or np.count_nonzero(depth > 0) < FEWEST:
+            continue
+        limit = max(LEAST_ERROR, ERROR_SHARE * float(np.hypot(camera.width, camera.height)))
+        median = float(np.median(error[depth > 0]))
+        if not median <= limit:
+            place = scene.image_place(scene.images.names[image])
+            expected = f"a median reprojection error below {limit:.3g} px"
+            yield Hit(place, expected, f"{median:.3g} px")
+
+
+def _reprojections(
+    scene: RawScene,
+) -> Iterator[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
+    """Index of each image with finite pose and usable camera; depth and error of its points. [m]
+
+    Distortion is not applied: the error means something for pinhole cameras only.
+    """
+    images, points, seen = scene.images, scene.points, scene.observations
+    assert images is not None and points is not None and isinstance(seen, Observations)
+    good = good_poses(images)
+    for image, rows in seen.by_image(len(images)):
+        camera = scene.usable_cameras.get(int(images.camera_ids[image]))
+        if camera is None or not good[image]:
+            continue
+        xyz = points.xyz[seen.point[rows]]
+        target = images.keypoint_xy[seen.keypoint[rows]]
+        finite = np.isfinite(xyz).all(axis=1) & np.isfinite(target).all(axis=1)
+        depth, projected = _project(images, image, camera.K, xyz[finite])
+        yield image, depth, np.linalg.norm(projected - target[finite], axis=1)
+
+
+def _project(
+    images: RawImages, image: int, K: NDArray[np.float64], xyz: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Depth [m] and pixel position [m, 2] of points."""
+    rotation = rotation_from_quaternion(images.quaternions[image])
+    with np.errstate(all="ignore"):
+        local = xyz @ rotation.T + images.translations[image]
+        return local[:, 2], local[:, :2] / local[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]

@@ -1,0 +1,152 @@
+"""CS30 and CS31: ``sparse/split.txt``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+from chronoscene.formats.chronoscene import SPLIT
+from chronoscene.splits import Problem, ProblemKind
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rule import rule
+
+ELSEWHERE = ("split.txt", "sparse/0/split.txt", "images/split.txt")
+
+
+def problem_hit(file: str, problem: Problem) -> Hit:
+    """A problem of the parser as a hit."""
+    place = file if problem.line is None else f"{file}:{problem.line}"
+    remedy = None if "DATASET.md" in problem.todo else problem.todo
+    return Hit(place, problem.expected, problem.found, remedy)
+
+
+def _problems(scene: RawScene, *kinds: ProblemKind) -> Iterator[Hit]:
+    for problem in scene.split_problems:
+        if problem.kind in kinds:
+            yield problem_hit(SPLIT, problem)
+
+
+@rule(
+    "CS301",
+    "split-absent",
+    "error",
+    what="There is no `sparse/split.txt`, so no image has a period.",
+    remedy='write it: "<image name> <period id>" for each image',
+    bad="`split.txt` in `sparse/0/`",
+)
+def split_absent(scene: RawScene) -> Iterator[Hit]:
+    path = scene.root / SPLIT
+    if not os.path.lexists(path):
+        elsewhere = [p for p in ELSEWHERE if (scene.root / p).is_file()]
+        if elsewhere:
+            yield Hit(SPLIT, "the periods of the images", f"{elsewhere[0]} instead", "move it")
+        else:
+            yield Hit(SPLIT, "the periods of the images", "no such file")
+
+
+@rule(
+    "CS302",
+    "split-not-text",
+    "error",
+    what="`split.txt` is not a readable text file.",
+    remedy="save it as UTF-8",
+    bad="a spreadsheet saved under this name",
+)
+def split_not_text(scene: RawScene) -> Iterator[Hit]:
+    if scene.split_text is None and os.path.lexists(scene.root / SPLIT):
+        yield Hit(SPLIT, "a text file", "bytes that are not UTF-8, or no file to read")
+
+
+@rule(
+    "CS303",
+    "split-line",
+    "error",
+    what="A line of `split.txt` does not have a name and a period.",
+    remedy='write "<image name> <period id>"',
+    bad="`a.jpg`",
+    needs=("split",),
+)
+def split_line(scene: RawScene) -> Iterator[Hit]:
+    yield from _problems(scene, "fields")
+
+
+@rule(
+    "CS304",
+    "split-period",
+    "error",
+    what="The last field of a line of `split.txt` is not a period id.",
+    remedy="write a whole number 0, 1, ... at the end of the line",
+    bad="`a.jpg 2016-05`",
+    needs=("split",),
+)
+def split_period(scene: RawScene) -> Iterator[Hit]:
+    yield from _problems(scene, "period")
+
+
+@rule(
+    "CS305",
+    "image-without-period",
+    "error",
+    what="A registered image is not in `split.txt`.",
+    remedy="add a line for it",
+    bad="`images.bin` has `a.jpg`, `split.txt` does not name it",
+    needs=("images", "split"),
+)
+def image_without_period(scene: RawScene) -> Iterator[Hit]:
+    # An ambiguous line leaves several images without a period; it is reported by itself.
+    for name in scene.names:
+        if scene.periods is not None and name not in scene.periods:
+            yield Hit(f"{scene.image_place(name)}", f"a line in {SPLIT}", "none that names it")
+
+
+@rule(
+    "CS306",
+    "split-ambiguous",
+    "error",
+    what="A name in `split.txt` fits several images.",
+    remedy="write the full names below images/",
+    bad="`0001 0` with `x/0001.png` and `y/0001.png` in the model",
+    needs=("images", "split"),
+)
+def split_ambiguous(scene: RawScene) -> Iterator[Hit]:
+    yield from _problems(scene, "ambiguous")
+
+
+@rule(
+    "CS307",
+    "split-contradiction",
+    "error",
+    what="`split.txt` gives an image two periods.",
+    remedy="keep one of the two lines",
+    bad="`a.jpg 0` and, further down, `a.jpg 1`",
+    needs=("images", "split"),
+)
+def split_contradiction(scene: RawScene) -> Iterator[Hit]:
+    yield from _problems(scene, "contradiction")
+
+
+@rule(
+    "CS308",
+    "split-duplicate",
+    "info",
+    what="`split.txt` lists an image twice, with the same period.",
+    remedy="delete one of the lines",
+    bad="`a.jpg 0` twice",
+    needs=("images", "split"),
+)
+def split_duplicate(scene: RawScene) -> Iterator[Hit]:
+    yield from _problems(scene, "duplicate")
+
+
+@rule(
+    "CS309",
+    "split-unknown",
+    "warning",
+    what="`split.txt` names an image that is not in the model; the line has no effect.",
+    remedy="correct the name, or delete the line if the image could not be registered",
+    bad="`IMG_1.jpg 0`, the image is `IMG_0001.jpg`",
+    needs=("images", "split"),
+)
+def split_unknown(scene: RawScene) -> Iterator[Hit]:
+    yield from _problems(scene, "unknown")

@@ -1,0 +1,113 @@
+"""CS32: ``sparse/0/test.txt``."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+
+from chronoscene.formats.chronoscene import TEST
+from chronoscene.splits import DEFAULT_RULE
+from chronoscene.validation.finding import Hit, counted, quote
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rule import rule
+from chronoscene.validation.rules.split import problem_hit
+
+ELSEWHERE = ("test.txt", "sparse/test.txt", "images/test.txt")
+
+
+@rule(
+    "CS321",
+    "test-absent",
+    "info",
+    what="There is no `sparse/0/test.txt`; the default split is used.",
+    remedy="list the test images in sparse/0/test.txt, so that everybody has the same split",
+    bad="a scene without `test.txt`",
+)
+def test_absent(scene: RawScene) -> Iterator[Hit]:
+    if os.path.lexists(scene.root / TEST) or _elsewhere(scene):
+        return
+    size = "" if scene.tests is None else f" gives {counted(len(scene.tests), 'test view')}"
+    yield Hit(TEST, "a list of test images", f"none; {DEFAULT_RULE}{size}")
+
+
+@rule(
+    "CS322",
+    "test-misplaced",
+    "warning",
+    what="`test.txt` is not in `sparse/0/`, so it is not read.",
+    remedy="move it to sparse/0/test.txt",
+    bad="`sparse/test.txt`",
+)
+def test_misplaced(scene: RawScene) -> Iterator[Hit]:
+    if not os.path.lexists(scene.root / TEST):
+        for place in _elsewhere(scene):
+            yield Hit(TEST, "the list of test images", f"{place} instead")
+
+
+@rule(
+    "CS323",
+    "test-not-text",
+    "error",
+    what="`test.txt` is not a readable text file.",
+    remedy="save it as UTF-8",
+    bad="a `test.txt` in an old Windows encoding",
+)
+def test_not_text(scene: RawScene) -> Iterator[Hit]:
+    if scene.test_text is None and os.path.lexists(scene.root / TEST):
+        yield Hit(TEST, "a text file", "bytes that are not UTF-8, or no file to read")
+
+
+@rule(
+    "CS324",
+    "test-unknown",
+    "warning",
+    what="`test.txt` names an image that is not in the model; the line has no effect, so the image "
+    "that is meant may be among the training images.",
+    remedy="correct the name, or delete the line",
+    bad="`IMG_1` in `test.txt`, the image is `IMG_0001.jpg`",
+    needs=("images", "test"),
+)
+def test_unknown(scene: RawScene) -> Iterator[Hit]:
+    for problem in scene.test_problems:
+        if problem.kind == "unknown":
+            yield problem_hit(TEST, problem)
+
+
+@rule(
+    "CS325",
+    "test-ambiguous",
+    "error",
+    what="A name in `test.txt` fits several images.",
+    remedy="write the full names below images/",
+    bad="`0001` with `x/0001.png` and `y/0001.png` in the model",
+    needs=("images", "test"),
+)
+def test_ambiguous(scene: RawScene) -> Iterator[Hit]:
+    for problem in scene.test_problems:
+        if problem.kind == "ambiguous":
+            yield problem_hit(TEST, problem)
+
+
+@rule(
+    "CS326",
+    "test-duplicate",
+    "info",
+    what="`test.txt` has the same line twice.",
+    remedy="delete one of the lines",
+    bad="`a.jpg` twice",
+    needs=("test",),
+)
+def test_duplicate(scene: RawScene) -> Iterator[Hit]:
+    for name, times in Counter(entry.name for entry in scene.test or ()).items():
+        if times > 1:
+            yield Hit(TEST, "each name once", f"{quote(name)} {times} times")
+
+
+def _elsewhere(scene: RawScene) -> list[str]:
+    return [place for place in ELSEWHERE if (scene.root / place).is_file()]
+
+
+# Their names begin with what they are about; a test runner must not collect them.
+for _check in (test_absent, test_misplaced, test_not_text, test_unknown, test_ambiguous):
+    _check.__test__ = False  # type: ignore[attr-defined]

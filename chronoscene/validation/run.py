@@ -1,0 +1,123 @@
+"""Run the rules on scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from chronoscene.errors import SceneError
+from chronoscene.validation.finding import SEVERITIES, Finding, Hit, printable
+from chronoscene.validation.raw_model import model_files
+from chronoscene.validation.raw_scene import RawScene, Track, no_progress
+from chronoscene.validation.report import SceneReport, Skipped, summarise
+from chronoscene.validation.rule import Rule, all_rules
+
+RULE_FAILED = "CS000"
+"""Code of the finding that a rule itself failed: our mistake, reported as such."""
+
+
+def find_folders(path: Path) -> list[Path]:
+    """The folder itself if it looks like a scene, else the folders in it that do, sorted.
+
+    Looking like a scene is not much: it has ``sparse/`` or ``images/``, or files of a model.
+
+    Raises:
+        SceneError: If there is nothing that looks like a scene.
+    """
+    if not path.is_dir():
+        found = "a file" if path.exists() else "nothing"
+        raise SceneError(path, expected="a scene folder", found=found, todo="check the path")
+    try:
+        children = sorted(p for p in path.iterdir() if p.is_dir())
+        if _like_scene(path):
+            return [path]
+        inside = [child for child in children if _like_scene(child)]
+    except OSError as error:
+        found = error.strerror or "an error"
+        raise SceneError(path, expected="a folder", found=found, todo="check the rights") from error
+    if inside:
+        return inside
+    raise SceneError(
+        path,
+        expected="a scene (a folder with images/ and sparse/) or a folder of scenes",
+        found="neither",
+        todo="give the folder of one scene; DATASET.md describes its files",
+    )
+
+
+def _like_scene(path: Path) -> bool:
+    return any((path / name).is_dir() for name in ("sparse", "images")) or bool(model_files(path))
+
+
+def validate_scene(
+    path: Path,
+    *,
+    rules: Sequence[Rule] | None = None,
+    decode: bool = False,
+    track: Track = no_progress,
+) -> SceneReport:
+    """Run rules on one scene folder. Reads only; never raises for what is in the folder.
+
+    Args:
+        path: The scene folder.
+        rules: Rules to run (see `chronoscene.validation.rule.choose_rules`); None for all.
+        decode: Whether to decode all images: slower, finds damaged pixels and copied images.
+        track: Shows the progress of what takes long.
+    """
+    scene = RawScene(Path(path), decode=decode, track=track)
+    findings: list[Finding] = []
+    skipped: list[Skipped] = []
+    for rule in sorted(all_rules() if rules is None else rules, key=lambda r: (r.last, r.code)):
+        reason = _reason_to_skip(rule, scene, findings)
+        if reason is not None:
+            skipped.append(Skipped(rule.code, reason))
+        else:
+            findings.extend(_run(rule, scene))
+    findings.sort(key=lambda f: (SEVERITIES.index(f.severity), f.code))
+    return SceneReport(
+        name=printable(scene.name),
+        path=Path(path),
+        summary=summarise(scene),
+        findings=tuple(findings),
+        skipped=tuple(sorted(skipped, key=lambda s: s.code)),
+    )
+
+
+def _reason_to_skip(rule: Rule, scene: RawScene, findings: Sequence[Finding]) -> str | None:
+    for attribute in rule.needs:
+        if getattr(scene, attribute) is None:
+            return scene.reason(attribute)
+    if rule.last and any(f.severity == "error" for f in findings):
+        return "other rules found errors"
+    return None
+
+
+def _run(rule: Rule, scene: RawScene) -> Iterator[Finding]:
+    try:
+        for hit in rule.check(scene):
+            yield _finding(rule, hit)
+    except Exception as error:  # a mistake in one rule must not hide what the others find
+        failed = replace(rule, code=RULE_FAILED, name="rule-failed", severity="error")
+        yield _finding(
+            failed,
+            Hit(
+                f"rule {rule.code}",
+                "a rule that runs on every scene",
+                f"{type(error).__name__}: {error}",
+                "report this; it is a mistake in ChronoScene, not in the scene",
+            ),
+        )
+
+
+def _finding(rule: Rule, hit: Hit) -> Finding:
+    return Finding(
+        code=rule.code,
+        name=rule.name,
+        severity=rule.severity,
+        place=printable(hit.place),
+        expected=printable(hit.expected),
+        found=printable(hit.found),
+        remedy=printable(hit.remedy or rule.remedy),
+        count=hit.count,
+    )

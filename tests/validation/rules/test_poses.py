@@ -1,0 +1,35 @@
+import numpy as np
+import pytest
+
+IMAGES = "sparse/0/images.txt"
+
+
+@pytest.mark.parametrize("fields", [{5: "nan"}, {1: "inf"}, {1: "0", 2: "0", 3: "0", 4: "0"}])
+def test_pose_not_finite(scene, fields):
+    scene.edit_fields(IMAGES, 2, fields)
+    scene.expect("CS121", place="images.txt (a001.png)", found=next(iter(fields.values())))
+
+
+def test_quaternion_not_unit(scene):
+    words = scene.lines(IMAGES)[2].split()
+    doubled = {i: str(2 * float(words[i])) for i in range(1, 5)}
+    scene.edit_fields(IMAGES, 2, doubled)
+    scene.expect("CS122", place="images.txt (a001.png)", found="length 2")
+
+
+def test_far_from_origin(scene):
+    from chronoscene.geometry import rotation_from_quaternion
+
+    shift = np.array([442_000.0, 4_427_000.0, 50.0])
+    lines = scene.lines(IMAGES)
+    for i in range(0, len(lines), 2):
+        words = lines[i].split()
+        rotation = rotation_from_quaternion([float(w) for w in words[1:5]])
+        moved = np.array([float(w) for w in words[5:8]]) - rotation @ shift
+        lines[i] = " ".join([*words[:5], *(f"{x:.17g}" for x in moved), *words[8:]])
+    scene.write(IMAGES, lines)
+    points = [line.split() for line in scene.lines("sparse/0/points3D.txt")]
+    for words in points:
+        words[1:4] = [f"{float(w) + s:.17g}" for w, s in zip(words[1:4], shift, strict=True)]
+    scene.write("sparse/0/points3D.txt", [" ".join(words) for words in points])
+    scene.expect("CS123", place="images.txt", found="cameras 4.45e+06 away")
