@@ -61,7 +61,7 @@ class Problem:
         return Problem(
             {name: cast(tensor) for name, tensor in self.fixed.items()},
             {name: cast(tensor) for name, tensor in self.leaves.items()},
-            tuple(HeadWeights(*map(cast, head)) for head in self.heads),
+            tuple(HeadWeights(*map(cast, head)) for head in self.heads),  # type: ignore[arg-type]
             self.dims,
             self.grads,
         )
