@@ -155,7 +155,7 @@ def finished_bench(
     """Folder, outcome and messages of one bench over three strategies and every kind of failure."""
     runs = tmp_path_factory.mktemp("bench") / "runs"
     said: list[str] = []
-    names = ("MEAN", "BLIND", "RAISES", "NOT_FINITE", "BAD_IMAGE", "KILLED")
+    names = ("MEAN", "BLIND", "RAISES", "NOT_FINITE", "KILLED")
     first = BenchSettings(
         scenes=(scene_folder,),
         methods=tuple(f"toy_methods:{name}" for name in names),

@@ -1,0 +1,54 @@
+"""What is shown while a method trains."""
+
+import io
+
+import pytest
+from rich.console import Console
+
+from chronoscene.bench.display import ProgressDisplay, format_time
+from chronoscene.bench.stopping import StopRule
+from chronoscene.methods import StepReport
+
+
+def shown(live):
+    buffer = io.StringIO()
+    console = Console(file=buffer, force_terminal=live, width=200, color_system=None)
+    with ProgressDisplay("plaza: toy [x]", console) as display:
+        display.begin("all", StopRule(100, None))
+        for i, psnr in enumerate([None, 20.0, 20.0, 21.0], start=1):
+            display.update(25 * i, 5.0 * i, StepReport(0.5, 1234), psnr)
+        display.begin("period-1", StopRule(None, 60.0))
+        display.update(1, 6.0, StepReport(0.25, 7), 30.0)
+    return buffer.getvalue()
+
+
+def test_without_a_terminal_each_probe_is_a_line():
+    assert shown(False).splitlines() == [
+        "plaza: toy [x]:  50% iteration 50, loss 0.5000, PSNR 20.00 dB, 1234 primitives, 5.0 it/s, "
+        "0:10 left",
+        "plaza: toy [x]: 100% iteration 100, loss 0.5000, PSNR 21.00 dB, 1234 primitives, 5.0 it/s",
+        "plaza: toy [x] period-1:  10% iteration 1, loss 0.2500, PSNR 30.00 dB, 7 primitives, "
+        "0.2 it/s, 0:54 left",
+    ]
+
+
+def test_on_a_terminal_there_is_a_bar():
+    text = shown(True)
+    assert "plaza: toy [x] period-1" in text
+    for part in ("10%", "iteration 1,", "loss 0.2500", "PSNR 30.00 dB", "0:54 left", "━"):
+        assert part in text
+
+
+def test_the_loss_is_smoothed():
+    display = ProgressDisplay("x", Console(file=io.StringIO()))
+    display.begin("all", StopRule(10, None))
+    display.update(1, 1.0, StepReport(1.0, 1), None)
+    display.update(2, 2.0, StepReport(0.0, 1), None)
+    assert "loss 0.9500" in display.status(2, 2.0, 1, None)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0:00"), (59.6, "1:00"), (61, "1:01"), (3661, "1:01:01")]
+)
+def test_times(seconds, text):
+    assert format_time(seconds) == text

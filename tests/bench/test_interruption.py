@@ -1,0 +1,89 @@
+"""A bench that is killed or interrupted loses nothing finished and leaves nothing half done."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from chronoscene.bench.results import read_run, run_folders
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from chronoscene.bench.runner import BenchSettings, run_bench
+run_bench(
+    BenchSettings(
+        scenes=(Path(sys.argv[1]),),
+        methods=("toy_methods:MEAN",),
+        runs=Path(sys.argv[2]),
+        threads=1,
+        seeds=(0, 1),
+        overrides={"sleep": sys.argv[3]},
+        iterations=int(sys.argv[4]),
+        overwrite=True,
+    ),
+    lambda line: print(line, flush=True),
+)
+"""
+
+
+def wait_for(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if found := condition():
+            return found
+        time.sleep(0.05)
+    raise AssertionError("waited in vain")
+
+
+def workers_of(pid):
+    path = Path(f"/proc/{pid}/task/{pid}/children")
+    return [int(child) for child in path.read_text().split()] if path.exists() else []
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_path):
+    runs = tmp_path / "runs"
+    command = [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs), "0.01", "150"]
+    done = runs / "ring/mean-joint-balanced/seed0/run.json"
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        wait_for(done.is_file)
+        before = done.read_bytes()
+        partial = wait_for(lambda: list(runs.glob("ring/*/.seed1.*.partial/config.json")))
+        (worker,) = workers_of(process.pid)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    # The worker notices that its bench is gone; it must not write into the next one's folder.
+    wait_for(lambda: not Path(f"/proc/{worker}").exists(), 30)
+    assert partial[0].parent.exists()
+    again = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "1 of 2 runs are finished and kept" in again.stdout
+    assert done.read_bytes() == before
+    assert [p.name for p in run_folders(runs)] == ["seed0", "seed1"]
+    assert not list(runs.rglob("*.partial"))
+    a, b = (read_run(p) for p in run_folders(runs))
+    assert a.aggregates == b.aggregates and a.config_hash == b.config_hash
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+def test_an_interrupted_bench_leaves_no_process_and_no_half_run(scene_folder, tmp_path):
+    runs = tmp_path / "runs"
+    command = [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs), "0.01", "100000"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+    )
+    wait_for(lambda: list(runs.glob("ring/*/.seed0.*.partial/config.json")))
+    (worker,) = workers_of(process.pid)
+    os.killpg(process.pid, signal.SIGINT)  # what Ctrl-C does
+    process.communicate(timeout=30)
+    assert process.returncode != 0
+    assert not Path(f"/proc/{worker}").exists()
+    assert not list(runs.rglob("*.partial"))
+    assert json.loads((runs / "results.json").read_text()) == []

@@ -1,0 +1,236 @@
+"""Whole benches: what is written, what is kept, what survives failures, kills and edits."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chronoscene.bench import results
+from chronoscene.bench.images import read_manifest
+from chronoscene.bench.results import read_rows, read_run, run_folders
+from chronoscene.bench.runner import BenchSettings, first_difference, split_overrides
+from chronoscene.errors import ConfigError, MetricUnavailableError, SceneError
+from chronoscene.methods import load_spec
+
+FIELDS = {
+    "method",
+    "strategy",
+    "scene",
+    "seed",
+    "aggregates",
+    "periods",
+    "seconds",
+    "iterations",
+    "primitives",
+    "checkpoint_bytes",
+    "peak_memory_bytes",
+    "device",
+    "commit",
+    "skipped",
+}
+
+
+def names(runs):
+    return [str(p.relative_to(runs)) for p in run_folders(runs)]
+
+
+def test_runs_lie_where_they_should(finished_bench):
+    runs = finished_bench[0]
+    assert names(runs) == [
+        "ring/blind-pooled-balanced/seed0",
+        "ring/mean-joint-balanced/seed0",
+        "ring/mean-pooled-balanced/seed0",
+        "ring/mean-separate-balanced/seed0",
+    ]
+    folder = runs / "ring/mean-joint-balanced/seed0"
+    files = sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
+    assert files == [
+        "checkpoint/model.json",
+        "config.json",
+        "curve.csv",
+        "predictions/a/2.png.png",
+        "predictions/b/1.png.png",
+        "predictions/b/2.png.png",
+        "predictions/manifest.json",
+        "rows.csv",
+        "run.json",
+    ]
+    separate = runs / "ring/mean-separate-balanced/seed0/checkpoint"
+    assert sorted(p.name for p in separate.iterdir()) == ["period-0", "period-1"]
+    assert not [p for p in runs.rglob("*") if "partial" in p.name]
+
+
+def test_results_are_one_list_with_the_agreed_fields(finished_bench):
+    runs = finished_bench[0]
+    found = json.loads((runs / "results.json").read_text())
+    assert len(found) == 4
+    for run in found:
+        assert run.keys() >= FIELDS
+        assert set(run["aggregates"]) == {"macro", "micro", "worst"}
+        assert set(run["periods"]) == {"0", "1"}
+        assert run["peak_memory_bytes"] > 50e6 and run["seconds"] > 0
+        assert run["device"].startswith("cpu (") and "1 thread)" in run["device"]
+        assert set(run["skipped"]) >= {"lpips_vgg"} or "lpips_vgg" in run["aggregates"]["macro"]
+
+
+def test_strategies_show_in_the_numbers(finished_bench):
+    runs = finished_bench[0]
+    by_name = {p.parent.name: read_run(p) for p in run_folders(runs)}
+    told, pooled = by_name["mean-joint-balanced"], by_name["mean-pooled-balanced"]
+    separate, blind = by_name["mean-separate-balanced"], by_name["blind-pooled-balanced"]
+    # Noise of at most 9 grey values around each period's colour: 33.7 dB; the mean of both colours
+    # is some 60 grey values away.
+    assert told.aggregates["worst"]["psnr"] > 33 and separate.aggregates["worst"]["psnr"] > 33
+    assert pooled.aggregates["macro"]["psnr"] < 15
+    assert blind.aggregates == pooled.aggregates
+    assert told.primitives == separate.primitives == 2 and pooled.primitives == 1
+    assert told.iterations == separate.iterations == 20
+    assert blind.notices == ["blind takes no period: joint is run and recorded as pooled"]
+
+
+def test_failures_stop_nobody_else(finished_bench):
+    runs, outcome, said = finished_bench
+    assert len(outcome.finished) == 2
+    reasons = {f.method: f.reason for f in outcome.failures}
+    assert reasons["raises"] == "RuntimeError: the toy is broken (see error.log)"
+    assert "iteration 6: expected a finite loss, found nan" in reasons["not-finite"]
+    assert reasons["killed"] == "the process was ended by SIGKILL (out of memory?)"
+    assert "the toy is broken" in (runs / "ring/raises-joint-balanced/seed0/error.log").read_text()
+    assert any("blind takes no period" in line for line in said)
+    assert len(results.read_failures(runs)) == 3
+
+
+def test_rows_hold_every_view_and_metric(finished_bench):
+    runs = finished_bench[0]
+    with (runs / "rows.csv").open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    metrics = {"psnr", "ssim", "ssim_valid"}
+    for folder in run_folders(runs):
+        record, rows = read_run(folder), read_rows(folder)
+        views = [e.view for e in read_manifest(folder / "predictions").images]
+        assert {(r.view, r.metric) for r in rows} >= {(v, m) for v in views for m in metrics}
+        mine = [line for line in lines if line["config_hash"] == record.config_hash]
+        assert len(mine) == len(rows)
+        assert {line["scene_hash"] for line in mine} == {record.scene_hash}
+        assert [float(line["value"]) for line in mine] == [row.value for row in rows]
+
+
+def test_curves_belong_to_models(finished_bench):
+    path = finished_bench[0] / "ring/mean-separate-balanced/seed0/curve.csv"
+    with path.open(newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert list(lines[0]) == ["seconds", "iteration", "primitives", "psnr", "parameters", "model"]
+    assert {line["model"] for line in lines} == {"period-0", "period-1"}
+    assert max(int(line["iteration"]) for line in lines) == 10
+
+
+def test_the_dataset_is_left_alone(scene_folder, finished_bench):
+    files = {p.relative_to(scene_folder).parts[0] for p in scene_folder.rglob("*") if p.is_file()}
+    assert files == {"images", "sparse"}
+
+
+def test_finished_runs_are_kept_and_failed_ones_tried_again(bench, runs):
+    folder = runs / "ring/mean-joint-balanced/seed0"
+    before = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in folder.rglob("*") if p.is_file()}
+    outcome, said = bench("MEAN", "RAISES", runs=runs)
+    after = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in folder.rglob("*") if p.is_file()}
+    assert after == before
+    assert outcome.skipped == 1 and outcome.finished == (folder,)
+    assert said[0] == "1 of 2 runs are finished and kept"
+    assert [f.method for f in outcome.failures] == ["raises"]
+
+
+def test_other_settings_are_refused_or_replace(bench, runs):
+    folder = runs / "ring/mean-joint-balanced/seed0"
+    with pytest.raises(ConfigError, match=r"with iterations 7, found .* with iterations 20;"):
+        bench("MEAN", runs=runs, iterations=7)
+    assert read_run(folder).iterations == 20
+    bench("MEAN", runs=runs, iterations=7, overwrite=True)
+    assert read_run(folder).iterations == 7
+
+
+def test_seeds_overrides_and_budgets(bench):
+    overrides = {"sleep": "0.01", "mean.rate": "0.25"}
+    outcome, _ = bench("MEAN", budget_seconds=0.4, seeds=(3,), overrides=overrides)
+    (folder,) = outcome.finished
+    record = read_run(folder)
+    assert folder.name == "seed3" and record.seed == 3
+    assert 0.4 <= record.seconds < 0.6 and 5 < record.iterations < 45
+    config = json.loads((folder / "config.json").read_text())["config"]
+    assert config["method_config"]["rate"] == 0.25
+    assert config["stop"] == {"iterations": None, "seconds": 0.4}
+
+
+def test_separate_models_share_or_repeat(bench):
+    each, _ = bench("MEAN", strategies=("separate",), iterations=9, separate_iterations="each")
+    assert read_run(each.finished[0]).iterations == 18
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"preset": "best"}, "expected one of balanced, slow"),
+        ({"overrides": {"rates": "1"}}, "did you mean 'rate'"),
+        ({"overrides": {"chronogs.rate": "1"}}, "name a method that is run"),
+        ({"device": "cuda"}, "mean --device: expected one of cpu"),
+        ({"overrides": {"iterations": "0"}}, "expected a positive number"),
+        ({"strategies": ("mixed",)}, "expected one of joint, pooled, separate"),
+    ],
+)
+def test_wrong_settings_end_before_anything_is_trained(bench, tmp_path, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        bench("MEAN", **changes)
+    assert not list(tmp_path.glob("runs/ring/*"))
+
+
+def test_wrong_weights_end_before_anything_is_trained(bench, tmp_path):
+    (tmp_path / "w").mkdir()
+    with pytest.raises(MetricUnavailableError, match="vgg16-397923af"):
+        bench("MEAN", lpips_weights=tmp_path / "w")
+
+
+def test_scenes_of_one_name_are_refused(bench, scene_folder, tmp_path):
+    other = Path(shutil.copytree(scene_folder, tmp_path / "copy" / "ring"))
+    with pytest.raises(ConfigError, match="'ring', the name of"):
+        bench("MEAN", scenes=(scene_folder, other))
+
+
+def test_another_evaluation_size_needs_another_folder(bench, runs):
+    with pytest.raises(ConfigError, match="expected --max-width 12, found --max-width 1600"):
+        bench("BLIND", runs=runs, seeds=(7,), max_width=12)
+
+
+def test_a_scene_that_is_none(bench, tmp_path):
+    with pytest.raises(SceneError, match="expected a scene"):
+        bench("MEAN", scenes=(tmp_path,))
+
+
+def test_images_are_trained_and_scored_at_the_evaluation_size(bench):
+    (folder,) = bench("MEAN", max_width=12)[0].finished
+    assert {(e.width, e.height) for e in read_manifest(folder / "predictions").images} == {(12, 8)}
+    assert "ssim_valid" in read_run(folder).skipped
+
+
+def test_memory_is_that_of_the_run_alone(bench, finished_bench):
+    """A worker does not inherit the peak of a big parent, and its own arrays count."""
+    low = read_run(finished_bench[0] / "ring/mean-joint-balanced/seed0").peak_memory_bytes
+    parent = np.ones(1_000_000_000, np.uint8)
+    outcome, _ = bench("MEAN", overrides={"ballast": "300000000"})
+    high = read_run(outcome.finished[0]).peak_memory_bytes
+    assert parent.all()
+    assert 290e6 < high - low < 400e6
+
+
+def test_differences_are_named():
+    old = {"config": {"a": 1, "b": {"c": 2}}, "seed": 0}
+    new = {"config": {"a": 1, "b": {"c": 3}}, "seed": 0}
+    assert first_difference(old, new) == ("c 2", "c 3")
+
+
+def test_overrides_with_a_prefix_are_for_one_method(tmp_path):
+    settings = BenchSettings((), (), tmp_path, overrides={"blind.rate": "1", "rate": "2"})
+    specs = [load_spec("toy_methods:MEAN"), load_spec("toy_methods:BLIND")]
+    assert split_overrides(settings, specs) == {"mean": {"rate": "2"}, "blind": {"rate": "1"}}
