@@ -83,6 +83,12 @@ def smooth(low, high, x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def lottery(draw, share, seen):  # type: ignore[no-untyped-def]
+    """1 for draws below ``share``, else 0; tends to the mean where cells are too small to see."""
+    return (seen if draw < share else 0.0) + (1.0 - seen) * share
+
+
+@njit(cache=True)
 def mix(a, b, t):  # type: ignore[no-untyped-def]
     """Colours between a (t = 0) and b (t = 1)."""
     return (a[0] + (b[0] - a[0]) * t, a[1] + (b[1] - a[1]) * t, a[2] + (b[2] - a[2]) * t)

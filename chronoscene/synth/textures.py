@@ -11,7 +11,7 @@ import math
 
 from numba import njit
 
-from chronoscene.synth.noise import fade, fbm, hash01, mix, pulse, scaled, smooth, span
+from chronoscene.synth.noise import fade, fbm, hash01, lottery, mix, pulse, scaled, smooth, span
 
 PLAIN, PLASTER, BRICK, PANEL, CONCRETE, TILES, FLAT_ROOF, ASPHALT, PAVING, GRASS = range(10)
 SOIL, LEAVES, WOOD, PAINT, CORRUGATED, FIELDS, GLASS, SIGN, WATER, SOLAR, DOOR = range(10, 21)
@@ -230,9 +230,10 @@ def _grass(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     ix, iy = math.floor(x / 0.35), math.floor(y / 0.35)
     pick = hash01(ix, iy, seed + 3)
     cluster = 0.5 + 0.5 * fbm(x, y, 2.2, 3, seed + 4, fw)
-    if pick < s[11] * cluster:  # fallen leaves, or flowers
-        leaf = (0.36, 0.15, 0.03) if hash01(ix, iy, seed + 5) < 0.6 else (0.45, 0.29, 0.05)
-        color = mix(color, leaf, 0.85 * fade(0.3, 0.7 * fw))
+    litter = lottery(pick, s[11] * cluster, fade(0.3, 0.7 * fw))  # fallen leaves, or flowers
+    leaf = (0.36, 0.15, 0.03) if hash01(ix, iy, seed + 5) < 0.6 else (0.45, 0.29, 0.05)
+    leaf = mix((0.396, 0.206, 0.038), leaf, fade(0.3, 0.7 * fw))
+    color = mix(color, leaf, 0.85 * litter)
     return color
 
 
@@ -243,8 +244,9 @@ def _soil(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     color = mix(c0, c1, smooth(-0.5, 0.5, fbm(u, v, 4.0, 6, seed, fw)))
     color = scaled(color, 1.0 + 0.4 * fbm(u, v, 0.5, 3, seed + 1, fw))
     ix, iy = math.floor(u / 0.3), math.floor(v / 0.3)
-    if hash01(ix, iy, seed + 2) < s[10]:
-        color = mix(color, scaled(c2, 0.6 + 0.8 * hash01(ix, iy, seed + 3)), fade(0.3, 0.7 * fw))
+    seen = fade(0.3, 0.7 * fw)
+    stone = scaled(c2, 1.0 + 0.8 * seen * (hash01(ix, iy, seed + 3) - 0.5))
+    color = mix(color, stone, lottery(hash01(ix, iy, seed + 2), s[10], seen))
     wave = v + 0.8 * fbm(u, 0.3 * v, 9.0, 2, seed + 4, fw)
     rut = pulse(wave, 6.5, 0.45, fw) + pulse(wave - 1.8, 6.5, 0.45, fw)
     return scaled(color, 1.0 - s[11] * 0.4 * rut)
@@ -262,8 +264,7 @@ def _leaves(s, x, y, z, seed, fw):  # type: ignore[no-untyped-def]
     pick = hash01(ix + 57 * iz, iy, seed + 1)
     near = fade(size, 0.8 * fw)
     color = mix(c0, c1, min(1.0, max(0.0, 0.5 + 0.8 * clump + 0.5 * near * (pick - 0.5))))
-    if hash01(ix, iy + 31 * iz, seed + 2) < s[11]:
-        color = mix(color, c2, near)
+    color = mix(color, c2, lottery(hash01(ix, iy + 31 * iz, seed + 2), s[11], near))
     dark = fbm(a * 1.3, b * 1.3, 1.6 * size, 3, seed + 3, fw)
     return scaled(color, max(0.25, 0.92 + 0.6 * dark + 0.35 * near * (pick - 0.5)))
 
@@ -299,8 +300,9 @@ def _corrugated(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     if s[12] > 0.0:
         iu = math.floor(u / 0.45)
         letter = span(v, 0.45 * sv, 0.7 * sv, fw) * pulse(u, 0.45, 0.3, fw)
-        inside = 1.0 if 0.2 * su < u < 0.75 * su and hash01(iu, 3, seed) < 0.8 else 0.0
-        color = mix(color, c2, letter * inside * fade(0.3, 0.7 * fw))
+        inside = span(u, 0.2 * su, 0.75 * su, fw)
+        there = lottery(hash01(iu, 3, seed), 0.8, fade(0.3, 0.7 * fw))
+        color = mix(color, c2, letter * inside * there)
     rust = smooth(0.55 - s[11], 0.8 - s[11], fbm(u * 1.5, v * 0.6, 1.0, 4, seed + 1, fw) + 0.2)
     return _weather(mix(color, c1, 0.8 * rust), u, v, seed, fw, 0.15)
 
@@ -380,7 +382,8 @@ def _sign(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
                     else:
                         side = 0.12 + 0.56 * (stroke - 3)
                         ink = max(ink, span(a, side - 0.07, side + 0.07, w) * span(b, 0.0, 1.0, w))
-            color = mix(color, c1, ink * fade(0.25 * height, 0.5 * fw))
+            seen = fade(0.25 * height, 0.5 * fw)
+            color = mix(color, c1, seen * ink + (1.0 - seen) * 0.25 * span(b, 0.0, 1.0, w))
     border = 1.0 - span(u, 0.05, su - 0.05, fw) * span(v, 0.05, sv - 0.05, fw)
     return mix(color, c2, min(1.0, max(0.0, border)))
 

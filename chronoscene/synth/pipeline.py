@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from datetime import date
 from pathlib import Path
@@ -29,8 +31,13 @@ FIRST_YEAR = 2016
 def run(out: Path, settings: SynthSettings, progress: Progress | None = None) -> None:
     """Make a scene; see `chronoscene.synth.generate`. The folder appears complete or not at all."""
     _refuse_used(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
+    _make_parent(out)
+    with (
+        warnings.catch_warnings(),
+        tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary,
+    ):
+        # open3d loads a TBB that Numba finds too old; Numba then takes another layer, and says so.
+        warnings.filterwarnings("ignore", message="The TBB threading layer")
         raw, staged = Path(temporary) / "raw", Path(temporary) / "scene"
         scene = _make(raw, settings, progress or (lambda done, total, what: None), out.name)
         scene_format.write(scene, staged, image_source="link")
@@ -47,6 +54,21 @@ def _refuse_used(out: Path) -> None:
             expected="a new or empty folder",
             found="a folder with files" if out.is_dir() else "a file",
             todo="choose another folder, or empty this one",
+        )
+
+
+def _make_parent(out: Path) -> None:
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        writable = os.access(out.parent, os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
+        raise SceneError(
+            out.parent,
+            expected="a folder that can be written",
+            found="one that cannot",
+            todo="choose another place for the scene",
         )
 
 
