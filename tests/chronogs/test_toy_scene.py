@@ -1,0 +1,190 @@
+"""A place of two periods, small enough to train: what each kind of feature is there for.
+
+In period 1 a box stands on the ground and the wall has another colour. Images are traced
+analytically, so nothing of ours is on both sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from chronogs.config import ChronoGSConfig
+from chronogs.method import ChronoGS
+from chronoscene.geometry import Sim3
+from chronoscene.methods import TrainingSet, TrainingView
+
+pytestmark = pytest.mark.slow
+
+WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
+BOX = np.array([[-0.3, -0.3, 0.0], [0.3, 0.3, 0.5]])
+STEPS = 500
+
+Array = NDArray[np.float64]
+
+
+def camera(angle: float, radius: float, height: float) -> Array:
+    """Pose that looks from a ring at a point above the middle. [4, 4]"""
+    centre = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+    forward = np.array([0.0, 0.0, 0.15]) - centre
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    return pose
+
+
+def paint(points: Array, tint: Array) -> Array:
+    """A smooth texture around a colour. [N, 3]"""
+    wave = np.sin(9.0 * points[:, :1] + np.sin(7.0 * points[:, 1:2]) + 8.0 * points[:, 2:])
+    return tint * (0.75 + 0.25 * wave)
+
+
+def trace(pose: Array, period: int) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The image and where it shows the box. [H, W, 3], [H, W]"""
+    v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1)
+    rays = rays.reshape(-1, 3) @ pose[:3, :3]
+    origin = -pose[:3, :3].T @ pose[:3, 3]
+    image, depth = np.zeros((len(rays), 3)), np.full(len(rays), np.inf)
+    wall = [[0.8, 0.3, 0.2], [0.2, 0.4, 0.8]][period]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis, level, tint in ((2, 0.0, [0.6, 0.6, 0.5]), (1, 1.2, wall)):
+            t = (level - origin[axis]) / rays[:, axis]
+            points = origin + t[:, None] * rays
+            inside = (np.abs(points[:, 0]) < 1.2) & (points[:, 1] < 1.2 + 1e-9)
+            inside &= (points[:, 1] > -1.2) & (points[:, 2] > -1e-9) & (points[:, 2] < 0.8)
+            hit = (t > 0) & (t < depth) & inside
+            image[hit], depth[hit] = paint(points[hit], np.array(tint)), t[hit]
+        slabs = (BOX[:, None] - origin) / rays
+        enter, leave = slabs.min(axis=0).max(axis=1), slabs.max(axis=0).min(axis=1)
+    box = (enter < leave) & (enter > 0) & (enter < depth) & (period == 1)
+    points = origin + enter[box, None] * rays[box]
+    image[box] = paint(points, np.array([0.2, 0.7, 0.3]))
+    pixels = np.round(image.reshape(HEIGHT, WIDTH, 3) * 255).astype(np.uint8)
+    return pixels, box.reshape(HEIGHT, WIDTH)
+
+
+def surface_points() -> NDArray[np.float32]:
+    """Points on ground, wall and box. [P, 3]"""
+    generator = np.random.default_rng(0)
+    ground = generator.uniform(-1.2, 1.2, (500, 3)) * [1, 1, 0]
+    wall = generator.uniform([-1.2, 1.2, 0], [1.2, 1.2, 0.8], (200, 3))
+    box = generator.uniform(BOX[0], BOX[1], (200, 3))
+    side = generator.integers(0, 5, 200)
+    for i, (axis, end) in enumerate([(0, 0), (0, 1), (1, 0), (1, 1), (2, 1)]):
+        box[side == i, axis] = BOX[end, axis]
+    return np.concatenate([ground, wall, box]).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A held-out view and its truth."""
+
+    view: TrainingView
+    image: NDArray[np.uint8]
+    box: NDArray[np.bool_]
+
+
+def make_views(period: int, angles: Array, radius: float, height: float) -> list[TrainingView]:
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    return [
+        TrainingView(
+            K=K, width=WIDTH, height=HEIGHT, cam_from_world=camera(a, radius, height),
+            name=f"{period}_{a:.3f}_{radius}.png", period=period,
+        )
+        for a in angles
+    ]  # fmt: skip
+
+
+def training_set(periods: tuple[int, ...]) -> TrainingSet:
+    """Views of some of the periods, numbered from 0."""
+    arc = np.linspace(-np.pi * 0.95, -0.05 * np.pi, 14)
+    truth, views = [], []
+    for number, period in enumerate(periods):
+        for view in (*make_views(period, arc, 1.9, 1.2), *make_views(period, arc, 1.6, 0.8)):
+            truth.append(trace(view.cam_from_world, period)[0])
+            views.append(
+                TrainingView(
+                    K=view.K, width=WIDTH, height=HEIGHT, cam_from_world=view.cam_from_world,
+                    name=view.name, period=number,
+                )
+            )  # fmt: skip
+    points = surface_points()
+    return TrainingSet(
+        views=tuple(views),
+        num_periods=len(periods),
+        points=points,
+        colors=np.zeros((len(points), 3), np.uint8),
+        point_periods=np.ones((len(points), len(periods)), bool),
+        training_from_world=Sim3.identity(),
+        camera_extent=1.1,
+        background=np.zeros(3, np.float32),
+        load_image=lambda index: truth[index],
+    )
+
+
+def held_out(period: int) -> list[Held]:
+    arc = np.linspace(-np.pi * 0.9, -0.1 * np.pi, 6) + 0.07
+    views = make_views(period, arc, 1.75, 1.0)
+    return [Held(v, *trace(v.cam_from_world, period)) for v in views]
+
+
+def train(periods: tuple[int, ...] = (0, 1), **options: int) -> ChronoGS:
+    config = ChronoGSConfig(
+        iterations=STEPS,
+        offsets_per_anchor=5,
+        voxel_size=0.5,
+        voxel_unit="spacing",
+        density_interval=25,
+        **options,  # type: ignore[arg-type]
+    )
+    made = ChronoGS(config)
+    made.setup(training_set(periods), seed=0, device="cpu")
+    for index in range(STEPS):
+        made.step(index, index / STEPS)
+    return made
+
+
+def psnr(
+    made: ChronoGS,
+    period: int,
+    label: int,
+    region: Callable[[Held], NDArray[np.bool_]] = lambda held: np.ones((HEIGHT, WIDTH), bool),
+) -> float:
+    """Mean PSNR of the held-out views of a period, rendered as period ``label``."""
+    values = []
+    for held in held_out(period):
+        mask = region(held)
+        error = made.render(held.view, label).rgb[mask] - held.image[mask] / 255.0
+        values.append(-10.0 * np.log10(np.square(error).mean()))
+    return float(np.mean(values))
+
+
+def box_of_period_1(held: Held) -> NDArray[np.bool_]:
+    return trace(held.view.cam_from_world, 1)[1]
+
+
+def test_what_the_features_are_for() -> None:
+    joint = train()
+    whole = [psnr(joint, p, p) for p in (0, 1)]
+    separate = [psnr(train((p,)), p, 0) for p in (0, 1)]
+    # One model of both periods is as good as one model each.
+    assert whole[0] > separate[0] - 1.0
+    assert whole[1] > separate[1] - 1.0
+
+    timeless = train(period_dim=0, global_dim=0)
+    for p in (0, 1):
+        assert psnr(timeless, p, p) < whole[p] - 4.0
+    # Its box is a ghost: half there in both periods.
+    for p in (0, 1):
+        assert psnr(timeless, p, p, box_of_period_1) < psnr(joint, p, p, box_of_period_1) - 4.0
+
+    no_global = train(global_dim=0)
+    assert np.mean([psnr(no_global, p, p) for p in (0, 1)]) > np.mean(whole) - 3.0
