@@ -120,7 +120,11 @@ class _Visible:
 
     def of(self, c: int) -> tuple[pipeline.Array, pipeline.Array, pipeline.Array]:
         """Flat arrays of one camera for the kernel, which writes integers as float bits."""
-        means2d, radii, depths = self.means2d[c], self.radii[c].view(torch.float32), self.depths[c]
+        means2d, radii, depths = (
+            self.means2d[c],
+            self.radii[c].view(torch.float32),
+            self.depths[c],
+        )
         return means2d.numpy().reshape(-1), radii.numpy().reshape(-1), depths.numpy()
 
 
@@ -231,7 +235,11 @@ class _Job:
         )
 
     def backward(
-        self, lease: _Lease, image_grad: Tensor, alpha_grad: Tensor, weighted_grad: Tensor | None
+        self,
+        lease: _Lease,
+        image_grad: Tensor,
+        alpha_grad: Tensor,
+        weighted_grad: Tensor | None,
     ) -> tuple[Tensor, ...]:
         """Gradients of means, quats, scales, opacities, colors and means2d."""
         assert lease.binned is not None

@@ -13,12 +13,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from chronoscene.rasterizer.cpu import layout as lay
+from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel, serial_kernel
 from chronoscene.rasterizer.cpu.project import chunk_of
 from chronoscene.rasterizer.cpu.simd import (
-    FLAGS,
     floor,
     make_constant,
     maximum,
@@ -30,7 +30,6 @@ from chronoscene.rasterizer.cpu.simd import (
     to_int,
 )
 
-_FAST = set(FLAGS)
 # A pixel on the rim of the ellipse may pass the test of its alpha after rounding; the blocks must
 # include it. In units of log2(alpha).
 _SLACK = 1e-3
@@ -39,7 +38,7 @@ _LEVEL_MIN = lay.LEVEL_MIN - _SLACK
 _block_rows = make_constant([4.0 * i + 0.5 for i in range(8)])  # first row of centres of each
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _columns(mx: Any, my: Any, tile_y: int, record: Any, at: int, width: int) -> Any:
     """First and last block column that the ellipse covers in each block row of a tile row.
 
@@ -63,7 +62,7 @@ def _columns(mx: Any, my: Any, tile_y: int, record: Any, at: int, width: int) ->
     return to_int(first) >> 2, select(hit, to_int(last) >> 2, -1)
 
 
-@njit(forceinline=True)
+@inlined
 def _tile_blocks(first: Any, last: Any, tile_x: int) -> Any:
     """Bits of the blocks between two columns in each row, within one tile."""
     low = maximum(first - np.int32(8 * tile_x), 0)
@@ -74,7 +73,7 @@ def _tile_blocks(first: Any, last: Any, tile_x: int) -> Any:
     return pack_bytes(select(some, bits, 0))
 
 
-@njit(nogil=True, fastmath=_FAST)
+@helper
 def _list_part(first, last, at, limit, order, view, scene, counts, listed):
     """Pairs of the Gaussians first..last of the order of drawing. Returns the list's end.
 
@@ -110,7 +109,7 @@ def _list_part(first, last, at, limit, order, view, scene, counts, listed):
     return at
 
 
-@njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
+@kernel
 def list_pairs(threads, order, count, starts, ends, view, scene, counts, listed):
     """List the pairs of each part and count them by tile.
 
@@ -139,7 +138,7 @@ def list_pairs(threads, order, count, starts, ends, view, scene, counts, listed)
         )
 
 
-@njit(nogil=True, parallel=True, cache=True)
+@kernel
 def bound_pairs(threads, order, count, records_int, bounds):
     """Upper bound of the number of pairs of each part: tiles of rectangles. int64 [threads]"""
     for t in prange(threads):
@@ -151,7 +150,7 @@ def bound_pairs(threads, order, count, records_int, bounds):
         bounds[t] = total
 
 
-@njit(nogil=True, cache=True)
+@serial_kernel
 def tile_offsets(counts, tile_starts):
     """Turn counts by part and tile into places: by tile, within a tile by part."""
     total = 0
@@ -164,7 +163,7 @@ def tile_offsets(counts, tile_starts):
     tile_starts[counts.shape[1]] = total
 
 
-@njit(nogil=True)
+@helper
 def _scatter_part(first, last, places, listed, entries):
     list_tile, list_gaussian, list_blocks, list_row = listed
     entry_gaussian, entry_blocks, entry_row = entries
@@ -177,7 +176,7 @@ def _scatter_part(first, last, places, listed, entries):
         entry_row[place] = list_row[j]
 
 
-@njit(nogil=True, parallel=True, cache=True)
+@kernel
 def scatter_pairs(threads, starts, ends, places, listed, entries):
     """Move the listed pairs to their tiles, keeping their order.
 

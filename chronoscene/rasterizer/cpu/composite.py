@@ -12,14 +12,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from chronoscene.rasterizer.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from chronoscene.rasterizer.cpu import layout as lay
+from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
 from chronoscene.rasterizer.cpu.simd import (
-    FLAGS,
     LANES,
-    absolute,
     any_lane,
     as_float,
     as_int,
@@ -39,36 +38,57 @@ from chronoscene.rasterizer.cpu.simd import (
     store_where,
     trailing_zeros,
 )
-from chronoscene.rasterizer.cpu.vecmath import exp2
+from chronoscene.rasterizer.cpu.vecmath import ROUND, exp2
 
-_FAST = set(FLAGS)
 _AHEAD = 6  # entries by which records are asked for in advance
 _PARTS = 16 // LANES  # vectors per block
 _PART_ROWS = LANES // 4
 _PIXELS = lay.TILE_PIXELS
 _STATE = 64  # numbers per block going forward: light, red, green, blue
 _BACK = 96  # going backward: light, behind, gradient of red, green, blue, end of what counts
+_STEPS, _BACK_STEPS = 64 * _STATE, 64 * _BACK  # where the 24 numbers of `_whitened` are
+FORWARD_NUMBERS, BACKWARD_NUMBERS = _STEPS + 32, _BACK_STEPS + 32
+"""Scratch of one thread."""
 _LEVEL_MIN = lay.LEVEL_MIN
 
 _lane_x = make_constant([i % 4 + 0.5 for i in range(LANES)])
 _lane_y = make_constant([i // 4 + 0.5 for i in range(LANES)])
-_BLOCK_X = np.array([4.0 * (b % 8) for b in range(64)], dtype=np.float32)
-_BLOCK_Y = np.array([4.0 * (b // 8) for b in range(64)], dtype=np.float32)
+_block_steps = make_constant([4.0 * i for i in range(8)])
 
 
-@njit(forceinline=True, fastmath=_FAST)
-def _whitened(records: Any, at: int, left: Any, top: Any) -> Any:
-    """Axes of a Gaussian and (u, v) of the lanes of a tile's first block."""
-    axis_xx, axis_xy = splat(records[at + 2]), splat(records[at + 3])
-    axis_yy, level = splat(records[at + 4]), splat(records[at + 5])
+@inlined
+def _whitened(records: Any, at: int, left: Any, top: Any, state: Any, steps: int) -> Any:
+    """Level of a Gaussian, and (u, v) of the pixels of a tile's first block.
+
+    How u and v change from block to block goes into 24 numbers of ``state``: u by column, u by
+    row, v by row. Adding them costs less than multiplying anew: additions have units of their own.
+    """
+    axis_xx, axis_xy, axis_yy = records[at + 2], records[at + 3], records[at + 4]
+    store(state, steps, _block_steps() * axis_xx)
+    store(state, steps + 8, _block_steps() * axis_xy)
+    store(state, steps + 16, _block_steps() * axis_yy)
     dx = _lane_x() + (left - records[at])
     dy = _lane_y() + (top - records[at + 1])
-    return axis_xx, axis_xy, axis_yy, level, axis_xx * dx + axis_xy * dy, axis_yy * dy
+    return splat(records[at + 5]), dx * axis_xx + dy * axis_xy, dy * axis_yy
 
 
-@njit(nogil=True)
-def _start_tile(left, top, width, height, state, last, plane, end):
+@inlined
+def _offset(u0: Any, v0: Any, block: Any, part: int, state: Any, steps: int) -> Any:
+    """(u, v) of the pixels of part of a block."""
+    row = block >> 3
+    u = u0 + state[steps + (block & 7)] + state[steps + 8 + row]
+    v = v0 + state[steps + 16 + row]
+    if _PARTS > 1:  # the second half is two pixels below
+        u = u + state[steps + 9] * np.float32(0.5 * part)
+        v = v + state[steps + 17] * np.float32(0.5 * part)
+    return u, v
+
+
+@helper
+def _start_tile(left, top, width, height, state, planes, plane, end):
     """Light everywhere, pixels outside the image dead. Returns the blocks inside."""
+    transmittance, last = planes
+    transmittance[plane : plane + _PIXELS] = np.float32(1.0)
     live = np.uint64(0)
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
@@ -79,7 +99,7 @@ def _start_tile(left, top, width, height, state, last, plane, end):
             state[at : at + 16] = np.float32(1.0)
             live |= np.uint64(1) << np.uint64(block)
             continue
-        state[at : at + 16] = np.float32(-1.0)
+        state[at : at + 16] = np.float32(0.0)
         if x < width and y < height:
             live |= np.uint64(1) << np.uint64(block)
             for row in range(min(4, height - y)):
@@ -88,7 +108,7 @@ def _start_tile(left, top, width, height, state, last, plane, end):
     return live
 
 
-@njit(nogil=True)
+@helper
 def _any_light(state, at):
     """Whether any pixel of a block is alive."""
     alive = False
@@ -97,13 +117,16 @@ def _any_light(state, at):
     return alive
 
 
-@njit(nogil=True, fastmath=_FAST)
-def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records, last, state):
+@helper
+def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records, planes, state):
     """Composite the entries of a tile. Returns where it stopped.
 
-    Dead pixels are marked by a negative transmittance. The blocks of each entry are cut down to
-    those that were alive, for the backward pass.
+    A dead pixel has light 0 here, so that nothing adds to it; what light it had is kept in the
+    planes, with the entry before which it ended. That happens once per pixel: the branch is rare,
+    and keeps the test out of the chain of dependent instructions. The blocks of each entry are cut
+    down to those that were alive, for the backward pass.
     """
+    transmittance, last = planes
     for entry in range(start, end):
         bits = blocks[entry] & live
         blocks[entry] = bits
@@ -113,7 +136,7 @@ def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records
                 return entry
             continue
         record = lay.RECORD * gaussians[entry]
-        axis_xx, axis_xy, axis_yy, level, u0, v0 = _whitened(records, record, left, top)
+        level, u0, v0 = _whitened(records, record, left, top, state, _STEPS)
         red, green = splat(records[record + 6]), splat(records[record + 7])
         blue = splat(records[record + 8])
         while bits != 0:
@@ -121,31 +144,31 @@ def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records
             bits &= bits - np.uint64(1)
             for part in range(_PARTS):
                 at = _STATE * block + LANES * part
-                y = _BLOCK_Y[block] + np.float32(_PART_ROWS * part)
-                u = axis_xx * _BLOCK_X[block] + (axis_xy * y + u0)
-                v = axis_yy * y + v0
-                power = level - v * v - u * u
-                alpha = minimum(exp2(power), ALPHA_MAX)
+                u, v = _offset(u0, v0, block, part, state, _STEPS)
+                rest = level - v * v
+                power = rest - u * u
+                alpha = minimum(exp2(power, power + ROUND), ALPHA_MAX)
                 light = load(state, at)
                 weight = select(power >= _LEVEL_MIN, alpha * light, 0.0)
                 after = light - weight
-                alive = after > TRANSMITTANCE_MIN
-                weight = select(alive, weight, 0.0)
                 dying = (light > 0.0) & (after <= TRANSMITTANCE_MIN)
+                if any_lane(dying):
+                    weight = select(dying, 0.0, weight)
+                    after = select(dying, 0.0, after)
+                    here = plane + 16 * block + LANES * part
+                    store_where(transmittance, here, dying, light)
+                    store_where(last, here, dying, splat_int(entry))
+                    store(state, at, after)
+                    if not _any_light(state, _STATE * block):
+                        live &= ~(np.uint64(1) << np.uint64(block))
+                store(state, at, after)
                 store(state, at + 16, load(state, at + 16) + weight * red)
                 store(state, at + 32, load(state, at + 32) + weight * green)
                 store(state, at + 48, load(state, at + 48) + weight * blue)
-                after = select(alive, after, light)
-                store(state, at, after)
-                if any_lane(dying):
-                    store(state, at, select(dying, 0.0 - light, after))
-                    store_where(last, plane + 16 * block + LANES * part, dying, splat_int(entry))
-                    if not _any_light(state, _STATE * block):
-                        live &= ~(np.uint64(1) << np.uint64(block))
     return end
 
 
-@njit(nogil=True, fastmath=_FAST)
+@helper
 def _write_tile(left, top, width, height, plane, state, transmittance, background, image, alphas):
     """Colours over the background, and opacity, from a tile's state to the image."""
     red, green, blue = background
@@ -154,7 +177,11 @@ def _write_tile(left, top, width, height, plane, state, transmittance, backgroun
         at = _STATE * block
         for part in range(_PARTS):
             i = at + LANES * part
-            light = absolute(load(state, i))
+            light, kept = (
+                load(state, i),
+                load(transmittance, plane + 16 * block + LANES * part),
+            )
+            light = select(light > 0.0, light, kept)
             store(state, i, light)
             store(transmittance, plane + 16 * block + LANES * part, light)
             store(state, i + 16, load(state, i + 16) + light * red)
@@ -179,7 +206,7 @@ def _write_tile(left, top, width, height, plane, state, transmittance, backgroun
                         image[3 * pixel + c] = state[at + 16 + 16 * c + k]
 
 
-@njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
+@kernel
 def composite(
     threads,
     counter,
@@ -207,13 +234,13 @@ def composite(
         blocks: Blocks of each entry; cut down to those that were alive. uint64
         records: See `layout`.
         planes: (transmittance, end of the entries that count), by tile, written.
-        states: Scratch, `64 * 64` per thread.
+        states: Scratch, `FORWARD_NUMBERS` per thread.
         background: Three numbers.
         image, alphas: Written. [H * W * 3], [H * W]
     """
     tiles_x = (width + lay.TILE - 1) // lay.TILE
     tiles = tile_stops.size
-    transmittance, last = planes
+    transmittance, _ = planes
     for t in prange(threads):
         state = states[t]
         while True:
@@ -222,7 +249,7 @@ def composite(
                 break
             left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
             plane, start, end = _PIXELS * tile, tile_starts[tile], tile_starts[tile + 1]
-            live = _start_tile(left, top, width, height, state, last, plane, end)
+            live = _start_tile(left, top, width, height, state, planes, plane, end)
             tile_stops[tile] = _forward_tile(
                 start,
                 end,
@@ -233,7 +260,7 @@ def composite(
                 gaussians,
                 blocks,
                 records,
-                last,
+                planes,
                 state,
             )
             _write_tile(
@@ -250,7 +277,7 @@ def composite(
             )
 
 
-@njit(nogil=True, fastmath=_FAST)
+@helper
 def _start_backward(
     left, top, width, height, plane, planes, image_grad, alpha_grad, background, state
 ):
@@ -286,7 +313,7 @@ def _start_backward(
             store(state, i + 80, as_float(load(last, k)))
 
 
-@njit(nogil=True, fastmath=_FAST)
+@helper
 def _backward_tile(start, stop, left, top, entries, records, touched, rows, state):
     """Rows of the entries of a tile, from the last to the first.
 
@@ -304,7 +331,7 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
         if bits == 0:
             continue
         record = lay.RECORD * gaussians[entry]
-        axis_xx, axis_xy, axis_yy, level, u0, v0 = _whitened(records, record, left, top)
+        level, u0, v0 = _whitened(records, record, left, top, state, _BACK_STEPS)
         red, green = splat(records[record + 6]), splat(records[record + 7])
         blue = splat(records[record + 8])
         s = su = sv = suu = suv = svv = sr = sg = sb = splat(np.float32(0.0))
@@ -314,24 +341,28 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
             bits &= bits - np.uint64(1)
             for part in range(_PARTS):
                 at = _BACK * block + LANES * part
-                y = _BLOCK_Y[block] + np.float32(_PART_ROWS * part)
-                u = axis_xx * _BLOCK_X[block] + (axis_xy * y + u0)
-                v = axis_yy * y + v0
-                power = level - v * v - u * u
-                raw = exp2(power)
+                u, v = _offset(u0, v0, block, part, state, _BACK_STEPS)
+                rest = level - v * v
+                power = rest - u * u
+                raw = exp2(power, power + ROUND)
                 counts = (power >= _LEVEL_MIN) & (number < as_int(load(state, at + 80)))
                 alpha = select(counts, minimum(raw, ALPHA_MAX), 0.0)
                 light = load(state, at) / (1.0 - alpha)
                 behind = load(state, at + 16)
-                gr, gg, gb = load(state, at + 32), load(state, at + 48), load(state, at + 64)
+                gr, gg, gb = (
+                    load(state, at + 32),
+                    load(state, at + 48),
+                    load(state, at + 64),
+                )
                 difference = gr * red + (gg * green + (gb * blue - behind))
                 weight = alpha * light
+                step = alpha * difference
                 store(state, at, light)
-                store(state, at + 16, alpha * difference + behind)
+                store(state, at + 16, step + behind)
                 sr = sr + weight * gr
                 sg = sg + weight * gg
                 sb = sb + weight * gb
-                g = select(raw <= ALPHA_MAX, weight * difference, 0.0)
+                g = select(raw <= ALPHA_MAX, step * light, 0.0)
                 gu, gv = g * u, g * v
                 s = s + g
                 su = su + gu
@@ -344,7 +375,7 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
         store_sums(rows, lay.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
 
 
-@njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
+@kernel
 def composite_backward(
     threads,
     counter,
@@ -368,7 +399,7 @@ def composite_backward(
         threads, counter, width, height, tile_starts, tile_stops: As `composite` left them.
         entries: (gaussian, blocks, place of its row) of each entry; as `composite` left them.
         records, planes: As `composite` left them.
-        states: Scratch, `64 * 96` per thread.
+        states: Scratch, `BACKWARD_NUMBERS` per thread.
         background: Three numbers.
         image_grad, alpha_grad: [H * W * 3], [H * W]
         touched: Zeros; 1 is written where a row is. uint8

@@ -37,7 +37,12 @@ WHITEN = math.sqrt(0.5 * LOG2_E)  # u and v over WHITEN are standard deviations
 
 # Camera numbers in one float32 array.
 ROTATION, TRANSLATION, FX, FY, CX, CY = 0, 9, 12, 13, 14, 15
-X_MIN, X_MAX, Y_MIN, Y_MAX = 16, 17, 18, 19  # limits of x / z and y / z for the Jacobian
+X_MIN, X_MAX, Y_MIN, Y_MAX = (
+    16,
+    17,
+    18,
+    19,
+)  # limits of x / z and y / z for the Jacobian
 NEAR, FAR, BLUR = 20, 21, 22
 CAMERA = 24
 

@@ -11,8 +11,18 @@ from numpy.typing import NDArray
 
 from chronoscene.rasterizer.constants import CLAMP_MARGIN
 from chronoscene.rasterizer.cpu import layout as lay
-from chronoscene.rasterizer.cpu.bins import bound_pairs, list_pairs, scatter_pairs, tile_offsets
-from chronoscene.rasterizer.cpu.composite import composite, composite_backward
+from chronoscene.rasterizer.cpu.bins import (
+    bound_pairs,
+    list_pairs,
+    scatter_pairs,
+    tile_offsets,
+)
+from chronoscene.rasterizer.cpu.composite import (
+    BACKWARD_NUMBERS,
+    FORWARD_NUMBERS,
+    composite,
+    composite_backward,
+)
 from chronoscene.rasterizer.cpu.project import add_rows, project, project_backward
 from chronoscene.rasterizer.cpu.simd import LANES
 from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, sort_by_depth
@@ -69,17 +79,32 @@ class Binned:
 
 
 def make_view(
-    viewmat: Array, K: Array, width: int, height: int, near: float, far: float, eps2d: float
+    viewmat: Array,
+    K: Array,
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    eps2d: float,
 ) -> View:
     """Numbers of a camera as the kernels want them."""
     fx, fy, cx, cy = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    margin_x, margin_y = CLAMP_MARGIN * 0.5 * width / fx, CLAMP_MARGIN * 0.5 * height / fy
+    margin_x, margin_y = (
+        CLAMP_MARGIN * 0.5 * width / fx,
+        CLAMP_MARGIN * 0.5 * height / fy,
+    )
     camera = np.zeros(lay.CAMERA, np.float32)
     camera[lay.ROTATION : lay.ROTATION + 9] = viewmat[:3, :3].reshape(-1)
     camera[lay.TRANSLATION : lay.TRANSLATION + 3] = viewmat[:3, 3]
     camera[lay.FX], camera[lay.FY], camera[lay.CX], camera[lay.CY] = fx, fy, cx, cy
-    camera[lay.X_MIN], camera[lay.X_MAX] = -cx / fx - margin_x, (width - cx) / fx + margin_x
-    camera[lay.Y_MIN], camera[lay.Y_MAX] = -cy / fy - margin_y, (height - cy) / fy + margin_y
+    camera[lay.X_MIN], camera[lay.X_MAX] = (
+        -cx / fx - margin_x,
+        (width - cx) / fx + margin_x,
+    )
+    camera[lay.Y_MIN], camera[lay.Y_MAX] = (
+        -cy / fy - margin_y,
+        (height - cy) / fy + margin_y,
+    )
     camera[lay.NEAR], camera[lay.FAR], camera[lay.BLUR] = near, far, eps2d
     return View(camera, width, height)
 
@@ -89,7 +114,10 @@ def _counter() -> Array:
 
 
 def bin_gaussians(
-    workspace: Workspace, scene: Gaussians, view: View, visible: tuple[Array, Array, Array]
+    workspace: Workspace,
+    scene: Gaussians,
+    view: View,
+    visible: tuple[Array, Array, Array],
 ) -> Binned:
     """Project, sort and list by tile; ``visible`` receives means2d, radii (as bits), depths."""
     threads, n, w = numba.get_num_threads(), scene.opacities.size, workspace.array
@@ -174,11 +202,16 @@ def _bin_pairs(
 
 
 def render(
-    workspace: Workspace, binned: Binned, view: View, background: Array, image: Array, alphas: Array
+    workspace: Workspace,
+    binned: Binned,
+    view: View,
+    background: Array,
+    image: Array,
+    alphas: Array,
 ) -> None:
     """Composite the three channels in the records."""
     threads = numba.get_num_threads()
-    states = workspace.array("forward", threads * 4 * lay.TILE_PIXELS, np.float32)
+    states = workspace.array("forward", threads * FORWARD_NUMBERS, np.float32)
     composite(
         threads,
         _counter(),
@@ -207,7 +240,7 @@ def render_backward(
 ) -> tuple[Array, Array]:
     """Sums over pixels by entry: (touched, rows)."""
     threads, count = numba.get_num_threads(), int(binned.numbering[1][-1])
-    states = workspace.array("backward", threads * 6 * lay.TILE_PIXELS, np.float32)
+    states = workspace.array("backward", threads * BACKWARD_NUMBERS, np.float32)
     rows = workspace.array("rows", max(1, count) * lay.RECORD, np.float32)
     touched = workspace.array("touched", max(1, count), np.uint8)
     touched[:] = 0

@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from chronoscene.rasterizer.cpu import layout as lay
+from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
 from chronoscene.rasterizer.cpu.simd import (
-    FLAGS,
     LANES,
     absolute,
     as_float,
@@ -36,13 +36,12 @@ from chronoscene.rasterizer.cpu.simd import (
 )
 from chronoscene.rasterizer.cpu.vecmath import log2
 
-_FAST = set(FLAGS)
 _HUGE = 1e30
 _LEVEL_MIN = lay.LEVEL_MIN
 _ALPHA_MIN = 1.0 / 255.0
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _to_camera(camera: Any, x: Any, y: Any, z: Any) -> Any:
     return (
         camera[0] * x + (camera[1] * y + (camera[2] * z + camera[9])),
@@ -51,7 +50,7 @@ def _to_camera(camera: Any, x: Any, y: Any, z: Any) -> Any:
     )
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _unit(w: Any, x: Any, y: Any, z: Any) -> Any:
     """Unit quaternion and one over the length; scaled first, so that no square underflows."""
     largest = maximum(maximum(absolute(w), absolute(x)), maximum(absolute(y), absolute(z)))
@@ -61,7 +60,7 @@ def _unit(w: Any, x: Any, y: Any, z: Any) -> Any:
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse * scale
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _rotation(w: Any, x: Any, y: Any, z: Any) -> Any:
     """Rotation matrix of a unit quaternion, by rows."""
     return (
@@ -77,7 +76,7 @@ def _rotation(w: Any, x: Any, y: Any, z: Any) -> Any:
     )
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _rotated_row(camera: Any, i: int, r: Any, s: Any) -> Any:
     """Row i of (world-to-camera rotation) (Gaussian's rotation) diag(scales)."""
     a, b, c = camera[3 * i], camera[3 * i + 1], camera[3 * i + 2]
@@ -88,12 +87,12 @@ def _rotated_row(camera: Any, i: int, r: Any, s: Any) -> Any:
     )
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _dot(a: Any, b: Any) -> Any:
     return a[0] * b[0] + (a[1] * b[1] + a[2] * b[2])
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _image_row(focal: Any, ratio: Any, m: Any, depth_row: Any) -> Any:
     """Row of J M: image axis of the three scaled axes; ``focal`` is f / z."""
     return (
@@ -103,7 +102,7 @@ def _image_row(focal: Any, ratio: Any, m: Any, depth_row: Any) -> Any:
     )
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _ellipse(a: Any, b: Any, blur: Any) -> Any:
     """Shear xy/yy, variance of x given y, variance of y, of Sigma = (a, b)(a, b)^T + blur I.
 
@@ -117,7 +116,7 @@ def _ellipse(a: Any, b: Any, blur: Any) -> Any:
     return shear, _dot(d, d) + blur * (1.0 + shear * shear), yy
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _tile_range(low: Any, high: Any, size: int) -> Any:
     """First tile and number of tiles of pixel centres between two coordinates."""
     first = maximum(minimum(0.0 - floor(0.5 - low), float(size)), 0.0)
@@ -127,9 +126,20 @@ def _tile_range(low: Any, high: Any, size: int) -> Any:
     return start, select(last < first, 0, count)
 
 
-@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+@helper
 def _project_group(
-    at, means, quats, scales, opacities, colors, camera, width, height, records, keys, out
+    at,
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    camera,
+    width,
+    height,
+    records,
+    keys,
+    out,
 ):
     """Project Gaussians at..at+LANES into records, sort keys and what the caller sees."""
     means2d, radii, depths = out
@@ -197,18 +207,20 @@ def _project_group(
     rx = to_int(minimum(zero - floor(zero - ex), 2e9))
     ry = to_int(minimum(zero - floor(zero - ey), 2e9))
     store_columns(
-        radii, 2 * at, (as_float(select(visible, rx, 0)), as_float(select(visible, ry, 0)))
+        radii,
+        2 * at,
+        (as_float(select(visible, rx, 0)), as_float(select(visible, ry, 0))),
     )
     store(depths, at, select(visible, pz, 0.0))
 
 
-@njit(nogil=True)
+@helper
 def chunk_of(gaussian, chunks):
     """Number of the chunk of a Gaussian."""
     return min(gaussian // lay.CHUNK, chunks - 1)
 
 
-@njit(nogil=True)
+@helper
 def _chunk_range(chunk, chunks, n):
     """First Gaussian of a chunk and the end. The last one takes what is left of the division,
     so that none of several is shorter than a vector."""
@@ -216,7 +228,7 @@ def _chunk_range(chunk, chunks, n):
     return first, n if chunk == chunks - 1 else first + lay.CHUNK
 
 
-@njit(nogil=True)
+@helper
 def _number_rows(first, last, records_int, row_starts):
     """Give each Gaussian one row for each tile of its rectangle. Returns the number of rows."""
     row = 0
@@ -228,7 +240,7 @@ def _number_rows(first, last, records_int, row_starts):
     return row
 
 
-@njit(nogil=True, parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+@kernel
 def project(
     threads,
     counter,
@@ -290,7 +302,7 @@ def project(
             chunk_rows[chunk] = _number_rows(first, last, records_int, row_starts)
 
 
-@njit(nogil=True, fastmath=_FAST)
+@helper
 def _add_rows(row, end, touched, rows, sums, at):
     """Add rows row..end, in this order, to 16 numbers at ``sums[at]``."""
     total = load16(sums, at)
@@ -300,7 +312,7 @@ def _add_rows(row, end, touched, rows, sums, at):
     store(sums, at, total)
 
 
-@njit(nogil=True)
+@helper
 def _rows_of(gaussian, last, chunk, numbering):
     """First row of a Gaussian and the end of its rows, in a chunk that ends before ``last``."""
     row_starts, row_bases = numbering
@@ -310,7 +322,7 @@ def _rows_of(gaussian, last, chunk, numbering):
     return base + row_starts[gaussian], end
 
 
-@njit(nogil=True, parallel=True, cache=True, fastmath=_FAST)
+@kernel
 def add_rows(threads, counter, numbering, touched, rows, sums):
     """Add the rows of each Gaussian to its 16 numbers in ``sums``; see `project_backward`."""
     n, chunks = sums.size // lay.RECORD, numbering[1].size - 1
@@ -325,7 +337,7 @@ def add_rows(threads, counter, numbering, touched, rows, sums):
                 _add_rows(row, end, touched, rows, sums, lay.RECORD * i)
 
 
-@njit(nogil=True, parallel=True, cache=True)
+@kernel
 def set_colors(threads, values, channels, first, records):
     """Put up to three of the channels of each Gaussian into its record, zeros for missing ones."""
     for i in prange(records.size // lay.RECORD):
@@ -336,7 +348,7 @@ def set_colors(threads, values, channels, first, records):
             records[lay.RECORD * i + lay.COLOR + c] = value
 
 
-@njit(forceinline=True, fastmath=_FAST)
+@inlined
 def _quaternion_gradient(w: Any, x: Any, y: Any, z: Any, d: Any) -> Any:
     """Gradient of a unit quaternion from that of its rotation matrix, given by rows."""
     return (
@@ -350,9 +362,19 @@ def _quaternion_gradient(w: Any, x: Any, y: Any, z: Any, d: Any) -> Any:
     )
 
 
-@njit(nogil=True, fastmath=_FAST, error_model="numpy")
+@helper
 def _backward_group(
-    at, sums, sums_at, means, quats, scales, opacities, depth_gradients, camera, keys, grads
+    at,
+    sums,
+    sums_at,
+    means,
+    quats,
+    scales,
+    opacities,
+    depth_gradients,
+    camera,
+    keys,
+    grads,
 ):
     """Gradients of Gaussians at..at+LANES from their sums over pixels."""
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_means2d = grads
@@ -480,7 +502,7 @@ def _backward_group(
     store_columns(grad_means2d, 2 * at, (select(drawn, gmx, 0.0), select(drawn, gmy, 0.0)))
 
 
-@njit(nogil=True, parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+@kernel
 def project_backward(
     threads,
     counter,

@@ -93,7 +93,9 @@ def _shuffle(builder: Any, a: Any, b: Any, lanes: Sequence[int | None]) -> Any:
     """Lanes of a, then of b, by number; None is any value."""
     free = a.type.count - 1
     return builder.shuffle_vector(
-        a, b, _constant([min(k, free) if i is None else i for k, i in enumerate(lanes)], _I32)
+        a,
+        b,
+        _constant([min(k, free) if i is None else i for k, i in enumerate(lanes)], _I32),
     )
 
 
@@ -537,7 +539,12 @@ def store_columns(typingctx: Any, array: Any, offset: Any, columns: Any) -> Any:
             flat = range(i * LANES, (i + 1) * LANES)
             row = _pick(builder, vectors, [(k % count, k // count) for k in flat])
             address = _vector_address(
-                context, builder, sig.args[0], args[0], _offset(builder, args[1], i * LANES), LANES
+                context,
+                builder,
+                sig.args[0],
+                args[0],
+                _offset(builder, args[1], i * LANES),
+                LANES,
             )
             builder.store(row, address, align=4)
         return context.get_dummy_value()
@@ -635,7 +642,9 @@ def _pairwise_sums(builder: Any, vectors: list[Any]) -> Any:
             x, y = (zeros if v is None else v for v in (a, b))
             folded.append(
                 builder.fadd(
-                    _shuffle(builder, x, y, low), _shuffle(builder, x, y, high), flags=FLAGS
+                    _shuffle(builder, x, y, low),
+                    _shuffle(builder, x, y, high),
+                    flags=FLAGS,
                 )
             )
         vectors = folded
@@ -701,7 +710,12 @@ def load_pixels(typingctx: Any, array: Any, offset: Any, stride: Any, channels: 
         for _ in range(LANES // 4):
             for first in range(count):
                 four = _load(
-                    context, builder, sig.args[0], args[0], _offset(builder, at, 4 * first), 4
+                    context,
+                    builder,
+                    sig.args[0],
+                    args[0],
+                    _offset(builder, at, 4 * first),
+                    4,
                 )
                 parts.append(four)
             at = builder.add(at, args[2])

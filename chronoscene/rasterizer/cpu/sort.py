@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from chronoscene.rasterizer.cpu.kernel import helper, kernel
 
 DIGIT_BITS = 11
 
 
-@njit(nogil=True)
+@helper
 def _find_range(keys, first, last, found):
     """Count, smallest and largest of the keys that are not negative."""
     count, low, high = 0, np.int64(0x7FFFFFFF), np.int64(-1)
@@ -23,7 +25,7 @@ def _find_range(keys, first, last, found):
     found[0], found[1], found[2] = count, low, high
 
 
-@njit(nogil=True)
+@helper
 def _compact(keys, first, last, base, at, pairs):
     """Write (key - base) << 32 | index for the keys that are not negative."""
     for i in range(first, last):
@@ -33,14 +35,14 @@ def _compact(keys, first, last, base, at, pairs):
             at += 1
 
 
-@njit(nogil=True)
+@helper
 def _count_digits(pairs, first, last, shift, mask, counts):
     counts[:] = 0
     for i in range(first, last):
         counts[(pairs[i] >> shift) & mask] += 1
 
 
-@njit(nogil=True)
+@helper
 def _offsets(counts, digits):
     """Turn counts [threads, digits] into places: by digit, within a digit by thread."""
     total = 0
@@ -51,7 +53,7 @@ def _offsets(counts, digits):
             total += count
 
 
-@njit(nogil=True)
+@helper
 def _scatter(pairs, first, last, shift, mask, places, target):
     for i in range(first, last):
         pair = pairs[i]
@@ -60,7 +62,7 @@ def _scatter(pairs, first, last, shift, mask, places, target):
         places[digit] += 1
 
 
-@njit(nogil=True, parallel=True, cache=True)
+@kernel
 def sort_by_depth(threads, keys, counts, pairs, spare):
     """Sort the indices of keys that are not negative by key, then by index.
 
@@ -96,7 +98,12 @@ def sort_by_depth(threads, keys, counts, pairs, spare):
         shift, mask = 32 + p * width, (1 << width) - 1
         for t in prange(threads):
             _count_digits(
-                source, total * t // threads, total * (t + 1) // threads, shift, mask, counts[t]
+                source,
+                total * t // threads,
+                total * (t + 1) // threads,
+                shift,
+                mask,
+                counts[t],
             )
         _offsets(counts, mask + 1)
         for t in prange(threads):

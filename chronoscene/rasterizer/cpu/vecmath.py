@@ -4,31 +4,35 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import njit
+from chronoscene.rasterizer.cpu.kernel import inlined
+from chronoscene.rasterizer.cpu.simd import as_float, as_int, to_float
 
-from chronoscene.rasterizer.cpu.simd import FLAGS, as_float, as_int, to_float
+ROUND = 12582912.0
+"""1.5 * 2^23: adding it leaves the nearest whole number in the low bits."""
 
-_ROUND = 12582912.0  # 1.5 * 2^23: adding it leaves the nearest whole number in the low bits
 
-
-@njit(forceinline=True, fastmath=set(FLAGS))
-def exp2(x: Any) -> Any:
+@inlined
+def exp2(x: Any, shifted: Any) -> Any:
     """2^x for -126 < x < 127, relative error below 2.4e-7; some other number outside.
 
-    Polynomial of least maximal relative error on half an octave either side of a whole number.
+    Polynomial of least maximal relative error on half an octave either side of a whole number,
+    evaluated by pairs: what waits for it is longer than the arithmetic.
+
+    Args:
+        x: Exponents.
+        shifted: x + ROUND, which the caller may have sooner than x.
     """
-    shifted = x + _ROUND
     exponent = as_int(shifted) << 23
-    f = x - (shifted - _ROUND)
-    p = f * 0.0013276472454890609 + 0.009675540961325169
-    p = p * f + 0.05550713092088699
-    p = p * f + 0.24022120237350464
-    p = p * f + 0.6931469440460205
-    p = p * f + 1.0000001192092896
+    f = x - (shifted - ROUND)
+    ff = f * f
+    low = f * 0.6931469440460205 + 1.0000001192092896
+    middle = f * 0.05550713092088699 + 0.24022120237350464
+    high = f * 0.0013276472454890609 + 0.009675540961325169
+    p = (high * ff + middle) * ff + low
     return as_float(as_int(p) + exponent)
 
 
-@njit(forceinline=True, fastmath=set(FLAGS))
+@inlined
 def log2(x: Any) -> Any:
     """Base-2 logarithm of normal positive numbers, absolute error below 3e-7 near 1.
 

@@ -14,9 +14,18 @@ from numpy.typing import NDArray
 
 _GROWTH = 1.25
 _KEPT = 4
+_LINE = 64
 
 _free: list[Workspace] = []
 _lock = threading.Lock()
+
+
+def aligned(size: int, dtype: type) -> NDArray[Any]:
+    """Uninitialised array that begins on a cache line, so that no vector straddles two."""
+    count = size * np.dtype(dtype).itemsize
+    raw = np.empty(count + _LINE, np.uint8)
+    start = -raw.ctypes.data % _LINE
+    return raw[start : start + count].view(dtype)
 
 
 class Workspace:
@@ -30,7 +39,7 @@ class Workspace:
         have = self._arrays.get(name)
         if have is None or have.size < size:
             capacity = size if have is None else max(size, int(have.size * _GROWTH))
-            have = self._arrays[name] = np.empty(capacity, dtype)
+            have = self._arrays[name] = aligned(capacity, dtype)
         return have[:size]
 
 
