@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -56,6 +56,19 @@ class AnchorMethod:
         """Weights of the periods' features. [T]"""
         raise NotImplementedError
 
+    def after_update(self, model: AnchorModel, rates: Mapping[str, float]) -> None:
+        """What a method does to the features after each optimiser step; here nothing."""
+
+    def stored_tensors(self) -> dict[str, Tensor]:
+        """The model as it goes to disk, by name."""
+        return self.model.tensors()
+
+    def restored_tensors(
+        self, stored: dict[str, Tensor], layout: AnchorLayout
+    ) -> dict[str, Tensor]:
+        """Inverse of `stored_tensors`."""
+        return stored
+
     @property
     def model(self) -> AnchorModel:
         """The tensors; there are none before `setup` or `load`."""
@@ -86,6 +99,7 @@ class AnchorMethod:
             seed=seed,
             rates=self.rates(train.camera_extent),
             weights=torch.from_numpy(np.stack(periods)),
+            after_update=self.after_update,
         )
         self._meta = build_meta(
             self.name,
@@ -139,7 +153,7 @@ class AnchorMethod:
 
     def save(self, folder: Path) -> None:
         """Write the model; the optimiser's state is not kept."""
-        save_tensors(folder, self.model.tensors(), self._meta)
+        save_tensors(folder, self.stored_tensors(), self._meta)
 
     def load(self, folder: Path, *, device: str) -> None:
         """Read a model; its own layout and options count, not those given to the constructor."""
@@ -148,13 +162,22 @@ class AnchorMethod:
             raise CheckpointError(
                 folder / "model.json", expected="a layout", found="none", todo="train again"
             )
-        self._model = AnchorModel.from_tensors(AnchorLayout.from_meta(meta["layout"]), tensors)
+        layout = AnchorLayout.from_meta(meta["layout"])
+        try:
+            self._model = AnchorModel.from_tensors(layout, self.restored_tensors(tensors, layout))
+        except KeyError as error:
+            raise CheckpointError(
+                folder / "model.safetensors",
+                expected=f"the tensor {error}",
+                found=", ".join(sorted(tensors)),
+                todo="the model is of another version: train again",
+            ) from error
         self._background = torch.tensor(meta["background"], dtype=torch.float32, device=device)
         self._trainer, self._meta = None, meta
 
     def size(self) -> MethodSize:
         """Anchors, and all stored numbers."""
-        tensors = self.model.tensors().values()
+        tensors = self.stored_tensors().values()
         return MethodSize(len(self.model), sum(tensor.numel() for tensor in tensors))
 
 

@@ -221,6 +221,7 @@ class AnchorModel:
             offset = self.anchors - centre
             features = torch.cat([features[:, :base_dim], offset, features[:, base_dim:]], dim=1)
             base_dim += 3
+        opacity, covariance, color = [self._kernel_head(name) for name in HEADS]
         return decode(
             self.anchors,
             self.offsets,
@@ -228,7 +229,9 @@ class AnchorModel:
             self._scales_in_use(),
             self.global_features,
             period_weights,
-            *(self._kernel_head(name) for name in HEADS),
+            opacity,
+            covariance,
+            color,
             centre,
             visible,
             base_dim=base_dim,

@@ -7,7 +7,7 @@ same bytes for any number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ from chronoscene.training.view import camera_centre_tensor
 from chronoscene.training.volume_loss import mean_volume
 
 Rates = Mapping[str, tuple[float, float]]
+AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]
 
 _ADAM_EPS = 1e-15
 _MARGIN = 1e-9
@@ -88,6 +89,8 @@ class AnchorTrainer:
         seed: All random choices follow from it.
         rates: Learning rates by tensor name.
         weights: Period weights of each period. [T, T]
+        after_update: Called with the model and the learning rates after each step that changed
+            the features.
     """
 
     def __init__(
@@ -100,8 +103,10 @@ class AnchorTrainer:
         seed: int,
         rates: Rates,
         weights: Tensor,
+        after_update: AfterUpdate | None = None,
     ) -> None:
         self.config = config
+        self.after_update = after_update
         self.model = model.requires_grad()
         self.train = train
         self.rules = density_rules(config, voxel_size)
@@ -238,6 +243,8 @@ class AnchorTrainer:
         rates = {name: log_linear(done, *rate) for name, rate in self.rates.items()}
         self.optimizer.step(rates, skip=skip)
         self._decay(rates, skip)
+        if self.after_update is not None and "features" in rates and "features" not in skip:
+            self.after_update(self.model, rates)
         self.optimizer.zero_grad()
 
     @torch.no_grad()
