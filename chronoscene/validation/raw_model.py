@@ -168,7 +168,14 @@ def _damage(file: str, error: OSError | SceneError) -> Damage:
 
 
 def _read_points(path: Path) -> RawPoints:
-    records = read_points(path)
+    try:
+        records = read_points(path)
+    except SceneError as error:
+        if not error.found.startswith("-"):
+            raise
+        # A last record that is too short comes as a negative number of bytes after it.
+        ends = Damage(path.name, error.expected, "a file that ends inside its last record")
+        raise DamagedError(ends) from error
     return RawPoints(
         ids=records.heads["id"].astype(np.int64),
         xyz=np.ascontiguousarray(records.heads["xyz"]),

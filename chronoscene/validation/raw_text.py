@@ -69,6 +69,8 @@ def _camera(fields: list[str]) -> Camera | str:
         return "numbers after the name of the camera model"
     if len(params) != count:
         return f"{count} parameters for {fields[1]}"
+    if not 0 <= camera_id < 2**32:
+        return "a camera id of 32 bits"
     return Camera(camera_id, fields[1], width, height, params)
 
 
@@ -90,6 +92,13 @@ def read_images(path: Path) -> RawImages:
         except (ValueError, IndexError, OverflowError):
             damages.append(Damage(f"{path.name}:{number}", _IMAGE_LINE, quote(line)))
     values, lengths = _numbers(path, keypoint_lines, _KEYPOINT_LINE, _triples, damages)
+    _raise_any(damages)
+    infinite = np.flatnonzero(~np.isfinite(values))
+    for row in np.unique(np.searchsorted(np.cumsum(lengths), infinite, "right")):
+        number, line = keypoint_lines[row]  # COLMAP stops reading there
+        damages.append(
+            Damage(f"{path.name}:{number}", "finite positions of keypoints", quote(line))
+        )
     _raise_any(damages)
     table = np.array(heads, np.float64).reshape(-1, 9)
     keypoints = values.reshape(-1, 3)
@@ -117,6 +126,11 @@ def read_points(path: Path) -> RawPoints:
     _raise_any(damages)
     start = np.concatenate([[0], np.cumsum(lengths)])
     heads = values[start[:-1, None] + np.arange(8)]
+    rgb = heads[:, 4:7]
+    for row in np.flatnonzero(~((rgb >= 0) & (rgb <= 255) & (rgb % 1 == 0)).all(axis=1)):
+        number, line = lines[row]
+        damages.append(Damage(f"{path.name}:{number}", "a colour of three 0..255", quote(line)))
+    _raise_any(damages)
     order = np.argsort(heads[:, 0], kind="stable")
     ids = _integers(heads[order, 0])
     if len(twice := ids[1:][ids[1:] == ids[:-1]]):

@@ -12,7 +12,7 @@ from chronoscene.validation.rules import (
     poses,
     reprojection,
     split,
-    test_list,
+    testlist,
 )
 
 __all__ = [
@@ -27,5 +27,5 @@ __all__ = [
     "poses",
     "reprojection",
     "split",
-    "test_list",
+    "testlist",
 ]

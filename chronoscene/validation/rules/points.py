@@ -157,9 +157,11 @@ def points_of_one_period(scene: RawScene) -> Iterator[Hit]:
 )
 def period_unconnected(scene: RawScene) -> Iterator[Hit]:
     seen = _seen(scene)
+    if np.count_nonzero(seen.any(axis=0)) < 2:
+        return  # nothing to be connected with
     shared = seen.sum(axis=1) > 1
     for column, period in enumerate(scene.period_ids):
-        if seen.shape[1] > 1 and seen[:, column].any() and not seen[shared, column].any():
+        if seen[:, column].any() and not seen[shared, column].any():
             found = f"0 of {np.count_nonzero(seen[:, column])}"
             yield Hit(f"period {period}", "points shared with another period", found)
 
@@ -181,6 +183,24 @@ def image_without_points(scene: RawScene) -> Iterator[Hit]:
     if names:
         found = f"{counted(len(names), 'image')} without any: {shown(sorted(names))}"
         yield Hit(scene.model_file("images"), "points in every image", found, count=len(names))
+
+
+@rule(
+    "CS510",
+    "observation-not-finite",
+    "warning",
+    what="A point is observed at NaN or infinity in an image.",
+    remedy="remove these observations; they come from pixels that cannot be undistorted",
+    bad="a keypoint at `nan nan` in a track",
+    needs=("observations",),
+)
+def observation_not_finite(scene: RawScene) -> Iterator[Hit]:
+    seen, images = scene.observations, scene.images
+    assert seen is not None and images is not None
+    xy = images.keypoint_xy[seen.keypoint[seen.valid]]
+    if bad := int(np.count_nonzero(~np.isfinite(xy).all(axis=1))):
+        found = f"NaN or infinity in {bad} of {len(xy)} observations"
+        yield Hit(scene.model_file("images"), "finite pixel positions", found, count=bad)
 
 
 def _seen(scene: RawScene) -> NDArray[np.bool_]:

@@ -81,10 +81,11 @@ def far_from_origin(scene: RawScene) -> Iterator[Hit]:
     good = good_poses(images)
     if np.count_nonzero(good) < 2:
         return
-    centres = camera_centres(images)[good]
-    middle = np.median(centres, axis=0)
-    extent = float(np.median(np.linalg.norm(centres - middle, axis=1)))
-    distance = float(np.linalg.norm(middle))
+    with np.errstate(all="ignore"):  # absurd translations become infinite and compare as false
+        centres = camera_centres(images)[good]
+        middle = np.median(centres, axis=0)
+        extent = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+        distance = float(np.linalg.norm(middle))
     if extent > 0 and distance > FAR * extent:
         found = f"cameras {distance:.3g} away from it, within {extent:.3g} of their median"
         yield Hit(scene.model_file("images"), "cameras near the origin of the world", found)
@@ -92,6 +93,5 @@ def far_from_origin(scene: RawScene) -> Iterator[Hit]:
 
 def camera_centres(images: RawImages) -> NDArray[np.float64]:
     """Camera centres in the world; meaningless where `good_poses` is false. [I, 3]"""
-    with np.errstate(all="ignore"):
-        rotations = rotation_from_quaternion(images.quaternions)
-        return -np.einsum("nji,nj->ni", rotations, images.translations)
+    rotations = rotation_from_quaternion(images.quaternions)
+    return -np.einsum("nji,nj->ni", rotations, images.translations)

@@ -115,7 +115,9 @@ def _reprojections(
         target = images.keypoint_xy[seen.keypoint[rows]]
         finite = np.isfinite(xyz).all(axis=1) & np.isfinite(target).all(axis=1)
         depth, projected = _project(images, image, camera.K, xyz[finite])
-        yield image, depth, np.linalg.norm(projected - target[finite], axis=1)
+        with np.errstate(all="ignore"):  # infinite for absurd poses
+            error = np.linalg.norm(projected - target[finite], axis=1)
+        yield image, depth, error
 
 
 def _project(

@@ -1,5 +1,8 @@
 import shutil
 
+from chronoscene.errors import SceneError
+from chronoscene.formats import chronoscene as our_format
+
 
 def test_no_images_folder(scene):
     scene.path("images").rename(scene.path("photos"))
@@ -43,9 +46,6 @@ def test_bad_world_json(scene):
 
 
 def test_reader_has_the_last_word(scene, monkeypatch):
-    from chronoscene.errors import SceneError
-    from chronoscene.formats import chronoscene as our_format
-
     def refuse(path):
         place = path / "sparse/0"
         raise SceneError(place, expected="a model", found="one it hates", todo="ask it why")

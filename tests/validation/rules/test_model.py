@@ -2,6 +2,9 @@ import struct
 
 import pytest
 
+from chronoscene.validation import pixels
+from chronoscene.validation.raw_scene import RawScene
+
 CAMERAS, IMAGES, POINTS = (f"sparse/0/{stem}.txt" for stem in ("cameras", "images", "points3D"))
 
 
@@ -92,7 +95,7 @@ def test_empty_binary_file(scene, stem):
 
 def test_every_damaged_text_line_is_named(scene):
     scene.edit_fields(IMAGES, 0, {3: "zero"})
-    scene.edit_fields(IMAGES, 4, {8: "one"})
+    scene.edit_fields(IMAGES, 4, {1: "one"})
     scene.expect("CS103", place="images.txt:1", found="zero", times=2)
     scene.expect("CS103", place="images.txt:5", found="one", times=2)
 
@@ -104,12 +107,20 @@ def test_damaged_keypoint_and_point_lines(scene):
     scene.expect("CS103", place="points3D.txt:40", found="'7 0 0 0 1 2 3 x'", times=2)
 
 
+@pytest.mark.parametrize("colour", ["nan", "256", "-1", "1.5"])
+def test_colour_that_is_none(scene, colour):
+    scene.edit_fields(POINTS, 2, {5: colour})
+    scene.expect("CS103", place="points3D.txt:3", found=colour)
+
+
 def test_many_damaged_lines_are_counted(scene):
     scene.write(POINTS, ["broken"] * 500)
     scene.expect("CS103", place="points3D.txt", found="400 more damaged lines", times=101)
 
 
-@pytest.mark.parametrize("line", ["1 PINHOLE 64 48 50 50 32", "1 PINEHOLE 64 48 50", "1", "a b c d"])
+@pytest.mark.parametrize(
+    "line", ["1 PINHOLE 64 48 50 50 32", "1 PINEHOLE 64 48 50", "1", "a b c d"]
+)
 def test_damaged_camera_line(scene, line):
     scene.write(CAMERAS, [line])
     scene.expect("CS103", place="cameras.txt:1", found=line)
@@ -165,14 +176,10 @@ def test_name_leaves_folder(scene, name):
 
 
 def test_files_outside_are_not_opened(scene, monkeypatch):
-    from chronoscene.validation import pixels
-
     opened = []
     monkeypatch.setattr(pixels, "read_header", lambda path: opened.append(path))
     scene.write("secret.png", b"x")
     scene.edit_fields(IMAGES, 0, {9: "../secret.png"})
-    from chronoscene.validation.raw_scene import RawScene
-
     assert len(RawScene(scene.root).headers) == 13
     assert not [path for path in opened if "secret" in str(path)]
 

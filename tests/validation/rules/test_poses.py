@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 
+from chronoscene.geometry import rotation_from_quaternion
+
 IMAGES = "sparse/0/images.txt"
 
 
@@ -18,8 +20,6 @@ def test_quaternion_not_unit(scene):
 
 
 def test_far_from_origin(scene):
-    from chronoscene.geometry import rotation_from_quaternion
-
     shift = np.array([442_000.0, 4_427_000.0, 50.0])
     lines = scene.lines(IMAGES)
     for i in range(0, len(lines), 2):

@@ -24,7 +24,7 @@ ELSEWHERE = ("test.txt", "sparse/test.txt", "images/test.txt")
     remedy="list the test images in sparse/0/test.txt, so that everybody has the same split",
     bad="a scene without `test.txt`",
 )
-def test_absent(scene: RawScene) -> Iterator[Hit]:
+def list_absent(scene: RawScene) -> Iterator[Hit]:
     if os.path.lexists(scene.root / TEST) or _elsewhere(scene):
         return
     size = "" if scene.tests is None else f" gives {counted(len(scene.tests), 'test view')}"
@@ -39,7 +39,7 @@ def test_absent(scene: RawScene) -> Iterator[Hit]:
     remedy="move it to sparse/0/test.txt",
     bad="`sparse/test.txt`",
 )
-def test_misplaced(scene: RawScene) -> Iterator[Hit]:
+def list_misplaced(scene: RawScene) -> Iterator[Hit]:
     if not os.path.lexists(scene.root / TEST):
         for place in _elsewhere(scene):
             yield Hit(TEST, "the list of test images", f"{place} instead")
@@ -53,7 +53,7 @@ def test_misplaced(scene: RawScene) -> Iterator[Hit]:
     remedy="save it as UTF-8",
     bad="a `test.txt` in an old Windows encoding",
 )
-def test_not_text(scene: RawScene) -> Iterator[Hit]:
+def list_not_text(scene: RawScene) -> Iterator[Hit]:
     if scene.test_text is None and os.path.lexists(scene.root / TEST):
         yield Hit(TEST, "a text file", "bytes that are not UTF-8, or no file to read")
 
@@ -68,7 +68,7 @@ def test_not_text(scene: RawScene) -> Iterator[Hit]:
     bad="`IMG_1` in `test.txt`, the image is `IMG_0001.jpg`",
     needs=("images", "test"),
 )
-def test_unknown(scene: RawScene) -> Iterator[Hit]:
+def list_unknown(scene: RawScene) -> Iterator[Hit]:
     for problem in scene.test_problems:
         if problem.kind == "unknown":
             yield problem_hit(TEST, problem)
@@ -83,7 +83,7 @@ def test_unknown(scene: RawScene) -> Iterator[Hit]:
     bad="`0001` with `x/0001.png` and `y/0001.png` in the model",
     needs=("images", "test"),
 )
-def test_ambiguous(scene: RawScene) -> Iterator[Hit]:
+def list_ambiguous(scene: RawScene) -> Iterator[Hit]:
     for problem in scene.test_problems:
         if problem.kind == "ambiguous":
             yield problem_hit(TEST, problem)
@@ -98,7 +98,7 @@ def test_ambiguous(scene: RawScene) -> Iterator[Hit]:
     bad="`a.jpg` twice",
     needs=("test",),
 )
-def test_duplicate(scene: RawScene) -> Iterator[Hit]:
+def list_duplicate(scene: RawScene) -> Iterator[Hit]:
     for name, times in Counter(entry.name for entry in scene.test or ()).items():
         if times > 1:
             yield Hit(TEST, "each name once", f"{quote(name)} {times} times")
@@ -106,8 +106,3 @@ def test_duplicate(scene: RawScene) -> Iterator[Hit]:
 
 def _elsewhere(scene: RawScene) -> list[str]:
     return [place for place in ELSEWHERE if (scene.root / place).is_file()]
-
-
-# Their names begin with what they are about; a test runner must not collect them.
-for _check in (test_absent, test_misplaced, test_not_text, test_unknown, test_ambiguous):
-    _check.__test__ = False  # type: ignore[attr-defined]

@@ -1,0 +1,135 @@
+"""chronoscene validate: exit status, options, where the report goes."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from chronoscene.cli import cli, main
+
+PERIODS = {f"{'ab'[p]}{i}.png": p for p in (0, 1) for i in range(7)}
+
+
+def run(*arguments):
+    """Exit status and standard output."""
+    result = CliRunner().invoke(cli, ["validate", *map(str, arguments)])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout
+
+
+@pytest.fixture
+def good(make_scene_folder) -> Path:
+    return make_scene_folder(PERIODS, tests=["a3", "b3"])
+
+
+@pytest.fixture
+def warned(good) -> Path:
+    (good / "sparse/0/test.txt").write_text("a3\nb3\nnobody\n")
+    return good
+
+
+@pytest.fixture
+def broken(good) -> Path:
+    (good / "images/a0.png").unlink()
+    return good
+
+
+def test_good_scene(good):
+    status, text = run(good)
+    assert status == 0
+    assert text.startswith("scene: 14 images, 1 camera, 30 points, 2 periods (0: 6 + 1 test")
+    assert "0 errors, 0 warnings" in text
+
+
+def test_errors_make_status_1(broken):
+    status, text = run(broken)
+    assert status == 1
+    assert "images/a0.png: expected an image, found nothing" in text
+
+
+@pytest.mark.parametrize(("options", "expected"), [([], 0), (["--strict"], 1)])
+def test_warnings_count_when_strict(warned, options, expected):
+    status, text = run(warned, *options)
+    assert status == expected
+    assert "1 warning" in text
+
+
+def test_folder_of_scenes(make_scene_folder, tmp_path):
+    for name in ("one", "two"):
+        make_scene_folder(PERIODS, name=f"all/{name}", tests=["a3", "b3"])
+    (tmp_path / "all/two/images/a0.png").unlink()
+    status, text = run(tmp_path / "all")
+    assert status == 1
+    assert "2 scenes, 1 not valid" in text
+
+
+def test_json(broken):
+    status, text = run(broken, "--format", "json")
+    document = json.loads(text)
+    assert status == 1 and not document["valid"]
+    assert document["scenes"][0]["findings"][0]["code"] == "CS201"
+
+
+def test_out(broken, tmp_path):
+    status, text = run(broken, "--format", "json", "--out", tmp_path / "report.json")
+    assert (status, text) == (1, "")
+    assert json.loads((tmp_path / "report.json").read_text())["counts"]["error"] == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["report.json", "scene"]
+
+
+def test_out_has_no_colours(broken, tmp_path):
+    run(broken, "--out", tmp_path / "report.txt")
+    assert "\x1b" not in (tmp_path / "report.txt").read_text()
+
+
+def test_ignore_makes_a_scene_valid(broken):
+    status, text = run(broken, "--ignore", "CS201")
+    assert status == 0
+    assert "CS201" not in text
+
+
+@pytest.mark.parametrize(
+    "options", [["--select", "CS3,CS1"], ["--select", "CS3", "--select", "CS1"]]
+)
+def test_select(broken, options):
+    assert run(broken, *options)[0] == 0
+    assert run(broken, "--select", "image-missing")[0] == 1
+
+
+def test_decode(good):
+    assert "not checked (pixels are decoded with --decode only): CS206, CS604" in run(good)[1]
+    status, text = run(good, "--decode")
+    assert status == 0 and "not checked" not in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{tmp}/absent"], "expected a scene folder, found nothing"),
+        (["{tmp}/empty"], "expected a scene (a folder with images/ and sparse/)"),
+        (["{scene}", "--select", "CS999"], "--select: expected codes of rules"),
+        (["{scene}", "--out", "{tmp}/absent/report"], "No such file or directory"),
+    ],
+)
+def test_nothing_to_read_or_wrong_usage_is_status_2(
+    good, tmp_path, monkeypatch, capsys, arguments, message
+):
+    (tmp_path / "empty").mkdir()
+    words = [a.format(tmp=tmp_path, scene=good) for a in arguments]
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "validate", *words])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_names_that_the_output_cannot_encode(good, monkeypatch):
+    split = good / "sparse/split.txt"
+    split.write_text(split.read_text() + "пусто.png 1\n", encoding="utf-8")
+    result = CliRunner(charset="ascii").invoke(cli, ["validate", str(good)])
+    assert result.exit_code == 0
+    assert "\\u043f" in result.stdout

@@ -1,0 +1,84 @@
+"""The raw reader agrees with the strict one on good models, in every form."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chronoscene.colmap import read_model
+from chronoscene.geometry import rotation_from_quaternion
+from chronoscene.validation.observations import observe
+from chronoscene.validation.raw_model import model_files, read_raw_model
+from chronoscene.validation.raw_text import read_points
+
+
+@pytest.mark.parametrize("form", ["text", "classic", "rigs"])
+def test_agrees_with_the_strict_reader(scene, form):
+    if form != "text":
+        scene.to_binary(classic=form == "classic")
+    raw = read_raw_model(scene.path("sparse/0"))
+    model = read_model(scene.path("sparse/0"))
+    assert raw.damages == ()
+    order = np.argsort(raw.images.names)
+    assert [raw.images.names[i] for i in order] == [image.name for image in model.images]
+    assert raw.images.ids[order].tolist() == [image.image_id for image in model.images]
+    assert raw.cameras == (model.images[0].camera,)
+    rotations = rotation_from_quaternion(raw.images.quaternions)[order]
+    strict = np.stack([image.cam_from_world for image in model.images])
+    np.testing.assert_allclose(rotations, strict[:, :3, :3], atol=1e-12)
+    np.testing.assert_allclose(raw.images.translations[order], strict[:, :3, 3], atol=1e-12)
+    np.testing.assert_array_equal(raw.points.ids, model.points.ids)
+    np.testing.assert_array_equal(raw.points.xyz, model.points.xyz)
+    seen = observe(raw.images, raw.points)
+    assert seen.valid.all()
+    np.testing.assert_array_equal(raw.images.keypoint_xy[seen.keypoint], model.points.track_xy)
+    np.testing.assert_array_equal(np.argsort(order)[seen.image], model.points.track_frame)
+
+
+def test_binary_wins_only_if_complete(tmp_path):
+    for file in ("cameras.bin", "images.bin", "cameras.txt", "images.txt", "points3D.txt"):
+        (tmp_path / file).write_bytes(b"")
+    assert set(model_files(tmp_path).values()) == {"cameras.txt", "images.txt", "points3D.txt"}
+    (tmp_path / "points3D.bin").write_bytes(b"")
+    assert set(model_files(tmp_path).values()) == {"cameras.bin", "images.bin", "points3D.bin"}
+
+
+@given(
+    tracks=st.dictionaries(
+        st.integers(0, 2**40),
+        st.lists(st.tuples(st.integers(0, 2**31 - 1), st.integers(0, 2**31 - 1)), max_size=4),
+        max_size=8,
+    ),
+    data=st.data(),
+)
+def test_points_of_any_track_lengths_in_any_order(tmp_path_factory, tracks, data):
+    order = data.draw(st.permutations(sorted(tracks)))
+    lines = [
+        f"{i} {i % 7} 0.5 -2 1 2 3 0.25 " + " ".join(f"{a} {b}" for a, b in tracks[i])
+        for i in order
+    ]
+    path = tmp_path_factory.mktemp("points") / "points3D.txt"
+    path.write_text("# comment\n\n" + "\n".join(lines))
+    points = read_points(path)
+    assert points.ids.tolist() == sorted(tracks)
+    assert points.xyz[:, 0].tolist() == [i % 7 for i in sorted(tracks)]
+    pairs = list(zip(points.track_image.tolist(), points.track_keypoint.tolist(), strict=True))
+    ends = points.track_start.tolist()
+    for row, i in enumerate(sorted(tracks)):
+        assert pairs[ends[row] : ends[row + 1]] == tracks[i]
+
+
+@pytest.mark.parametrize("target", ["cameras", "images", "points3D"])
+def test_unreadable_file_is_a_damage(scene, target, monkeypatch):
+    from pathlib import Path
+
+    read = Path.read_bytes
+
+    def refuse(self):
+        if self.name == f"{target}.txt":
+            raise PermissionError(13, "Permission denied")
+        return read(self)
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    raw = read_raw_model(scene.path("sparse/0"))
+    assert [(d.file, d.found) for d in raw.damages] == [(f"{target}.txt", "Permission denied")]

@@ -1,0 +1,85 @@
+"""The table of rules, and how rules are chosen."""
+
+from pathlib import Path
+
+import pytest
+
+from chronoscene.errors import ConfigError
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rule import RULES, all_rules, choose_rules, rule
+
+
+def codes(rules):
+    return [r.code for r in rules]
+
+
+def test_every_rule_is_documented():
+    for r in all_rules():
+        assert r.what.endswith("."), r
+        assert r.remedy and not r.remedy.endswith("."), r
+        assert r.bad, r
+
+
+def test_every_rule_has_a_test_that_breaks_it():
+    tests = "".join(p.read_text() for p in (Path(__file__).parent / "rules").glob("test_*.py"))
+    assert [r.code for r in all_rules() if f'"{r.code}"' not in tests] == []
+
+
+def test_every_need_is_an_attribute_with_a_reason(tmp_path):
+    scene = RawScene(tmp_path)
+    for r in all_rules():
+        for attribute in r.needs:
+            assert hasattr(RawScene, attribute), (r.code, attribute)
+            assert scene.reason(attribute), (r.code, attribute)
+
+
+def test_codes_are_sorted_and_names_unique():
+    rules = all_rules()
+    assert codes(rules) == sorted(RULES)
+    assert len({r.name for r in rules}) == len(rules)
+
+
+def test_a_code_cannot_be_given_twice():
+    with pytest.raises(AssertionError, match="CS201"):
+        rule("CS201", "other", "info", what="", remedy="", bad="")
+
+
+def test_a_name_cannot_be_given_twice():
+    with pytest.raises(AssertionError, match="image-missing"):
+        rule("CS299", "image-missing", "info", what="", remedy="", bad="")
+
+
+def test_choose_all():
+    assert choose_rules() == all_rules()
+
+
+@pytest.mark.parametrize(
+    "select", [["CS201"], ["cs201"], ["image-missing"], [" CS201 "], ["CS201", "CS201"]]
+)
+def test_select_one(select):
+    assert codes(choose_rules(select)) == ["CS201"]
+
+
+def test_select_a_group():
+    chosen = codes(choose_rules(["CS2", "CS301"]))
+    assert chosen[0] == "CS201" and chosen[-1] == "CS301"
+    assert all(c.startswith("CS2") for c in chosen[:-1]) and len(chosen) > 5
+
+
+def test_ignore_wins_over_select():
+    assert codes(choose_rules(["CS201", "CS202"], ["CS202"])) == ["CS201"]
+
+
+def test_ignore_alone():
+    assert not [c for c in codes(choose_rules([], ["CS7"])) if c.startswith("CS7")]
+
+
+@pytest.mark.parametrize("text", ["CS999", "nonsense", "", "2", "CS2x"])
+def test_unknown_code(text):
+    with pytest.raises(ConfigError, match="--select: expected codes of rules"):
+        choose_rules([text])
+
+
+def test_unknown_name_gets_a_hint():
+    with pytest.raises(ConfigError, match="did you mean image-missing"):
+        choose_rules([], ["image-mising"])
