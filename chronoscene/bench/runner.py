@@ -9,7 +9,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -81,11 +83,12 @@ def run_bench(settings: BenchSettings, say: Say) -> BenchOutcome:
         say(f"{len(plan) - len(todo)} of {len(plan)} runs are finished and kept")
     failures = []
     try:
-        for number, (job, _) in enumerate(todo, start=1):
-            say(f"[{number}/{len(todo)}] {job.label}")
-            if (failure := run_in_process(job)) is not None:
-                failures.append(failure)
-                say(f"failed: {failure.reason}")
+        with stoppable():
+            for number, (job, _) in enumerate(todo, start=1):
+                say(f"[{number}/{len(todo)}] {job.label}")
+                if (failure := run_in_process(job)) is not None:
+                    failures.append(failure)
+                    say(f"failed: {failure.reason}")
     finally:
         results.write_summary(settings.runs)
     finished = [job.folder for job, _ in plan if (job.folder / results.RUN_FILE).is_file()]
@@ -272,8 +275,27 @@ def _fresh_staging(folder: Path) -> Path:
     return staging
 
 
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """Turn SIGTERM (of a batch system, say) into an exit that ends the worker and cleans up."""
+
+    def stop(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        # None stands for a handler that some library installed; it would print a stack trace.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a worker; it got the interrupt too, and has a moment to obey."""
+    """End a worker; it has a moment to obey."""
+    process.terminate()
     try:
         process.wait(timeout=5)
     except subprocess.TimeoutExpired:

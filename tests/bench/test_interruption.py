@@ -73,17 +73,22 @@ def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_pat
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-def test_an_interrupted_bench_leaves_no_process_and_no_half_run(scene_folder, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_bench_leaves_no_process_and_no_half_run(number, scene_folder, tmp_path):
     runs = tmp_path / "runs"
     command = [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs), "0.01", "100000"]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     wait_for(lambda: list(runs.glob("ring/*/.seed0.*.partial/config.json")))
     (worker,) = workers_of(process.pid)
-    os.killpg(process.pid, signal.SIGINT)  # what Ctrl-C does
-    process.communicate(timeout=30)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # what Ctrl-C does
+    else:
+        process.send_signal(number)  # what a batch system does
+    _, errors = process.communicate(timeout=30)
     assert process.returncode != 0
+    assert "stack trace" not in errors
     assert not Path(f"/proc/{worker}").exists()
     assert not list(runs.rglob("*.partial"))
     assert json.loads((runs / "results.json").read_text()) == []
