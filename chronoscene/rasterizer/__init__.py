@@ -67,7 +67,7 @@ def rasterize(
         height: Image height in pixels.
         near_plane: Centres nearer than this z-depth, in world units, are culled.
         far_plane: Centres farther than this z-depth, in world units, are culled.
-        eps2d: Variance in pixels squared added to the projected covariances.
+        eps2d: Variance in pixels squared, 0 or more, added to the projected covariances.
         backgrounds: What the remaining light sees; None is black. [C, D]
         render_depth: Also return the expected z-depth, differentiable.
         backend: auto, reference, cpu or cuda. Auto is cuda for CUDA tensors, else cpu.
@@ -77,7 +77,7 @@ def rasterize(
         ShapeError: If a shape differs from the above, or a number is not finite.
         BackendError: If the backend is unknown or cannot be used on this machine.
     """
-    from chronoscene.rasterizer.validate import check_finite_inputs, check_inputs
+    from chronoscene.rasterizer.validate import check_finite_inputs, check_inputs, check_options
 
     check_choice("backend", backend, ["auto", *BACKENDS], error=BackendError)
     if backend == "auto":
@@ -91,6 +91,7 @@ def rasterize(
     }
     arrays = {**gaussians, "viewmats": viewmats, "Ks": Ks}
     check_inputs(arrays, backgrounds, width, height)
+    check_options(near_plane, far_plane, eps2d)
     if check_finite:
         check_finite_inputs(arrays)
     return import_module(BACKENDS[backend]).rasterize(

@@ -72,6 +72,7 @@ def rasterize(
             everything = _project(means, quats, scales, *camera)
             extents = _extents(everything.covariances, opacities)
             visible = _visible(everything, extents, width, height, near_plane, far_plane)
+            visible &= torch.isfinite(colors).all(dim=-1)
             _fill_info(info, c, everything, extents, visible)
             # A stable sort: Gaussians at equal depth are drawn in the order of the input.
             order = torch.argsort(torch.where(visible, everything.depths, torch.inf), stable=True)

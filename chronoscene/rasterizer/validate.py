@@ -22,7 +22,9 @@ def check_inputs(
     """
     for name, size in (("width", width), ("height", height)):
         if size < 1:
-            raise ShapeError(name, expected="at least 1", found=str(size), todo="give a size")
+            raise ShapeError(
+                name, expected="at least 1 pixel", found=str(size), todo="correct the argument"
+            )
     for name, array in arrays.items():
         if not array.is_floating_point():
             raise ShapeError(
@@ -40,8 +42,23 @@ def check_inputs(
         check_shape("backgrounds", backgrounds, (cameras, arrays["colors"].shape[1]))
 
 
+def check_options(near_plane: float, far_plane: float, eps2d: float) -> None:
+    """Raise a ShapeError unless 0 < near < far and the blur is not negative."""
+    if not 0 < near_plane < far_plane:
+        raise ShapeError(
+            "near_plane, far_plane",
+            expected="0 < near_plane < far_plane",
+            found=f"{near_plane}, {far_plane}",
+            todo="correct the arguments",
+        )
+    if not 0 <= eps2d < float("inf"):
+        raise ShapeError(
+            "eps2d", expected="at least 0", found=str(eps2d), todo="correct the argument"
+        )
+
+
 def check_finite_inputs(arrays: dict[str, Tensor]) -> None:
-    """Raise a ShapeError that names the first nan or infinite element.
+    """Raise a ShapeError that names the first nan or infinite element, or a bad focal length.
 
     A sum is finite only if every element is, and costs a fraction of an elementwise test; that
     test is run only if the sum is not finite, since large finite elements may overflow it.
@@ -59,3 +76,11 @@ def check_finite_inputs(arrays: dict[str, Tensor]) -> None:
                 found=str(data[tuple(index)].item()),
                 todo="find where it comes from, or pass check_finite=False to cull such Gaussians",
             )
+    focals = arrays["Ks"].detach()[:, [0, 1], [0, 1]]
+    for camera in torch.nonzero((focals <= 0).any(-1))[:1, 0].tolist():
+        raise ShapeError(
+            f"Ks[{camera}]",
+            expected="positive focal lengths",
+            found=str(focals[camera].tolist()),
+            todo="mirror the camera by its pose, not by its intrinsics",
+        )

@@ -1,0 +1,121 @@
+"""The CUDA backend: gsplat's public ``rasterization``, classic mode, not packed.
+
+gsplat is the optional extra ``cuda``; it is imported when the backend is used. Its numbers differ
+from the reference by rounding and by its footprint rule; see README.md.
+
+Source: gsplat 1.5 documentation of ``rasterization`` and its ``meta`` dictionary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from chronoscene.errors import BackendError
+from chronoscene.rasterizer import reference
+from chronoscene.rasterizer.constants import ALPHA_MIN
+from chronoscene.rasterizer.types import RasterInfo, Rasterization
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float,
+    far_plane: float,
+    eps2d: float,
+    backgrounds: Tensor | None,
+    render_depth: bool,
+) -> Rasterization:
+    """Render Gaussians; see `chronoscene.rasterizer.rasterize`. Everything is cast to float32."""
+    render = _load(means.device)
+    options: dict[str, Any] = {
+        "near_plane": near_plane,
+        "far_plane": far_plane,
+        "eps2d": eps2d,
+        "backgrounds": None if backgrounds is None else backgrounds.float(),
+    }
+    arrays = tuple(x.float() for x in (means, quats, scales, opacities, colors))
+    cameras = (viewmats.float(), Ks.float(), width, height)
+    if means.shape[0] == 0:  # gsplat launches no kernel for nothing
+        empty: Callable[..., Rasterization] = reference.rasterize
+        return empty(*arrays, *cameras, **options, render_depth=render_depth)
+    gaussians, drawable = _without_bad_rows(*arrays)
+    image, alphas, meta = render(
+        *gaussians,
+        *cameras,
+        **options,
+        packed=False,
+        rasterize_mode="classic",
+        render_mode="RGB+ED" if render_depth else "RGB",
+    )
+    depths = None
+    if render_depth:
+        image, depths = image[..., :-1], torch.where(alphas > 0, image[..., -1:], 0)
+    return Rasterization(image, alphas, depths, _info(meta, drawable))
+
+
+def _load(device: torch.device) -> Callable[..., Any]:
+    """gsplat's function, if it can be used here."""
+    try:
+        module = import_module("gsplat")
+    except ImportError as error:
+        raise BackendError(
+            "backend 'cuda'",
+            expected="the package gsplat",
+            found=f"{type(error).__name__}: {error}",
+            todo="pip install 'chronoscene[cuda]', or choose backend='cpu'",
+        ) from None
+    if not torch.cuda.is_available():
+        raise BackendError(
+            "backend 'cuda'",
+            expected="an NVIDIA GPU and a torch built for CUDA",
+            found=f"torch {torch.__version__} without one",
+            todo="choose backend='cpu', or install torch and 'chronoscene[cuda]' for your GPU",
+        )
+    if device.type != "cuda":
+        raise BackendError(
+            "backend 'cuda'",
+            expected="tensors on a GPU",
+            found=str(device),
+            todo="move them with .cuda(), or choose backend='auto'",
+        )
+    function: Callable[..., Any] = module.rasterization
+    return function
+
+
+def _without_bad_rows(*arrays: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+    """Gaussians with nan, without a rotation or too faint to see, made invisible and harmless."""
+    means, quats, scales, opacities, colors = arrays
+    finite = torch.stack([torch.isfinite(x.reshape(len(x), -1)).all(-1) for x in arrays]).all(0)
+    good = finite & (quats != 0).any(-1) & (opacities > ALPHA_MIN)
+    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    rows = good[:, None]
+    return (
+        torch.where(rows, means, 0),
+        torch.where(rows, quats, identity),
+        torch.where(rows, scales, 1),
+        torch.where(good, opacities, 0),
+        torch.where(rows, colors, 0),
+    ), good
+
+
+def _info(meta: dict[str, Any], drawable: Tensor) -> RasterInfo:
+    """gsplat's facts, zero where culled; the gradient of its means2d is kept."""
+    radii = torch.where(drawable[:, None], meta["radii"], 0).int()
+    means2d = meta["means2d"]
+    if means2d.requires_grad:
+        means2d.retain_grad()
+    visible = (radii > 0).all(-1)
+    return RasterInfo(means2d, radii, torch.where(visible, meta["depths"].detach(), 0))
