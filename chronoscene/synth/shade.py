@@ -14,6 +14,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from chronoscene.synth.light import sky_radiance
+from chronoscene.synth.noise import mix
 from chronoscene.synth.textures import albedo
 
 Array = NDArray[np.float64]
@@ -227,14 +228,20 @@ def _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes):  # type: ignor
 
 
 @njit(cache=True)
-def _sample(ray, t, tri, u, v, lit, tables, sky, probes, fw_unit):  # type: ignore[no-untyped-def]
-    """Radiance along one ray."""
-    if tri == MISS:
-        dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        return sky_radiance(dx / length, dy / length, dz / length, sky, True)
-    base = _base(ray, t, tri, u, v, tables, fw_unit)
-    return _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes)
+def _sky(ray, sky):  # type: ignore[no-untyped-def]
+    """Radiance of the sky along a ray."""
+    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    return sky_radiance(dx / length, dy / length, dz / length, sky, True)
+
+
+@njit(cache=True)
+def _share(lit, first, count):  # type: ignore[no-untyped-def]
+    """Share of samples that the sun reaches."""
+    total = 0.0
+    for i in range(first, first + count):
+        total += 1.0 if lit[i] else 0.0
+    return total / count
 
 
 @njit(cache=True)
@@ -279,34 +286,30 @@ def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # ty
     out = np.empty((len(t) // per_pixel, 3), np.uint8)
     for pixel in prange(len(out)):
         r, g, b = 0.0, 0.0, 0.0
-        first, end = pixel * per_pixel, (pixel + 1) * per_pixel
-        if per_pixel > 1 and _uniform(tri, first, end, tables):
+        first, count, stride, wide = pixel * per_pixel, per_pixel, 1, fw_unit
+        uniform = per_pixel > 1 and _uniform(tri, first, first + per_pixel, tables)
+        old = (0.0, 0.0, 0.0)
+        if uniform:
             # Textures are filtered, so two samples on a diagonal are enough on one patch.
-            last, sun = end - 1, 0.0
-            for i in range(first, end):
-                sun += 1.0 if lit[i] else 0.0
-            u0, v0, u1, v1 = uv[first, 0], uv[first, 1], uv[last, 0], uv[last, 1]
-            wide = fw_unit * math.sqrt(0.5 * per_pixel)
-            a0 = _base(rays[first], float(t[first]), tri[first], u0, v0, tables, wide)
-            a1 = _base(rays[last], float(t[last]), tri[last], u1, v1, tables, wide)
-            base = (0.5 * (a0[0] + a1[0]), 0.5 * (a0[1] + a1[1]), 0.5 * (a0[2] + a1[2]))
-            c = _radiance(
-                rays[first], float(t[first]), tri[first], u0, v0, sun / per_pixel, base, tables,
-                sky, probes,
-            )  # fmt: skip
-            r, g, b = (
-                per_pixel * min(c[0], 6.0),
-                per_pixel * min(c[1], 6.0),
-                per_pixel * min(c[2], 6.0),
-            )
-        else:
-            for i in range(first, end):
-                c = _sample(
-                    rays[i], float(t[i]), tri[i], uv[i, 0], uv[i, 1],
-                    1.0 if lit[i] else 0.0, tables, sky, probes, fw_unit,
-                )  # fmt: skip
-                # A cap keeps one bright sample from whitening an edge.
-                r, g, b = r + min(c[0], 6.0), g + min(c[1], 6.0), b + min(c[2], 6.0)
+            count, stride, wide = 2, per_pixel - 1, fw_unit * math.sqrt(0.5 * per_pixel)
+        for k in range(count):
+            i = first + k * stride
+            u, v, sun = float(uv[i, 0]), float(uv[i, 1]), 1.0 if lit[i] else 0.0
+            if tri[i] == MISS:
+                c = _sky(rays[i], sky)
+            else:
+                base = _base(rays[i], float(t[i]), tri[i], u, v, tables, wide)
+                if uniform and k == 0:
+                    old = base
+                    continue
+                if uniform:
+                    base = mix(old, base, 0.5)
+                    sun = _share(lit, first, per_pixel)
+                c = _radiance(rays[i], float(t[i]), tri[i], u, v, sun, base, tables, sky, probes)
+            # A cap keeps one bright sample from whitening an edge.
+            weight = per_pixel if uniform else 1
+            r, g = r + weight * min(c[0], 6.0), g + weight * min(c[1], 6.0)
+            b += weight * min(c[2], 6.0)
         gain = sky.exposure / per_pixel
         out[pixel, 0] = int(255.0 * _tone(r * gain * sky.white[0]) + 0.5)
         out[pixel, 1] = int(255.0 * _tone(g * gain * sky.white[1]) + 0.5)
