@@ -41,6 +41,7 @@ from chronoscene.validation.pixels import (
     read_pixels,
 )
 from chronoscene.validation.raw_model import FORMS, RawImages, RawModel, RawPoints, read_raw_model
+from chronoscene.validation.reprojection import Reprojection, reproject
 
 T = TypeVar("T")
 Track = Callable[[Sequence[T], str], Iterable[T]]
@@ -58,6 +59,7 @@ _REASONS = {
     "images": "the images of the model cannot be read",
     "points": "the points of the model cannot be read",
     "observations": "the images or the points of the model cannot be read",
+    "reprojections": "the model cannot be read completely",
     "split": f"{SPLIT} cannot be read",
     "split_text": f"{SPLIT} cannot be read",
     "periods": f"{SPLIT} or the images of the model cannot be read",
@@ -149,6 +151,14 @@ class RawScene:
         if self.images is None or self.points is None:
             return None
         return observe(self.images, self.points)
+
+    @cached_property
+    def reprojections(self) -> list[Reprojection] | None:
+        """Of the images with a usable camera, a finite pose and observations."""
+        images, points, seen = self.images, self.points, self.observations
+        if self.cameras is None or images is None or points is None or seen is None:
+            return None
+        return list(reproject(self.usable_cameras, images, points, seen))
 
     # Periods and split.
 

@@ -103,8 +103,9 @@ def track_disagrees(scene: RawScene) -> Iterator[Hit]:
     if wrong := int(np.count_nonzero(~agree)):
         found = f"{counted(wrong, 'observation')} whose keypoint names another point or none"
         yield Hit(scene.model_file("points3D"), "keypoints that agree", found, count=wrong)
-    claimed = int(np.count_nonzero(images.keypoint_point >= 0))
-    if lost := claimed - len(np.unique(keypoints[agree])):
+    claimed = images.keypoint_point >= 0
+    claimed[keypoints[agree]] = False
+    if lost := int(np.count_nonzero(claimed)):
         found = f"{counted(lost, 'keypoint')} of points whose track does not have them"
         yield Hit(scene.model_file("images"), "tracks that agree", found, count=lost)
 

@@ -11,6 +11,7 @@ from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.raw_model import RawImages
 from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.reprojection import good_poses
 from chronoscene.validation.rule import rule
 
 UNIT_TOLERANCE = 1e-3
@@ -19,13 +20,6 @@ UNIT_TOLERANCE = 1e-3
 FAR = 1000.0
 """Distance from the origin in extents of the scene. Single precision has 7 digits: at this distance
 it resolves a ten-thousandth of the scene, about a pixel."""
-
-
-def good_poses(images: RawImages) -> NDArray[np.bool_]:
-    """Which poses are finite with a quaternion that is not zero. [I]"""
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(images.quaternions, axis=1)
-    return np.isfinite(norm) & (norm > 0) & np.isfinite(images.translations).all(axis=1)
 
 
 @rule(

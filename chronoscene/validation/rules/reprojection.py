@@ -5,16 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.scene import PINHOLE_MODELS
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.observations import Observations
-from chronoscene.validation.raw_model import RawImages
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.poses import good_poses
 
 MOST_OUTSIDE = 0.05
 """Share of observations outside of the image; undistortion leaves a few there."""
@@ -62,11 +57,11 @@ def observations_outside(scene: RawScene) -> Iterator[Hit]:
     remedy="store world-to-camera poses with +x right, +y down, +z forward (negate the y and z "
     "axes of OpenGL cameras; invert camera-to-world poses)",
     bad="poses with OpenGL axes",
-    needs=("cameras", "observations"),
+    needs=("reprojections",),
 )
 def points_behind_cameras(scene: RawScene) -> Iterator[Hit]:
     total = behind = 0
-    for _, depth, _ in _reprojections(scene):
+    for _, depth, _ in scene.reprojections or ():
         total += len(depth)
         behind += int(np.count_nonzero(~(depth > 0)))
     if behind > MOST_BEHIND * total:
@@ -81,11 +76,11 @@ def points_behind_cameras(scene: RawScene) -> Iterator[Hit]:
     what="The points that an image sees do not project to where it sees them.",
     remedy="check pose, camera and image size of this image, or register it again",
     bad="a camera-to-world pose; a focal length of another image size",
-    needs=("cameras", "observations"),
+    needs=("images", "reprojections"),
 )
 def pose_disagrees(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
-    for image, depth, error in _reprojections(scene):
+    for image, depth, error in scene.reprojections or ():
         camera = scene.usable_cameras[int(scene.images.camera_ids[image])]
         if camera.model not in PINHOLE_MODELS or np.count_nonzero(depth > 0) < FEWEST:
             continue
@@ -95,36 +90,3 @@ def pose_disagrees(scene: RawScene) -> Iterator[Hit]:
             place = scene.image_place(scene.images.names[image])
             expected = f"a median reprojection error below {limit:.3g} px"
             yield Hit(place, expected, f"{median:.3g} px")
-
-
-def _reprojections(
-    scene: RawScene,
-) -> Iterator[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
-    """Index of each image with finite pose and usable camera; depth and error of its points. [m]
-
-    Distortion is not applied: the error means something for pinhole cameras only.
-    """
-    images, points, seen = scene.images, scene.points, scene.observations
-    assert images is not None and points is not None and isinstance(seen, Observations)
-    good = good_poses(images)
-    for image, rows in seen.by_image(len(images)):
-        camera = scene.usable_cameras.get(int(images.camera_ids[image]))
-        if camera is None or not good[image]:
-            continue
-        xyz = points.xyz[seen.point[rows]]
-        target = images.keypoint_xy[seen.keypoint[rows]]
-        finite = np.isfinite(xyz).all(axis=1) & np.isfinite(target).all(axis=1)
-        depth, projected = _project(images, image, camera.K, xyz[finite])
-        with np.errstate(all="ignore"):  # infinite for absurd poses
-            error = np.linalg.norm(projected - target[finite], axis=1)
-        yield image, depth, error
-
-
-def _project(
-    images: RawImages, image: int, K: NDArray[np.float64], xyz: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Depth [m] and pixel position [m, 2] of points."""
-    rotation = rotation_from_quaternion(images.quaternions[image])
-    with np.errstate(all="ignore"):
-        local = xyz @ rotation.T + images.translations[image]
-        return local[:, 2], local[:, :2] / local[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
