@@ -1,0 +1,6 @@
+"""Makes ``tiny_training`` importable."""
+
+import sys
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parent / "support"))
