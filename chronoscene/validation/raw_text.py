@@ -127,7 +127,7 @@ def read_points(path: Path) -> RawPoints:
     start = np.concatenate([[0], np.cumsum(lengths)])
     heads = values[start[:-1, None] + np.arange(8)]
     rgb = heads[:, 4:7]
-    for row in np.flatnonzero(~((rgb >= 0) & (rgb <= 255) & (rgb % 1 == 0)).all(axis=1)):
+    for row in np.flatnonzero(~((rgb >= 0) & (rgb <= 255) & (rgb == np.floor(rgb))).all(axis=1)):
         number, line = lines[row]
         damages.append(Damage(f"{path.name}:{number}", "a colour of three 0..255", quote(line)))
     _raise_any(damages)

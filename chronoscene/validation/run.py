@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from chronoscene.errors import SceneError
 from chronoscene.validation.finding import SEVERITIES, Finding, Hit, printable
 from chronoscene.validation.raw_model import model_files
 from chronoscene.validation.raw_scene import RawScene, Track, no_progress
-from chronoscene.validation.report import SceneReport, Skipped, summarise
+from chronoscene.validation.report import SceneReport, Skipped, Summary, summarise
 from chronoscene.validation.rule import Rule, all_rules
 
 RULE_FAILED = "CS000"
@@ -69,16 +69,19 @@ def validate_scene(
     findings: list[Finding] = []
     skipped: list[Skipped] = []
     for rule in sorted(all_rules() if rules is None else rules, key=lambda r: (r.last, r.code)):
-        reason = _reason_to_skip(rule, scene, findings)
-        if reason is not None:
-            skipped.append(Skipped(rule.code, reason))
-        else:
-            findings.extend(_run(rule, scene))
+        try:
+            reason = _reason_to_skip(rule, scene, findings)
+            if reason is not None:
+                skipped.append(Skipped(rule.code, reason))
+                continue
+            findings.extend(_finding(rule, hit) for hit in rule.check(scene))
+        except Exception as error:  # a mistake of ours must not hide what other rules find
+            findings.append(_failure(rule, error))
     findings.sort(key=lambda f: (SEVERITIES.index(f.severity), f.code))
     return SceneReport(
         name=printable(scene.name),
         path=Path(path),
-        summary=summarise(scene),
+        summary=_summary(scene),
         findings=tuple(findings),
         skipped=tuple(sorted(skipped, key=lambda s: s.code)),
     )
@@ -93,21 +96,22 @@ def _reason_to_skip(rule: Rule, scene: RawScene, findings: Sequence[Finding]) ->
     return None
 
 
-def _run(rule: Rule, scene: RawScene) -> Iterator[Finding]:
+def _failure(rule: Rule, error: Exception) -> Finding:
+    hit = Hit(
+        f"rule {rule.code}",
+        "a rule that runs on every scene",
+        f"{type(error).__name__}: {error}",
+        "report this; it is a mistake in ChronoScene, not in the scene",
+    )
+    failed = replace(rule, code=RULE_FAILED, name="rule-failed", severity="error")
+    return _finding(failed, hit)
+
+
+def _summary(scene: RawScene) -> Summary:
     try:
-        for hit in rule.check(scene):
-            yield _finding(rule, hit)
-    except Exception as error:  # a mistake in one rule must not hide what the others find
-        failed = replace(rule, code=RULE_FAILED, name="rule-failed", severity="error")
-        yield _finding(
-            failed,
-            Hit(
-                f"rule {rule.code}",
-                "a rule that runs on every scene",
-                f"{type(error).__name__}: {error}",
-                "report this; it is a mistake in ChronoScene, not in the scene",
-            ),
-        )
+        return summarise(scene)
+    except Exception:  # the rules that need the same part have said so
+        return Summary(None, None, None, None, 0, ())
 
 
 def _finding(rule: Rule, hit: Hit) -> Finding:

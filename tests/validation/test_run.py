@@ -2,6 +2,7 @@
 
 import hashlib
 import random
+import subprocess
 import sys
 
 import pytest
@@ -78,6 +79,17 @@ def test_rule_that_fails_becomes_a_finding(scene):
     failed = report.findings[0]
     assert (failed.place, failed.found) == ("rule CS299", "ZeroDivisionError: oh dear")
     assert "report this" in failed.remedy
+
+
+def test_part_that_cannot_be_read_for_a_mistake_of_ours(scene, monkeypatch):
+    def fails(folder):
+        raise ZeroDivisionError("oh dear")
+
+    monkeypatch.setattr("chronoscene.validation.raw_scene.read_raw_model", fails)
+    scene.path("sparse/split.txt").unlink()
+    report = scene.validate()
+    assert {f.code for f in report.findings} == {"CS000", "CS301"}
+    assert report.summary.images is None
 
 
 def test_remedy_of_the_rule_unless_the_hit_has_one(scene):
@@ -171,8 +183,6 @@ def test_what_the_reader_refuses_has_an_error(scene):
 
 
 def test_torch_is_not_imported():
-    import subprocess
-
     code = (
         "import sys, chronoscene.cli.validate, chronoscene.validation.rule as r; r.all_rules()\n"
         "heavy = {'torch', 'numba', 'open3d', 'cv2', 'pandas', 'matplotlib'} & set(sys.modules)\n"
