@@ -1,4 +1,4 @@
-# make demo    a scene, its checks and a benchmark of three methods, from nothing, in 12 minutes
+# make demo    a scene, its checks and a benchmark of three methods, from nothing
 # make test    lint, types and tests, from nothing
 # make lint    lint and types alone
 # make clean   remove what demo and tools wrote; distclean also removes the environment
