@@ -1,4 +1,8 @@
-"""Gradients of the anchor decode, compiled."""
+"""Gradients of the anchor decode, compiled.
+
+Anchors with a gradient are gathered into blocks. The first layers are matrix products over a block;
+for the second layers see `_decode_second`.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,9 @@ from typing import NamedTuple
 from numba import njit, prange
 from numpy import float32
 
-from chronoscene.training._decode_forward import (
-    fill_cycles,
-    gather_inputs,
-    head_columns,
-    hidden_layer,
-    task_work,
-)
+from chronoscene.training._decode_forward import factors, gather_inputs, hidden_layer, task_work
 from chronoscene.training._decode_layout import BLOCK, CHUNK, CYCLE, Gradients
+from chronoscene.training._decode_second import add_offset
 from chronoscene.training._matmul import product
 from chronoscene.training._simd import (
     LANES,
@@ -29,7 +28,7 @@ from chronoscene.training._simd import (
     write,
     write_index,
 )
-from chronoscene.training._vector_math import any_bit, is_zero, quad_spread, quad_sum
+from chronoscene.training._vector_math import quad_spread, quad_sum, store_cycle
 
 SLICE = 1024
 """Gradients of weights summed over the chunks by one task."""
@@ -56,117 +55,123 @@ class AnchorGradients(NamedTuple):
 
 
 @njit(nogil=True, error_model="numpy")
-def _all_zero(values, start, count):  # type: ignore[no-untyped-def]
-    bits = splat(ZERO)
+def _has_gradient(grads, g):  # type: ignore[no-untyped-def]
+    """Whether a Gaussian has one: it may be out of the image, or behind others."""
+    found = read(grads.opacities, g) != ZERO
+    for c in range(3 * g, 3 * g + 3):
+        found |= read(grads.colors, c) != ZERO
+        found |= read(grads.means, c) != ZERO
+        found |= read(grads.scales, c) != ZERO
+    for c in range(4 * g, 4 * g + 4):
+        found |= read(grads.quats, c) != ZERO
+    return found
+
+
+@njit(nogil=True, error_model="numpy")
+def _raw_gradients(outputs, grads, g, count, work, done):  # type: ignore[no-untyped-def]
+    """Gradients of the raw outputs of the Gaussians of an anchor, behind those ``done`` before."""
     for c in range(0, count, LANES):
-        bits = any_bit(bits, load_first(values, start + c, count - c))
-    return is_zero(bits)
-
-
-@njit(nogil=True, error_model="numpy")
-def _is_idle(grads, first, count):  # type: ignore[no-untyped-def]
-    """Whether no Gaussian of an anchor has a gradient: its offsets may all be switched off."""
-    return (
-        _all_zero(grads.opacities, first, count)
-        and _all_zero(grads.colors, 3 * first, 3 * count)
-        and _all_zero(grads.scales, 3 * first, 3 * count)
-        and _all_zero(grads.means, 3 * first, 3 * count)
-        and _all_zero(grads.quats, 4 * first, 4 * count)
-    )
-
-
-@njit(nogil=True, error_model="numpy")
-def _raw_quats(outputs, grads, first, count, raw, at):  # type: ignore[no-untyped-def]
-    """d q = (g - (g . unit) unit) / |q|."""
+        opacity = load_first(outputs.opacities, g + c, count - c)
+        grad = load_first(grads.opacities, g + c, count - c)
+        store(work.opacities, done + c, grad * (ONE - opacity) * (ONE + opacity))
     for c in range(0, 4 * count, LANES):
-        unit = load_first(outputs.quats, 4 * first + c, 4 * count - c)
-        grad = load_first(grads.quats, 4 * first + c, 4 * count - c)
-        inverse = load_first(outputs.inverse_norms, first + c // 4, count - c // 4)
+        unit = load_first(outputs.quats, 4 * g + c, 4 * count - c)
+        grad = load_first(grads.quats, 4 * g + c, 4 * count - c)
+        inverse = load_first(outputs.inverse_norms, g + c // 4, count - c // 4)
         along = quad_sum(unit * grad)
-        store(raw, at + c, (grad - along * unit) * quad_spread(inverse))
-
-
-@njit(nogil=True, error_model="numpy")
-def _sum_cycles(cycles, at, out, start):  # type: ignore[no-untyped-def]
-    """Add up every third of CYCLE numbers."""
-    a = b = c = ZERO
-    for i in range(at, at + CYCLE, 3):
-        a += read(cycles, i)
-        b += read(cycles, i + 1)
-        c += read(cycles, i + 2)
-    write(out, start, a)
-    write(out, start + 1, b)
-    write(out, start + 2, c)
-
-
-@njit(nogil=True, error_model="numpy")
-def _raw_row(layout, source, outputs, grads, anchor, first, work, at, out):  # type: ignore[no-untyped-def]
-    """Gradients of the raw outputs of an anchor, and of its offsets and log scales."""
-    count, raw, cycles = layout.offsets, work.raw, work.cycles
-    fill_cycles(source, anchor, cycles)
-    for c in range(0, count, LANES):
-        opacity = load_first(outputs.opacities, first + c, count - c)
-        grad = load_first(grads.opacities, first + c, count - c)
-        store(raw, at + c, grad * (ONE - opacity) * (ONE + opacity))
-    _raw_quats(outputs, grads, first, count, raw, at + layout.quats_at)
-    sums = 3 * CYCLE
-    for c in range(0, 2 * CYCLE, LANES):
-        store(cycles, sums + c, splat(ZERO))
+        store(work.quats, 4 * done + c, (grad - along * unit) * quad_spread(inverse))
     for c in range(0, 3 * count, LANES):
-        phase, left, here = c % CYCLE, 3 * count - c, 3 * first + c
-        color = load_first(outputs.colors, here, left)
-        grad = load_first(grads.colors, here, left)
-        store(raw, at + layout.colors_at + c, grad * color * (ONE - color))
-        scale = load_first(outputs.scales, here, left)
-        grad = load_first(grads.scales, here, left) * scale
-        share = scale / load(cycles, CYCLE + phase)
-        store(raw, at + layout.scales_at + c, grad * (ONE - share))
-        at_scale = sums + CYCLE + phase
-        store(cycles, at_scale, load(cycles, at_scale) + grad)
-        # The mean is the anchor's plus offset times exp(log_scales[0:3]).
-        grad = load_first(grads.means, here, left) * load(cycles, phase)
-        offset_at = 3 * count * anchor + c
-        store_first(out.offsets, offset_at, grad, left)
-        grad = grad * load_first(source.offsets, offset_at, left)
-        store(cycles, sums + phase, load(cycles, sums + phase) + grad)
-    _sum_cycles(cycles, sums, out.log_scales, 6 * anchor)
-    _sum_cycles(cycles, sums + CYCLE, out.log_scales, 6 * anchor + 3)
+        at, left = 3 * g + c, 3 * count - c
+        color = load_first(outputs.colors, at, left)
+        grad = load_first(grads.colors, at, left)
+        store(work.colors, 3 * done + c, grad * color * (ONE - color))
+        scale = load_first(outputs.scales, at, left)
+        grad = load_first(grads.scales, at, left) * scale
+        store(work.factors, 3 * done + c, grad)
+        share = scale / load(work.row, CYCLE + c % CYCLE)
+        store(work.scales, 3 * done + c, grad * (ONE - share))
 
 
 @njit(nogil=True, error_model="numpy")
-def _add_column_sums(values, columns, out):  # type: ignore[no-untyped-def]
-    for c in range(0, columns, LANES):
-        total = load(out, c)
-        for i in range(BLOCK):
-            total = total + load(values, i * columns + c)
-        store(out, c, total)
+def _offset_gradients(layout, source, outputs, grads, m, g, count, work, done, out):  # type: ignore[no-untyped-def]
+    """Gradients of the offsets and log scales: means are anchor + offset exp(log_scales[0:3])."""
+    anchor = read_index(source.visible, m)
+    for c in range(3):
+        offset_sum = scale_sum = ZERO
+        for i in range(count):
+            j = read_index(outputs.positions, g + i) - m * layout.offsets
+            at = 3 * (anchor * layout.offsets + j) + c
+            grad = read(grads.means, 3 * (g + i) + c) * read(work.row, c)
+            write(out.offsets, at, grad)
+            offset_sum += grad * read(source.offsets, at)
+            scale_sum += read(work.factors, 3 * (done + i) + c)
+        write(out.log_scales, 6 * anchor + c, offset_sum)
+        write(out.log_scales, 6 * anchor + 3 + c, scale_sum)
+
+
+@njit(nogil=True, error_model="numpy")
+def _anchor_gradient(layout, source, outputs, grads, m, slot, work, done, out):  # type: ignore[no-untyped-def]
+    """Everything up to the raw outputs; notes the slot with every offset that has a gradient."""
+    g, stop = read_index(outputs.starts, m), read_index(outputs.starts, m + 1)
+    factors(source, read_index(source.visible, m), work.row)
+    store_cycle(work.row, CYCLE, work.row, 3)
+    _raw_gradients(outputs, grads, g, stop - g, work, done)
+    _offset_gradients(layout, source, outputs, grads, m, g, stop - g, work, done, out)
+    for i in range(stop - g):
+        if _has_gradient(grads, g + i):
+            j = read_index(outputs.positions, g + i) - m * layout.offsets
+            count = read_index(work.counts, j)
+            write_index(work.slots, 2 * (j * BLOCK + count), slot)
+            write_index(work.slots, 2 * (j * BLOCK + count) + 1, done + i)
+            write_index(work.counts, j, count + 1)
+    return done + stop - g
+
+
+@njit(nogil=True, error_model="numpy")
+def _sum_bias(slots, count, grads, number, bias, row):  # type: ignore[no-untyped-def]
+    for c in range(number):
+        total = read(bias, row + c)
+        for i in range(count):
+            total += read(grads, number * read_index(slots, 2 * i + 1) + c)
+        write(bias, row + c, total)
 
 
 @njit(nogil=True, error_model="numpy")
 def _output_layer_gradient(layout, weights, work, partial):  # type: ignore[no-untyped-def]
-    """From raw outputs to hidden units and to the second layers."""
-    pad, hiddens, outputs = layout.hidden_pad, layout.hiddens, layout.outputs_pad
-    for head in range(3):
-        first, count = head_columns(layout, head)
-        hidden = (work.hidden, head * pad, hiddens)
-        d_w2 = (partial.w2, first * pad, pad)
-        product((work.raw, first, 1, outputs), hidden, d_w2, d_w2, count, pad, BLOCK)
-        w2 = (weights.w2, first * pad, pad)
-        d_hidden = (work.d_hidden, head * pad, hiddens)
-        zeros = (weights.zeros, 0, 0)
-        product((work.raw, first, outputs, 1), w2, zeros, d_hidden, BLOCK, pad, count)
-    zero = splat(ZERO)
-    for i in range(0, BLOCK * hiddens, LANES):
-        grad = select_less(zero, load(work.hidden, i), load(work.d_hidden, i), zero)
-        store(work.d_hidden, i, grad)
-    _add_column_sums(work.raw, outputs, partial.b2)
-    _add_column_sums(work.d_hidden, hiddens, partial.b1)
+    """From the raw outputs to the hidden units and the second layers."""
+    for i in range(0, BLOCK * layout.hiddens, LANES):
+        store(work.d_hidden, i, splat(ZERO))
+    grads = (work.opacities, work.scales, work.quats, work.colors)
+    places = (work.hidden, work.d_hidden, weights.w2, partial.w2)
+    lengths = (layout.hiddens, layout.hidden_pad)
+    for j in range(layout.offsets):
+        scale, quat = layout.scales_at + 3 * j, layout.quats_at + 4 * j
+        color = layout.colors_at + 3 * j
+        slots, count = work.slots + 16 * j * BLOCK, read_index(work.counts, j)
+        for unit in range(0, layout.hidden_pad, LANES):
+            add_offset(grads, places, (j, scale, quat, color), lengths, slots, count, unit)
+        _sum_bias(slots, count, work.opacities, 1, partial.b2, j)
+        _sum_bias(slots, count, work.scales, 3, partial.b2, scale)
+        _sum_bias(slots, count, work.quats, 4, partial.b2, quat)
+        _sum_bias(slots, count, work.colors, 3, partial.b2, color)
+        write_index(work.counts, j, 0)
 
 
 @njit(nogil=True, error_model="numpy")
-def _hidden_layer_gradient(layout, weights, work, partial):  # type: ignore[no-untyped-def]
+def _hidden_layer_gradient(layout, weights, work, count, partial):  # type: ignore[no-untyped-def]
     """From hidden units to features and to the first layers."""
     hiddens, inputs, columns = layout.hiddens, layout.inputs_pad, layout.features_pad
+    zero = splat(ZERO)
+    for i in range(0, count * hiddens, LANES):
+        grad = select_less(zero, load(work.hidden, i), load(work.d_hidden, i), zero)
+        store(work.d_hidden, i, grad)
+    for i in range(count * hiddens, BLOCK * hiddens, LANES):
+        store(work.d_hidden, i, zero)
+    for c in range(0, hiddens, LANES):
+        total = load(partial.b1, c)
+        for i in range(count):
+            total = total + load(work.d_hidden, i * hiddens + c)
+        store(partial.b1, c, total)
     d_hidden = (work.d_hidden, 0, hiddens)
     d_w1 = (partial.w1_t, 0, hiddens)
     product((work.x, 0, 1, inputs), d_hidden, d_w1, d_w1, inputs, hiddens, BLOCK)
@@ -191,35 +196,34 @@ def _write_features(layout, source, anchor, d_x, at, out):  # type: ignore[no-un
 
 
 @njit(nogil=True, error_model="numpy")
-def _block_gradient(layout, weights, source, count, work, partial, out):  # type: ignore[no-untyped-def]
-    """Everything behind the raw outputs of the anchors in the first rows of the work space."""
-    for i in range(count * layout.outputs_pad, BLOCK * layout.outputs_pad, LANES):
-        store(work.raw, i, splat(ZERO))
-    hidden_layer(layout, weights, work)
-    _output_layer_gradient(layout, weights, work, partial)
-    _hidden_layer_gradient(layout, weights, work, partial)
+def _block_gradient(layout, weights, source, outputs, grads, count, work, partial, out):  # type: ignore[no-untyped-def]
+    """Gradients from the visible anchors in the first rows of the work space."""
+    hidden_layer(layout, weights, work, 0, layout.hiddens)
+    done = 0
     for i in range(count):
-        anchor = read_index(work.rows, i)
+        m = read_index(work.rows, i)
+        done = _anchor_gradient(layout, source, outputs, grads, m, i, work, done, out)
+    _output_layer_gradient(layout, weights, work, partial)
+    _hidden_layer_gradient(layout, weights, work, count, partial)
+    for i in range(count):
+        anchor = read_index(source.visible, read_index(work.rows, i))
         _write_features(layout, source, anchor, work.d_x, i * layout.features_pad, out)
 
 
 @njit(nogil=True, error_model="numpy")
-def _chunk_gradient(  # type: ignore[no-untyped-def]
-    layout, weights, source, outputs, grads, begin, end, minimum, work, partial, out
-):
-    """Anchors begin..end, those with a gradient gathered into blocks."""
+def _chunk_gradient(layout, weights, source, outputs, grads, begin, end, work, partial, out):  # type: ignore[no-untyped-def]
+    """Visible anchors begin..end, those with a gradient gathered into blocks."""
     count = 0
     for m in range(begin, end):
-        first = m * layout.offsets
-        if not _is_idle(grads, first, layout.offsets):
-            anchor = read_index(source.visible, m)
-            write_index(work.rows, count, anchor)
-            at = count * layout.outputs_pad
-            _raw_row(layout, source, outputs, grads, anchor, first, work, at, out)
-            gather_inputs(layout, source, anchor, minimum, work.x, count * layout.inputs_pad)
+        g, stop = read_index(outputs.starts, m), read_index(outputs.starts, m + 1)
+        while g < stop and not _has_gradient(grads, g):
+            g += 1
+        if g < stop:
+            write_index(work.rows, count, m)
+            gather_inputs(layout, source, m, work.x, count)
             count += 1
         if count == BLOCK or (m == end - 1 and count):
-            _block_gradient(layout, weights, source, count, work, partial, out)
+            _block_gradient(layout, weights, source, outputs, grads, count, work, partial, out)
             count = 0
 
 
@@ -234,12 +238,12 @@ def _chunk_partial(partial, chunk, size):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def decode_backward(  # type: ignore[no-untyped-def]
-    layout, weights, source, limits, outputs, grads, out, partial, size, work, work_size, tasks
+    layout, weights, source, outputs, grads, out, partial, size, work, work_size, tasks
 ):
     """Gradients of what `decode_forward` reads.
 
     Args:
-        layout: As forward, like ``weights``, ``source``, ``limits``, ``work`` and ``work_size``.
+        layout: As forward, like ``weights``, ``source``, ``work`` and ``work_size``.
         outputs: `Outputs` of the forward pass.
         grads: `OutputGradients`.
         out: `AnchorGradients`, written in rows of anchors that have a gradient.
@@ -255,9 +259,7 @@ def decode_backward(  # type: ignore[no-untyped-def]
             begin = chunk * CHUNK
             end = min(begin + CHUNK, source.num_visible)
             part = _chunk_partial(partial, chunk, size)
-            _chunk_gradient(
-                layout, weights, source, outputs, grads, begin, end, limits[0], own, part, out
-            )
+            _chunk_gradient(layout, weights, source, outputs, grads, begin, end, own, part, out)
     for i in prange((size + SLICE - 1) // SLICE):
         for j in range(i * SLICE, min((i + 1) * SLICE, size), LANES):
             total = load_first(partial.w1_t, j, size - j)

@@ -1,4 +1,8 @@
-"""Decode anchors, compiled: blocks of anchors through the joined heads."""
+"""Decode anchors, compiled: blocks of anchors through the joined heads.
+
+Two passes. The first finds the opacities, and so which Gaussians live and where in the output they
+go; the second decodes the shapes and colours of anchors that have a living Gaussian.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +12,19 @@ from typing import NamedTuple
 from numba import njit, prange
 from numpy import float32
 
-from chronoscene.training._decode_layout import BLOCK, CHUNK, CYCLE, Work
+from chronoscene.training._decode_layout import (
+    BLOCK,
+    CHUNK,
+    MIN_DISTANCE,
+    MIN_QUAT_NORM,
+    Work,
+)
 from chronoscene.training._matmul import product, relu_product
 from chronoscene.training._simd import (
     LANES,
+    copy_quad,
     load,
     load_first,
-    multiply_add,
     read,
     read_index,
     select_less,
@@ -22,6 +32,7 @@ from chronoscene.training._simd import (
     store,
     store_first,
     write,
+    write_index,
 )
 from chronoscene.training._vector_math import (
     exp,
@@ -30,12 +41,13 @@ from chronoscene.training._vector_math import (
     quad_sum,
     sigmoid,
     square_root,
-    store_cycle,
     tanh,
 )
 
 ZERO = float32(0)
 ONE = float32(1)
+LEAST_DISTANCE = float32(MIN_DISTANCE)
+LEAST_SQUARE = float32(MIN_QUAT_NORM**2)
 
 
 class Anchors(NamedTuple):
@@ -56,15 +68,21 @@ class Anchors(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Addresses of what comes out."""
+    """Addresses of what comes out, L living Gaussians."""
 
+    alphas: int
+    """Opacities of all offsets. [M k]"""
+    starts: int
+    """First Gaussian of each visible anchor, and L at the end. int64 [M + 1]"""
+    positions: int
+    """Position of each Gaussian among all offsets. int64 [L]"""
     means: int
     quats: int
     scales: int
     opacities: int
     colors: int
     inverse_norms: int
-    """1 / |q| of the quaternions before they were made unit, 0 without a direction. [M k]"""
+    """1 / |q| of the quaternions before they were made unit, 0 without a direction. [L]"""
 
 
 @njit(nogil=True, error_model="numpy")
@@ -73,18 +91,26 @@ def task_work(work, task, size):  # type: ignore[no-untyped-def]
     move = 4 * task * size
     return Work(
         work.rows + move,
+        work.counts + move,
+        work.slots + move,
         work.x + move,
         work.hidden + move,
         work.raw + move,
         work.d_hidden + move,
         work.d_x + move,
-        work.cycles + move,
+        work.row + move,
+        work.opacities + move,
+        work.scales + move,
+        work.quats + move,
+        work.colors + move,
+        work.factors + move,
     )
 
 
 @njit(nogil=True, error_model="numpy")
-def gather_inputs(layout, source, anchor, minimum, x, at):  # type: ignore[no-untyped-def]
+def gather_inputs(layout, source, m, x, slot):  # type: ignore[no-untyped-def]
     """Write the input of the heads: base feature, mixed period feature, unit direction."""
+    anchor, at = read_index(source.visible, m), slot * layout.inputs_pad
     row = anchor * layout.row
     for c in range(0, layout.base, LANES):
         store(x, at + c, load_first(source.features, row + c, layout.base - c))
@@ -100,7 +126,7 @@ def gather_inputs(layout, source, anchor, minimum, x, at):  # type: ignore[no-un
     dy = read(source.anchors, 3 * anchor + 1) - read(source.centre, 1)
     dz = read(source.anchors, 3 * anchor + 2) - read(source.centre, 2)
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    over = ONE / length if length > minimum else ZERO
+    over = ONE / length if length > LEAST_DISTANCE else ZERO
     write(x, at + layout.features, dx * over)
     write(x, at + layout.features + 1, dy * over)
     write(x, at + layout.features + 2, dz * over)
@@ -109,123 +135,148 @@ def gather_inputs(layout, source, anchor, minimum, x, at):  # type: ignore[no-un
 
 
 @njit(nogil=True, error_model="numpy")
-def fill_cycles(source, anchor, cycles):  # type: ignore[no-untyped-def]
-    """Repeat exp(log_scales[0:3]), exp(log_scales[3:6]) and the position, CYCLE numbers each."""
-    work = 3 * CYCLE
-    for c in range(0, 6, LANES):
-        store(cycles, work + c, exp(load_first(source.log_scales, 6 * anchor + c, 6 - c)))
-    store_cycle(cycles, 0, cycles, work)
-    store_cycle(cycles, CYCLE, cycles, work + 3)
-    for c in range(3):
-        write(cycles, work + c, read(source.anchors, 3 * anchor + c))
-    store_cycle(cycles, 2 * CYCLE, cycles, work)
+def hidden_layer(layout, weights, work, first, columns):  # type: ignore[no-untyped-def]
+    """First layer of some heads for a block."""
+    right = (weights.w1_t, first, layout.hiddens)
+    bias = (weights.b1, first, 0)
+    out = (work.hidden, first, layout.hiddens)
+    inputs = layout.inputs
+    relu_product((work.x, 0, layout.inputs_pad, 1), right, bias, out, BLOCK, columns, inputs)
 
 
 @njit(nogil=True, error_model="numpy")
-def hidden_layer(layout, weights, work):  # type: ignore[no-untyped-def]
-    """First layer of the three heads for a block."""
-    hiddens = layout.hiddens
-    relu_product(
-        (work.x, 0, layout.inputs_pad, 1),
-        (weights.w1_t, 0, hiddens),
-        (weights.b1, 0, 0),
-        (work.hidden, 0, hiddens),
-        BLOCK,
-        hiddens,
-        layout.inputs,
-    )
+def _output_layer(layout, weights, work, head, first, columns):  # type: ignore[no-untyped-def]
+    """Second layer of a head for a block: ``columns`` of the outputs from ``first`` on."""
+    left = (work.hidden, head * layout.hidden_pad, layout.hiddens, 1)
+    right = (weights.w2_t, first, layout.outputs_pad)
+    out = (work.raw, first, layout.outputs_pad)
+    product(left, right, (weights.b2, first, 0), out, BLOCK, columns, layout.hidden)
 
 
 @njit(nogil=True, error_model="numpy")
-def head_columns(layout, head):  # type: ignore[no-untyped-def]
-    """First column and number of columns of a head's outputs."""
-    if head == 0:
-        return 0, layout.scales_at
-    if head == 1:
-        return layout.scales_at, layout.colors_at - layout.scales_at
-    return layout.colors_at, layout.outputs_pad - layout.colors_at
-
-
-@njit(nogil=True, error_model="numpy")
-def _output_layer(layout, weights, work):  # type: ignore[no-untyped-def]
-    outputs = layout.outputs_pad
-    for head in range(3):
-        first, count = head_columns(layout, head)
-        product(
-            (work.hidden, head * layout.hidden_pad, layout.hiddens, 1),
-            (weights.w2_t, first, outputs),
-            (weights.b2, first, 0),
-            (work.raw, first, outputs),
-            BLOCK,
-            count,
-            layout.hidden,
-        )
-
-
-@njit(nogil=True, error_model="numpy")
-def _write_quats(raw, at, count, first, min_square, out):  # type: ignore[no-untyped-def]
-    """Make 4-vectors unit; without a direction they become the identity."""
-    minimum = splat(min_square)
-    for c in range(0, 4 * count, LANES):
-        value = load(raw, at + c)
-        square = quad_sum(value * value)
-        inverse = select_less(square, minimum, splat(ZERO), ONE / square_root(square))
-        unit = select_less(square, minimum, quad_identity(), value * inverse)
-        store_first(out.quats, 4 * first + c, unit, 4 * count - c)
-        quads = min(count - c // 4, LANES // 4)
-        store_first(out.inverse_norms, first + c // 4, quad_heads(inverse), quads)
-
-
-@njit(nogil=True, error_model="numpy")
-def _write_row(layout, source, anchor, first, work, at, min_square, out):  # type: ignore[no-untyped-def]
-    """Turn the raw outputs of an anchor into Gaussians ``first``, ``first + 1``, ..."""
-    count, raw, cycles = layout.offsets, work.raw, work.cycles
-    fill_cycles(source, anchor, cycles)
+def _count_row(raw, at, count, m, above, out):  # type: ignore[no-untyped-def]
+    """Opacities of an anchor, and how many of its Gaussians live."""
+    first = m * count
     for c in range(0, count, LANES):
-        store_first(out.opacities, first + c, tanh(load(raw, at + c)), count - c)
-    _write_quats(raw, at + layout.quats_at, count, first, min_square, out)
-    for c in range(0, 3 * count, LANES):
-        phase, left = c % CYCLE, 3 * count - c
-        color = sigmoid(load(raw, at + layout.colors_at + c))
-        store_first(out.colors, 3 * first + c, color, left)
-        scale = sigmoid(load(raw, at + layout.scales_at + c)) * load(cycles, CYCLE + phase)
-        store_first(out.scales, 3 * first + c, scale, left)
-        offset = load_first(source.offsets, 3 * count * anchor + c, left)
-        mean = multiply_add(offset, load(cycles, phase), load(cycles, 2 * CYCLE + phase))
-        store_first(out.means, 3 * first + c, mean, left)
-
-
-@njit(nogil=True, error_model="numpy")
-def _decode_chunk(layout, weights, source, begin, end, limits, work, out):  # type: ignore[no-untyped-def]
-    for start in range(begin, end, BLOCK):
-        count = min(BLOCK, end - start)
-        for i in range(count):
-            anchor = read_index(source.visible, start + i)
-            gather_inputs(layout, source, anchor, limits[0], work.x, i * layout.inputs_pad)
-        hidden_layer(layout, weights, work)
-        _output_layer(layout, weights, work)
-        for i in range(count):
-            anchor, first = read_index(source.visible, start + i), (start + i) * layout.offsets
-            at = i * layout.outputs_pad
-            _write_row(layout, source, anchor, first, work, at, limits[1], out)
+        store_first(out.alphas, first + c, tanh(load(raw, at + c)), count - c)
+    living = 0
+    for j in range(first, first + count):
+        # What is not a number lives, so that it does not go unnoticed.
+        living += not (read(out.alphas, j) <= above)
+    write_index(out.starts, m + 1, living)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def decode_forward(layout, weights, source, limits, out, work, work_size, tasks):  # type: ignore[no-untyped-def]
-    """Decode all visible anchors.
+def decode_opacities(layout, weights, source, above, out, work, work_size, tasks):  # type: ignore[no-untyped-def]
+    """First pass: opacities of all offsets, and the starts of the anchors.
 
     Args:
         layout: `Layout`.
         weights: `Weights`.
         source: `Anchors`.
-        limits: Least distance that has a direction, least square of such a quaternion.
-        out: `Outputs`, written.
+        above: Gaussians live unless their opacity is this or less. float32
+        out: `Outputs`, alphas and starts written.
         work: `Work` of the first task, finite numbers.
         work_size: Numbers in it.
         tasks: Into how many tasks to divide the work; does not change the result.
     """
     for task in prange(tasks):
         own = task_work(work, task, work_size)
+        for begin in range(task * BLOCK, source.num_visible, tasks * BLOCK):
+            count = min(BLOCK, source.num_visible - begin)
+            for i in range(count):
+                gather_inputs(layout, source, begin + i, own.x, i)
+            hidden_layer(layout, weights, own, 0, layout.hidden_pad)
+            _output_layer(layout, weights, own, 0, 0, layout.scales_at)
+            for i in range(count):
+                at = i * layout.outputs_pad
+                _count_row(own.raw, at, layout.offsets, begin + i, above, out)
+    write_index(out.starts, 0, 0)
+    for m in range(source.num_visible):
+        total = read_index(out.starts, m) + read_index(out.starts, m + 1)
+        write_index(out.starts, m + 1, total)
+
+
+@njit(nogil=True, error_model="numpy")
+def factors(source, anchor, row):  # type: ignore[no-untyped-def]
+    """Write exp(log_scales) of an anchor."""
+    for c in range(0, 6, LANES):
+        store(row, c, exp(load_first(source.log_scales, 6 * anchor + c, 6 - c)))
+
+
+@njit(nogil=True, error_model="numpy")
+def _gather_living(layout, source, m, slot, above, work, done, out):  # type: ignore[no-untyped-def]
+    """Put raw outputs of the living Gaussians of an anchor behind those ``done`` before."""
+    anchor, raw = read_index(source.visible, m), slot * layout.outputs_pad
+    factors(source, anchor, work.row)
+    g = read_index(out.starts, m)
+    for j in range(layout.offsets):
+        position = m * layout.offsets + j
+        opacity = read(out.alphas, position)
+        if opacity <= above:
+            continue
+        write(out.opacities, g, opacity)
+        write_index(out.positions, g, position)
+        # Four numbers where three are meant: the next ones overwrite the fourth.
+        copy_quad(work.factors, 3 * done, work.row, 3)
+        copy_quad(work.scales, 3 * done, work.raw, raw + layout.scales_at + 3 * j)
+        copy_quad(work.quats, 4 * done, work.raw, raw + layout.quats_at + 4 * j)
+        copy_quad(work.colors, 3 * done, work.raw, raw + layout.colors_at + 3 * j)
+        for c in range(3):
+            offset = read(source.offsets, 3 * (anchor * layout.offsets + j) + c)
+            mean = read(source.anchors, 3 * anchor + c) + offset * read(work.row, c)
+            write(out.means, 3 * g + c, mean)
+        g += 1
+        done += 1
+    return done
+
+
+@njit(nogil=True, error_model="numpy")
+def _activate(work, count, first, out):  # type: ignore[no-untyped-def]
+    """Turn raw outputs of ``count`` Gaussians into those from ``first`` on."""
+    for c in range(0, 3 * count, LANES):
+        left, at = 3 * count - c, 3 * first + c
+        store_first(out.colors, at, sigmoid(load(work.colors, c)), left)
+        scale = sigmoid(load(work.scales, c)) * load(work.factors, c)
+        store_first(out.scales, at, scale, left)
+    least = splat(LEAST_SQUARE)
+    for c in range(0, 4 * count, LANES):
+        value = load(work.quats, c)
+        square = quad_sum(value * value)
+        inverse = select_less(square, least, splat(ZERO), ONE / square_root(square))
+        # Without a direction they become the identity.
+        unit = select_less(square, least, quad_identity(), value * inverse)
+        store_first(out.quats, 4 * first + c, unit, 4 * count - c)
+        quads = min(count - c // 4, LANES // 4)
+        store_first(out.inverse_norms, first + c // 4, quad_heads(inverse), quads)
+
+
+@njit(nogil=True, error_model="numpy")
+def _decode_block(layout, weights, source, count, above, work, out):  # type: ignore[no-untyped-def]
+    hidden_layer(layout, weights, work, layout.hidden_pad, 2 * layout.hidden_pad)
+    scales, colors = layout.scales_at, layout.colors_at
+    _output_layer(layout, weights, work, 1, scales, colors - scales)
+    _output_layer(layout, weights, work, 2, colors, layout.outputs_pad - colors)
+    done = 0
+    for i in range(count):
+        m = read_index(work.rows, i)
+        done = _gather_living(layout, source, m, i, above, work, done, out)
+    _activate(work, done, read_index(out.starts, read_index(work.rows, 0)), out)
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def decode_forward(layout, weights, source, above, out, work, work_size, tasks):  # type: ignore[no-untyped-def]
+    """Second pass: everything of the living Gaussians; arguments as `decode_opacities`."""
+    for task in prange(tasks):
+        own = task_work(work, task, work_size)
         for begin in range(task * CHUNK, source.num_visible, tasks * CHUNK):
             end = min(begin + CHUNK, source.num_visible)
-            _decode_chunk(layout, weights, source, begin, end, limits, own, out)
+            count = 0
+            for m in range(begin, end):
+                if read_index(out.starts, m) < read_index(out.starts, m + 1):
+                    write_index(own.rows, count, m)
+                    gather_inputs(layout, source, m, own.x, count)
+                    count += 1
+                if count == BLOCK or (m == end - 1 and count):
+                    _decode_block(layout, weights, source, count, above, own, out)
+                    count = 0

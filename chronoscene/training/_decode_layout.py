@@ -24,6 +24,10 @@ task works in stays in the second-level cache."""
 CHUNK = 512
 """Anchors per partial sum of weight gradients. Fixed, so that sums do not depend on the number of
 threads."""
+MIN_DISTANCE = 1e-12
+"""Of an anchor from the camera, in world units; nearer, it has no direction."""
+MIN_QUAT_NORM = 1e-12
+"""Shorter quaternions carry no direction: they become the identity and get no gradient."""
 CYCLE = 3 * LANES
 """Three numbers in turn look the same every so many lanes."""
 
@@ -120,19 +124,34 @@ class Work(NamedTuple):
     """Addresses of what one task works in."""
 
     rows: int
-    """Anchors of the block. int64 [BLOCK]"""
+    """Which of the visible anchors are in the block. int64 [BLOCK]"""
+    counts: int
+    """Anchors of the block in which an offset has a gradient; zeros between blocks. int64 [k]"""
+    slots: int
+    """And which, as pairs of row in the block and Gaussian. int64 [k, BLOCK, 2]"""
     x: int
     """Inputs. [BLOCK, inputs_pad], and some more"""
     hidden: int
     """[BLOCK, hiddens]"""
     raw: int
-    """Outputs before activation, or their gradients. [BLOCK, outputs_pad]"""
+    """Outputs before activation. [BLOCK, outputs_pad]"""
     d_hidden: int
     """[BLOCK, hiddens]"""
     d_x: int
     """[BLOCK, features_pad]"""
-    cycles: int
-    """Patterns of one row. [5 CYCLE]"""
+    row: int
+    """Of one anchor: exp(log_scales) of the Gaussians over and over. [2 CYCLE]"""
+    opacities: int
+    """Gradients of raw opacities, Gaussians of the block one after the other. [BLOCK k + LANES]"""
+    scales: int
+    """Raw scales, or their gradients. [3 (BLOCK k + LANES)]"""
+    quats: int
+    """[4 (BLOCK k + LANES)]"""
+    colors: int
+    """[3 (BLOCK k + LANES)]"""
+    factors: int
+    """What to multiply the scales by, or their gradients times the scales.
+    [3 (BLOCK k + LANES)]"""
 
 
 def weight_sizes(layout: Layout) -> tuple[int, ...]:
@@ -159,12 +178,15 @@ def work_sizes(layout: Layout) -> tuple[int, ...]:
     """Numbers in each of `Work`."""
     return (
         2 * BLOCK,
+        2 * layout.scales_at,
+        4 * layout.offsets * BLOCK,
         BLOCK * layout.inputs_pad + 2 * LANES,
         BLOCK * layout.hiddens,
         BLOCK * layout.outputs_pad,
         BLOCK * layout.hiddens,
         BLOCK * layout.features_pad,
-        5 * CYCLE,
+        2 * CYCLE,
+        *(n * (BLOCK * layout.offsets + LANES) for n in (1, 3, 4, 3, 3)),
     )
 
 

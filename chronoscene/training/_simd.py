@@ -278,3 +278,19 @@ def write_index(typing: Any, address: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(types.intp, types.intp, types.int64), generate
+
+
+@intrinsic
+def copy_quad(typing: Any, out: Any, start: Any, memory: Any, index: Any) -> Any:
+    """Copy four float32 from ``index`` of one memory to ``start`` of another."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointer = ir.VectorType(FLOAT, 4).as_pointer()
+        source = emit_address(context, builder, signature.args[2], *args[2:])
+        target = emit_address(context, builder, signature.args[0], *args[:2])
+        value = builder.load(builder.bitcast(source, pointer), typ=pointer.pointee)
+        value.align = 4
+        builder.store(value, builder.bitcast(target, pointer)).align = 4
+        return context.get_dummy_value()
+
+    return types.void(out, types.intp, memory, types.intp), generate

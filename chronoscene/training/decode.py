@@ -22,9 +22,16 @@ from chronoscene.training._decode_backward import (
     OutputGradients,
     decode_backward,
 )
-from chronoscene.training._decode_forward import Anchors, Outputs, decode_forward
+from chronoscene.training._decode_forward import (
+    Anchors,
+    Outputs,
+    decode_forward,
+    decode_opacities,
+)
 from chronoscene.training._decode_layout import (
     CHUNK,
+    MIN_DISTANCE,
+    MIN_QUAT_NORM,
     Gradients,
     Head,
     Weights,
@@ -38,13 +45,8 @@ from chronoscene.training._decode_layout import (
     work_sizes,
 )
 
-MIN_DISTANCE = 1e-12
-"""Of an anchor from the camera, in world units; nearer, it has no direction."""
-MIN_QUAT_NORM = 1e-12
-"""Shorter quaternions carry no direction: they become the identity and get no gradient."""
-
-
-LIMITS = np.array([MIN_DISTANCE, MIN_QUAT_NORM**2], dtype=np.float32)
+ALL = np.float32(-np.inf)
+"""Opacity above which Gaussians live, if all shall."""
 
 
 class HeadWeights(NamedTuple):
@@ -176,38 +178,94 @@ def decode(
     """
     tensors = (offsets, features, log_scales, global_features)
     heads = (opacity_head, covariance_head, color_head)
-    _check(anchors, tensors, period_weights, heads, camera_centre, visible, base_dim, period_dim)
-    if anchors.device.type != "cpu" or features.dtype != torch.float32:
-        return decode_reference(
-            anchors, *tensors, period_weights, *heads, camera_centre, visible,
-            base_dim=base_dim, period_dim=period_dim,
-        )  # fmt: skip
     fixed = (anchors, period_weights, camera_centre, visible)
-    weights = (weight for head in heads for weight in head)
-    return Decoded(*_Decode.apply((base_dim, period_dim), fixed, *tensors, *weights))
+    return _decode(fixed, tensors, heads, (base_dim, period_dim), ALL)[0]
+
+
+def decode_living(
+    anchors: Tensor,
+    offsets: Tensor,
+    features: Tensor,
+    log_scales: Tensor,
+    global_features: Tensor,
+    period_weights: Tensor,
+    opacity_head: HeadWeights,
+    covariance_head: HeadWeights,
+    color_head: HeadWeights,
+    camera_centre: Tensor,
+    visible: Tensor,
+    *,
+    base_dim: int,
+    period_dim: int,
+) -> tuple[Decoded, Tensor]:
+    """Decode only what can be seen: `decode` without the Gaussians of opacity 0 or less.
+
+    A rasterizer culls those anyway. With few offsets switched on this is much faster.
+
+    Returns:
+        decoded: The L living Gaussians.
+        index: Their positions in the output of `decode`, ascending. int64 [L]
+    """
+    tensors = (offsets, features, log_scales, global_features)
+    heads = (opacity_head, covariance_head, color_head)
+    fixed = (anchors, period_weights, camera_centre, visible)
+    return _decode(fixed, tensors, heads, (base_dim, period_dim), np.float32(0))
+
+
+def _decode(
+    fixed: tuple[Tensor, Tensor, Tensor, Tensor],
+    tensors: tuple[Tensor, Tensor, Tensor, Tensor],
+    heads: tuple[HeadWeights, HeadWeights, HeadWeights],
+    dims: tuple[int, int],
+    above: np.float32,
+) -> tuple[Decoded, Tensor]:
+    anchors, period_weights, camera_centre, visible = fixed
+    _check(anchors, tensors, period_weights, heads, camera_centre, visible, *dims)
+    weights = [weight for head in heads for weight in head]
+    floats = (*fixed[:3], *tensors, *weights)
+    if all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in floats):
+        *outputs, index = _Decode.apply(dims, above, fixed, *tensors, *weights)
+        return Decoded(*outputs), index
+    decoded = decode_reference(
+        anchors, *tensors, period_weights, *heads, camera_centre, visible,
+        base_dim=dims[0], period_dim=dims[1],
+    )  # fmt: skip
+    index = (~(decoded.opacities <= float(above))).nonzero()[:, 0]
+    return Decoded(*(value[index] for value in decoded)), index
 
 
 class _Decode(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, dims: tuple[int, int], fixed: tuple[Tensor, ...], *tensors: Tensor
+        ctx: Any,
+        dims: tuple[int, int],
+        above: np.float32,
+        fixed: tuple[Tensor, ...],
+        *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
         job = _Job(dims, fixed, tensors)
-        count = job.source.num_visible * job.layout.offsets
-        shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, 3), (count,))
-        outputs = [torch.empty(shape) for shape in shapes]
-        addresses = Outputs(*(tensor.data_ptr() for tensor in outputs))
-        decode_forward(job.layout, job.weights, job.source, LIMITS, addresses, *job.work)
+        count = job.source.num_visible
+        starts = torch.empty(count + 1, dtype=torch.int64)
+        alphas = torch.empty(count * job.layout.offsets)
+        places = Outputs(alphas.data_ptr(), starts.data_ptr(), *([0] * 7))
+        decode_opacities(job.layout, job.weights, job.source, above, places, *job.work)
+        living = int(starts[-1])
+        index = torch.empty(living, dtype=torch.int64)
+        shapes = ((living, 3), (living, 4), (living, 3), (living,), (living, 3), (living,))
+        outputs = (starts, index, *(torch.empty(shape) for shape in shapes))
+        places = _outputs(alphas, *outputs)
+        decode_forward(job.layout, job.weights, job.source, above, places, *job.work)
         ctx.save_for_backward(*fixed, *tensors, *outputs)
         ctx.dims = dims
-        return tuple(outputs[:5])
+        ctx.mark_non_differentiable(index)
+        return (*outputs[2:7], index)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
         fixed, tensors, outputs = saved[:4], saved[4:20], saved[20:]
         job = _Job(ctx.dims, fixed, tensors)
-        grads = tuple(grad.contiguous() for grad in grads)
+        grads = tuple(grad.contiguous() for grad in grads[:5])
         out = [torch.zeros(tensor.shape) for tensor in tensors]
         sizes = gradient_sizes(job.layout)
         chunks = max(1, -(-job.source.num_visible // CHUNK))
@@ -217,8 +275,7 @@ class _Decode(torch.autograd.Function):
             job.layout,
             job.weights,
             job.source,
-            LIMITS,
-            Outputs(*(tensor.data_ptr() for tensor in outputs)),
+            _outputs(torch.empty(0), *outputs),
             OutputGradients(*(grad.data_ptr() for grad in grads)),
             AnchorGradients(*(tensor.data_ptr() for tensor in out[:3])),
             partial,
@@ -229,7 +286,11 @@ class _Decode(torch.autograd.Function):
         ends = (job.shared.data_ptr(), _heads(out[4:]), shared.data_ptr())
         unpack_gradients(job.layout, partial, job.heads, *ends)
         out[3] = fixed[1].detach()[:, None] * shared
-        return None, None, *out
+        return None, None, None, *out
+
+
+def _outputs(*tensors: Tensor) -> Outputs:
+    return Outputs(*(tensor.data_ptr() for tensor in tensors))
 
 
 class _Job:

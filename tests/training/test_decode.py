@@ -14,7 +14,13 @@ from torch import Tensor
 
 from chronoscene.errors import ShapeError
 from chronoscene.training._decode_layout import BLOCK, CHUNK
-from chronoscene.training.decode import Decoded, HeadWeights, decode, decode_reference
+from chronoscene.training.decode import (
+    Decoded,
+    HeadWeights,
+    decode,
+    decode_living,
+    decode_reference,
+)
 
 # Worst of 400 random problems against float64, relative to the largest number of a tensor (or to
 # `SMALL`, where sums cancel): values 1.6e-6, gradients 5e-6, from quaternions near zero.
@@ -44,7 +50,7 @@ class Problem:
         torch.autograd.backward(list(out), [grad.to(out.means) for grad in self.grads])
         return out, {n: torch.zeros_like(x) if x.grad is None else x.grad for n, x in named.items()}
 
-    def call(self, function: Any, leaves: Any, heads: Any) -> Decoded:
+    def call(self, function: Any, leaves: Any, heads: Any) -> Any:
         """Outputs."""
         names = ("opacity_head", "covariance_head", "color_head")
         named = dict(zip(names, heads, strict=True))
@@ -136,7 +142,7 @@ def assert_near(name: str, value: Tensor, truth: Tensor, tolerance: float) -> No
         assert error <= tolerance * max(float(truth.detach().abs().max()), SMALL), (name, error)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     anchors=st.integers(1, 40),
     visible=st.integers(0, 40),
@@ -279,6 +285,88 @@ def test_outputs_that_do_not_matter() -> None:
     _, grads = problem.run(decode)
     assert ours is not None
     assert torch.equal(ours, grads["features"])
+
+
+def living_gradients(problem: Problem, function: Any) -> tuple[Decoded, Tensor, dict[str, Tensor]]:
+    """Run with gradients for living Gaussians only; outputs of those, their index, gradients."""
+    with torch.no_grad():
+        opacities = problem.call(decode, problem.leaves, problem.heads).opacities
+    living = opacities > 0
+    index = living.nonzero()[:, 0]
+    if function is decode_living:
+        whole, problem.grads = problem.grads, tuple(grad[index] for grad in problem.grads)
+        found: list[Tensor] = []
+
+        def run(**arguments: Any) -> Decoded:
+            out, positions = decode_living(**arguments)
+            found.append(positions)
+            return out
+
+        out, grads = problem.run(run)
+        problem.grads = whole
+        return out, found[0], grads
+    problem.grads = tuple(
+        grad * living.reshape(-1, *[1] * (grad.ndim - 1)) for grad in problem.grads
+    )
+    out, grads = problem.run(function)
+    return Decoded(*(value[index] for value in out)), index, grads
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    visible=st.integers(0, 30),
+    offsets=st.integers(1, 12),
+    hidden=st.integers(1, 40),
+    shift=st.sampled_from([-9.0, -1.0, -0.3, 0.0, 9.0]),
+    seed=st.integers(0, 1000),
+)
+def test_living_equals_the_living_part(
+    visible: int, offsets: int, hidden: int, shift: float, seed: int
+) -> None:
+    problem = make_problem(visible=visible, offsets=offsets, hidden=hidden, seed=seed)
+    with torch.no_grad():
+        problem.heads[0].b2.add_(shift)
+    ours, index, our_grads = living_gradients(problem, decode_living)
+    whole, truth, grads = living_gradients(problem, decode)
+    assert torch.equal(index, truth)
+    assert all(torch.equal(a, b) for a, b in zip(ours, whole, strict=True))
+    assert all(torch.equal(our_grads[name], grad) for name, grad in grads.items())
+
+
+def test_living_over_several_chunks_and_threads() -> None:
+    problem = make_problem(anchors=3 * CHUNK, visible=2 * CHUNK + 77, offsets=5)
+    with torch.no_grad():
+        problem.heads[0].b2.sub_(0.5)
+    previous = numba.get_num_threads()
+    numba.set_num_threads(1)
+    one, _, one_grads = living_gradients(problem, decode_living)
+    one_grads = {name: grad.clone() for name, grad in one_grads.items()}
+    numba.set_num_threads(previous)
+    many, _, many_grads = living_gradients(problem, decode_living)
+    assert 0 < len(one.means) < 5 * (2 * CHUNK + 77)
+    assert all(torch.equal(a, b) for a, b in zip(one, many, strict=True))
+    assert all(torch.equal(grad, many_grads[name]) for name, grad in one_grads.items())
+
+
+def test_living_in_double_is_the_living_part_of_the_definition() -> None:
+    problem = make_problem().double()
+    out, index = problem.call(decode_living, problem.leaves, problem.heads)
+    truth = problem.call(decode_reference, problem.leaves, problem.heads)
+    assert torch.equal(index, (truth.opacities > 0).nonzero()[:, 0])
+    assert torch.equal(out.colors, truth.colors[index])
+
+
+def test_not_a_number_lives() -> None:
+    """It reaches the rasterizer, which reports it, instead of vanishing."""
+    problem = make_problem()
+    first = int(problem.fixed["visible"][0])
+    with torch.no_grad():
+        problem.leaves["features"][first, 0] = float("nan")
+    out, index = problem.call(decode_living, problem.leaves, problem.heads)
+    assert index[:3].tolist() == [0, 1, 2]
+    assert bool(out.opacities[:3].isnan().all())
+    assert bool(out.colors[:3].isnan().all())
+    assert bool(out.opacities[3:].isfinite().all())
 
 
 def test_same_bits_for_any_thread_count() -> None:
