@@ -26,7 +26,7 @@ class ProgressDisplay:
         self._live = self.console.is_terminal
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=24),
+            BarColumn(bar_width=12),
             TextColumn("{task.percentage:>3.0f}%"),
             TextColumn("{task.fields[status]}", markup=False),
             console=self.console,
@@ -58,7 +58,9 @@ class ProgressDisplay:
         self._stop, self._loss, self._psnr, self._shown = stop, None, None, 0.0
         if self._task is not None:
             self._bar.remove_task(self._task)
-        self._task = self._bar.add_task(self._name, total=1.0, status="setup")
+        # The runner has named the run already, and a terminal may be 80 columns wide.
+        shown = "" if part == "all" else part
+        self._task = self._bar.add_task(shown, total=1.0, status="setup")
 
     def update(
         self, iteration: int, seconds: float, report: StepReport, psnr: float | None
@@ -69,21 +71,21 @@ class ProgressDisplay:
         now, progress = time.monotonic(), self._stop.progress(iteration, seconds)
         if self._live and self._task is not None and (now - self._shown > REFRESH or progress == 1):
             self._shown = now
-            status = self.status(iteration, seconds, report.primitives, psnr)
+            status = self.status(iteration, seconds, psnr)
             self._bar.update(self._task, completed=progress, status=status)
         elif not self._live and psnr is not None and psnr != self._psnr:
-            status = self.status(iteration, seconds, report.primitives, psnr)
-            line = f"{self._name}: {progress:4.0%} {status}"
+            status = self.status(iteration, seconds, psnr)
+            line = f"{self._name}: {progress:4.0%} {status}, {report.primitives} primitives"
             self.console.print(line, highlight=False, markup=False, soft_wrap=True)
         self._psnr = psnr
 
-    def status(self, iteration: int, seconds: float, primitives: int, psnr: float | None) -> str:
+    def status(self, iteration: int, seconds: float, psnr: float | None) -> str:
         """One line on the state of the training."""
         left = self._stop.seconds_left(iteration, seconds)
         pieces = [f"iteration {iteration}", f"loss {self._loss:.4f}"]
         if psnr is not None:
-            pieces.append(f"PSNR {psnr:.2f} dB")
-        pieces += [f"{primitives} primitives", f"{iteration / max(seconds, 1e-9):.1f} it/s"]
+            pieces.append(f"{psnr:.2f} dB")
+        pieces.append(f"{iteration / max(seconds, 1e-9):.1f} it/s")
         if left is not None and left > 0:
             pieces.append(f"{format_time(left)} left")
         return ", ".join(pieces)
