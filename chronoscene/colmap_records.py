@@ -2,7 +2,7 @@
 
 Two reasons for a reader beside pycolmap: pycolmap gives points and observations one Python object
 at a time (seconds for a scene of half a million points), and it does not notice that a file ends
-early. Every length is checked here against the size of the file before it is used.
+early. Every length is checked against the size of the file before it is used.
 
 Records are little endian; a count comes first (u64). Camera: i32 id, i32 model, u64 width, u64
 height, f64 parameters. Image: i32 id, f64 quaternion wxyz, f64 translation, i32 camera, name ended
@@ -16,33 +16,28 @@ u64 image id).
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.errors import SceneError
+from chronoscene.record_reader import COUNT, RecordError, RecordReader, read_records
 
 CAMERA_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 """Number of parameters by COLMAP's model id, SIMPLE_PINHOLE (0) to EQUIRECTANGULAR (17)."""
 
-_COUNT = struct.Struct("<Q")
 _CAMERA_HEAD = struct.Struct("<iiQQ")
 _IMAGE_HEAD = struct.Struct("<i7di")
 _KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 _POINT_HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
-_POINT_BYTES = _POINT_HEAD.itemsize + _COUNT.size
+_POINT_BYTES = _POINT_HEAD.itemsize + COUNT.size
 _TRACK_BYTES = 8
 _RIG_HEAD = struct.Struct("<II")
-_SENSOR = struct.Struct("<iI")
+_SENSOR_BYTES = 8
 _POSE_BYTES = 7 * 8
 _FRAME_HEAD = struct.Struct("<II7dI")
 _FRAME_IMAGE_BYTES = 16
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +58,7 @@ def read_points(path: Path) -> PointRecords:
     Raises:
         SceneError: If the file cannot be read or ends inside a record.
     """
-    return _guarded(path, _walk_points)
+    return read_records(path, _walk_points)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,25 +95,25 @@ def read_cameras(path: Path) -> list[CameraRecord]:
     Raises:
         SceneError: If the file cannot be read, ends inside a record, or has an unknown model.
     """
-    return _guarded(path, _walk_cameras)
+    return read_records(path, _walk_cameras)
 
 
 def read_images(path: Path) -> list[ImageRecord]:
-    """Read ``images.bin`` without judging names and poses.
+    """Read ``images.bin`` in the order of the file, without judging ids, names and poses.
 
     Raises:
         SceneError: If the file cannot be read or ends inside a record.
     """
-    return _guarded(path, _walk_images)
+    return read_records(path, _walk_images)
 
 
 def read_keypoints(path: Path) -> dict[int, NDArray[np.float64]]:
     """Read the pixel positions in ``images.bin``: image id to keypoints [n, 2].
 
     Raises:
-        SceneError: If the file cannot be read or ends inside a record.
+        SceneError: If the file cannot be read, ends inside a record, or has an id twice.
     """
-    return {image.image_id: image.xy for image in read_images(path)}
+    return read_records(path, _walk_keypoints)
 
 
 def check_records(folder: Path) -> None:
@@ -129,130 +124,93 @@ def check_records(folder: Path) -> None:
     Raises:
         SceneError: If a file ends inside a record, or has a camera model that COLMAP does not know.
     """
-    _guarded(folder / "cameras.bin", _walk_cameras)
+    read_records(folder / "cameras.bin", _walk_cameras)
     for stem, walk in (("rigs", _walk_rigs), ("frames", _walk_frames)):
         path = folder / f"{stem}.bin"
         if path.exists():
-            _guarded(path, walk)
+            read_records(path, walk)
 
 
-class _DamagedError(Exception):
-    """What is wrong inside a file, in words."""
-
-
-def _guarded(path: Path, walk: Callable[[bytes], T]) -> T:
-    try:
-        return walk(path.read_bytes())
-    except OSError as error:
-        found = error.strerror or "unreadable"
-    except (struct.error, ValueError, IndexError):
-        found = "a file that ends inside a record"
-    except _DamagedError as error:
-        found = str(error)
-    raise SceneError(
-        path,
-        expected="complete COLMAP records",
-        found=found,
-        todo="copy the file again or write the model again with COLMAP",
-    )
-
-
-def _count(data: bytes, smallest_record: int) -> int:
-    """The leading count, refused if so many records cannot fit into the file."""
-    (count,) = _COUNT.unpack_from(data, 0)
-    if count * smallest_record > len(data) - _COUNT.size:
-        raise _DamagedError(f"{count} records announced in {len(data)} bytes")
-    return int(count)
-
-
-def _finish(data: bytes, at: int) -> None:
-    if at != len(data):
-        raise _DamagedError(f"{len(data) - at} bytes after the last record")
-
-
-def _walk_cameras(data: bytes) -> list[CameraRecord]:
+def _walk_cameras(reader: RecordReader) -> list[CameraRecord]:
     cameras = []
-    at = _COUNT.size
-    for _ in range(_count(data, _CAMERA_HEAD.size)):
-        camera_id, model, width, height = _CAMERA_HEAD.unpack_from(data, at)
+    for _ in reader.records("camera", _CAMERA_HEAD.size):
+        camera_id, model, width, height = reader.unpack(_CAMERA_HEAD)
         if not 0 <= model < len(CAMERA_PARAMETERS):
-            raise _DamagedError(f"camera {camera_id} with the unknown model id {model}")
-        at += _CAMERA_HEAD.size
-        params = struct.unpack_from(f"<{CAMERA_PARAMETERS[model]}d", data, at)
+            known = f"0..{len(CAMERA_PARAMETERS) - 1}"
+            raise RecordError(f"the unknown model id {model} for camera {camera_id}, not {known}")
+        params = reader.unpack(struct.Struct(f"<{CAMERA_PARAMETERS[model]}d"))
         cameras.append(CameraRecord(camera_id, model, width, height, params))
-        at += 8 * len(params)
-    _finish(data, at)
     return cameras
 
 
-def _walk_rigs(data: bytes) -> None:
-    at = _COUNT.size
-    for _ in range(_count(data, _RIG_HEAD.size)):
-        _rig_id, sensors = _RIG_HEAD.unpack_from(data, at)
-        at += _RIG_HEAD.size + (_SENSOR.size if sensors else 0)
-        if sensors * _SENSOR.size > len(data):
-            raise _DamagedError(f"a rig with {sensors} sensors, more than the file has")
+def _walk_rigs(reader: RecordReader) -> None:
+    for _ in reader.records("rig", _RIG_HEAD.size):
+        _rig_id, sensors = reader.unpack(_RIG_HEAD)
+        reader.parts = f"{sensors} sensors"
+        reader.skip(_SENSOR_BYTES if sensors else 0)
         for _ in range(sensors - 1):
-            at += _SENSOR.size
-            has_pose = data[at]
-            at += 1 + (_POSE_BYTES if has_pose else 0)
-    _finish(data, at)
+            has_pose = reader.data[reader.skip(_SENSOR_BYTES + 1) + _SENSOR_BYTES]
+            reader.skip(_POSE_BYTES if has_pose else 0)
 
 
-def _walk_frames(data: bytes) -> None:
-    at = _COUNT.size
-    for _ in range(_count(data, _FRAME_HEAD.size)):
-        (images,) = struct.unpack_from("<I", data, at + _FRAME_HEAD.size - 4)
-        at += _FRAME_HEAD.size + _FRAME_IMAGE_BYTES * images
-        if at > len(data):
-            raise _DamagedError(f"a frame with {images} images, more than the file has")
-    _finish(data, at)
+def _walk_frames(reader: RecordReader) -> None:
+    for _ in reader.records("frame", _FRAME_HEAD.size):
+        images = reader.unpack(_FRAME_HEAD)[-1]
+        reader.parts = f"{images} images"
+        reader.skip(_FRAME_IMAGE_BYTES * images)
 
 
-def _walk_images(data: bytes) -> list[ImageRecord]:
-    images: dict[int, ImageRecord] = {}
-    at = _COUNT.size
-    for _ in range(_count(data, _IMAGE_HEAD.size + 1 + _COUNT.size)):
-        image_id, qw, qx, qy, qz, tx, ty, tz, camera_id = _IMAGE_HEAD.unpack_from(data, at)
-        end = data.index(0, at + _IMAGE_HEAD.size)
-        name = data[at + _IMAGE_HEAD.size : end]
-        at = end + 1
-        (length,) = _COUNT.unpack_from(data, at)
-        at += _COUNT.size
-        if length * _KEYPOINT.itemsize > len(data) - at:
-            raise _DamagedError(f"image {image_id} with {length} keypoints, more than the file has")
-        if image_id in images:
-            raise _DamagedError(f"image id {image_id} twice")
-        records = np.frombuffer(data, _KEYPOINT, count=length, offset=at)
-        images[image_id] = ImageRecord(
-            image_id=image_id,
-            quaternion=(qw, qx, qy, qz),
-            translation=(tx, ty, tz),
-            camera_id=camera_id,
-            name=name,
-            xy=np.ascontiguousarray(records["xy"]),
-            point_ids=np.ascontiguousarray(records["point_id"]),
+def _walk_images(reader: RecordReader) -> list[ImageRecord]:
+    images = []
+    for _ in reader.records("image", _IMAGE_HEAD.size + 1 + COUNT.size):
+        image_id, qw, qx, qy, qz, tx, ty, tz, camera_id = reader.unpack(_IMAGE_HEAD)
+        name = reader.text()
+        (length,) = reader.unpack(COUNT)
+        reader.parts = f"{length} keypoints"
+        begin = reader.skip(length * _KEYPOINT.itemsize)
+        records = np.frombuffer(reader.data, _KEYPOINT, count=length, offset=begin)
+        images.append(
+            ImageRecord(
+                image_id=image_id,
+                quaternion=(qw, qx, qy, qz),
+                translation=(tx, ty, tz),
+                camera_id=camera_id,
+                name=name,
+                xy=np.ascontiguousarray(records["xy"]),
+                point_ids=np.ascontiguousarray(records["point_id"]),
+            )
         )
-        at += length * _KEYPOINT.itemsize
-    _finish(data, at)
-    return list(images.values())
+    return images
 
 
-def _walk_points(data: bytes) -> PointRecords:
-    count = _count(data, _POINT_BYTES)
-    offsets = np.empty(count, np.int64)
-    lengths = np.empty(count, np.int64)
-    unpack = _COUNT.unpack_from
-    at, end = _COUNT.size, len(data)
-    for i in range(count):
+def _walk_keypoints(reader: RecordReader) -> dict[int, NDArray[np.float64]]:
+    keypoints: dict[int, NDArray[np.float64]] = {}
+    for image in _walk_images(reader):
+        if image.image_id in keypoints:
+            raise RecordError(f"image id {image.image_id} twice")
+        keypoints[image.image_id] = image.xy
+    return keypoints
+
+
+def _walk_points(reader: RecordReader) -> PointRecords:
+    offsets, lengths = [], []
+    # The loop runs once for each of up to millions of points, so it does without the reader.
+    data, unpack, end = reader.data, COUNT.unpack_from, len(reader.data)
+    at = COUNT.size
+    for _ in reader.records("point", _POINT_BYTES):
+        if at + _POINT_BYTES > end:
+            raise reader.ends()
         (length,) = unpack(data, at + _POINT_HEAD.itemsize)
-        if length > end:
-            raise _DamagedError(f"record {i} with {length} observations, more than the file has")
-        offsets[i] = at
-        lengths[i] = length
+        offsets.append(at)
+        lengths.append(length)
         at += _POINT_BYTES + _TRACK_BYTES * length
-    _finish(data, at)
-    return _gather_points(np.frombuffer(data, np.uint8), offsets, lengths)
+        if at > end:
+            reader.parts = f"{length} observations"
+            raise reader.ends()
+        reader.at = at
+    return _gather_points(
+        np.frombuffer(data, np.uint8), np.array(offsets, np.int64), np.array(lengths, np.int64)
+    )
 
 
 def _gather_points(
@@ -264,9 +222,9 @@ def _gather_points(
     order = np.argsort(heads["id"], kind="stable")
     ids = heads["id"][order]
     if (ids[1:] == ids[:-1]).any():
-        raise _DamagedError(f"point id {ids[:-1][ids[1:] == ids[:-1]][0]} twice")
+        raise RecordError(f"point id {ids[:-1][ids[1:] == ids[:-1]][0]} twice")
     if len(ids) and ids[-1] > np.iinfo(np.int64).max:
-        raise _DamagedError(f"point id {ids[-1]}, more than 63 bits")
+        raise RecordError(f"point id {ids[-1]}, more than 63 bits")
     start = np.concatenate([[0], np.cumsum(lengths[order])])
     # Observation j of point i begins track_start[j] pairs after the first one of the point.
     first = (offsets + _POINT_BYTES)[order]

@@ -238,6 +238,27 @@ def test_random_damage_is_our_error_or_harmless(make_scene_folder, tmp_path, for
     assert outcomes == {"read", "refused"}
 
 
+@pytest.mark.parametrize(
+    ("stem", "record"),
+    [
+        ("cameras", "camera record 0"),
+        ("images", "image record 3, which announces"),
+        ("points3D", "point record 1, which announces"),
+        ("rigs", "rig record 0"),
+        ("frames", "frame record 3, which announces 1 images"),
+    ],
+)
+def test_the_record_that_a_file_ends_inside_is_named(make_scene_folder, stem, record):
+    folder = make_scene_folder(points=2) / "sparse" / "0"
+    path = folder / f"{stem}.bin"
+    path.write_bytes(path.read_bytes()[:-3])
+    with pytest.raises(SceneError, match=f"found a file that ends inside {record}"):
+        read_model(folder)
+    path.write_bytes(b"123")
+    with pytest.raises(SceneError, match="ends inside the number of its records"):
+        read_model(folder)
+
+
 def test_missing_files_are_named(tmp_path):
     with pytest.raises(SceneError, match="found nothing; copy the model there"):
         read_model(tmp_path / "none")

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap import MODEL_FILES
-from chronoscene.colmap_records import check_records, read_points
+from chronoscene.colmap_records import check_records
 from chronoscene.errors import SceneError
 from chronoscene.scene import Camera
 
@@ -142,7 +142,7 @@ def read_raw_model(folder: Path) -> RawModel:
     readers: dict[str, Callable[[Path], Any]] = {
         "cameras.bin": raw_binary.read_cameras,
         "images.bin": raw_binary.read_images,
-        "points3D.bin": _read_points,
+        "points3D.bin": raw_binary.read_points,
         "cameras.txt": raw_text.read_cameras,
         "images.txt": raw_text.read_images,
         "points3D.txt": raw_text.read_points,
@@ -165,24 +165,6 @@ def _damage(file: str, error: OSError | SceneError) -> Damage:
     if isinstance(error, SceneError):
         return Damage(file, error.expected, error.found)
     return Damage(file, "a file that can be read", error.strerror or "an error")
-
-
-def _read_points(path: Path) -> RawPoints:
-    try:
-        records = read_points(path)
-    except SceneError as error:
-        if not error.found.startswith("-"):
-            raise
-        # A last record that is too short comes as a negative number of bytes after it.
-        ends = Damage(path.name, error.expected, "a file that ends inside its last record")
-        raise DamagedError(ends) from error
-    return RawPoints(
-        ids=records.heads["id"].astype(np.int64),
-        xyz=np.ascontiguousarray(records.heads["xyz"]),
-        track_start=records.track_start,
-        track_image=records.tracks[:, 0].astype(np.int64),
-        track_keypoint=records.tracks[:, 1].astype(np.int64),
-    )
 
 
 def _rig_damages(folder: Path, files: dict[str, str], damages: list[Damage]) -> list[Damage]:

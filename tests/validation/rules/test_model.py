@@ -76,7 +76,7 @@ def test_unknown_camera_model_id(scene):
     data = bytearray(path.read_bytes())
     data[12:16] = struct.pack("<i", 99)
     path.write_bytes(data)
-    scene.expect("CS103", place="cameras.bin", found="99 for camera 1")
+    scene.expect("CS103", place="cameras.bin", found="model id 99 for camera 1")
 
 
 def test_damaged_frames(scene):
