@@ -43,6 +43,9 @@ MODEL = "sparse/0"
 PERIODS = "sparse/periods.json"
 WORLD = "sparse/world.json"
 
+MOST_PERIODS = 100_000
+"""Far beyond any real scene; a larger id is a mistake, and periods up to it would fill the memory."""
+
 ImageSource = Literal["copy", "link", "none"]
 
 
@@ -145,7 +148,19 @@ def read_tests(path: Path, names: list[str], periods: dict[str, int]) -> tuple[s
 
 
 def read_periods(path: Path, count: int) -> tuple[Period, ...]:
-    """Labels and dates from ``periods.json``, or the ids where the file is absent."""
+    """Labels and dates from ``periods.json``, or the ids where the file is absent.
+
+    Raises:
+        SceneError: If there are more than `MOST_PERIODS`, or the file is damaged or does not have
+            the periods 0 to ``count - 1``.
+    """
+    if count > MOST_PERIODS:
+        raise SceneError(
+            path / SPLIT,
+            expected=f"at most {MOST_PERIODS} periods",
+            found=f"{count}",
+            todo="number the periods 0, 1, ...; labels and dates go to sparse/periods.json",
+        )
     if not (path / PERIODS).exists():
         return tuple(Period(i, str(i)) for i in range(count))
     items = _read_json(path / PERIODS, list)

@@ -10,7 +10,7 @@ import pytest
 
 from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 from chronoscene.formats import detect_format, find_scenes, read_scene
-from chronoscene.formats.chronoscene import is_iso_date, write
+from chronoscene.formats.chronoscene import is_iso_date, read_periods, write
 from chronoscene.scene import Period, WorldFrame
 from chronoscene.splits import DEFAULT_RULE
 
@@ -149,6 +149,16 @@ def test_periods_and_world(make_scene_folder):
     scene = read_scene(folder)
     assert scene.periods == (Period(0, "alt"), Period(1, "1", "2023-04"))
     assert scene.world == WorldFrame("metre", None, (4e5, 5e6, 1.0))
+
+
+def test_a_huge_period_id_is_refused_before_anything_is_allocated(make_scene_folder):
+    folder = make_scene_folder()
+    assert len(read_periods(folder, 3)) == 3
+    for text in (None, "[]"):
+        if text is not None:
+            put(folder, "sparse/periods.json", text)
+        with pytest.raises(SceneError, match="at most 100000 periods, found 1000000000000"):
+            read_periods(folder, 10**12)
 
 
 @pytest.mark.parametrize(
