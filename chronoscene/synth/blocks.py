@@ -121,13 +121,20 @@ def _path(world: World, name: str, points: Array, width: float) -> None:
 # ------------------------------------------------------------------ things on the ground
 
 
-def _tree(world: World, name: str, at: Array, rng: np.random.Generator, size: float = 6.5) -> None:
+def _tree(
+    world: World,
+    name: str,
+    at: Array,
+    rng: np.random.Generator,
+    size: float = 6.5,
+    broad: bool = False,
+) -> None:
     """A tree that grows and changes with the seasons."""
     heights = stages.tree_heights(rng, world.periods, float(rng.uniform(0.75, 1.25) * size))
     states = [
         None if h is None else (h, season) for h, season in zip(heights, world.seasons, strict=True)
     ]
-    world.add(name, "tree", states, partial(grown, name, at, world.seed, 2))
+    world.add(name, "tree", states, partial(grown, name, at, world.seed, 2, broad))
 
 
 def _hedge(world: World, name: str, low: Array, high: Array) -> None:
@@ -196,7 +203,7 @@ def _avenue(world: World, name: str, rect: Rect) -> None:
             pit = Rect(at[0] - 0.6, at[1] - 0.6, at[0] + 0.6, at[1] + 0.6)
             world.always(f"{label}/pit", "ground",
                          partial(_floor, label, pit, "soil", SLAB + 0.015))  # fmt: skip
-            _tree(world, label, at, rng, 5.6)
+            _tree(world, label, at, rng, 5.6, broad=True)
 
 
 def _house(
@@ -402,7 +409,7 @@ def site(world: World, name: str, rect: Rect) -> None:
             for p, season in enumerate(world.seasons)
         ]
         at, label = inner.at(0.12 + 0.25 * i, 0.93), f"{name}/young_{i}"
-        world.add(label, "tree", young, partial(grown, label, at, world.seed, 2))
+        world.add(label, "tree", young, partial(grown, label, at, world.seed, 2, True))
 
 
 def _site_building(name: str, inner: Rect, rng: np.random.Generator) -> Building:
@@ -494,7 +501,7 @@ def suburb(world: World, name: str, rect: Rect) -> None:
             height = float(rng.uniform(5, 9))
             world.add(
                 label, "tree", [(height, season) for season in world.seasons],
-                partial(grown, label, at, world.seed, 2 if world.near else 1),
+                partial(grown, label, at, world.seed, 2 if world.near else 1, False),
             )  # fmt: skip
 
 

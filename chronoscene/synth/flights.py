@@ -182,7 +182,7 @@ def _free_pose(
 
     All periods count, since test cameras are rendered at every one of them.
     """
-    apart = 6.0 if kind == "aerial" else 1.2
+    apart = 6.0 if kind == "aerial" else 2.0
     for attempt in range(TRIES):
         shift = np.zeros(3)
         if attempt and kind == "aerial":

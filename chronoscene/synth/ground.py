@@ -102,7 +102,7 @@ def surroundings(world: World, xs: Array, ys: Array) -> None:
             height = float(rng.uniform(7, 15))
             states = [(height, season) for season in world.seasons]
             label = f"far_tree_{i}"
-            world.add(label, "tree", states, partial(grown, label, base, world.seed, 0))
+            world.add(label, "tree", states, partial(grown, label, base, world.seed, 0, False))
 
 
 def _farm(world: World, name: str, at: Array, z: float, rng: np.random.Generator) -> None:

@@ -38,6 +38,16 @@ def value_noise(x, y, seed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def value_noise_3d(x, y, z, seed):  # type: ignore[no-untyped-def]
+    """Smooth noise in -1..1 of a point in space with features of size 1."""
+    iz = math.floor(z)
+    t = z - iz
+    t = t * t * (3.0 - 2.0 * t)
+    low = value_noise(x, y, seed + 1013 * iz)
+    return low + t * (value_noise(x, y, seed + 1013 * (iz + 1)) - low)
+
+
+@njit(cache=True)
 def fade(size, fw):  # type: ignore[no-untyped-def]
     """Weight 0..1 of detail of a size seen with pixels of width ``fw``."""
     return min(1.0, max(0.0, size / fw * 0.8 - 0.6))

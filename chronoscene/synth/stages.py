@@ -40,8 +40,8 @@ def looks(rng: np.random.Generator, periods: int, chance: float) -> list[int]:
 
 
 def tree_heights(rng: np.random.Generator, periods: int, start: float) -> list[float | None]:
-    """Height per period: growth of 10 to 25 % each; some are planted late, some are felled."""
-    growth = float(rng.uniform(1.10, 1.25)) ** min(1.0, 4 / max(periods, 1))
+    """Height per period: 20 to 60 % more in the end; some are planted late, some are felled."""
+    growth = float(rng.uniform(1.2, 1.6)) ** (1 / max(periods - 1, 1))
     heights: list[float | None] = [round(start * growth**p, 2) for p in range(periods)]
     fate = rng.random()
     if periods > 1 and fate < 0.2:

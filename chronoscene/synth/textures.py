@@ -11,7 +11,18 @@ import math
 
 from numba import njit
 
-from chronoscene.synth.noise import fade, fbm, hash01, lottery, mix, pulse, scaled, smooth, span
+from chronoscene.synth.noise import (
+    fade,
+    fbm,
+    hash01,
+    lottery,
+    mix,
+    pulse,
+    scaled,
+    smooth,
+    span,
+    value_noise_3d,
+)
 
 PLAIN, PLASTER, BRICK, PANEL, CONCRETE, TILES, FLAT_ROOF, ASPHALT, PAVING, GRASS = range(10)
 SOIL, LEAVES, WOOD, PAINT, CORRUGATED, FIELDS, GLASS, SIGN, WATER, SOLAR, DOOR = range(10, 21)
@@ -254,19 +265,21 @@ def _soil(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _leaves(s, x, y, z, seed, fw):  # type: ignore[no-untyped-def]
-    """Foliage from two oblique cuts through the noise. Numbers: leaf size, litness."""
+    """Foliage: cells of leaf size in clumps of light and dark. Numbers: leaf size, accents."""
     c0, c1, c2 = _colors(s)
-    a, b = x + 0.7 * z, y - 0.6 * z
     size = s[10]
-    clump = fbm(a, b, 5.5 * size, 3, seed, fw)
-    ix, iy = math.floor(a / size), math.floor(b / size)
-    iz = math.floor((x - 0.5 * y + z) / size)
-    pick = hash01(ix + 57 * iz, iy, seed + 1)
-    near = fade(size, 0.8 * fw)
-    color = mix(c0, c1, min(1.0, max(0.0, 0.5 + 0.8 * clump + 0.5 * near * (pick - 0.5))))
-    color = mix(color, c2, lottery(hash01(ix, iy + 31 * iz, seed + 2), s[11], near))
-    dark = fbm(a * 1.3, b * 1.3, 1.6 * size, 3, seed + 3, fw)
-    return scaled(color, max(0.25, 0.92 + 0.6 * dark + 0.35 * near * (pick - 0.5)))
+    near, middle = fade(size, 0.8 * fw), fade(4.0 * size, fw)
+    # Cells lie askew and are shaken by noise, so that no rows of leaves show.
+    wx = (0.8 * x - 0.6 * y) / size + 0.9 * math.sin(2.3 * z / size)
+    wy = (0.6 * x + 0.8 * y) / size + 0.9 * math.sin(1.9 * z / size + 1.0)
+    wz = z / size + 0.8 * math.sin(2.1 * (x + 0.4 * y) / size)
+    ix, iy, iz = math.floor(wx), math.floor(wy), math.floor(wz)
+    pick = hash01(ix, iy, seed + 1 + 977 * iz)
+    coarse = value_noise_3d(wx / 9.0, wy / 9.0, wz / 9.0, seed)
+    clump = middle * value_noise_3d(wx / 3.5, wy / 3.5, wz / 3.5, seed + 3)
+    color = mix(c0, c1, min(1.0, max(0.0, 0.5 + 0.7 * coarse + 0.6 * near * (pick - 0.5))))
+    color = mix(color, c2, lottery(hash01(ix, iy, seed + 2 + 977 * iz), s[11], near))
+    return scaled(color, max(0.2, 0.9 + 0.45 * clump + 0.2 * coarse + 0.6 * near * (pick - 0.5)))
 
 
 @njit(cache=True)

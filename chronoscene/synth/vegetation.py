@@ -111,7 +111,16 @@ def trunk(b: PartBuilder, base: Array, top: Array, radius: float, style: int) ->
     b.triangles(tris, normals, style, origin=base)
 
 
-def tree(name: str, base: Array, height: float, season: str, seed: int, *, detail: int = 2) -> Part:
+def tree(
+    name: str,
+    base: Array,
+    height: float,
+    season: str,
+    seed: int,
+    *,
+    detail: int = 2,
+    broad: bool = False,
+) -> Part:
     """A tree; name and seed fix species and shape, height and season change with time.
 
     Args:
@@ -121,16 +130,20 @@ def tree(name: str, base: Array, height: float, season: str, seed: int, *, detai
         season: Palette of the leaves.
         seed: Seed of the scene.
         detail: 0 far away, 1 middle, 2 near.
+        broad: No conifer; they would stand in the way along a street.
     """
     rng = rng_for(seed, name, "tree")
     b = PartBuilder(key_number(name))
     species = int(rng.choice(3, p=[0.45, 0.4, 0.15]))
+    species = species % 2 if broad else species
     bark = pal.plain_style(b, srgb(96, 78, 60), 0.5, 0.2)
     leaf = pal.leaf_style(b, season, species, 0.24 if detail == 2 else 0.5)
     lean = rng.normal(0, 0.03, 2) * height
     top = base + np.array([lean[0], lean[1], 0.75 * height])
     trunk(b, base, top, 0.022 * height + 0.05, bark)
-    if species == 2:
+    if season == "winter" and species != 2:
+        _bare(b, base, top, height, bark, leaf, rng)
+    elif species == 2:
         _conifer(b, base, height, leaf, rng, detail)
     else:
         _broadleaf(b, base, top, height, leaf, rng, detail, slim=bool(rng.random() < 0.25))
@@ -151,6 +164,32 @@ def _conifer(
         blob(b, center, radii, leaf, rng, level=min(detail, 2), heart=heart, rough=0.28)
         if detail == 2:
             leaves(b, center, radii, leaf, rng, count=70, size=0.5, heart=heart)
+
+
+def _bare(
+    b: PartBuilder,
+    base: Array,
+    top: Array,
+    height: float,
+    bark: int,
+    leaf: int,
+    rng: np.random.Generator,
+) -> None:
+    """Branches and twigs in two orders, with a few brown leaves that stayed."""
+    stem = top - base
+    for _ in range(9):
+        start = base + stem * rng.uniform(0.45, 1.0)
+        way = _unit(rng.normal(0, 1, 3) * [1, 1, 0.4] + 0.7 * Z)
+        length = height * rng.uniform(0.22, 0.36)
+        end = start + length * way
+        trunk(b, start, end, 0.010 * height, bark)
+        for _ in range(5):
+            fork = start + rng.uniform(0.3, 1.0) * length * way
+            out = _unit(way + rng.normal(0, 0.6, 3) + 0.2 * Z)
+            tip = fork + 0.45 * length * out
+            trunk(b, fork, tip, 0.005 * height, bark)
+            leaves(b, tip, np.full(3, 0.09 * height), bark, rng, count=9, size=0.5, heart=base)
+    leaves(b, top, np.full(3, 0.2 * height), leaf, rng, count=30, size=0.3, heart=base)
 
 
 def _broadleaf(
@@ -180,9 +219,11 @@ def _broadleaf(
             leaves(b, center, r, leaf, rng, count=number, size=0.42, heart=heart)
 
 
-def grown(name: str, base: Array, seed: int, detail: int, state: tuple[float, str]) -> Part:
+def grown(
+    name: str, base: Array, seed: int, detail: int, broad: bool, state: tuple[float, str]
+) -> Part:
     """A tree in a state: height and season."""
-    return tree(name, base, state[0], state[1], seed, detail=detail)
+    return tree(name, base, state[0], state[1], seed, detail=detail, broad=broad)
 
 
 def hedge(name: str, low: Array, high: Array, seed: int, season: str) -> Part:
