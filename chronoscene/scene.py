@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 Split = Literal["train", "test"]
 
 PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
-"""Camera models without distortion: the ones that methods train on."""
+"""Camera models without distortion."""
+
+POLYNOMIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Camera models that are a pinhole where all their distortion parameters are zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,9 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether a pinhole projection describes the camera exactly."""
+        """Whether a pinhole projection describes the camera exactly: methods train on these."""
+        if self.model in POLYNOMIAL_MODELS:
+            return not any(self.distortion)
         return self.model in PINHOLE_MODELS
 
 

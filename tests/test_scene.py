@@ -42,6 +42,33 @@ def test_intrinsics_agree_with_colmap(model):
     assert camera.is_pinhole == (not camera.distortion and "FISHEYE" not in model)
 
 
+@pytest.mark.parametrize("model", MODELS)
+def test_what_is_a_pinhole_projects_as_one(model):
+    """COLMAP's projection of a camera with zero distortion is that of the calibration matrix."""
+    focals = 1 if model in ("RADIAL", "RADIAL_FISHEYE") or model.startswith("SIMPLE_") else 2
+    zeros = (0.0,) * (MODELS[model] - focals - 2)
+    camera = Camera(1, model, 64, 48, (*(50.0, 52.0)[:focals], 30.0, 25.0, *zeros))
+    ray = np.array([0.3, -0.2, 1.0])
+    if camera.is_pinhole:
+        pixel = to_pycolmap(camera).img_from_cam(ray)
+        np.testing.assert_allclose(pixel, (camera.K @ ray)[:2], rtol=1e-14)
+    perspective = "PINHOLE" in model or model.endswith(("RADIAL", "OPENCV"))
+    assert camera.is_pinhole == perspective
+
+
+@pytest.mark.parametrize("value", [1e-300, -1e-9, float("nan")])
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"])
+def test_any_distortion_at_all_is_no_pinhole(model, value):
+    params = (50.0,) * (MODELS[model] - 1)
+    zero = Camera(1, model, 64, 48, (*params, 0.0))
+    zeros = (0.0,) * len(zero.distortion)
+    kept = zero.params[: -len(zeros)]
+    assert replace(zero, params=kept + zeros).is_pinhole
+    for i in range(len(zeros)):
+        bent = (*zeros[:i], value, *zeros[i + 1 :])
+        assert not replace(zero, params=kept + bent).is_pinhole
+
+
 def tiny_scene() -> Scene:
     """Two periods of two images; points seen by both periods, by one, by none."""
     camera = Camera(1, "PINHOLE", 8, 8, (8.0, 8.0, 4.0, 4.0))

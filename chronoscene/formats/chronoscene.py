@@ -44,7 +44,7 @@ PERIODS = "sparse/periods.json"
 WORLD = "sparse/world.json"
 
 MOST_PERIODS = 100_000
-"""Far beyond any real scene; a larger id is a mistake, and periods up to it would fill the memory."""
+"""Far beyond any real scene: more come from a mistaken id, and would fill the memory."""
 
 ImageSource = Literal["copy", "link", "none"]
 

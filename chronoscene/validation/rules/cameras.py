@@ -7,16 +7,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.scene import PINHOLE_MODELS, Camera
+from chronoscene.scene import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.raw_scene import RawScene, is_usable
 from chronoscene.validation.rule import rule
 
-POLYNOMIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Models that are a pinhole if all distortion parameters are zero."""
-
 VISIBLE = 0.5
-"""Pixels; distortion below this moves nothing by more than half a pixel."""
+"""Pixels; distortion that moves nothing by as much may be dropped instead of undone."""
 
 WIDEST, NARROWEST = 150.0, 1.0
 """Degrees of view across the width that a pinhole photo may plausibly have."""
@@ -25,6 +22,7 @@ UNEQUAL = 0.1
 """Relative difference of fx and fy; pixels are square to a few percent in any camera."""
 
 UNDISTORT = "undistort the images and the model (colmap image_undistorter)"
+DROP = "write the camera as PINHOLE or SIMPLE_PINHOLE; its distortion is below half a pixel"
 
 
 @rule(
@@ -64,32 +62,34 @@ def camera_model(scene: RawScene) -> Iterator[Hit]:
     "CS133",
     "camera-distorted",
     "error",
-    what="A camera has distortion of half a pixel or more, which methods ignore.",
+    what="A camera has distortion, which methods cannot train with. Benchmarks refuse it.",
     remedy=UNDISTORT,
     bad="`SIMPLE_RADIAL` with k = -0.16",
     needs=("cameras",),
 )
 def camera_distorted(scene: RawScene) -> Iterator[Hit]:
-    for camera, shift in _distortions(scene):
-        if not shift < VISIBLE:
+    for camera in _polynomial(scene):
+        if not camera.is_pinhole:
+            shift = displacement(camera)
             found = f"{camera.model} whose distortion moves pixels by up to {shift:.3g} px"
-            yield Hit(_place(scene, camera), "a camera without distortion", found)
+            remedy = DROP if shift < VISIBLE else None
+            yield Hit(_place(scene, camera), "a camera without distortion", found, remedy)
 
 
 @rule(
     "CS134",
-    "camera-nearly-pinhole",
-    "warning",
-    what="A camera has a model with distortion, but (almost) no distortion. Benchmarks take "
-    "pinhole models only.",
-    remedy="write the camera as PINHOLE or SIMPLE_PINHOLE, without the distortion parameters",
+    "zero-distortion",
+    "info",
+    what="A camera has a model with distortion whose parameters are all zero. It is used as the "
+    "pinhole that it is; other readers may go by the name of the model.",
+    remedy="nothing to do here; write it as PINHOLE or SIMPLE_PINHOLE for other readers",
     bad="`SIMPLE_RADIAL` with k = 0",
     needs=("cameras",),
 )
-def camera_nearly_pinhole(scene: RawScene) -> Iterator[Hit]:
-    for camera, shift in _distortions(scene):
-        if shift < VISIBLE:
-            found = f"{camera.model} whose distortion moves pixels by up to {shift:.2g} px"
+def zero_distortion(scene: RawScene) -> Iterator[Hit]:
+    for camera in _polynomial(scene):
+        if camera.is_pinhole:
+            found = f"{camera.model} without distortion"
             yield Hit(_place(scene, camera), "PINHOLE or SIMPLE_PINHOLE", found)
 
 
@@ -185,11 +185,9 @@ def _brown(camera: Camera) -> Sequence[float]:
     return (*given, *(0.0,) * (8 - len(given)))
 
 
-def _distortions(scene: RawScene) -> Iterator[tuple[Camera, float]]:
-    """Usable cameras of polynomial models with their largest displacement."""
-    for camera in scene.usable_cameras.values():
-        if camera.model in POLYNOMIAL_MODELS:
-            yield camera, displacement(camera)
+def _polynomial(scene: RawScene) -> list[Camera]:
+    """Usable cameras of polynomial models."""
+    return [c for c in scene.usable_cameras.values() if c.model in POLYNOMIAL_MODELS]
 
 
 def _cameras(scene: RawScene) -> Sequence[Camera]:

@@ -72,7 +72,7 @@ def period_without_train(scene: RawScene) -> Iterator[Hit]:
 )
 def period_without_test(scene: RawScene) -> Iterator[Hit]:
     for period, (_train, test) in _views(scene).items():
-        if test == 0:
+        if test == 0 and scene.tests:
             yield Hit(TEST, f"a test view in period {period}", "none")
 
 
@@ -104,6 +104,20 @@ def period_few_views(scene: RawScene) -> Iterator[Hit]:
 def single_period(scene: RawScene) -> Iterator[Hit]:
     if len(scene.period_ids) == 1:
         yield Hit(SPLIT, "two periods or more", "one")
+
+
+@rule(
+    "CS407",
+    "no-test-view",
+    "error",
+    what="There is no test view at all, so nothing can be measured. Benchmarks refuse the scene.",
+    remedy="list images of every period in sparse/0/test.txt, or delete it for the default split",
+    bad="an empty `test.txt`",
+    needs=("tests",),
+)
+def no_test_view(scene: RawScene) -> Iterator[Hit]:
+    if scene.periods and not scene.tests:
+        yield Hit(TEST, "test views", "none that names an image of the model")
 
 
 def _views(scene: RawScene) -> dict[int, tuple[int, int]]:

@@ -17,8 +17,8 @@ from chronoscene.validation.rule import rule
 @rule(
     "CS501",
     "no-points",
-    "warning",
-    what="The model has no points, from which methods start.",
+    "error",
+    what="The model has no points, from which methods start. Benchmarks refuse the scene.",
     remedy="triangulate points (colmap point_triangulator)",
     bad="an empty `points3D.txt`",
     needs=("points",),
@@ -202,6 +202,25 @@ def observation_not_finite(scene: RawScene) -> Iterator[Hit]:
     if bad := int(np.count_nonzero(~np.isfinite(xy).all(axis=1))):
         found = f"NaN or infinity in {bad} of {len(xy)} observations"
         yield Hit(scene.model_file("images"), "finite pixel positions", found, count=bad)
+
+
+@rule(
+    "CS514",
+    "no-training-points",
+    "error",
+    what="No training image sees a point of the model, and methods may start from no others. "
+    "Benchmarks refuse the scene.",
+    remedy="triangulate points (colmap point_triangulator), or change the split",
+    bad="points without tracks; points that test images alone see",
+    needs=("observations", "tests"),
+)
+def no_training_points(scene: RawScene) -> Iterator[Hit]:
+    seen, images = scene.observations, scene.images
+    assert seen is not None and images is not None and scene.tests is not None
+    train = np.array([name not in scene.tests for name in images.names], bool)
+    if len(scene.points or ()) and not train[seen.image[seen.valid]].any():
+        found = f"0 of {len(scene.points or ())}"
+        yield Hit(scene.model_file("points3D"), "points that training images see", found)
 
 
 def _seen(scene: RawScene) -> NDArray[np.bool_]:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chronoscene.scene import PINHOLE_MODELS
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
@@ -82,7 +81,7 @@ def pose_disagrees(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
     for image, depth, error in scene.reprojections or ():
         camera = scene.usable_cameras[int(scene.images.camera_ids[image])]
-        if camera.model not in PINHOLE_MODELS or np.count_nonzero(depth > 0) < FEWEST:
+        if not camera.is_pinhole or np.count_nonzero(depth > 0) < FEWEST:
             continue
         limit = max(LEAST_ERROR, ERROR_SHARE * float(np.hypot(camera.width, camera.height)))
         median = float(np.median(error[depth > 0]))

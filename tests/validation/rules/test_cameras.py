@@ -51,12 +51,25 @@ def test_camera_distorted(scene, line):
     scene.expect("CS133", place=PLACE, found=line.split()[1])
 
 
+def test_distortion_that_nobody_sees_may_be_dropped(scene):
+    scene.write(CAMERAS, ["1 RADIAL 64 48 50 32 24 0.0001 -0.0001"])
+    report = scene.expect("CS133", place=PLACE, found="by up to 0.00")
+    finding = next(f for f in report.findings if f.code == "CS133")
+    assert finding.remedy.startswith("write the camera as PINHOLE")
+
+
 @pytest.mark.parametrize(
-    "line", ["1 SIMPLE_RADIAL 64 48 50 32 24 0", "1 RADIAL 64 48 50 32 24 0.0001 -0.0001"]
+    "line",
+    [
+        "1 SIMPLE_RADIAL 64 48 50 32 24 0",
+        "1 RADIAL 64 48 50 32 24 0 -0",
+        "1 FULL_OPENCV 64 48 50 50 32 24 0 0 0 0 0 0 0 0",
+    ],
 )
-def test_camera_nearly_pinhole(scene, line):
+def test_zero_distortion(scene, line):
     scene.write(CAMERAS, [line])
-    scene.expect("CS134", place=PLACE, found=line.split()[1])
+    report = scene.expect("CS134", place=PLACE, found=line.split()[1])
+    assert {f.severity for f in report.findings} == {"info"}
 
 
 def test_implausible_focal(scene):

@@ -117,3 +117,9 @@ def test_observation_not_finite(scene):
     assert data.count(struct.pack("<d", x)) == 1
     path.write_bytes(data.replace(struct.pack("<d", x), struct.pack("<d", math.nan)))
     scene.expect("CS510", place="sparse/0/images.bin", found="1 of 560 observations")
+
+
+def test_no_training_points(scene):
+    """All points are seen by the two test images alone."""
+    keep_images(scene, range(40), (4, 11))
+    scene.expect("CS514", place=POINTS, found="0 of 40", also={"CS509"})
