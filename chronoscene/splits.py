@@ -231,16 +231,8 @@ def _place(
     entry: SplitEntry, found: list[str], periods: dict[str, int], lines: dict[str, int]
 ) -> Problem | None:
     """Put one entry into ``periods``, or say why not."""
-    if not found:
-        return _problem("unknown", entry.line, "the name of a registered image", repr(entry.name))
-    if len(found) > 1:
-        return Problem(
-            "ambiguous",
-            entry.line,
-            "a name that fits one image",
-            f"{entry.name!r}, which fits {', '.join(map(repr, found[:3]))}",
-            "write the full names below images/",
-        )
+    if len(found) != 1:
+        return _not_one(entry, found)
     (name,) = found
     if name not in periods:
         periods[name], lines[name] = entry.period, entry.line
@@ -254,6 +246,19 @@ def _place(
             "keep one of the two lines",
         )
     return _problem("duplicate", entry.line, "each image once", f"{name!r} as in {lines[name]}")
+
+
+def _not_one(entry: SplitEntry | NameEntry, found: list[str]) -> Problem:
+    """The problem of a name that fits no image, or several."""
+    if not found:
+        return _problem("unknown", entry.line, "the name of a registered image", repr(entry.name))
+    return Problem(
+        "ambiguous",
+        entry.line,
+        "a name that fits one image",
+        f"{entry.name!r}, which fits {', '.join(map(repr, found[:3]))}",
+        "write the full names below images/",
+    )
 
 
 def check_period_ids(entries: Iterable[SplitEntry], used: Iterable[int]) -> list[Problem]:
@@ -296,20 +301,8 @@ def assign_tests(
         found = index.find(entry.name)
         if len(found) == 1:
             tests.add(found[0])
-        elif found:
-            problems.append(
-                Problem(
-                    "ambiguous",
-                    entry.line,
-                    "a name that fits one image",
-                    f"{entry.name!r}, which fits {', '.join(map(repr, found[:3]))}",
-                    "write the full names below images/",
-                )
-            )
         else:
-            problems.append(
-                _problem("unknown", entry.line, "the name of a registered image", repr(entry.name))
-            )
+            problems.append(_not_one(entry, found))
     return tests, problems
 
 

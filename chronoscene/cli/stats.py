@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import click
 
-from chronoscene.errors import ConfigError
+from chronoscene.cli.output import emit
 from chronoscene.formats import find_scenes, format_names, read_scene
 from chronoscene.stats import COUNT_RULES, WRITERS, CountRule, SceneCount, count_scene
 
@@ -56,28 +55,8 @@ def command(
     """
     scenes = [path for folder in folders for path in find_scenes(folder, format=dataset_format)]
     counts = [count_scene(read_scene(p, format=dataset_format), count=count) for p in scenes]
-    text = WRITERS[output_format](counts)
-    if out is None:
-        click.echo(text, nl=False)
-    else:
-        _write(out, text)
+    emit(WRITERS[output_format](counts), out)
     _remark_on_unseen(counts)
-
-
-def _write(out: Path, text: str) -> None:
-    """Write under a temporary name and rename."""
-    temporary = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-        temporary.replace(out)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise ConfigError(
-            f"--out {out}",
-            expected="a file that can be written",
-            found=error.strerror or "an error",
-            todo="choose another place",
-        ) from error
 
 
 def _remark_on_unseen(counts: list[SceneCount]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TypeVar
 
 import click
 
-from chronoscene.errors import ConfigError
+from chronoscene.cli.output import emit
 from chronoscene.validation.report import counts
 from chronoscene.validation.report_json import write_json
 from chronoscene.validation.report_text import write_text
@@ -68,12 +67,7 @@ def command(
         validate_scene(path, rules=rules, decode=decode, track=_progress)
         for path in find_folders(folder)
     ]
-    text = WRITERS[output_format](reports, strict=strict)
-    if out is None:
-        encoding = sys.stdout.encoding or "utf-8"
-        click.echo(text.encode(encoding, "backslashreplace").decode(encoding), nl=False)
-    else:
-        _write(out, click.unstyle(text))
+    emit(WRITERS[output_format](reports, strict=strict), out)
     total = counts(reports)
     if total["error"] or (strict and total["warning"]):
         context.exit(NOT_VALID)
@@ -94,19 +88,3 @@ def _progress(items: Sequence[T], description: str) -> Iterator[T]:
 
     console = Console(stderr=True)
     yield from track(items, description, console=console, transient=True)
-
-
-def _write(out: Path, text: str) -> None:
-    """Write under a temporary name and rename."""
-    temporary = out.with_name(f".{out.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-        temporary.replace(out)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise ConfigError(
-            f"--out {out}",
-            expected="a file that can be written",
-            found=error.strerror or "an error",
-            todo="choose another place",
-        ) from error

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from chronoscene.formats.chronoscene import SPLIT
 from chronoscene.splits import Problem, ProblemKind
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.raw_scene import RawScene, TextFile
 from chronoscene.validation.rule import rule
 
 ELSEWHERE = ("split.txt", "sparse/0/split.txt", "images/split.txt")
@@ -21,10 +21,15 @@ def problem_hit(file: str, problem: Problem) -> Hit:
     return Hit(place, problem.expected, problem.found, remedy)
 
 
-def _problems(scene: RawScene, *kinds: ProblemKind) -> Iterator[Hit]:
-    for problem in scene.split_problems:
-        if problem.kind in kinds:
-            yield problem_hit(SPLIT, problem)
+def problem_hits(file: str, problems: Iterable[Problem], kind: ProblemKind) -> Iterator[Hit]:
+    """The problems of one kind as hits."""
+    return (problem_hit(file, problem) for problem in problems if problem.kind == kind)
+
+
+def not_text(scene: RawScene, file: str, text: TextFile | None) -> Iterator[Hit]:
+    """A hit if the file is there and could not be read as text."""
+    if text is None and os.path.lexists(scene.root / file):
+        yield Hit(file, "a text file", "bytes that are not UTF-8, or no file to read")
 
 
 @rule(
@@ -54,8 +59,7 @@ def split_absent(scene: RawScene) -> Iterator[Hit]:
     bad="a spreadsheet saved under this name",
 )
 def split_not_text(scene: RawScene) -> Iterator[Hit]:
-    if scene.split_text is None and os.path.lexists(scene.root / SPLIT):
-        yield Hit(SPLIT, "a text file", "bytes that are not UTF-8, or no file to read")
+    return not_text(scene, SPLIT, scene.split_text)
 
 
 @rule(
@@ -68,7 +72,7 @@ def split_not_text(scene: RawScene) -> Iterator[Hit]:
     needs=("split",),
 )
 def split_line(scene: RawScene) -> Iterator[Hit]:
-    yield from _problems(scene, "fields")
+    return problem_hits(SPLIT, scene.split_problems, "fields")
 
 
 @rule(
@@ -81,7 +85,7 @@ def split_line(scene: RawScene) -> Iterator[Hit]:
     needs=("split",),
 )
 def split_period(scene: RawScene) -> Iterator[Hit]:
-    yield from _problems(scene, "period")
+    return problem_hits(SPLIT, scene.split_problems, "period")
 
 
 @rule(
@@ -110,7 +114,7 @@ def image_without_period(scene: RawScene) -> Iterator[Hit]:
     needs=("images", "split"),
 )
 def split_ambiguous(scene: RawScene) -> Iterator[Hit]:
-    yield from _problems(scene, "ambiguous")
+    return problem_hits(SPLIT, scene.split_problems, "ambiguous")
 
 
 @rule(
@@ -123,7 +127,7 @@ def split_ambiguous(scene: RawScene) -> Iterator[Hit]:
     needs=("images", "split"),
 )
 def split_contradiction(scene: RawScene) -> Iterator[Hit]:
-    yield from _problems(scene, "contradiction")
+    return problem_hits(SPLIT, scene.split_problems, "contradiction")
 
 
 @rule(
@@ -136,7 +140,7 @@ def split_contradiction(scene: RawScene) -> Iterator[Hit]:
     needs=("images", "split"),
 )
 def split_duplicate(scene: RawScene) -> Iterator[Hit]:
-    yield from _problems(scene, "duplicate")
+    return problem_hits(SPLIT, scene.split_problems, "duplicate")
 
 
 @rule(
@@ -149,4 +153,4 @@ def split_duplicate(scene: RawScene) -> Iterator[Hit]:
     needs=("images", "split"),
 )
 def split_unknown(scene: RawScene) -> Iterator[Hit]:
-    yield from _problems(scene, "unknown")
+    return problem_hits(SPLIT, scene.split_problems, "unknown")

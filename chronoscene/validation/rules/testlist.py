@@ -11,7 +11,7 @@ from chronoscene.splits import DEFAULT_RULE
 from chronoscene.validation.finding import Hit, counted, quote
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.split import problem_hit
+from chronoscene.validation.rules.split import not_text, problem_hits
 
 ELSEWHERE = ("test.txt", "sparse/test.txt", "images/test.txt")
 
@@ -54,8 +54,7 @@ def list_misplaced(scene: RawScene) -> Iterator[Hit]:
     bad="a `test.txt` in an old Windows encoding",
 )
 def list_not_text(scene: RawScene) -> Iterator[Hit]:
-    if scene.test_text is None and os.path.lexists(scene.root / TEST):
-        yield Hit(TEST, "a text file", "bytes that are not UTF-8, or no file to read")
+    return not_text(scene, TEST, scene.test_text)
 
 
 @rule(
@@ -69,9 +68,7 @@ def list_not_text(scene: RawScene) -> Iterator[Hit]:
     needs=("images", "test"),
 )
 def list_unknown(scene: RawScene) -> Iterator[Hit]:
-    for problem in scene.test_problems:
-        if problem.kind == "unknown":
-            yield problem_hit(TEST, problem)
+    return problem_hits(TEST, scene.test_problems, "unknown")
 
 
 @rule(
@@ -84,9 +81,7 @@ def list_unknown(scene: RawScene) -> Iterator[Hit]:
     needs=("images", "test"),
 )
 def list_ambiguous(scene: RawScene) -> Iterator[Hit]:
-    for problem in scene.test_problems:
-        if problem.kind == "ambiguous":
-            yield problem_hit(TEST, problem)
+    return problem_hits(TEST, scene.test_problems, "ambiguous")
 
 
 @rule(
