@@ -13,10 +13,11 @@ from numpy import float32
 
 from chronoscene.training._decode_forward import factors, gather_inputs, hidden_layer, task_work
 from chronoscene.training._decode_layout import BLOCK, CHUNK, CYCLE, Gradients
-from chronoscene.training._decode_second import add_offset
+from chronoscene.training._decode_second import add_biases, add_offset
 from chronoscene.training._matmul import product
 from chronoscene.training._simd import (
     LANES,
+    inner,
     load,
     load_first,
     read,
@@ -47,14 +48,14 @@ class OutputGradients(NamedTuple):
 
 
 class AnchorGradients(NamedTuple):
-    """Addresses of those with respect to what belongs to anchors, zeros at first."""
+    """Addresses of those with respect to what belongs to anchors."""
 
     offsets: int
     features: int
     log_scales: int
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _has_gradient(grads, g):  # type: ignore[no-untyped-def]
     """Whether a Gaussian has one: it may be out of the image, or behind others."""
     found = read(grads.opacities, g) != ZERO
@@ -67,7 +68,7 @@ def _has_gradient(grads, g):  # type: ignore[no-untyped-def]
     return found
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _raw_gradients(outputs, grads, g, count, work, done):  # type: ignore[no-untyped-def]
     """Gradients of the raw outputs of the Gaussians of an anchor, behind those ``done`` before."""
     for c in range(0, count, LANES):
@@ -92,7 +93,7 @@ def _raw_gradients(outputs, grads, g, count, work, done):  # type: ignore[no-unt
         store(work.scales, 3 * done + c, grad * (ONE - share))
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _offset_gradients(layout, source, outputs, grads, m, g, count, work, done, out):  # type: ignore[no-untyped-def]
     """Gradients of the offsets and log scales: means are anchor + offset exp(log_scales[0:3])."""
     anchor = read_index(source.visible, m)
@@ -109,7 +110,7 @@ def _offset_gradients(layout, source, outputs, grads, m, g, count, work, done, o
         write(out.log_scales, 6 * anchor + 3 + c, scale_sum)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _anchor_gradient(layout, source, outputs, grads, m, slot, work, done, out):  # type: ignore[no-untyped-def]
     """Everything up to the raw outputs; notes the slot with every offset that has a gradient."""
     g, stop = read_index(outputs.starts, m), read_index(outputs.starts, m + 1)
@@ -127,16 +128,7 @@ def _anchor_gradient(layout, source, outputs, grads, m, slot, work, done, out): 
     return done + stop - g
 
 
-@njit(nogil=True, error_model="numpy")
-def _sum_bias(slots, count, grads, number, bias, row):  # type: ignore[no-untyped-def]
-    for c in range(number):
-        total = read(bias, row + c)
-        for i in range(count):
-            total += read(grads, number * read_index(slots, 2 * i + 1) + c)
-        write(bias, row + c, total)
-
-
-@njit(nogil=True, error_model="numpy")
+@inner
 def _output_layer_gradient(layout, weights, work, partial):  # type: ignore[no-untyped-def]
     """From the raw outputs to the hidden units and the second layers."""
     for i in range(0, BLOCK * layout.hiddens, LANES):
@@ -150,14 +142,11 @@ def _output_layer_gradient(layout, weights, work, partial):  # type: ignore[no-u
         slots, count = work.slots + 16 * j * BLOCK, read_index(work.counts, j)
         for unit in range(0, layout.hidden_pad, LANES):
             add_offset(grads, places, (j, scale, quat, color), lengths, slots, count, unit)
-        _sum_bias(slots, count, work.opacities, 1, partial.b2, j)
-        _sum_bias(slots, count, work.scales, 3, partial.b2, scale)
-        _sum_bias(slots, count, work.quats, 4, partial.b2, quat)
-        _sum_bias(slots, count, work.colors, 3, partial.b2, color)
+        add_biases(grads, partial.b2, (j, scale, quat, color), slots, count)
         write_index(work.counts, j, 0)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _hidden_layer_gradient(layout, weights, work, count, partial):  # type: ignore[no-untyped-def]
     """From hidden units to features and to the first layers."""
     hiddens, inputs, columns = layout.hiddens, layout.inputs_pad, layout.features_pad
@@ -180,7 +169,7 @@ def _hidden_layer_gradient(layout, weights, work, count, partial):  # type: igno
     product((work.d_hidden, 0, hiddens, 1), w1, zeros, d_x, BLOCK, columns, hiddens)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _write_features(layout, source, anchor, d_x, at, out):  # type: ignore[no-untyped-def]
     """Spread the gradient of an input over the base and the periods that were mixed in."""
     row = anchor * layout.row
@@ -195,7 +184,7 @@ def _write_features(layout, source, anchor, d_x, at, out):  # type: ignore[no-un
             store_first(out.features, start + c, grad, left)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _block_gradient(layout, weights, source, outputs, grads, count, work, partial, out):  # type: ignore[no-untyped-def]
     """Gradients from the visible anchors in the first rows of the work space."""
     hidden_layer(layout, weights, work, 0, layout.hiddens)
@@ -210,9 +199,29 @@ def _block_gradient(layout, weights, source, outputs, grads, count, work, partia
         _write_features(layout, source, anchor, work.d_x, i * layout.features_pad, out)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
+def _set_zero(memory, start, stop):  # type: ignore[no-untyped-def]
+    for i in range(start, stop, LANES):
+        store_first(memory, i, splat(ZERO), stop - i)
+
+
+@inner
+def _clear_rows(layout, source, begin, end, out):  # type: ignore[no-untyped-def]
+    """Set to zero the rows of visible anchors begin..end, and those between them and the last
+    visible one before: soon enough before they are written that they are still in the cache."""
+    first = read_index(source.visible, begin - 1) + 1 if begin else 0
+    last = source.num_anchors
+    if end < source.num_visible:
+        last = read_index(source.visible, end - 1) + 1
+    _set_zero(out.offsets, 3 * layout.offsets * first, 3 * layout.offsets * last)
+    _set_zero(out.features, layout.row * first, layout.row * last)
+    _set_zero(out.log_scales, 6 * first, 6 * last)
+
+
+@inner
 def _chunk_gradient(layout, weights, source, outputs, grads, begin, end, work, partial, out):  # type: ignore[no-untyped-def]
     """Visible anchors begin..end, those with a gradient gathered into blocks."""
+    _clear_rows(layout, source, begin, end, out)
     count = 0
     for m in range(begin, end):
         g, stop = read_index(outputs.starts, m), read_index(outputs.starts, m + 1)
@@ -227,12 +236,11 @@ def _chunk_gradient(layout, weights, source, outputs, grads, begin, end, work, p
             count = 0
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _chunk_partial(partial, chunk, size):  # type: ignore[no-untyped-def]
     """Gradients of the weights in a chunk, set to zero."""
     move = 4 * chunk * size
-    for i in range(size):
-        write(partial.w1_t + move, i, ZERO)
+    _set_zero(partial.w1_t + move, 0, size)
     return Gradients(partial.w1_t + move, partial.b1 + move, partial.w2 + move, partial.b2 + move)
 
 
@@ -246,12 +254,12 @@ def decode_backward(  # type: ignore[no-untyped-def]
         layout: As forward, like ``weights``, ``source``, ``work`` and ``work_size``.
         outputs: `Outputs` of the forward pass.
         grads: `OutputGradients`.
-        out: `AnchorGradients`, written in rows of anchors that have a gradient.
+        out: `AnchorGradients`, written.
         partial: `Gradients` of the first chunk, in the end of all; those of other chunks follow.
         size: Numbers in it.
         tasks: As forward.
     """
-    # One at least: where nothing is visible, it is what sets the gradients to zero.
+    # One at least: where nothing is visible, it sets the gradients to zero.
     chunks = max(1, (source.num_visible + CHUNK - 1) // CHUNK)
     for task in prange(tasks):
         own = task_work(work, task, work_size)

@@ -23,8 +23,10 @@ from chronoscene.training._matmul import product, relu_product
 from chronoscene.training._simd import (
     LANES,
     copy_quad,
+    inner,
     load,
     load_first,
+    prefetch,
     read,
     read_index,
     select_less,
@@ -44,6 +46,8 @@ from chronoscene.training._vector_math import (
     tanh,
 )
 
+AHEAD = 16
+"""Anchors between the request for a row and its use."""
 ZERO = float32(0)
 ONE = float32(1)
 LEAST_DISTANCE = float32(MIN_DISTANCE)
@@ -58,6 +62,7 @@ class Anchors(NamedTuple):
     features: int
     log_scales: int
     centre: int
+    num_anchors: int
     visible: int
     num_visible: int
     periods: int
@@ -85,7 +90,7 @@ class Outputs(NamedTuple):
     """1 / |q| of the quaternions before they were made unit, 0 without a direction. [L]"""
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def task_work(work, task, size):  # type: ignore[no-untyped-def]
     """Work space of a task; ``size`` numbers after that of the task before."""
     move = 4 * task * size
@@ -107,9 +112,21 @@ def task_work(work, task, size):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
+def _prefetch_inputs(layout, source, m):  # type: ignore[no-untyped-def]
+    """Ask for the features of a later anchor: its row is far from those before."""
+    if m < source.num_visible:
+        row = read_index(source.visible, m) * layout.row
+        prefetch(source.features, row)
+        for s in range(source.num_periods):
+            period = read_index(source.periods, s)
+            prefetch(source.features, row + layout.base + period * layout.period)
+
+
+@inner
 def gather_inputs(layout, source, m, x, slot):  # type: ignore[no-untyped-def]
     """Write the input of the heads: base feature, mixed period feature, unit direction."""
+    _prefetch_inputs(layout, source, m + AHEAD)
     anchor, at = read_index(source.visible, m), slot * layout.inputs_pad
     row = anchor * layout.row
     for c in range(0, layout.base, LANES):
@@ -134,7 +151,7 @@ def gather_inputs(layout, source, m, x, slot):  # type: ignore[no-untyped-def]
         write(x, at + c, ZERO)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def hidden_layer(layout, weights, work, first, columns):  # type: ignore[no-untyped-def]
     """First layer of some heads for a block."""
     right = (weights.w1_t, first, layout.hiddens)
@@ -144,7 +161,7 @@ def hidden_layer(layout, weights, work, first, columns):  # type: ignore[no-unty
     relu_product((work.x, 0, layout.inputs_pad, 1), right, bias, out, BLOCK, columns, inputs)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _output_layer(layout, weights, work, head, first, columns):  # type: ignore[no-untyped-def]
     """Second layer of a head for a block: ``columns`` of the outputs from ``first`` on."""
     left = (work.hidden, head * layout.hidden_pad, layout.hiddens, 1)
@@ -153,7 +170,7 @@ def _output_layer(layout, weights, work, head, first, columns):  # type: ignore[
     product(left, right, (weights.b2, first, 0), out, BLOCK, columns, layout.hidden)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _count_row(raw, at, count, m, above, out):  # type: ignore[no-untyped-def]
     """Opacities of an anchor, and how many of its Gaussians live."""
     first = m * count
@@ -197,14 +214,14 @@ def decode_opacities(layout, weights, source, above, out, work, work_size, tasks
         write_index(out.starts, m + 1, total)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def factors(source, anchor, row):  # type: ignore[no-untyped-def]
     """Write exp(log_scales) of an anchor."""
     for c in range(0, 6, LANES):
         store(row, c, exp(load_first(source.log_scales, 6 * anchor + c, 6 - c)))
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _gather_living(layout, source, m, slot, above, work, done, out):  # type: ignore[no-untyped-def]
     """Put raw outputs of the living Gaussians of an anchor behind those ``done`` before."""
     anchor, raw = read_index(source.visible, m), slot * layout.outputs_pad
@@ -231,7 +248,7 @@ def _gather_living(layout, source, m, slot, above, work, done, out):  # type: ig
     return done
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _activate(work, count, first, out):  # type: ignore[no-untyped-def]
     """Turn raw outputs of ``count`` Gaussians into those from ``first`` on."""
     for c in range(0, 3 * count, LANES):
@@ -251,7 +268,7 @@ def _activate(work, count, first, out):  # type: ignore[no-untyped-def]
         store_first(out.inverse_norms, first + c // 4, quad_heads(inverse), quads)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _decode_block(layout, weights, source, count, above, work, out):  # type: ignore[no-untyped-def]
     hidden_layer(layout, weights, work, layout.hidden_pad, 2 * layout.hidden_pad)
     scales, colors = layout.scales_at, layout.colors_at

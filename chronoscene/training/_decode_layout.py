@@ -16,7 +16,7 @@ from typing import NamedTuple
 from numba import njit
 
 from chronoscene.training._matmul import PADDING
-from chronoscene.training._simd import LANES, read, write
+from chronoscene.training._simd import LANES, inner, read, write
 
 BLOCK = 64
 """Anchors whose rows go through the matrix products together; multiple of every ROW_TILE. What a
@@ -206,7 +206,7 @@ class Head(NamedTuple):
     b2: int
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _output_column(layout, head, output):  # type: ignore[no-untyped-def]
     """Column among the joined outputs of an output of head 0, 1, 2."""
     if head == 0:
@@ -219,7 +219,7 @@ def _output_column(layout, head, output):  # type: ignore[no-untyped-def]
     return layout.quats_at + 4 * offset + part - 3
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _num_outputs(layout, head):  # type: ignore[no-untyped-def]
     return layout.offsets * (1 if head == 0 else 7 if head == 1 else 3)
 

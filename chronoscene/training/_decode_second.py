@@ -93,3 +93,41 @@ def add_offset(
 
     integers = (types.intp, types.intp, types.intp)
     return types.void(grads, places, rows, lengths, *integers), generate
+
+
+@intrinsic
+def add_biases(typing: Any, grads: Any, d_b: Any, rows: Any, slots: Any, count: Any) -> Any:
+    """Add the gradients of the outputs of one offset to those of the biases.
+
+    Args:
+        grads: As for `add_offset`, like ``rows``, ``slots`` and ``count``. Four numbers are read
+            where an output has fewer.
+        d_b: Address of the gradients of the biases.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        b = builder
+        grads = [_Pointers(b, place) for place in cgutils.unpack_tuple(b, args[0], 4)]
+        biases, rows = _Pointers(b, args[1]), cgutils.unpack_tuple(b, args[2], 4)
+        count = args[4]
+        index = count.type
+        quad = ir.VectorType(FLOAT, 4)
+        sums = [cgutils.alloca_once_value(b, ir.Constant(quad, [0.0] * 4)) for _ in PARTS]
+        slots = b.inttoptr(args[3], ir.IntType(64).as_pointer())
+        with cgutils.for_range(b, count) as loop:
+            pair = b.add(b.mul(loop.index, index(2)), index(1))
+            gaussian = b.load(b.gep(slots, [pair]))
+            for part, (_, number) in enumerate(PARTS):
+                pointer = grads[part].at(b.mul(gaussian, index(number)))
+                value = b.load(b.bitcast(pointer, quad.as_pointer()), typ=quad)
+                value.align = 4
+                b.store(b.fadd(b.load(sums[part]), value), sums[part])
+        for part, (_, number) in enumerate(PARTS):
+            total = b.load(sums[part])
+            for i in range(number):
+                place = biases.at(b.add(rows[part], index(i)))
+                lane = b.extract_element(total, ir.IntType(32)(i))
+                b.store(b.fadd(b.load(place), lane), place)
+        return context.get_dummy_value()
+
+    return types.void(grads, d_b, rows, types.intp, types.intp), generate

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 
 from chronoscene.training._simd import (
@@ -21,6 +21,7 @@ from chronoscene.training._simd import (
     emit_multiply_add,
     emit_splat,
     emit_store,
+    inner,
     intrinsic,
 )
 
@@ -97,7 +98,7 @@ _TILE_1_RELU = _make_tile(1, relu=True)
 _TILE_2_RELU = _make_tile(2, relu=True)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def product(left, right, first, out, rows, columns, depth):  # type: ignore[no-untyped-def]
     """out = first + left @ right.
 
@@ -118,7 +119,7 @@ def product(left, right, first, out, rows, columns, depth):  # type: ignore[no-u
             _TILE_1(left, right, first, out, row, columns - LANES, depth)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def relu_product(left, right, first, out, rows, columns, depth):  # type: ignore[no-untyped-def]
     """out = max(0, first + left @ right); see `product`."""
     for column in range(0, columns - LANES, 2 * LANES):

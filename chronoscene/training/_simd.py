@@ -22,13 +22,23 @@ from typing import Any
 import llvmlite.binding
 import numba.extending
 from llvmlite import ir
-from numba import config, types
+from numba import config, njit, types
 from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 from numpy import float32
 
 # The declared type of an intrinsic has the typing context as an argument that callers leave out.
 intrinsic: Any = numba.extending.intrinsic
+
+_OPTIONS: dict[str, Any] = {
+    "nogil": True,
+    "error_model": "numpy",
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
+inner: Any = njit(**_OPTIONS)
+"""Decorator of functions that only compiled code calls: without ways in from elsewhere they compile
+faster."""
 
 FLAGS = ("contract", "nsz", "arcp")
 
@@ -294,3 +304,17 @@ def copy_quad(typing: Any, out: Any, start: Any, memory: Any, index: Any) -> Any
         return context.get_dummy_value()
 
     return types.void(out, types.intp, memory, types.intp), generate
+
+
+@intrinsic
+def prefetch(typing: Any, memory: Any, index: Any) -> Any:
+    """Ask for the cache line around ``index``; harmless where nothing is."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        pointer = emit_address(context, builder, signature.args[0], *args)
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, INT, INT, INT])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(function, [pointer, INT(0), INT(3), INT(1)])
+        return context.get_dummy_value()
+
+    return types.void(memory, types.intp), generate

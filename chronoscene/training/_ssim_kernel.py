@@ -30,6 +30,7 @@ from numpy import float32
 
 from chronoscene.training._simd import (
     LANES,
+    inner,
     load,
     multiply_add,
     select_less,
@@ -54,7 +55,7 @@ ONE = float32(1)
 TWO = float32(2)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _frame_row(source, divisor, out, start, stride):  # type: ignore[no-untyped-def]
     """Put a row of an image between its margins; uint8 is divided by 255 as torch does."""
     framed = out[start : start + stride]
@@ -65,7 +66,7 @@ def _frame_row(source, divisor, out, start, stride):  # type: ignore[no-untyped-
         inner[i] = float32(source[i]) / divisor
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _blur_columns(x, y, start, stride, out):  # type: ignore[no-untyped-def]
     """Vertical part of the four blurs for one row, into four rows of ``out``."""
     for column in range(0, stride, LANES):
@@ -97,7 +98,7 @@ def _blur_at(row, index):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _similarity_row(x, y, start, stride, inside, maps):  # type: ignore[no-untyped-def]
     """Sums of 1 - S and |x - y| over a row; the maps a, b, c of the row go into ``maps``."""
     rows = np.empty(4 * stride, dtype=float32)
@@ -134,7 +135,7 @@ def _similarity_row(x, y, start, stride, inside, maps):  # type: ignore[no-untyp
     return lane_sum(total), lane_sum(difference)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def _gradient_row(x, y, maps, start, stride, scales, out):  # type: ignore[no-untyped-def]
     """Gradient of scales[0] * sum|x - y| + scales[1] * sum(1 - S) for one row."""
     plane = maps.shape[0] // 3

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numpy import float32
 
@@ -19,6 +19,7 @@ from chronoscene.training._simd import (
     emit_address,
     emit_load,
     emit_store,
+    inner,
     intrinsic,
     multiply_add,
     select_less,
@@ -177,7 +178,7 @@ def _shift_exponent(typing: Any, value: Any, rounded: Any) -> Any:
     return Vector(Vector, Vector), generate
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def exp(x):  # type: ignore[no-untyped-def]
     """e to the x, within 1.2e-7 of its value. What is not a number stays so."""
     low = splat(EXP_LOW)
@@ -193,13 +194,13 @@ def exp(x):  # type: ignore[no-untyped-def]
     return select_less(high, x, splat(float32(math.inf)), _shift_exponent(total, rounded))
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def sigmoid(x):  # type: ignore[no-untyped-def]
     """1 / (1 + exp(-x))."""
     return ONE / (exp(ZERO - x) + ONE)
 
 
-@njit(nogil=True, error_model="numpy")
+@inner
 def tanh(x):  # type: ignore[no-untyped-def]
     """Hyperbolic tangent; small numbers keep their sign and digits."""
     square = x * x

@@ -266,7 +266,7 @@ class _Decode(torch.autograd.Function):
         fixed, tensors, outputs = saved[:4], saved[4:20], saved[20:]
         job = _Job(ctx.dims, fixed, tensors)
         grads = tuple(grad.contiguous() for grad in grads[:5])
-        out = [torch.zeros(tensor.shape) for tensor in tensors]
+        out = [torch.empty(tensor.shape) for tensor in tensors]
         sizes = gradient_sizes(job.layout)
         chunks = max(1, -(-job.source.num_visible // CHUNK))
         partials = torch.empty(chunks, sum(sizes))
@@ -318,6 +318,7 @@ class _Job:
             offsets=offsets.data_ptr(),
             features=features.data_ptr(),
             log_scales=log_scales.data_ptr(),
+            num_anchors=len(anchors),
             centre=centre.data_ptr(),
             visible=visible.data_ptr(),
             num_visible=len(visible),
@@ -377,13 +378,13 @@ def _check(
         check_shape(f"{name} head b1", head.b1, (hidden,))
         check_shape(f"{name} head w2", head.w2, (width * count, hidden))
         check_shape(f"{name} head b2", head.b2, (width * count,))
-    low, high = (int(end) for end in visible.aminmax()) if len(visible) else (0, -1)
-    if low < 0 or high >= rows:
+    rising = bool((visible[1:] > visible[:-1]).all())
+    if not rising or (len(visible) and (visible[0] < 0 or visible[-1] >= rows)):
         raise ShapeError(
             "visible",
-            expected=f"indices of {rows} anchors",
-            found=f"{low} to {high}",
-            todo="pass indices of rows that exist",
+            expected=f"ascending indices of {rows} anchors",
+            found="others",
+            todo="pass indices of rows that exist, sorted, each once",
         )
 
 

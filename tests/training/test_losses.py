@@ -74,16 +74,16 @@ def test_definition_equals_skimage_away_from_the_border() -> None:
     assert ours.mean() == pytest.approx(inner, abs=1e-12)
 
 
-def test_definition_passes_gradcheck() -> None:
-    image, target = random_images(6, 7)
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_definition_passes_gradcheck(weight: float) -> None:
+    image, target = random_images(3, 4)
     image = image.double().requires_grad_()
-    for weight in (0.0, 0.2, 1.0):
-        assert torch.autograd.gradcheck(
-            lambda x, w=weight: photometric_loss_reference(x, target, ssim_weight=w), (image,)
-        )
+    assert torch.autograd.gradcheck(
+        lambda x: photometric_loss_reference(x, target, ssim_weight=weight), (image,)
+    )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     height=st.integers(1, 40),
     width=st.integers(1, 40),
