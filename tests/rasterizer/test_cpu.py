@@ -1,0 +1,214 @@
+"""What is particular to the CPU backend: equal bits, buffers kept between calls, stages."""
+
+from __future__ import annotations
+
+import gc
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from chronoscene.rasterizer import rasterize
+from chronoscene.rasterizer.cpu import layout, pipeline, workspace
+from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, sort_by_depth
+
+MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+
+
+def everything(scene: Any) -> list[torch.Tensor]:
+    """All outputs and all gradients of one rendering."""
+    result, inputs = scene.render("cpu")
+    generator = torch.Generator().manual_seed(0)
+    loss = (result.image * torch.randn(result.image.shape, generator=generator)).sum()
+    (loss + (result.alphas**2).sum()).backward()
+    assert result.info.means2d.grad is not None
+    outputs = [result.image, result.alphas, result.info.means2d, result.info.means2d.grad]
+    return [*outputs, result.info.radii, *(x.grad for x in inputs.values())]
+
+
+def assert_equal_bits(a: list[torch.Tensor], b: list[torch.Tensor]) -> None:
+    for x, y in zip(a, b, strict=True):
+        assert torch.equal(x, y)
+
+
+@pytest.fixture
+def threads() -> Any:
+    before = numba.get_num_threads()
+    yield numba.set_num_threads
+    numba.set_num_threads(before)
+
+
+@pytest.mark.skipif(MOST_THREADS < 2, reason="needs two threads")
+@pytest.mark.parametrize(("count", "size"), [(3000, 150), (40, 20)])
+def test_bits_do_not_depend_on_the_number_of_threads(
+    count: int, size: int, tools: SimpleNamespace, threads: Any
+) -> None:
+    scene = tools.random_scene(
+        count, size, size + 7, backgrounds=np.array([[0.1, 0.2, 0.3]], np.float32)
+    )
+    results = []
+    for number in (1, 2, 1, MOST_THREADS):
+        threads(number)
+        results.append(everything(scene))
+    for other in results[1:]:
+        assert_equal_bits(results[0], other)
+
+
+def test_buffers_of_other_scenes_leave_no_trace(tools: SimpleNamespace) -> None:
+    """A small scene after a large one, and after one that has other pixels ended."""
+    small = tools.random_scene(50, 45, 30, seed=1)
+    workspace.clear()
+    fresh = everything(small)
+    large = tools.random_scene(3000, 120, 90, seed=2)
+    everything(large.with_(opacities=np.full(3000, 0.99, np.float32), scales=large.scales * 4))
+    assert_equal_bits(fresh, everything(small))
+
+
+def test_two_graphs_at_once_do_not_share_buffers(tools: SimpleNamespace) -> None:
+    a, b = tools.random_scene(60, 40, 40, seed=1), tools.random_scene(70, 30, 50, seed=2)
+    alone = [everything(a), everything(b)]
+    results = [scene.render("cpu") for scene in (a, b)]
+    for (result, inputs), expected in zip(results, alone, strict=True):
+        generator = torch.Generator().manual_seed(0)
+        loss = (result.image * torch.randn(result.image.shape, generator=generator)).sum()
+        (loss + (result.alphas**2).sum()).backward()
+        assert_equal_bits([x.grad for x in inputs.values()], expected[5:])
+
+
+def test_a_graph_can_be_walked_twice(tools: SimpleNamespace) -> None:
+    result, inputs = tools.random_scene(60, 40, 40).render("cpu")
+    loss = (result.image**2).sum()
+    first = torch.autograd.grad(loss, list(inputs.values()), retain_graph=True)
+    tools.random_scene(90, 40, 40, seed=5).render("cpu")[0].image.sum().backward()
+    second = torch.autograd.grad(loss, list(inputs.values()))
+    assert_equal_bits(list(first), list(second))
+
+
+def test_workspaces_come_back(tools: SimpleNamespace) -> None:
+    workspace.clear()
+    scene = tools.random_scene(30, 20, 20)
+    for _ in range(5):
+        everything(scene)
+        with torch.no_grad():
+            scene.render("cpu")
+    gc.collect()
+    assert 1 <= len(workspace._free) <= 2
+
+
+def test_rendering_without_gradients_gives_equal_images(tools: SimpleNamespace) -> None:
+    scene = tools.random_scene(60, 40, 40)
+    with torch.no_grad():
+        plain = scene.render("cpu")[0]
+    assert not plain.info.means2d.requires_grad and not plain.image.requires_grad
+    assert torch.equal(plain.image, scene.render("cpu")[0].image)
+
+
+def test_only_asked_gradients(tools: SimpleNamespace) -> None:
+    """Gradients of some inputs do not need those of others."""
+    scene = tools.random_scene(60, 40, 40)
+    expected = everything(scene)
+    inputs: dict[str, Any]
+    inputs = {name: x.detach() for name, x in scene.tensors(torch.float32).items()}
+    inputs["opacities"].requires_grad_()
+    result = rasterize(
+        **inputs,
+        viewmats=torch.tensor(scene.viewmats),
+        Ks=torch.tensor(scene.Ks),
+        width=40,
+        height=40,
+    )
+    generator = torch.Generator().manual_seed(0)
+    loss = (result.image * torch.randn(result.image.shape, generator=generator)).sum()
+    (loss + (result.alphas**2).sum()).backward()
+    assert_equal_bits([inputs["opacities"].grad], [expected[5 + 3]])
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    keys=hnp.arrays(
+        np.int32,
+        st.integers(1, 300),
+        elements=st.one_of(st.just(-1), st.integers(0, 2**31 - 1), st.integers(0, 7)),
+    ),
+    threads=st.integers(1, 5),
+)
+def test_sort_is_stable_and_leaves_out_negative_keys(keys: np.ndarray, threads: int) -> None:
+    pairs, spare = np.empty(keys.size, np.int64), np.empty(keys.size, np.int64)
+    counts = np.empty((threads, 1 << DIGIT_BITS), np.int64)
+    count, in_spare = sort_by_depth(threads, keys, counts, pairs, spare)
+    order = (spare if in_spare else pairs)[:count] & 0xFFFFFFFF
+    expected = np.argsort(keys, kind="stable")
+    np.testing.assert_array_equal(order, expected[keys[expected] >= 0])
+
+
+def test_blocks_are_those_that_the_ellipse_touches(tools: SimpleNamespace) -> None:
+    """No block with a pixel above the threshold is missing, and few others are listed."""
+    scene = tools.random_scene(400, 100, 70, seed=3)
+    names = ("means", "quats", "scales", "opacities", "colors")
+    gaussians = pipeline.Gaussians(*(getattr(scene, name).reshape(-1) for name in names))
+    view = pipeline.make_view(scene.viewmats[0], scene.Ks[0], 100, 70, 0.01, 1e10, 0.3)
+    visible = (np.empty(800, np.float32), np.empty(800, np.float32), np.empty(400, np.float32))
+    binned = pipeline.bin_gaussians(workspace.Workspace(), gaussians, view, visible)
+    listed = np.zeros((400, 3 * 32, 4 * 32), bool)
+    for tile in range(view.tiles):
+        y, x = 32 * (tile // view.tiles_x), 32 * (tile % view.tiles_x)
+        for entry in range(binned.tile_starts[tile], binned.tile_starts[tile + 1]):
+            bits = np.unpackbits(
+                binned.entries[1][entry : entry + 1].view(np.uint8), bitorder="little"
+            )
+            blocks = np.kron(bits.reshape(8, 8), np.ones((4, 4), np.uint8)).astype(bool)
+            listed[binned.entries[0][entry], y : y + 32, x : x + 32] |= blocks
+    needed = _touched(binned.records.reshape(-1, layout.RECORD), binned.keys >= 0)
+    assert needed.any() and not (needed & ~listed[:, :70, :100]).any()
+    in_blocks = np.pad(needed, ((0, 0), (0, 2), (0, 0))).reshape(400, 18, 4, 25, 4).any((2, 4))
+    assert listed[:, :70:4, :100:4].sum() <= 1.05 * in_blocks.sum()
+
+
+def _touched(records: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """Pixels where alpha counts, from the records. [N, 70, 100]"""
+    y, x = np.mgrid[:70, :100] + 0.5
+    dx, dy = x - records[:, 0, None, None], y - records[:, 1, None, None]
+    u = records[:, 2, None, None] * dx + records[:, 3, None, None] * dy
+    v = records[:, 4, None, None] * dy
+    power = records[:, 5, None, None] - u**2 - v**2
+    return (power >= layout.LEVEL_MIN) & drawn[:, None, None]
+
+
+def test_lists_grow_when_gaussians_cover_many_tiles(
+    tools: SimpleNamespace, check_agreement: Any
+) -> None:
+    """Every Gaussian covers all 20 tiles: more pairs than the first guess has room for."""
+    scene = tools.random_scene(30, 150, 120, seed=4)
+    check_agreement(scene.with_(scales=np.full((30, 3), 3.0, np.float32)))
+
+
+@pytest.mark.slow
+def test_narrow_vectors_agree_too(tmp_path: Path) -> None:
+    """The kernels compiled for a processor without AVX-512, in another process."""
+    features = "+avx,+avx2,+fma,+bmi,+bmi2,+popcnt,+lzcnt,+f16c,+movbe,+sse4.2"
+    if "avx2" not in Path("/proc/cpuinfo").read_text():
+        pytest.skip("needs a processor with AVX2")
+    environment = dict(
+        os.environ,
+        NUMBA_CPU_NAME="haswell",
+        NUMBA_CPU_FEATURES=features,
+        NUMBA_CACHE_DIR=str(tmp_path),
+    )
+    test = Path(__file__).with_name("test_agreement.py")
+    result = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", str(test)],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 0, result.stdout[-3000:]
