@@ -3,233 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.synth import furniture as fur
-from chronoscene.synth import palettes as pal
 from chronoscene.synth import stages
 from chronoscene.synth.buildings import SLAB, Building, finished, foundation, frame, rubble
-from chronoscene.synth.ground import PARKING, pavement
-from chronoscene.synth.mesh import Part, PartBuilder, srgb
-from chronoscene.synth.seeds import key_number, rng_for
-from chronoscene.synth.textures import PAVING
-from chronoscene.synth.vegetation import grown, hedge
+from chronoscene.synth.mesh import Part
+from chronoscene.synth.placing import (
+    Rect,
+    floor,
+    lawn,
+    park_cars,
+    path,
+    paved_block,
+    plant,
+    plant_hedge,
+    put_bench,
+    put_house,
+    scatter_trees,
+)
+from chronoscene.synth.seeds import rng_for
+from chronoscene.synth.vegetation import grown
 from chronoscene.synth.world import World
 
 Array = NDArray[np.float64]
-X, Y, Z = np.eye(3)
-RING = 3.0
-"""Width of pavements, metres."""
-
-
-@dataclass(frozen=True, slots=True)
-class Rect:
-    """Axis-aligned rectangle in metres."""
-
-    x0: float
-    y0: float
-    x1: float
-    y1: float
-
-    def inset(self, d: float) -> Rect:
-        return Rect(self.x0 + d, self.y0 + d, self.x1 - d, self.y1 - d)
-
-    @property
-    def size(self) -> tuple[float, float]:
-        return self.x1 - self.x0, self.y1 - self.y0
-
-    @property
-    def center(self) -> tuple[float, float]:
-        return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
-
-    def at(self, fx: float, fy: float, z: float = SLAB) -> Array:
-        """Point at fractions of the extents. [3]"""
-        dx, dy = self.size
-        return np.array([self.x0 + fx * dx, self.y0 + fy * dy, z])
-
-
-# ------------------------------------------------------------------ ground of a block
-
-
-def _pavement(world: World, name: str, rect: Rect, ring: float = RING) -> Rect:
-    low, high = np.array([rect.x0, rect.y0]), np.array([rect.x1, rect.y1])
-    world.always(f"{name}/pavement", "ground", lambda: pavement(name, low, high, ring, world.seed))
-    return rect.inset(ring)
-
-
-def _floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
-    """One rectangle of ground: ``lawn SEASON``, ``soil``, ``car_park``, ``slabs``, ``rings``."""
-    b = PartBuilder(key_number(name, "floor"))
-    kind, _, season = surface.partition(" ")
-    dx, dy = rect.size
-    if kind == "lawn":
-        style = pal.grass_style(b, season, 0.22)
-    elif kind == "mown":
-        style = pal.grass_style(b, season, 0.10, 0.22)
-    elif kind == "soil":
-        style = pal.soil_style(b, 0.10, 0.8)
-    elif kind == "car_park":
-        style = pal.asphalt_style(b, 3)
-    elif kind == "rings":
-        style = b.style(
-            PAVING, srgb(184, 160, 132), srgb(132, 92, 74), srgb(96, 84, 72),
-            (0.8, 0.8, 0.5, 2.0, 4.4),
-        )  # fmt: skip
-    elif kind == "bands":
-        style = b.style(
-            PAVING, srgb(176, 168, 154), srgb(118, 112, 108), srgb(84, 80, 76),
-            (0.6, 0.6, 0.0, 1.0, 4.8),
-        )  # fmt: skip
-    else:
-        style = b.style(
-            PAVING, srgb(168, 150, 128), srgb(150, 140, 128), srgb(92, 84, 74),
-            (0.4, 0.2, 0.5, 0.0, 1.0),
-        )  # fmt: skip
-    b.quads([rect.x0, rect.y0, z], dx * X, dy * Y, style)
-    return b.build()
-
-
-def _lawn(world: World, name: str, rect: Rect, kind: str = "lawn", z: float = SLAB) -> None:
-    states = [f"{kind} {season}" for season in world.seasons]
-    world.add(f"{name}/lawn", "lawn", states, lambda s: _floor(name, rect, s, z))
-
-
-def _path(world: World, name: str, points: Array, width: float) -> None:
-    """Gravel path along a curve, a hand above the lawn's surface."""
-    way = np.gradient(points, axis=0)
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    side = np.column_stack([-way[:, 1], way[:, 0]]) * width / 2
-
-    def make() -> Part:
-        b = PartBuilder(key_number(name))
-        style = pal.soil_style(b, 0.05, 0.0)
-        left = np.column_stack([points + side, np.full(len(points), SLAB + 0.02)])
-        right = np.column_stack([points - side, np.full(len(points), SLAB + 0.02)])
-        frame = (np.zeros(3), X, Y)
-        for i in range(len(points) - 1):
-            b.polygon([right[i], right[i + 1], left[i + 1], left[i]], style, frame=frame)
-        return b.build()
-
-    world.always(name, "ground", make)
-
-
-# ------------------------------------------------------------------ things on the ground
-
-
-def _tree(
-    world: World,
-    name: str,
-    at: Array,
-    rng: np.random.Generator,
-    size: float = 6.5,
-    broad: bool = False,
-) -> None:
-    """A tree that grows and changes with the seasons."""
-    heights = stages.tree_heights(rng, world.periods, float(rng.uniform(0.75, 1.25) * size))
-    states = [
-        None if h is None else (h, season) for h, season in zip(heights, world.seasons, strict=True)
-    ]
-    world.add(name, "tree", states, partial(grown, name, at, world.seed, 2, broad))
-
-
-def _hedge(world: World, name: str, low: Array, high: Array) -> None:
-    world.add(name, "tree", world.seasons, partial(hedge, name, low, high, world.seed))
-
-
-def _cars(
-    world: World, name: str, places: list[tuple[float, float, float, float]], chance: float
-) -> None:
-    """Parked cars: each place (x, y, z, heading) holds one car, another or none per period."""
-    rng = rng_for(world.seed, name, "cars")
-    for i, (x, y, z, turn) in enumerate(places):
-        stay = rng.random() < 0.2
-        here = rng.random(world.periods) < chance
-        heading = turn + rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
-        base = np.array([x, y, z])
-        every = range(world.periods)
-        groups = [list(every)] if stay else [[p] for p in every]
-        for k, group in enumerate(groups):
-            label = f"{name}/car_{i}_{k}"
-            present = [p in group and bool(here[group[0]]) for p in every]
-            world.place(label, "car", present, partial(fur.car, label, base, heading, world.seed))
-
-
-def _lamps(world: World, name: str, rect: Rect) -> None:
-    """Lamps along the kerb, arms over the road."""
-    r = rect.inset(0.8)
-    dx, dy = r.size
-    spots = [(f, 0.0, -np.pi / 2) for f in np.linspace(0.2, 0.8, max(1, int(dx // 18)))]
-    spots += [(f, 1.0, np.pi / 2) for f in np.linspace(0.2, 0.8, max(1, int(dx // 18)))]
-    spots += [(0.0, f, np.pi) for f in np.linspace(0.3, 0.7, max(1, int(dy // 22)))]
-    spots += [(1.0, f, 0.0) for f in np.linspace(0.3, 0.7, max(1, int(dy // 22)))]
-    for i, (fx, fy, turn) in enumerate(spots):
-        label, at = f"{name}/lamp_{i}", r.at(fx, fy)
-        world.always(label, "lamp", partial(fur.lamp, label, at, turn))
-
-
-def curb_side(world: World, name: str, rect: Rect, road: float) -> None:
-    """Cars in the parking lanes around a block, and lamps."""
-    places = []
-    off = PARKING / 2
-    step = 5.5
-    for k in range(int((rect.size[0] - 10) // step)):
-        x = rect.x0 + 8.0 + k * step
-        places += [(x, rect.y0 - off, 0.0, 0.0), (x, rect.y1 + off, 0.0, np.pi)]
-    for k in range(int((rect.size[1] - 10) // step)):
-        y = rect.y0 + 8.0 + k * step
-        places += [(rect.x0 - off, y, 0.0, np.pi / 2), (rect.x1 + off, y, 0.0, -np.pi / 2)]
-    _cars(world, name, places, 0.42)
-    _lamps(world, name, rect)
-    _avenue(world, name, rect)
-
-
-def _avenue(world: World, name: str, rect: Rect) -> None:
-    """Street trees in pits along some sides of a block."""
-    rng = rng_for(world.seed, name, "avenue")
-    r = rect.inset(1.0)
-    ends = [r.at(0, 0), r.at(1, 0), r.at(1, 1), r.at(0, 1), r.at(0, 0)]
-    for side, (a, b) in enumerate(pairwise(ends)):
-        if rng.random() < 0.45:
-            continue
-        length = float(np.linalg.norm(b - a))
-        for i in range(int((length - 10) // 9.5)):
-            at = a + (8.0 + 9.5 * i + rng.uniform(-0.5, 0.5)) / length * (b - a)
-            label = f"{name}/avenue_{side}{i}"
-            pit = Rect(at[0] - 0.6, at[1] - 0.6, at[0] + 0.6, at[1] + 0.6)
-            world.always(f"{label}/pit", "ground",
-                         partial(_floor, label, pit, "soil", SLAB + 0.015))  # fmt: skip
-            _tree(world, label, at, rng, 5.6, broad=True)
-
-
-def _house(
-    world: World, spec: Building, *, chance: float = 0.3, also: tuple[str, ...] = ()
-) -> None:
-    """A finished building, which may get another facade."""
-    rng = rng_for(world.seed, spec.name, "reclad")
-    states = stages.looks(rng, world.periods, chance)
-    walls = (spec.wall, str(rng.choice(["plaster", "panel", "brick"])))
-    world.add(
-        spec.name,
-        "facade",
-        [(walls[s], s) for s in states],
-        lambda s: finished(replace(spec, wall=s[0], look=s[1]), world.seed),
-    )
-
-
-# ------------------------------------------------------------------ fillers
+X = np.array([1.0, 0.0, 0.0])
 
 
 def square(world: World, name: str, rect: Rect) -> None:
     """Paved square: fountain, trees, benches, kiosks and, at times, a market."""
     rng = rng_for(world.seed, name)
-    inner = _pavement(world, name, rect)
+    inner = paved_block(world, name, rect)
     pattern = str(rng.choice(["rings", "bands"]))
-    world.always(f"{name}/paving", "ground", lambda: _floor(name, inner, pattern))
+    world.always(f"{name}/paving", "ground", lambda: floor(name, inner, pattern))
     mid = inner.at(0.5, 0.5)
     radius = min(3.6, 0.13 * min(inner.size))
     if rng.random() < 0.6:
@@ -240,12 +50,12 @@ def square(world: World, name: str, rect: Rect) -> None:
         c = inner.at(fx, fy)
         w = 0.11 * min(inner.size)
         bed = Rect(c[0] - w, c[1] - w, c[0] + w, c[1] + w)
-        _lawn(world, f"{name}/bed_{i}", bed, "mown", SLAB + 0.03)
+        lawn(world, f"{name}/bed_{i}", bed, "mown", SLAB + 0.03)
         for j in range(1 if w < 2.5 else 3):
             at = bed.at(*rng.uniform(0.2, 0.8, 2)) if w >= 2.5 else bed.at(0.5, 0.5)
-            _tree(world, f"{name}/tree_{i}{j}", at, rng)
+            plant(world, f"{name}/tree_{i}{j}", at, rng)
         side = np.sign(0.5 - fx)
-        _bench(world, f"{name}/bench_{i}", c + side * (w + 0.8) * X, -side * np.pi / 2)
+        put_bench(world, f"{name}/bench_{i}", c + side * (w + 0.8) * X, -side * np.pi / 2)
     for i in range(max(2, int(min(inner.size) // 7))):
         at = inner.at(*rng.uniform(0.3, 0.7, 2))
         if np.linalg.norm((at - mid)[:2]) < radius + 3.5:
@@ -260,29 +70,29 @@ def square(world: World, name: str, rect: Rect) -> None:
 def park(world: World, name: str, rect: Rect) -> None:
     """Lawn with paths, trees, hedges and benches."""
     rng = rng_for(world.seed, name)
-    inner = _pavement(world, name, rect)
-    _lawn(world, name, inner)
+    inner = paved_block(world, name, rect)
+    lawn(world, name, inner)
     t = np.linspace(0, 1, 25)
     bend = rng.uniform(-0.16, 0.16, 2)
     first = np.stack([t, 0.2 + 0.6 * t + bend[0] * np.sin(np.pi * t)], axis=1)
     second = np.stack([0.75 - 0.5 * t + bend[1] * np.sin(2 * np.pi * t), t], axis=1)
     low, size = np.array([inner.x0, inner.y0]), np.array(inner.size)
     for i, curve in enumerate((first, second)):
-        _path(world, f"{name}/path_{i}", low + curve * size, 2.2)
+        path(world, f"{name}/path_{i}", low + curve * size, 2.2)
     curves = low + np.concatenate([first, second]) * size
-    _scatter_trees(world, name, inner, rng, int(np.prod(size) / 70), curves)
+    scatter_trees(world, name, inner, rng, int(np.prod(size) / 70), curves)
     for i in range(4):
         k = int(rng.integers(4, 20)) + 25 * (i % 2)
         at = np.array([*(curves[k] + [1.6, 1.0]), SLAB])
-        _bench(world, f"{name}/bench_{i}", at, float(rng.uniform(0, 6.28)))
-    _hedge(world, f"{name}/hedge_s", inner.at(0.05, 0.03), inner.at(0.6, 0.03))
-    _hedge(world, f"{name}/hedge_e", inner.at(0.97, 0.3), inner.at(0.97, 0.95))
+        put_bench(world, f"{name}/bench_{i}", at, float(rng.uniform(0, 6.28)))
+    plant_hedge(world, f"{name}/hedge_s", inner.at(0.05, 0.03), inner.at(0.6, 0.03))
+    plant_hedge(world, f"{name}/hedge_e", inner.at(0.97, 0.3), inner.at(0.97, 0.95))
 
 
 def houses(world: World, name: str, rect: Rect) -> None:
     """Rows of attached houses along two sides with a courtyard between them."""
     rng = rng_for(world.seed, name)
-    inner = _pavement(world, name, rect)
+    inner = paved_block(world, name, rect)
     dx, dy = inner.size
     depth = min(11.0, 0.42 * dy) if dy > 20 else min(11.0, 0.75 * dy)
     rows = [(inner.y0, inner.y0 + depth, 0)]
@@ -305,17 +115,17 @@ def houses(world: World, name: str, rect: Rect) -> None:
                 storey=float(rng.uniform(2.9, 3.3)), ground=float(rng.uniform(3.5, 4.2)),
             )  # fmt: skip
             spec = _fit_roof(spec)
-            _house(world, spec, chance=0.35)
+            put_house(world, spec, chance=0.35)
     y0, y1 = inner.y0 + depth, (rows[1][0] if len(rows) > 1 else inner.y1)
     yard = Rect(inner.x0, y0, inner.x1, y1)
-    _lawn(world, name, yard)
+    lawn(world, name, yard)
     back = Rect(inner.x0, inner.y0, inner.x1, y0)
-    world.always(f"{name}/floor_0", "ground", lambda: _floor(name, back, "slabs"))
+    world.always(f"{name}/floor_0", "ground", lambda: floor(name, back, "slabs"))
     if len(rows) > 1:
         front = Rect(inner.x0, y1, inner.x1, inner.y1)
-        world.always(f"{name}/floor_1", "ground", lambda: _floor(name, front, "slabs"))
+        world.always(f"{name}/floor_1", "ground", lambda: floor(name, front, "slabs"))
     if y1 - y0 > 4:
-        _scatter_trees(world, name, yard.inset(1.5), rng, max(1, int(dx * (y1 - y0) / 130)))
+        scatter_trees(world, name, yard.inset(1.5), rng, max(1, int(dx * (y1 - y0) / 130)))
 
 
 def _fit_roof(spec: Building) -> Building:
@@ -330,68 +140,68 @@ def _fit_roof(spec: Building) -> Building:
 def slabs(world: World, name: str, rect: Rect) -> None:
     """One or two long flat-roofed buildings on lawns, with a car park."""
     rng = rng_for(world.seed, name)
-    inner = _pavement(world, name, rect)
+    inner = paved_block(world, name, rect)
     dy = inner.size[1]
     upper = Rect(inner.x0, inner.y0 + 0.55 * dy, inner.x1, inner.y1)
     lower = Rect(inner.x0, inner.y0, inner.x1, inner.y0 + 0.55 * dy)
-    _lawn(world, f"{name}/north", upper)
+    lawn(world, f"{name}/north", upper)
     wall = str(rng.choice(["panel", "concrete", "brick", "panel"]))
     spec = Building(
         f"{name}/slab", upper.x0 + 2, upper.y0 + 1.0, upper.x1 - 2,
         upper.y0 + 1.0 + min(12.0, upper.size[1] - 3), int(rng.integers(4, 8)), "flat", wall,
         balconies=bool(rng.random() < 0.7),
     )  # fmt: skip
-    _house(world, spec, chance=0.5)
+    put_house(world, spec, chance=0.5)
     lot = Rect(lower.x0, lower.y0, lower.x1, lower.y0 + min(17.0, lower.size[1]))
-    world.always(f"{name}/car_park", "ground", lambda: _floor(name, lot, "car_park"))
+    world.always(f"{name}/car_park", "ground", lambda: floor(name, lot, "car_park"))
     places = []
     for k in range(int((lot.size[0] - 1) // 2.6)):
         x = lot.x0 + 1.35 + 2.6 * k
         places += [(x, lot.y0 + 2.5, SLAB, np.pi / 2), (x, lot.y1 - 2.5, SLAB, np.pi / 2)]
-    _cars(world, f"{name}/lot", places if lot.size[1] > 11 else places[::2], 0.4)
+    park_cars(world, f"{name}/lot", places if lot.size[1] > 11 else places[::2], 0.4)
     if lot.y1 < lower.y1 - 0.5:
         rest = Rect(lower.x0, lot.y1, lower.x1, lower.y1)
-        _lawn(world, f"{name}/strip", rest, "mown")
+        lawn(world, f"{name}/strip", rest, "mown")
         if rest.size[1] > 3:
-            _scatter_trees(world, name, rest.inset(1.2), rng, int(rest.size[0] // 8))
+            scatter_trees(world, name, rest.inset(1.2), rng, int(rest.size[0] // 8))
 
 
 def tower(world: World, name: str, rect: Rect) -> None:
     """A high building with a low wing, on a paved and planted base."""
     rng = rng_for(world.seed, name)
-    inner = _pavement(world, name, rect)
-    world.always(f"{name}/paving", "ground", lambda: _floor(name, inner, "bands"))
+    inner = paved_block(world, name, rect)
+    world.always(f"{name}/paving", "ground", lambda: floor(name, inner, "bands"))
     w = min(16.0, 0.5 * min(inner.size))
     x0, y0 = inner.at(*rng.uniform(0.08, 0.3, 2))[:2]
     spec = Building(
         f"{name}/tower", x0, y0, x0 + w, y0 + w, int(rng.integers(8, 11)), "flat",
         str(rng.choice(["panel", "concrete"])), blank=(False, False, False, False),
     )  # fmt: skip
-    _house(world, spec, chance=0.6)
+    put_house(world, spec, chance=0.6)
     if inner.x1 - (x0 + w) > 7:
         wing = Building(
             f"{name}/wing", x0 + w, y0 + 0.2 * w, inner.x1 - 1.5, y0 + 0.85 * w, 2, "flat",
             "panel", blank=(False, False, False, True), shops=(True, False, True, False),
         )  # fmt: skip
-        _house(world, wing, chance=0.5)
+        put_house(world, wing, chance=0.5)
     free = Rect(inner.x0 + 1.5, y0 + w + 2.5, inner.x1 - 1.5, inner.y1 - 1.5)
     if free.size[1] > 3:
         bed = free.inset(0.5)
-        _lawn(world, name, bed, "mown", SLAB + 0.04)
-        _scatter_trees(world, name, bed.inset(0.8), rng, int(bed.size[0] * bed.size[1] / 45))
+        lawn(world, name, bed, "mown", SLAB + 0.04)
+        scatter_trees(world, name, bed.inset(0.8), rng, int(bed.size[0] * bed.size[1] / 45))
 
 
 def site(world: World, name: str, rect: Rect) -> None:
     """A building site: empty lot, foundation, frame with crane, finished building."""
     rng = rng_for(world.seed, name)
-    inner = _pavement(world, name, rect)
+    inner = paved_block(world, name, rect)
     steps = stages.site_stages(world.periods)
     spec = _site_building(name, inner, rng)
     done = {p for p, s in enumerate(steps) if s == "finished"}
     surfaces: list[str | None] = [
         f"mown {light.season}" if p in done else "soil" for p, light in enumerate(world.lights)
     ]
-    world.add(f"{name}/floor", "ground", surfaces, lambda s: _floor(name, inner, s))
+    world.add(f"{name}/floor", "ground", surfaces, lambda s: floor(name, inner, s))
 
     def make(stage: str) -> Part:
         if stage == "foundation":
@@ -445,7 +255,7 @@ def _site_gear(world: World, name: str, inner: Rect, steps: list[str], spec: Bui
 def renewal(world: World, name: str, rect: Rect) -> None:
     """An old building that is pulled down; a car park takes its place. Houses stand beside it."""
     rng = rng_for(world.seed, name)
-    inner = _pavement(world, name, rect)
+    inner = paved_block(world, name, rect)
     dx, dy = inner.size
     left = Rect(inner.x0, inner.y0, inner.x0 + 0.6 * dx, inner.y1)
     right = Rect(left.x1, inner.y0, inner.x1, inner.y1)
@@ -461,28 +271,28 @@ def renewal(world: World, name: str, rect: Rect) -> None:
     world.add(spec.name, "building", [None if s == "park" else s for s in steps], make)
     floors = {"house": "slabs", "rubble": "soil", "park": "car_park"}
     world.add(f"{name}/floor", "ground", [floors[s] for s in steps],
-              lambda s: _floor(name, left, s))  # fmt: skip
+              lambda s: floor(name, left, s))  # fmt: skip
     parked = [s == "park" for s in steps]
     for k in range(int((left.size[0] - 1) // 2.6)):
         here = [p and bool(rng.random() < 0.55) for p in parked]
         at = np.array([left.x0 + 1.35 + 2.6 * k, left.y0 + 2.5, SLAB])
         label = f"{name}/visitor_{k}"
         world.place(label, "car", here, partial(fur.car, label, at, np.pi / 2, world.seed))
-    _lawn(world, name, right)
-    house = Building(
+    lawn(world, name, right)
+    beside = Building(
         f"{name}/house", right.x0 + 1.0, right.y0 + 0.3 * dy, right.x1 - 0.5, right.y1 - 1.0,
         int(rng.integers(2, 5)), "hip", "plaster",
     )  # fmt: skip
-    _house(world, house, chance=0.7)
-    _scatter_trees(world, name, Rect(right.x0 + 1, right.y0 + 1, right.x1 - 1,
+    put_house(world, beside, chance=0.7)
+    scatter_trees(world, name, Rect(right.x0 + 1, right.y0 + 1, right.x1 - 1,
                                      right.y0 + 0.25 * dy), rng, 2)  # fmt: skip
 
 
 def suburb(world: World, name: str, rect: Rect) -> None:
     """Detached houses in gardens, simpler than the core."""
     rng = rng_for(world.seed, name)
-    inner = _pavement(world, name, rect, 2.0)
-    _lawn(world, name, inner)
+    inner = paved_block(world, name, rect, 2.0)
+    lawn(world, name, inner)
     dx, dy = inner.size
     cols, rows = max(1, int(dx // 18)), max(1, int(dy // 18))
     for i in range(cols):
@@ -503,30 +313,6 @@ def suburb(world: World, name: str, rect: Rect) -> None:
                 label, "tree", [(height, season) for season in world.seasons],
                 partial(grown, label, at, world.seed, 2 if world.near else 1, False),
             )  # fmt: skip
-
-
-def _scatter_trees(
-    world: World,
-    name: str,
-    rect: Rect,
-    rng: np.random.Generator,
-    count: int,
-    avoid: Array | None = None,
-) -> None:
-    """Trees at random places that keep apart from each other and from given points."""
-    taken: list[Array] = []
-    for i in range(count):
-        for _ in range(20):
-            at = rect.at(*rng.random(2))
-            near = [*taken, *([] if avoid is None else avoid)]
-            if all(np.hypot(at[0] - q[0], at[1] - q[1]) > 2.6 for q in near):
-                taken.append(at)
-                _tree(world, f"{name}/tree_{i}", at, rng)
-                break
-
-
-def _bench(world: World, name: str, at: Array, turn: float) -> None:
-    world.always(name, "bench", partial(fur.bench, name, at, turn))
 
 
 def _unit2(v: Array) -> Array:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.synth import blocks as fill
-from chronoscene.synth.blocks import Rect
 from chronoscene.synth.ground import road_network, surroundings
 from chronoscene.synth.light import make_lights
+from chronoscene.synth.placing import Rect, curb_side
 from chronoscene.synth.seeds import rng_for
 from chronoscene.synth.settings import SynthSettings
 from chronoscene.synth.world import World
@@ -63,7 +63,7 @@ def make_world(settings: SynthSettings) -> World:
         if role != "suburb":
             x, y = rect.center
             world.focus.append(np.array([x, y, 3.0]))
-            fill.curb_side(world, name, rect, ROAD)
+            curb_side(world, name, rect, ROAD)
     surroundings(world, plan.x, plan.y)
     return world
 

@@ -108,3 +108,16 @@ def mix(a, b, t):  # type: ignore[no-untyped-def]
 def scaled(a, f):  # type: ignore[no-untyped-def]
     """Colour times a factor."""
     return (a[0] * f, a[1] * f, a[2] * f)
+
+
+@njit(cache=True)
+def colors(s):  # type: ignore[no-untyped-def]
+    return (s[1], s[2], s[3]), (s[4], s[5], s[6]), (s[7], s[8], s[9])
+
+
+@njit(cache=True)
+def weather(color, u, v, seed, fw, strength):  # type: ignore[no-untyped-def]
+    """Blotches, streaks that run down, and grain: what keeps real walls from being flat."""
+    blotch = fbm(u, v, 2.6, 5, seed + 11, fw)
+    streak = fbm(u * 3.0, v * 0.35, 1.0, 3, seed + 12, 0.6 * fw)
+    return scaled(color, max(0.25, 1.0 + strength * (0.75 * blotch + 0.45 * streak)))

@@ -13,16 +13,9 @@ from numpy.typing import NDArray
 from chronoscene.scene import Camera
 from chronoscene.synth.light import Light, sky_args
 from chronoscene.synth.mesh import Part
-from chronoscene.synth.shade import (
-    MISS,
-    Probes,
-    Tables,
-    albedo_at,
-    camera_rays,
-    probe_values,
-    shade,
-    shadow_rays,
-)
+from chronoscene.synth.probes import Probes, probe_values
+from chronoscene.synth.shade import albedo_at, camera_rays, shade, shadow_rays
+from chronoscene.synth.tables import MISS, Tables
 
 Array = NDArray[np.float64]
 MAX_SAMPLES = 1_500_000

@@ -7,45 +7,15 @@ on the number of threads.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
 from chronoscene.synth.light import sky_radiance
 from chronoscene.synth.noise import mix
+from chronoscene.synth.probes import probe_light
+from chronoscene.synth.tables import MISS, hit_normals
 from chronoscene.synth.textures import albedo
-
-Array = NDArray[np.float64]
-MISS = 0xFFFFFFFF
-"""Primitive id that the ray caster gives to rays that hit nothing."""
-
-
-class Tables(NamedTuple):
-    """Geometry of one period as flat arrays; see `chronoscene.synth.mesh`."""
-
-    corners: NDArray[np.float32]
-    """[T, 3, 3]"""
-    normals: NDArray[np.float32]
-    """[T, 3, 3]"""
-    tri_patch: NDArray[np.int32]
-    patches: Array
-    patch_style: NDArray[np.int32]
-    patch_seed: NDArray[np.int32]
-    styles: Array
-
-
-class Probes(NamedTuple):
-    """Indirect light on a grid: radiance of order 1 in spherical harmonics."""
-
-    origin: Array
-    step: Array
-    """[3]"""
-    values: NDArray[np.float32]
-    """Mean radiance and three slopes per colour. [X, Y, Z, 4, 3]"""
-    valid: NDArray[np.float32]
-    """0 inside of objects. [X, Y, Z]"""
 
 
 @njit(cache=True, parallel=True)
@@ -69,27 +39,6 @@ def camera_rays(world_from_cam, k, width, row0, rows, ss):  # type: ignore[no-un
     return rays
 
 
-@njit(cache=True)
-def _normals(tables, tri, u, v, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Flat and smooth unit normals of a hit, both turned towards the viewer."""
-    a, b, c = tables.corners[tri, 0], tables.corners[tri, 1], tables.corners[tri, 2]
-    e0, e1, e2 = float(b[0] - a[0]), float(b[1] - a[1]), float(b[2] - a[2])
-    f0, f1, f2 = float(c[0] - a[0]), float(c[1] - a[1]), float(c[2] - a[2])
-    gx, gy, gz = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
-    scale = 1.0 / max(1e-12, math.sqrt(gx * gx + gy * gy + gz * gz))
-    gx, gy, gz = gx * scale, gy * scale, gz * scale
-    n = tables.normals[tri]
-    w = 1.0 - u - v
-    sx = w * n[0, 0] + u * n[1, 0] + v * n[2, 0]
-    sy = w * n[0, 1] + u * n[1, 1] + v * n[2, 1]
-    sz = w * n[0, 2] + u * n[1, 2] + v * n[2, 2]
-    scale = 1.0 / max(1e-12, math.sqrt(sx * sx + sy * sy + sz * sz))
-    sx, sy, sz = sx * scale, sy * scale, sz * scale
-    if gx * dx + gy * dy + gz * dz > 0.0:
-        gx, gy, gz = -gx, -gy, -gz
-    return gx, gy, gz, sx, sy, sz
-
-
 @njit(cache=True, parallel=True)
 def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ignore[no-untyped-def]
     """Rays to the sun for all samples; whether each is needed.
@@ -104,7 +53,7 @@ def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ig
         if tri[i] == MISS:
             continue
         r = rays[i]
-        gx, gy, gz, _, _, _ = _normals(tables, tri[i], uv[i, 0], uv[i, 1], r[3], r[4], r[5])
+        gx, gy, gz, _, _, _ = hit_normals(tables, tri[i], uv[i, 0], uv[i, 1], r[3], r[4], r[5])
         turn = 2.399963 * (i % count)
         radius = spread * math.sqrt((i % count + 0.5) / count)
         # Two axes across the sun's direction; the sun is never in the zenith.
@@ -131,30 +80,6 @@ def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ig
 
 
 @njit(cache=True)
-def _probe(probes, x, y, z, dx, dy, dz, slope):  # type: ignore[no-untyped-def]
-    """Indirect radiance around a point for a direction; ``slope`` 2/3 gives diffuse light."""
-    nx, ny, nz = probes.valid.shape
-    fx = min(max((x - probes.origin[0]) / probes.step[0], 0.0), nx - 1.001)
-    fy = min(max((y - probes.origin[1]) / probes.step[1], 0.0), ny - 1.001)
-    fz = min(max((z - probes.origin[2]) / probes.step[2], 0.0), nz - 1.001)
-    ix, iy, iz = int(fx), int(fy), int(fz)
-    r, g, b, total = 0.0, 0.0, 0.0, 0.0
-    for corner in range(8):
-        i, j, k = corner & 1, (corner >> 1) & 1, corner >> 2
-        wx = fx - ix if i else 1.0 - fx + ix
-        wy = fy - iy if j else 1.0 - fy + iy
-        wz = fz - iz if k else 1.0 - fz + iz
-        w = (wx * wy * wz + 1e-4) * probes.valid[ix + i, iy + j, iz + k]
-        p = probes.values[ix + i, iy + j, iz + k]
-        r += w * max(0.0, p[0, 0] + slope * (p[1, 0] * dx + p[2, 0] * dy + p[3, 0] * dz))
-        g += w * max(0.0, p[0, 1] + slope * (p[1, 1] * dx + p[2, 1] * dy + p[3, 1] * dz))
-        b += w * max(0.0, p[0, 2] + slope * (p[1, 2] * dx + p[2, 2] * dy + p[3, 2] * dz))
-        total += w
-    inverse = 1.0 / max(total, 1e-9)
-    return r * inverse, g * inverse, b * inverse
-
-
-@njit(cache=True)
 def surface_albedo(tables, tri, x, y, z, fw):  # type: ignore[no-untyped-def]
     """Texture of a triangle at a world point seen with pixels of width ``fw``."""
     patch = tables.tri_patch[tri]
@@ -173,7 +98,7 @@ def _reflected(x, y, z, n, d, style, facing, lit, sky, probes):  # type: ignore[
     mx, my, mz = d[0] - k * n[0], d[1] - k * n[1], d[2] - k * n[2]
     grazing = (1.0 - min(1.0, abs(0.5 * k))) ** 5
     strength = style[20] + (1.0 - style[20]) * grazing * 0.6 * style[21]
-    r, g, b = _probe(probes, x, y, z, mx, my, mz, 1.0)
+    r, g, b = probe_light(probes, x, y, z, mx, my, mz, 1.0)
     if mz > 0.0:
         sr, sg, sb = sky_radiance(mx, my, mz, sky, False)
         r, g, b = 0.5 * (r + sr), 0.5 * (g + sg), 0.5 * (b + sb)
@@ -189,7 +114,7 @@ def _base(ray, t, tri, u, v, tables, fw_unit):  # type: ignore[no-untyped-def]
     """Albedo of a hit for samples of the given width at unit distance."""
     dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    gx, gy, gz, _, _, _ = _normals(tables, tri, u, v, dx, dy, dz)
+    gx, gy, gz, _, _, _ = hit_normals(tables, tri, u, v, dx, dy, dz)
     slant = max(0.25, abs(gx * dx + gy * dy + gz * dz) / length)
     fw = max(1e-4, fw_unit * t * length / math.sqrt(slant))
     return surface_albedo(tables, tri, ray[0] + t * dx, ray[1] + t * dy, ray[2] + t * dz, fw)
@@ -202,7 +127,7 @@ def _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes):  # type: ignor
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     d = (dx / length, dy / length, dz / length)
     x, y, z = ray[0] + t * dx, ray[1] + t * dy, ray[2] + t * dz
-    gx, gy, gz, sx, sy, sz = _normals(tables, tri, u, v, dx, dy, dz)
+    gx, gy, gz, sx, sy, sz = hit_normals(tables, tri, u, v, dx, dy, dz)
     style = tables.styles[tables.patch_style[tables.tri_patch[tri]]]
     through = style[22]
     if through <= 0.0 and sx * gx + sy * gy + sz * gz < 0.0:
@@ -215,7 +140,7 @@ def _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes):  # type: ignor
     else:
         direct = lit * max(0.0, facing) if flat > 0.0 else 0.0
     ox, oy, oz = x + 0.8 * gx, y + 0.8 * gy, z + 0.8 * gz
-    er, eg, eb = _probe(probes, ox, oy, oz, sx, sy, sz, 2.0 / 3.0)
+    er, eg, eb = probe_light(probes, ox, oy, oz, sx, sy, sz, 2.0 / 3.0)
     r = base[0] * (direct * sky.sun[0] + er)
     g = base[1] * (direct * sky.sun[1] + eg)
     b = base[2] * (direct * sky.sun[2] + eb)
@@ -327,55 +252,3 @@ def albedo_at(points, tri, tables, fw):  # type: ignore[no-untyped-def]
             c = surface_albedo(tables, tri[i], x, y, z, max(1e-4, fw[i]))
             out[i, 0], out[i, 1], out[i, 2] = c[0], c[1], c[2]
     return out
-
-
-@njit(cache=True, parallel=True)
-def probe_values(  # type: ignore[no-untyped-def]
-    rays, t, tri, uv, lit, tables, mean_albedo, sky, count
-):
-    """Radiance of order 1 around each probe from the rays that it sent.
-
-    Hits get sun and a constant sky; a probe that mostly sees backs of surfaces is inside.
-
-    Returns:
-        values: [P, 4, 3] float32
-        valid: [P] float32
-    """
-    number = len(t) // count
-    values = np.zeros((number, 4, 3), np.float32)
-    valid = np.ones(number, np.float32)
-    for p in prange(number):
-        acc = np.zeros((4, 3))
-        backs = 0
-        for i in range(p * count, (p + 1) * count):
-            dx, dy, dz = float(rays[i, 3]), float(rays[i, 4]), float(rays[i, 5])
-            if tri[i] == MISS:
-                c = sky_radiance(dx, dy, dz, sky, False)
-            else:
-                n = tables.normals[tri[i], 0]
-                style = tables.patch_style[tables.tri_patch[tri[i]]]
-                solid = tables.styles[style, 22] <= 0.0
-                if solid and n[0] * dx + n[1] * dy + n[2] * dz > 0.0:
-                    backs += 1
-                    continue
-                d = sky.direction
-                facing = max(0.0, n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
-                sun = facing if lit[i] else 0.0
-                m = mean_albedo[style]
-                c = (
-                    m[0] * (sun * sky.sun[0] + 0.4 * sky.horizon[0]),
-                    m[1] * (sun * sky.sun[1] + 0.4 * sky.horizon[1]),
-                    m[2] * (sun * sky.sun[2] + 0.4 * sky.horizon[2]),
-                )
-            for k in range(3):
-                acc[0, k] += c[k]
-                acc[1, k] += 3.0 * dx * c[k]
-                acc[2, k] += 3.0 * dy * c[k]
-                acc[3, k] += 3.0 * dz * c[k]
-        seen = max(1, count - backs)
-        if backs > 0.25 * count:
-            valid[p] = 0.0
-        for j in range(4):
-            for k in range(3):
-                values[p, j, k] = acc[j, k] / seen
-    return values, valid

@@ -18,7 +18,7 @@ from chronoscene.synth.flights import View
 from chronoscene.synth.render import PeriodRenderer
 from chronoscene.synth.seeds import rng_for
 from chronoscene.synth.settings import SynthSettings
-from chronoscene.synth.shade import MISS
+from chronoscene.synth.tables import MISS
 
 Array = NDArray[np.float64]
 
