@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from chronoscene.bench.ground_truth import ground_truth_folder
 from chronoscene.bench.images import ImageEntry, load_image, read_manifest, safe_name
 from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord, read_run, run_folders
+from chronoscene.files import replacing
 from chronoscene.metrics.image import psnr
 
 CELL_WIDTH = 2.6
@@ -110,9 +110,8 @@ def _draw(
     what = "error of the test views" if errors else "test views"
     figure.suptitle(f"{scene}: {what}", fontsize=12)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    figure.savefig(partial, format="png", bbox_inches="tight", pad_inches=0.1)
-    os.replace(partial, path)
+    with replacing(path) as partial:
+        figure.savefig(partial, format="png", bbox_inches="tight", pad_inches=0.1)
 
 
 def _draw_row(

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from chronoscene.bench.files import write_text
 from chronoscene.errors import CheckpointError
+from chronoscene.files import write_text_atomic
 
 MANIFEST = "manifest.json"
 
@@ -144,7 +144,7 @@ class ImageWriter:
             details=dict(details),
             images=tuple(sorted(self._entries, key=lambda e: e.view)),
         )
-        write_text(self.folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
+        write_text_atomic(self.folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
         return manifest
 
 

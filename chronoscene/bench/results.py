@@ -15,8 +15,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from chronoscene.bench.files import csv_text, write_text
+from chronoscene.bench.files import csv_text
 from chronoscene.errors import CheckpointError
+from chronoscene.files import write_text_atomic
 
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.json"
@@ -131,8 +132,8 @@ def write_run(folder: Path, record: RunRecord, rows: Iterable[Row]) -> None:
     """Write ``rows.csv`` and then ``run.json``, whose presence says that the run is complete."""
     shared = [getattr(record, name) for name in RUN_COLUMNS]
     table = [[*shared, *(getattr(row, name) for name in ROW_COLUMNS)] for row in rows]
-    write_text(folder / ROWS_FILE, csv_text((*RUN_COLUMNS, *ROW_COLUMNS), table))
-    write_text(folder / RUN_FILE, record.model_dump_json(indent=1) + "\n")
+    write_text_atomic(folder / ROWS_FILE, csv_text((*RUN_COLUMNS, *ROW_COLUMNS), table))
+    write_text_atomic(folder / RUN_FILE, record.model_dump_json(indent=1) + "\n")
 
 
 def read_run(folder: Path) -> RunRecord:
@@ -207,7 +208,7 @@ def read_failures(runs: Path) -> list[Failure]:
 
 def write_failure(folder: Path, failure: Failure) -> None:
     """Write ``failed.json``."""
-    write_text(folder / FAILURE_FILE, failure.model_dump_json(indent=1) + "\n")
+    write_text_atomic(folder / FAILURE_FILE, failure.model_dump_json(indent=1) + "\n")
 
 
 def read_failure(folder: Path) -> Failure | None:
@@ -228,9 +229,9 @@ def write_summary(runs: Path) -> list[RunRecord]:
     folders = run_folders(runs)
     records = [read_run(folder) for folder in folders]
     documents = [json.loads(record.model_dump_json()) for record in records]
-    write_text(runs / RESULTS_FILE, json.dumps(documents, indent=1, allow_nan=False) + "\n")
+    write_text_atomic(runs / RESULTS_FILE, json.dumps(documents, indent=1, allow_nan=False) + "\n")
     lines = [",".join((*RUN_COLUMNS, *ROW_COLUMNS)) + "\n"]
     for folder in folders:
         lines += (folder / ROWS_FILE).read_text(encoding="utf-8").splitlines(keepends=True)[1:]
-    write_text(runs / ROWS_FILE, "".join(lines))
+    write_text_atomic(runs / ROWS_FILE, "".join(lines))
     return records

@@ -19,7 +19,7 @@ from typing import Any
 
 from chronoscene.bench import results
 from chronoscene.bench.display import ProgressDisplay
-from chronoscene.bench.files import csv_text, folder_bytes, write_text
+from chronoscene.bench.files import csv_text, folder_bytes
 from chronoscene.bench.ground_truth import ground_truth_folder
 from chronoscene.bench.identity import (
     describe_device,
@@ -42,6 +42,7 @@ from chronoscene.bench.training import (
 )
 from chronoscene.bench.warmup import forget_peak_memory, warm_up
 from chronoscene.errors import BackendError, ChronoSceneError
+from chronoscene.files import write_text_atomic
 from chronoscene.formats import read_scene
 from chronoscene.images import ImageStore
 from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
@@ -76,7 +77,7 @@ def run_job(job: Job, *, parent: int | None = None) -> None:
     started = datetime.now(UTC).isoformat(timespec="seconds")
     spec, staging = load_spec(job.method), Path(job.staging)
     machine = Machine(pick_device(job.device, spec), set_threads(job.threads))
-    write_text(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
+    write_text_atomic(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
     scene = read_scene(job.scene_root)
     parts = make_parts(scene, ImageStore(scene, max_width=job.max_width), job.strategy)
     writer = ImageWriter(staging / results.PREDICTIONS)
@@ -187,7 +188,7 @@ def _save(method: Method, checkpoint: Path, part: Part) -> None:
 def _write_curve(folder: Path, outcomes: list[PartOutcome]) -> None:
     columns = [f.name for f in fields(CurvePoint)]
     points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
-    write_text(folder / results.CURVE_FILE, csv_text(columns, points))
+    write_text_atomic(folder / results.CURVE_FILE, csv_text(columns, points))
 
 
 def _peak_device_memory(device: str) -> int | None:

@@ -11,6 +11,7 @@ from chronoscene.bench.protocol import STRATEGIES
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.stopping import parse_duration
 from chronoscene.checks import check_choice
+from chronoscene.cli.output import emit
 from chronoscene.cli.table import split_list
 from chronoscene.errors import ConfigError
 from chronoscene.images import MAX_WIDTH
@@ -135,7 +136,7 @@ def report(outcome: BenchOutcome, out: Path) -> None:
 
     if outcome.finished:
         records, failures = read_runs([out])
-        click.echo(format_runs(records, failures, "table"))
+        emit(format_runs(records, failures, "table") + "\n", None)
         paths = [out / RESULTS_FILE, out / ROWS_FILE, *draw_figures(out)]
         click.echo("\n".join(str(path) for path in paths))
     else:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.files import write_text
 from chronoscene.bench.table_formats import FORMATS, format_runs
 from chronoscene.bench.tables import read_runs
+from chronoscene.cli.output import emit
 from chronoscene.errors import ConfigError
 from chronoscene.metrics.table import metric_info
 
@@ -35,12 +35,7 @@ def command(
     wanted = [metric_info(m).name for text in metrics for m in split_list("--metric", text)]
     records, failures = read_runs(folders)
     text = format_runs(records, failures, style, wanted)
-    if out is None:
-        click.echo(text, nl=False)
-        return
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_text(out, text)
-    click.echo(str(out))
+    emit(text, out)
 
 
 def split_list(option: str, text: str) -> tuple[str, ...]:
