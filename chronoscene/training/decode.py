@@ -256,15 +256,16 @@ class _Decode(torch.autograd.Function):
         places = _outputs(alphas, *outputs)
         decode_forward(job.layout, job.weights, job.source, above, places, *job.work)
         ctx.save_for_backward(*fixed, *tensors, *outputs)
-        ctx.dims = dims
+        ctx.job = job
         ctx.mark_non_differentiable(index)
         return (*outputs[2:7], index)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        # Read here although the job knows them too: torch checks that nobody changed them.
         saved = ctx.saved_tensors
         fixed, tensors, outputs = saved[:4], saved[4:20], saved[20:]
-        job = _Job(ctx.dims, fixed, tensors)
+        job = ctx.job
         grads = tuple(grad.contiguous() for grad in grads[:5])
         out = [torch.empty(tensor.shape) for tensor in tensors]
         sizes = gradient_sizes(job.layout)
