@@ -17,6 +17,6 @@ unit of the scene does not matter."""
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     "fast": _SHORT | {"iterations": 800, "density_interval": 40, "offsets_per_anchor": 5},
-    "balanced": _SHORT | {"iterations": 2_500, "density_interval": 50},
+    "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
     "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
 }
