@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from chronoscene.errors import CheckpointError
+from chronoscene.files import replacing, write_text_atomic
 from chronoscene.geometry import Sim3
 
 TENSOR_FILE = "model.safetensors"
@@ -65,15 +65,12 @@ def save_tensors(folder: Path, tensors: Mapping[str, Tensor], meta: Mapping[str,
     """
     # Copies, since views that share memory cannot be told apart in the file.
     stored = {k: tensors[k].detach().cpu().contiguous().clone() for k in sorted(tensors)}
-    partial = folder / f"{TENSOR_FILE}.partial"
-    save_file(stored, partial)
-    digest = _sha256(partial)
-    os.replace(partial, folder / TENSOR_FILE)
+    with replacing(folder / TENSOR_FILE) as partial:
+        save_file(stored, partial)
+        digest = _sha256(partial)
     document = {**meta, "format_version": FORMAT_VERSION, "tensors_sha256": digest}
     text = json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n"
-    partial = folder / f"{META_FILE}.partial"
-    partial.write_text(text, encoding="utf-8")
-    os.replace(partial, folder / META_FILE)
+    write_text_atomic(folder / META_FILE, text)
 
 
 def load_tensors(
