@@ -16,6 +16,10 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 
+# Before torch: it says how idle threads wait.
+import chronoscene  # noqa: F401
+
+# isort: split
 import torch
 from torch import Tensor
 

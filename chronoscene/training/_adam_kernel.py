@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
-from numba import njit, prange
+from numba import prange
 from numpy import float32
+
+from chronoscene.training._compile import kernel
 
 BETA1 = 0.9
 BETA2 = 0.999
@@ -24,12 +26,7 @@ TINY_MEAN = float32(1e-34)
 TINY_SQUARE = float32(1e-37)
 
 
-@njit(
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-    fastmath={"contract", "nsz", "arcp"},
-)
+@kernel(fastmath={"contract", "nsz", "arcp"})
 def adam_block(values, grads, means, squares, rate, root, eps):  # type: ignore[no-untyped-def]
     """Update a flat array in place.
 
@@ -52,12 +49,7 @@ def adam_block(values, grads, means, squares, rate, root, eps):  # type: ignore[
         squares[i] = square
 
 
-@njit(
-    cache=True,
-    nogil=True,
-    parallel=True,
-    error_model="numpy",
-)
+@kernel(parallel=True)
 def adam_blocks(values, grads, means, squares, rate, root, eps):  # type: ignore[no-untyped-def]
     """Update a large flat array in place, blocks spread over the threads."""
     size = values.shape[0]

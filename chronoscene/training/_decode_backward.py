@@ -6,53 +6,31 @@ for the second layers see `_decode_second`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-from numba import njit, prange
+from numba import prange
 from numpy import float32
 
+from chronoscene.training._compile import inner, kernel
 from chronoscene.training._decode_forward import factors, gather_inputs, hidden_layer, task_work
 from chronoscene.training._decode_layout import BLOCK, CHUNK, CYCLE, Gradients
 from chronoscene.training._decode_second import add_biases, add_offset
 from chronoscene.training._matmul import product
-from chronoscene.training._simd import (
-    LANES,
-    inner,
+from chronoscene.training._memory import (
     load,
     load_first,
     read,
     read_index,
-    select_less,
-    splat,
     store,
     store_first,
     write,
     write_index,
 )
+from chronoscene.training._simd import LANES, select_less, splat
 from chronoscene.training._vector_math import quad_spread, quad_sum, store_cycle
 
 SLICE = 1024
 """Gradients of weights summed over the chunks by one task."""
 ZERO = float32(0)
 ONE = float32(1)
-
-
-class OutputGradients(NamedTuple):
-    """Addresses of the gradients of the loss with respect to the outputs."""
-
-    means: int
-    quats: int
-    scales: int
-    opacities: int
-    colors: int
-
-
-class AnchorGradients(NamedTuple):
-    """Addresses of those with respect to what belongs to anchors."""
-
-    offsets: int
-    features: int
-    log_scales: int
 
 
 @inner
@@ -244,7 +222,7 @@ def _chunk_partial(partial, chunk, size):  # type: ignore[no-untyped-def]
     return Gradients(partial.w1_t + move, partial.b1 + move, partial.w2 + move, partial.b2 + move)
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@kernel(parallel=True)
 def decode_backward(  # type: ignore[no-untyped-def]
     layout, weights, source, outputs, grads, out, partial, size, work, work_size, tasks
 ):

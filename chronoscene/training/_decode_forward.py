@@ -7,11 +7,11 @@ go; the second decodes the shapes and colours of anchors that have a living Gaus
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-from numba import njit, prange
+from numba import prange
 from numpy import float32
 
+from chronoscene.training._compile import inner, kernel
 from chronoscene.training._decode_layout import (
     BLOCK,
     CHUNK,
@@ -20,22 +20,19 @@ from chronoscene.training._decode_layout import (
     Work,
 )
 from chronoscene.training._matmul import product, relu_product
-from chronoscene.training._simd import (
-    LANES,
+from chronoscene.training._memory import (
     copy_quad,
-    inner,
     load,
     load_first,
     prefetch,
     read,
     read_index,
-    select_less,
-    splat,
     store,
     store_first,
     write,
     write_index,
 )
+from chronoscene.training._simd import LANES, select_less, splat
 from chronoscene.training._vector_math import (
     exp,
     quad_heads,
@@ -52,42 +49,6 @@ ZERO = float32(0)
 ONE = float32(1)
 LEAST_DISTANCE = float32(MIN_DISTANCE)
 LEAST_SQUARE = float32(MIN_QUAT_NORM**2)
-
-
-class Anchors(NamedTuple):
-    """Addresses of what is decoded; see `chronoscene.training.decode.decode_reference`."""
-
-    anchors: int
-    offsets: int
-    features: int
-    log_scales: int
-    centre: int
-    num_anchors: int
-    visible: int
-    num_visible: int
-    periods: int
-    """Those of weight other than 0. int64"""
-    weights: int
-    """Their weights."""
-    num_periods: int
-
-
-class Outputs(NamedTuple):
-    """Addresses of what comes out, L living Gaussians."""
-
-    alphas: int
-    """Opacities of all offsets. [M k]"""
-    starts: int
-    """First Gaussian of each visible anchor, and L at the end. int64 [M + 1]"""
-    positions: int
-    """Position of each Gaussian among all offsets. int64 [L]"""
-    means: int
-    quats: int
-    scales: int
-    opacities: int
-    colors: int
-    inverse_norms: int
-    """1 / |q| of the quaternions before they were made unit, 0 without a direction. [L]"""
 
 
 @inner
@@ -183,7 +144,7 @@ def _count_row(raw, at, count, m, above, out):  # type: ignore[no-untyped-def]
     write_index(out.starts, m + 1, living)
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@kernel(parallel=True)
 def decode_opacities(layout, weights, source, above, out, work, work_size, tasks):  # type: ignore[no-untyped-def]
     """First pass: opacities of all offsets, and the starts of the anchors.
 
@@ -281,7 +242,7 @@ def _decode_block(layout, weights, source, count, above, work, out):  # type: ig
     _activate(work, done, read_index(out.starts, read_index(work.rows, 0)), out)
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@kernel(parallel=True)
 def decode_forward(layout, weights, source, above, out, work, work_size, tasks):  # type: ignore[no-untyped-def]
     """Second pass: everything of the living Gaussians; arguments as `decode_opacities`."""
     for task in prange(tasks):

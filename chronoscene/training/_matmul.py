@@ -12,6 +12,7 @@ from typing import Any
 from numba import types
 from numba.core import cgutils
 
+from chronoscene.training._compile import inner
 from chronoscene.training._simd import (
     LANES,
     MANY_REGISTERS,
@@ -21,7 +22,6 @@ from chronoscene.training._simd import (
     emit_multiply_add,
     emit_splat,
     emit_store,
-    inner,
     intrinsic,
 )
 

@@ -1,15 +1,11 @@
 """Explicit vectors of float32 for compiled kernels.
 
 LLVM does not vectorise loops over few numbers, nor keep a block of a matrix product in registers.
-So `Vector` is one machine register (16 lanes with AVX-512, 8 with AVX2, else 4), with arithmetic,
-loads and stores that become single instructions, and `tile_product` is the inner loop of a matrix
-product. Without a fused multiply-add in hardware the same code multiplies and adds.
+So `Vector` is one machine register (16 lanes with AVX-512, 8 with AVX2, else 4), with arithmetic
+that becomes single instructions. `_memory` has loads and stores, `_vector_math` functions. Without
+a fused multiply-add in hardware the same code multiplies and adds.
 
-Memory is a flat float32 array or, as an integer, an address. Loops over rows want addresses: Numba
-counts the references to an array whenever it is passed on, and threads that do so with the same
-array wait for each other. The caller keeps the memory alive.
-
-None of these check bounds. Functions named ``emit_`` write LLVM code and are for other intrinsics.
+Functions named ``emit_`` write LLVM code and are for other intrinsics.
 """
 
 from __future__ import annotations
@@ -22,23 +18,13 @@ from typing import Any
 import llvmlite.binding
 import numba.extending
 from llvmlite import ir
-from numba import config, njit, types
+from numba import config, types
 from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 from numpy import float32
 
 # The declared type of an intrinsic has the typing context as an argument that callers leave out.
 intrinsic: Any = numba.extending.intrinsic
-
-_OPTIONS: dict[str, Any] = {
-    "nogil": True,
-    "error_model": "numpy",
-    "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-}
-inner: Any = njit(**_OPTIONS)
-"""Decorator of functions that only compiled code calls: without ways in from elsewhere they compile
-faster."""
 
 FLAGS = ("contract", "nsz", "arcp")
 
@@ -148,74 +134,6 @@ _define_operator(operator.truediv, "fdiv")
 
 
 @intrinsic
-def load(typing: Any, memory: Any, index: Any) -> Any:
-    """Read LANES numbers from ``index`` on."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return emit_load(builder, emit_address(context, builder, signature.args[0], *args))
-
-    return Vector(memory, types.intp), generate
-
-
-@intrinsic
-def store(typing: Any, memory: Any, index: Any, value: Any) -> Any:
-    """Write LANES numbers from ``index`` on."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = emit_address(context, builder, signature.args[0], *args[:2])
-        emit_store(builder, args[2], address)
-        return context.get_dummy_value()
-
-    return types.void(memory, types.intp, Vector), generate
-
-
-def emit_first_lanes(builder: Any, count: Any) -> Any:
-    """Mask of the lanes below ``count``, any integer."""
-    wide = count.type
-    clipped = builder.select(builder.icmp_signed("<", count, wide(LANES)), count, wide(LANES))
-    single = builder.insert_element(
-        ir.Constant(INTS, ir.Undefined), builder.trunc(clipped, INT), INT(0)
-    )
-    counts = builder.shuffle_vector(
-        single, ir.Constant(INTS, ir.Undefined), ir.Constant(INTS, [0] * LANES)
-    )
-    return builder.icmp_signed("<", ir.Constant(INTS, list(range(LANES))), counts)
-
-
-@intrinsic
-def load_first(typing: Any, memory: Any, index: Any, count: Any) -> Any:
-    """Read the first ``count`` lanes, and nothing beyond; the others are 0."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = emit_address(context, builder, signature.args[0], *args[:2])
-        pointer = builder.bitcast(address, FLOATS.as_pointer())
-        mask = emit_first_lanes(builder, args[2])
-        kind = ir.FunctionType(FLOATS, [pointer.type, INT, mask.type, FLOATS])
-        name = f"llvm.masked.load.v{LANES}f32.p0"
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
-        return builder.call(function, [pointer, INT(4), mask, emit_constant(0.0)])
-
-    return Vector(memory, types.intp, types.intp), generate
-
-
-@intrinsic
-def store_first(typing: Any, memory: Any, index: Any, value: Any, count: Any) -> Any:
-    """Write the first ``count`` lanes and nothing beyond."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = emit_address(context, builder, signature.args[0], *args[:2])
-        pointer = builder.bitcast(address, FLOATS.as_pointer())
-        mask = emit_first_lanes(builder, args[3])
-        kind = ir.FunctionType(ir.VoidType(), [FLOATS, pointer.type, INT, mask.type])
-        name = f"llvm.masked.store.v{LANES}f32.p0"
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
-        builder.call(function, [args[2], pointer, INT(4), mask])
-        return context.get_dummy_value()
-
-    return types.void(memory, types.intp, Vector, types.intp), generate
-
-
-@intrinsic
 def splat(typing: Any, value: Any) -> Any:
     """The same number in all lanes."""
 
@@ -243,78 +161,3 @@ def select_less(typing: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
         return builder.select(builder.fcmp_ordered("<", args[0], args[1]), args[2], args[3])
 
     return Vector(Vector, Vector, Vector, Vector), generate
-
-
-@intrinsic
-def read(typing: Any, memory: Any, index: Any) -> Any:
-    """One float32."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(emit_address(context, builder, signature.args[0], *args))
-
-    return types.float32(memory, types.intp), generate
-
-
-@intrinsic
-def write(typing: Any, memory: Any, index: Any, value: Any) -> Any:
-    """Set one float32."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[2], emit_address(context, builder, signature.args[0], *args[:2]))
-        return context.get_dummy_value()
-
-    return types.void(memory, types.intp, types.float32), generate
-
-
-@intrinsic
-def read_index(typing: Any, address: Any, index: Any) -> Any:
-    """One int64 of those at an address."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        wide = ir.IntType(64)
-        pointer = builder.inttoptr(args[0], wide.as_pointer())
-        return builder.load(builder.gep(pointer, [args[1]]))
-
-    return types.int64(types.intp, types.intp), generate
-
-
-@intrinsic
-def write_index(typing: Any, address: Any, index: Any, value: Any) -> Any:
-    """Set one int64 of those at an address."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
-        builder.store(args[2], builder.gep(pointer, [args[1]]))
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, types.int64), generate
-
-
-@intrinsic
-def copy_quad(typing: Any, out: Any, start: Any, memory: Any, index: Any) -> Any:
-    """Copy four float32 from ``index`` of one memory to ``start`` of another."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = ir.VectorType(FLOAT, 4).as_pointer()
-        source = emit_address(context, builder, signature.args[2], *args[2:])
-        target = emit_address(context, builder, signature.args[0], *args[:2])
-        value = builder.load(builder.bitcast(source, pointer), typ=pointer.pointee)
-        value.align = 4
-        builder.store(value, builder.bitcast(target, pointer)).align = 4
-        return context.get_dummy_value()
-
-    return types.void(out, types.intp, memory, types.intp), generate
-
-
-@intrinsic
-def prefetch(typing: Any, memory: Any, index: Any) -> Any:
-    """Ask for the cache line around ``index``; harmless where nothing is."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = emit_address(context, builder, signature.args[0], *args)
-        kind = ir.FunctionType(ir.VoidType(), [pointer.type, INT, INT, INT])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(function, [pointer, INT(0), INT(3), INT(1)])
-        return context.get_dummy_value()
-
-    return types.void(memory, types.intp), generate

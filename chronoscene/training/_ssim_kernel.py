@@ -25,19 +25,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy import float32
 
-from chronoscene.training._simd import (
-    LANES,
-    inner,
-    load,
-    multiply_add,
-    select_less,
-    splat,
-    store,
-    store_first,
-)
+from chronoscene.training._compile import inner, kernel
+from chronoscene.training._memory import load, store, store_first
+from chronoscene.training._simd import LANES, multiply_add, select_less, splat
 from chronoscene.training._vector_math import lane_sum
 
 RADIUS = 5
@@ -89,7 +82,7 @@ def _blur_columns(x, y, start, stride, out):  # type: ignore[no-untyped-def]
         store(out, 3 * stride + column, gaps)
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@inner
 def _blur_at(row, index):  # type: ignore[no-untyped-def]
     total = splat(ZERO)
     for tap in range(2 * RADIUS + 1):
@@ -161,7 +154,7 @@ def _gradient_row(x, y, maps, start, stride, scales, out):  # type: ignore[no-un
         store_first(out, column, gradient, out.shape[0] - column)
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+@kernel(parallel=True)
 def l1_ssim(image, target, divisor, scales, gradient):  # type: ignore[no-untyped-def]
     """Sums of |x - y| and 1 - S over all numbers, and the gradient of their weighted sum.
 

@@ -10,6 +10,7 @@ from numba import types
 from numba.core import cgutils
 from numpy import float32
 
+from chronoscene.training._compile import inner
 from chronoscene.training._simd import (
     FLOATS,
     INT,
@@ -19,7 +20,6 @@ from chronoscene.training._simd import (
     emit_address,
     emit_load,
     emit_store,
-    inner,
     intrinsic,
     multiply_add,
     select_less,
