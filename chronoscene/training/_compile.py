@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
@@ -33,13 +34,34 @@ def kernel(*, parallel: bool = False, **options: Any) -> Callable[[Callable[...,
             dispatcher: Any = njit(cache=True, **options)(function)
         except RuntimeError:  # nowhere to keep it: compile in every process
             return njit(**options)(function)
-        # Numba compares the age of one file, but a kernel consists of several.
         index: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-        if hasattr(index, "_source_stamp"):
+        if hasattr(index, "_source_stamp") and hasattr(index, "_load_index"):
+            # Numba compares the age of one file, but a kernel consists of several.
             index._source_stamp = _stamp()
+            index._load_index = _forgiving(index._load_index)
         return dispatcher
 
     return decorate
+
+
+def _forgiving(load: Callable[[], dict[Any, Any]]) -> Callable[[], dict[Any, Any]]:
+    """An index that cannot be read counts as empty: it may be damaged, or name types of an older
+    version of this package."""
+
+    def load_or_nothing() -> dict[Any, Any]:
+        try:
+            return load()
+        except (
+            AttributeError,
+            EOFError,
+            ImportError,
+            pickle.UnpicklingError,
+            TypeError,
+            ValueError,
+        ):
+            return {}
+
+    return load_or_nothing
 
 
 @cache
