@@ -6,6 +6,8 @@ import gc
 import os
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,8 +21,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from chronoscene.rasterizer import rasterize
-from chronoscene.rasterizer.cpu import layout, pipeline, workspace
-from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, sort_by_depth
+from chronoscene.rasterizer.cpu import layout, pipeline, team, workspace
+from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, SORT_PHASES, sort_phases
 
 MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
 
@@ -140,15 +142,83 @@ def test_only_asked_gradients(tools: SimpleNamespace) -> None:
         st.integers(1, 300),
         elements=st.one_of(st.just(-1), st.integers(0, 2**31 - 1), st.integers(0, 7)),
     ),
-    threads=st.integers(1, 5),
+    parts=st.integers(1, 5),
 )
-def test_sort_is_stable_and_leaves_out_negative_keys(keys: np.ndarray, threads: int) -> None:
+def test_sort_is_stable_and_leaves_out_negative_keys(keys: np.ndarray, parts: int) -> None:
     pairs, spare = np.empty(keys.size, np.int64), np.empty(keys.size, np.int64)
-    counts = np.empty((threads, 1 << DIGIT_BITS), np.int64)
-    count, in_spare = sort_by_depth(threads, keys, counts, pairs, spare)
-    order = (spare if in_spare else pairs)[:count] & 0xFFFFFFFF
+    counts, result = np.empty((parts, 1 << DIGIT_BITS), np.int64), np.empty(3, np.int64)
+    in_spare = []
+
+    def kernel(worker: int, control: np.ndarray) -> None:
+        in_spare.append(sort_phases(control, 0, keys, counts, pairs, spare, result)[1])
+
+    team.launch(kernel, 2, phases=SORT_PHASES)
+    order = (spare if in_spare[0] else pairs)[: result[0]] & 0xFFFFFFFF
     expected = np.argsort(keys, kind="stable")
     np.testing.assert_array_equal(order, expected[keys[expected] >= 0])
+
+
+def test_team_does_every_job_once_and_waits_for_all(threads: Any) -> None:
+    """Many short launches, with more workers than processors."""
+    threads(MOST_THREADS)
+    done = np.zeros(50, np.int64)
+
+    def kernel(worker: int, control: np.ndarray, jobs: np.ndarray) -> None:
+        while True:
+            with lock:
+                job = int(control[0])
+                control[0] += 1
+            if job >= jobs.size:
+                return
+            jobs[job] += 1
+
+    lock = threading.Lock()
+    for k in range(300):
+        team.launch(kernel, 50, done)
+        assert (done == k + 1).all()
+
+
+@pytest.mark.skipif(MOST_THREADS < 2, reason="needs two threads")
+def test_an_error_in_a_helper_reaches_the_caller(threads: Any) -> None:
+    threads(2)
+    entered = threading.Event()
+
+    def kernel(worker: int, control: np.ndarray) -> None:
+        if worker == 1:
+            entered.set()
+            raise ZeroDivisionError
+        assert entered.wait(30)
+
+    with pytest.raises(ZeroDivisionError):
+        team.launch(kernel, 2)
+    team.launch(lambda worker, control: None, 2)  # and the team works on
+
+
+def test_callers_from_several_threads_get_their_own_results(tools: SimpleNamespace) -> None:
+    scenes = [tools.random_scene(400, 64, 64, seed=k) for k in range(4)]
+    expected = [everything(scene) for scene in scenes]
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(5):
+            for got, wanted in zip(pool.map(everything, scenes), expected, strict=True):
+                assert_equal_bits(got, wanted)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_child_can_render(tools: SimpleNamespace) -> None:
+    """The child has none of the threads that the parent's team counts on."""
+    code = """
+import os, numpy as np
+from chronoscene.rasterizer.cpu import team
+def kernel(worker, control, seen): seen[worker] += 1
+team.launch(kernel, 2, np.zeros(2))
+child = os.fork()
+if child == 0:
+    seen = np.zeros(2)
+    team.launch(kernel, 2, seen)
+    os._exit(0 if seen[0] == 1 else 1)
+assert os.waitpid(child, 0)[1] == 0
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
 def test_blocks_are_those_that_the_ellipse_touches(tools: SimpleNamespace) -> None:

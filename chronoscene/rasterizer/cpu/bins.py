@@ -1,8 +1,8 @@
 """Which blocks of which tiles a Gaussian touches, and the list of Gaussians of every tile.
 
-In the order of drawing, each thread writes (Gaussian, tile, blocks) pairs of its part to its own
-region of a list; a stable counting sort by tile then keeps the order of drawing in every tile,
-whatever the number of threads.
+In the order of drawing, the (Gaussian, tile, blocks) pairs of each part are written to a region of
+a list; a stable counting sort by tile then keeps the order of drawing in every tile,
+whatever the number of parts.
 """
 
 # mypy: allow-untyped-defs
@@ -13,11 +13,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import prange
 
 from chronoscene.rasterizer.cpu import layout as lay
-from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel, serial_kernel
-from chronoscene.rasterizer.cpu.project import chunk_of
+from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
+from chronoscene.rasterizer.cpu.phases import draw, finish, wait_for
+from chronoscene.rasterizer.cpu.project import chunk_of, project_chunk
 from chronoscene.rasterizer.cpu.simd import (
     floor,
     make_constant,
@@ -29,6 +29,7 @@ from chronoscene.rasterizer.cpu.simd import (
     sqrt,
     to_int,
 )
+from chronoscene.rasterizer.cpu.sort import SORT_PHASES, sort_phases
 
 # A pixel on the rim of the ellipse may pass the test of its alpha after rounding; the blocks must
 # include it. In units of log2(alpha).
@@ -109,56 +110,15 @@ def _list_part(first, last, at, limit, order, view, scene, counts, listed):
     return at
 
 
-@kernel
-def list_pairs(threads, order, count, starts, ends, view, scene, counts, listed):
-    """List the pairs of each part and count them by tile.
-
-    Args:
-        threads: Number of parts.
-        order: Gaussians in the order of drawing, in the low 32 bits. int64
-        count: How many of them.
-        starts: Where each part may write, and the end of the last. int64 [threads + 1]
-        ends: Written: where it stopped; beyond its room if that was too little. int64 [threads]
-        view: (width of the image in pixels, tiles per row).
-        scene: (records, records as int32, first row of each chunk of Gaussians).
-        counts: Written: pairs by part and tile. int64 [threads, tiles]
-        listed: (tile, gaussian, blocks uint64, row) of each pair, written. int32
-    """
-    for t in prange(threads):
-        ends[t] = _list_part(
-            count * t // threads,
-            count * (t + 1) // threads,
-            starts[t],
-            starts[t + 1],
-            order,
-            view,
-            scene,
-            counts[t],
-            listed,
-        )
-
-
-@kernel
-def bound_pairs(threads, order, count, records_int, bounds):
-    """Upper bound of the number of pairs of each part: tiles of rectangles. int64 [threads]"""
-    for t in prange(threads):
-        total = 0
-        for i in range(count * t // threads, count * (t + 1) // threads):
-            base = lay.RECORD * (order[i] & 0xFFFFFFFF)
-            xs, ys = records_int[base + lay.TILES_X], records_int[base + lay.TILES_Y]
-            total += (xs >> 16) * (ys >> 16)
-        bounds[t] = total
-
-
-@serial_kernel
-def tile_offsets(counts, tile_starts):
+@helper
+def _tile_offsets(counts, tile_starts):
     """Turn counts by part and tile into places: by tile, within a tile by part."""
     total = 0
     for tile in range(counts.shape[1]):
         tile_starts[tile] = total
-        for t in range(counts.shape[0]):
-            count = counts[t, tile]
-            counts[t, tile] = total
+        for part in range(counts.shape[0]):
+            count = counts[part, tile]
+            counts[part, tile] = total
             total += count
     tile_starts[counts.shape[1]] = total
 
@@ -176,16 +136,93 @@ def _scatter_part(first, last, places, listed, entries):
         entry_row[place] = list_row[j]
 
 
+@helper
+def _sum_up(row_bases):
+    """Turn the numbers of rows of the chunks, each one place late, into first rows."""
+    row_bases[0] = 0
+    for chunk in range(1, row_bases.size):
+        row_bases[chunk] += row_bases[chunk - 1]
+
+
+@helper
+def _list_phase(control, phase, starts, ends, order, count, view, scene, counts, listed):
+    """List the pairs of each part and count them by tile. Returns whether there was room."""
+    parts = ends.size
+    part = draw(control, phase)
+    while part < parts:
+        ends[part] = _list_part(
+            count * part // parts,
+            count * (part + 1) // parts,
+            starts[part],
+            starts[part + 1],
+            order,
+            view,
+            scene,
+            counts[part],
+            listed,
+        )
+        finish(control, phase)
+        part = draw(control, phase)
+    wait_for(control, phase, parts)
+    room = True
+    for part in range(parts):
+        room &= ends[part] <= starts[part + 1]
+    return room
+
+
 @kernel
-def scatter_pairs(threads, starts, ends, places, listed, entries):
-    """Move the listed pairs to their tiles, keeping their order.
+def bin_gaussians(
+    worker, control, gaussians, camera, view, records, keys, numbering, out, sorting, parts, tiles
+):
+    """From Gaussians to the list of every tile, in one launch.
 
     Args:
-        threads: Number of parts.
-        starts, ends: Of each part in the list.
-        places: Next free place by part and tile.
-        listed: From `list_pairs`.
-        entries: (gaussian int32, blocks uint64, row int32), written.
+        worker, control: See `team.launch`; `BIN_PHASES` phases.
+        gaussians, camera, records, keys, numbering, out: See `project.project_chunk`.
+        view: (width, height, tiles per row).
+        sorting: (counts, pairs, spare, result) of `sort.sort_phases`. The last has a fourth number
+            that is set to 1 if there was not enough room to list the pairs.
+        parts: (where each part may write and the end, where it stopped). int64
+        tiles: (scratch by part and tile int64, start of each tile and the end int64, listed
+            (tile, gaussian, blocks, row), entries (gaussian, blocks, row)); the last is the result.
+            int32, blocks uint64
     """
-    for t in prange(threads):
-        _scatter_part(starts[t], ends[t], places[t], listed, entries)
+    width, height, tiles_x = view
+    _, row_bases = numbering
+    chunks = row_bases.size - 1
+    chunk = draw(control, 0)
+    while chunk < chunks:
+        project_chunk(
+            chunk, chunks, gaussians, camera, (width, height), records, keys, numbering, out
+        )
+        finish(control, 0)
+        chunk = draw(control, 0)
+    wait_for(control, 0, chunks)
+    if draw(control, 1) == 0:
+        _sum_up(row_bases)
+        finish(control, 1)
+
+    digits, pairs, spare, result = sorting
+    phase, in_spare = sort_phases(control, 2, keys, digits, pairs, spare, result)
+    order = spare if in_spare else pairs
+    wait_for(control, 1, 1)
+
+    starts, ends = parts
+    counts, tile_starts, listed, entries = tiles
+    scene = (records[0], records[1], row_bases)
+    if not _list_phase(
+        control, phase, starts, ends, order, result[0], (width, tiles_x), scene, counts, listed
+    ):
+        result[3] = 1
+        return
+    if draw(control, phase + 1) == 0:
+        _tile_offsets(counts, tile_starts)
+        finish(control, phase + 1)
+    wait_for(control, phase + 1, 1)
+    part = draw(control, phase + 2)
+    while part < ends.size:
+        _scatter_part(starts[part], ends[part], counts[part], listed, entries)
+        part = draw(control, phase + 2)
+
+
+BIN_PHASES = 2 + SORT_PHASES + 3

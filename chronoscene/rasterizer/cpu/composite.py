@@ -12,17 +12,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import prange
 
 from chronoscene.rasterizer.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from chronoscene.rasterizer.cpu import layout as lay
 from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
+from chronoscene.rasterizer.cpu.phases import draw
 from chronoscene.rasterizer.cpu.simd import (
     LANES,
     any_lane,
     as_float,
     as_int,
-    fetch_add,
     load,
     load_pixels,
     make_constant,
@@ -48,7 +47,7 @@ _STATE = 64  # numbers per block going forward: light, red, green, blue
 _BACK = 96  # going backward: light, behind, gradient of red, green, blue, end of what counts
 _STEPS, _BACK_STEPS = 64 * _STATE, 64 * _BACK  # where the 24 numbers of `_whitened` are
 FORWARD_NUMBERS, BACKWARD_NUMBERS = _STEPS + 32, _BACK_STEPS + 32
-"""Scratch of one thread."""
+"""Scratch of one worker."""
 _LEVEL_MIN = lay.LEVEL_MIN
 
 _lane_x = make_constant([i % 4 + 0.5 for i in range(LANES)])
@@ -208,8 +207,8 @@ def _write_tile(left, top, width, height, plane, state, transmittance, backgroun
 
 @kernel
 def composite(
-    threads,
-    counter,
+    worker,
+    control,
     width,
     height,
     tile_starts,
@@ -226,7 +225,7 @@ def composite(
     """Composite all tiles.
 
     Args:
-        threads, counter: As in `project.project`; workers take tiles.
+        worker, control: See `team.launch`; a job is a tile.
         width, height: Of the image in pixels.
         tile_starts: First entry of each tile, and the end of the last. int64 [tiles + 1]
         tile_stops: Written: where compositing stopped. int64 [tiles]
@@ -234,47 +233,45 @@ def composite(
         blocks: Blocks of each entry; cut down to those that were alive. uint64
         records: See `layout`.
         planes: (transmittance, end of the entries that count), by tile, written.
-        states: Scratch, `FORWARD_NUMBERS` per thread.
+        states: Scratch, `FORWARD_NUMBERS` per worker.
         background: Three numbers.
         image, alphas: Written. [H * W * 3], [H * W]
     """
     tiles_x = (width + lay.TILE - 1) // lay.TILE
     tiles = tile_stops.size
     transmittance, _ = planes
-    for t in prange(threads):
-        state = states[t]
-        while True:
-            tile = fetch_add(counter, 1)
-            if tile >= tiles:
-                break
-            left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
-            plane, start, end = _PIXELS * tile, tile_starts[tile], tile_starts[tile + 1]
-            live = _start_tile(left, top, width, height, state, planes, plane, end)
-            tile_stops[tile] = _forward_tile(
-                start,
-                end,
-                np.float32(left),
-                np.float32(top),
-                live,
-                plane,
-                gaussians,
-                blocks,
-                records,
-                planes,
-                state,
-            )
-            _write_tile(
-                left,
-                top,
-                width,
-                height,
-                plane,
-                state,
-                transmittance,
-                (background[0], background[1], background[2]),
-                image,
-                alphas,
-            )
+    state = states[worker]
+    tile = draw(control, 0)
+    while tile < tiles:
+        left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
+        plane, start, end = _PIXELS * tile, tile_starts[tile], tile_starts[tile + 1]
+        live = _start_tile(left, top, width, height, state, planes, plane, end)
+        tile_stops[tile] = _forward_tile(
+            start,
+            end,
+            np.float32(left),
+            np.float32(top),
+            live,
+            plane,
+            gaussians,
+            blocks,
+            records,
+            planes,
+            state,
+        )
+        _write_tile(
+            left,
+            top,
+            width,
+            height,
+            plane,
+            state,
+            transmittance,
+            (background[0], background[1], background[2]),
+            image,
+            alphas,
+        )
+        tile = draw(control, 0)
 
 
 @helper
@@ -296,15 +293,19 @@ def _start_backward(
                 store(state, i + 32, r)
                 store(state, i + 48, g)
                 store(state, i + 64, b)
-                (a,) = load_pixels(alpha_grad, pixel, width, 1)
-                store(state, i + 16, r * red + (g * green + (b * blue - a)))
+                behind = r * red + (g * green + b * blue)
+                if alpha_grad.size > 0:
+                    behind = behind - load_pixels(alpha_grad, pixel, width, 1)[0]
+                store(state, i + 16, behind)
         else:
             for k in range(16):
                 r = g = b = a = np.float32(0.0)
                 if x + k % 4 < width and y + k // 4 < height:
                     pixel = (y + k // 4) * width + x + k % 4
                     r, g = image_grad[3 * pixel], image_grad[3 * pixel + 1]
-                    b, a = image_grad[3 * pixel + 2], alpha_grad[pixel]
+                    b = image_grad[3 * pixel + 2]
+                    if alpha_grad.size > 0:
+                        a = alpha_grad[pixel]
                 state[at + 32 + k], state[at + 48 + k], state[at + 64 + k] = r, g, b
                 state[at + 16 + k] = r * red + g * green + b * blue - a
         for part in range(_PARTS):
@@ -377,8 +378,8 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
 
 @kernel
 def composite_backward(
-    threads,
-    counter,
+    worker,
+    control,
     width,
     height,
     tile_starts,
@@ -396,47 +397,43 @@ def composite_backward(
     """Sums over pixels of every entry, from the gradients of image and opacity.
 
     Args:
-        threads, counter, width, height, tile_starts, tile_stops: As `composite` left them.
+        worker, control, width, height, tile_starts, tile_stops: As `composite` left them.
         entries: (gaussian, blocks, place of its row) of each entry; as `composite` left them.
         records, planes: As `composite` left them.
-        states: Scratch, `BACKWARD_NUMBERS` per thread.
+        states: Scratch, `BACKWARD_NUMBERS` per worker.
         background: Three numbers.
-        image_grad, alpha_grad: [H * W * 3], [H * W]
+        image_grad, alpha_grad: [H * W * 3], [H * W] or nothing
         touched: Zeros; 1 is written where a row is. uint8
         rows: Written, 16 numbers per entry; see `layout`.
     """
     tiles_x = (width + lay.TILE - 1) // lay.TILE
     tiles = tile_stops.size
-    for t in prange(threads):
-        state = states[t]
-        while True:
-            tile = fetch_add(counter, 1)
-            if tile >= tiles:
-                break
-            left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
-            start, stop = tile_starts[tile], tile_stops[tile]
-            if stop == start:
-                continue
-            _start_backward(
-                left,
-                top,
-                width,
-                height,
-                _PIXELS * tile,
-                planes,
-                image_grad,
-                alpha_grad,
-                (background[0], background[1], background[2]),
-                state,
-            )
-            _backward_tile(
-                start,
-                stop,
-                np.float32(left),
-                np.float32(top),
-                entries,
-                records,
-                touched,
-                rows,
-                state,
-            )
+    state = states[worker]
+    tile = draw(control, 0)
+    while tile < tiles:
+        left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
+        start, stop = tile_starts[tile], tile_stops[tile]
+        _start_backward(
+            left,
+            top,
+            width,
+            height,
+            _PIXELS * tile,
+            planes,
+            image_grad,
+            alpha_grad,
+            (background[0], background[1], background[2]),
+            state,
+        )
+        _backward_tile(
+            start,
+            stop,
+            np.float32(left),
+            np.float32(top),
+            entries,
+            records,
+            touched,
+            rows,
+            state,
+        )
+        tile = draw(control, 0)

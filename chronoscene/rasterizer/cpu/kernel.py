@@ -30,20 +30,11 @@ def helper(function: Callable[..., Any]) -> Any:
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """What Python calls: may use ``prange``; kept on disk between processes."""
-    return _cached(function, parallel=True)
-
-
-def serial_kernel(function: Callable[..., Any]) -> Any:
-    """A kernel without ``prange``."""
-    return _cached(function)
-
-
-def _cached(function: Callable[..., Any], **options: Any) -> Any:
+    """What Python calls; kept on disk between processes."""
     try:
-        dispatcher = njit(cache=True, **_OPTIONS, **options)(function)
+        dispatcher = njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # no folder that we may write to: compile in every process
-        return njit(**_OPTIONS, **options)(function)
+        return njit(**_OPTIONS)(function)
     # Numba looks at the age of one file only; a kernel is made of several.
     index: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if hasattr(index, "_source_stamp"):

@@ -5,27 +5,23 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.rasterizer.constants import CLAMP_MARGIN
 from chronoscene.rasterizer.cpu import layout as lay
-from chronoscene.rasterizer.cpu.bins import (
-    bound_pairs,
-    list_pairs,
-    scatter_pairs,
-    tile_offsets,
-)
+from chronoscene.rasterizer.cpu.bins import BIN_PHASES
+from chronoscene.rasterizer.cpu.bins import bin_gaussians as bin_all
 from chronoscene.rasterizer.cpu.composite import (
     BACKWARD_NUMBERS,
     FORWARD_NUMBERS,
     composite,
     composite_backward,
 )
-from chronoscene.rasterizer.cpu.project import add_rows, project, project_backward
+from chronoscene.rasterizer.cpu.project import add_rows, project_backward
 from chronoscene.rasterizer.cpu.simd import LANES
-from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, sort_by_depth
+from chronoscene.rasterizer.cpu.sort import DIGIT_BITS
+from chronoscene.rasterizer.cpu.team import launch, threads
 from chronoscene.rasterizer.cpu.workspace import Workspace
 
 Array = NDArray[Any]
@@ -62,6 +58,11 @@ class Gaussians:
     opacities: Array
     colors: Array
 
+    @property
+    def arrays(self) -> tuple[Array, Array, Array, Array, Array]:
+        """In the order that kernels want."""
+        return self.means, self.quats, self.scales, self.opacities, self.colors
+
 
 @dataclass(slots=True)
 class Binned:
@@ -74,7 +75,10 @@ class Binned:
     tile_starts: Array
     tile_stops: Array
     entries: tuple[Array, Array, Array]
-    """Gaussian, blocks and row of each (Gaussian, tile) pair, by tile, then by depth."""
+    """Gaussian, blocks and row of each (Gaussian, tile) pair, by tile, then by depth; with room
+    beyond the last."""
+    total: int
+    """How many entries there are."""
     planes: tuple[Array, Array]
 
 
@@ -109,96 +113,75 @@ def make_view(
     return View(camera, width, height)
 
 
-def _counter() -> Array:
-    return np.zeros(1, np.int64)
+def _parts(count: int) -> int:
+    """Into how many parts a list is cut: several for each worker, so that one who comes late or
+    has the hard ones holds up nobody, but not so many that their counts outweigh the list."""
+    return max(1, min(4 * threads(), 64, count // 2048))
 
 
 def bin_gaussians(
-    workspace: Workspace,
-    scene: Gaussians,
-    view: View,
-    visible: tuple[Array, Array, Array],
+    workspace: Workspace, scene: Gaussians, view: View, visible: tuple[Array, Array, Array]
 ) -> Binned:
     """Project, sort and list by tile; ``visible`` receives means2d, radii (as bits), depths."""
-    threads, n, w = numba.get_num_threads(), scene.opacities.size, workspace.array
+    n, w = scene.opacities.size, workspace.array
+    chunks, parts = max(1, n // lay.CHUNK), _parts(n)
     records, keys = w("records", n * lay.RECORD, np.float32), w("keys", n, np.int32)
-    row_starts, chunk_rows = (
-        w("row_starts", n, np.int32),
-        np.empty(max(1, n // lay.CHUNK), np.int64),
+    numbering = (w("row_starts", n, np.int32), w("row_bases", chunks + 1, np.int64))
+    sorting = (
+        w("digits", parts << DIGIT_BITS, np.int64).reshape(parts, -1),
+        w("pairs", n, np.int64),
+        w("spare", n, np.int64),
+        np.zeros(4, np.int64),
     )
-    project(
-        threads,
-        _counter(),
-        scene.means,
-        scene.quats,
-        scene.scales,
-        scene.opacities,
-        scene.colors,
-        view.camera,
-        view.width,
-        view.height,
-        records,
-        records.view(np.int32),
-        keys,
-        (row_starts, chunk_rows),
-        visible,
-    )
-    numbering = (row_starts, np.concatenate([[0], np.cumsum(chunk_rows)]))
-    digits = w("digits", threads << DIGIT_BITS, np.int64).reshape(threads, -1)
-    pairs, spare = w("pairs", n, np.int64), w("spare", n, np.int64)
-    count, in_spare = sort_by_depth(threads, keys, digits, pairs, spare)
-    order = (spare if in_spare else pairs)[:count]
-    tile_starts, entries = _bin_pairs(workspace, view, order, records, numbering[1])
-    pixels = view.tiles * lay.TILE_PIXELS
+    ends, tile_starts = np.empty(parts, np.int64), w("tile_starts", view.tiles + 1, np.int64)
+    while True:
+        starts = np.arange(parts + 1) * int(workspace.pairs_per_gaussian * (n // parts + 1))
+        listed, entries = _lists(workspace, int(starts[-1]))
+        counts = w("tile_counts", parts * view.tiles, np.int64).reshape(parts, -1)
+        launch(
+            bin_all,
+            max(chunks, parts),
+            scene.arrays,
+            view.camera,
+            (view.width, view.height, view.tiles_x),
+            (records, records.view(np.int32)),
+            keys,
+            numbering,
+            visible,
+            sorting,
+            (starts, ends),
+            (counts, tile_starts, listed, entries),
+            phases=BIN_PHASES,
+        )
+        if sorting[3][3] == 0:
+            break
+        # A part has at most all rows; this is asked for once, then remembered.
+        needed = numbering[1][-1] / (n // parts + 1)
+        workspace.pairs_per_gaussian = min(needed, 4 * workspace.pairs_per_gaussian)
+        sorting[3][3] = 0
+    total, pixels = int(tile_starts[-1]), view.tiles * lay.TILE_PIXELS
     planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
     tile_stops = w("tile_stops", view.tiles, np.int64)
-    return Binned(keys, records, numbering, tile_starts, tile_stops, entries, planes)
+    return Binned(keys, records, numbering, tile_starts, tile_stops, entries, total, planes)
 
 
-def _bin_pairs(
-    workspace: Workspace, view: View, order: Array, records: Array, row_bases: Array
-) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Start of each tile, and its entries, from the Gaussians in the order of drawing."""
-    threads, w = numba.get_num_threads(), workspace.array
-    counts = w("counts", threads * view.tiles, np.int64).reshape(threads, -1)
-    scene = (records, records.view(np.int32), row_bases)
-    # Most rectangles have one or two tiles; exact bounds cost another pass over the records.
-    room = np.full(threads, 3 * (order.size // threads + 1), np.int64)
-    while True:
-        starts = np.concatenate([[0], np.cumsum(room)])
-        names = (
-            ("tile", np.int32),
-            ("gaussian", np.int32),
-            ("blocks", np.uint64),
-            ("row", np.int32),
-        )
-        listed = tuple(w("list_" + name, int(starts[-1]), kind) for name, kind in names)
-        ends = np.empty(threads, np.int64)
-        list_pairs(
-            threads,
-            order,
-            order.size,
-            starts,
-            ends,
-            (view.width, view.tiles_x),
-            scene,
-            counts,
-            listed,
-        )
-        if (ends <= starts[1:]).all():
-            break
-        bound_pairs(threads, order, order.size, scene[1], room)
-    tile_starts = w("tile_starts", view.tiles + 1, np.int64)
-    tile_offsets(counts, tile_starts)
-    total = int(tile_starts[-1])
-    entries = (
-        w("entry_gaussian", total + _MARGIN, np.int32),
-        w("entry_blocks", total, np.uint64),
-        w("entry_row", total, np.int32),
+def _lists(
+    workspace: Workspace, room: int
+) -> tuple[tuple[Array, Array, Array, Array], tuple[Array, Array, Array]]:
+    """Memory for (Gaussian, tile) pairs by part, and by tile."""
+    w = workspace.array
+    listed = (
+        w("list_tile", room, np.int32),
+        w("list_gaussian", room, np.int32),
+        w("list_blocks", room, np.uint64),
+        w("list_row", room, np.int32),
     )
-    entries[0][total:] = 0
-    scatter_pairs(threads, starts, ends, counts, listed, entries)
-    return tile_starts, entries
+    entries = (
+        w("entry_gaussian", room + _MARGIN, np.int32),
+        w("entry_blocks", room, np.uint64),
+        w("entry_row", room + _MARGIN, np.int32),
+    )
+    return listed, entries
 
 
 def render(
@@ -210,11 +193,11 @@ def render(
     alphas: Array,
 ) -> None:
     """Composite the three channels in the records."""
-    threads = numba.get_num_threads()
-    states = workspace.array("forward", threads * FORWARD_NUMBERS, np.float32)
-    composite(
-        threads,
-        _counter(),
+    workers = threads()
+    states = workspace.array("forward", workers * FORWARD_NUMBERS, np.float32)
+    launch(
+        composite,
+        view.tiles,
         view.width,
         view.height,
         binned.tile_starts,
@@ -223,7 +206,7 @@ def render(
         binned.entries[1],
         binned.records,
         binned.planes,
-        states.reshape(threads, -1),
+        states.reshape(workers, -1),
         background,
         image,
         alphas,
@@ -239,14 +222,14 @@ def render_backward(
     alpha_grad: Array,
 ) -> tuple[Array, Array]:
     """Sums over pixels by entry: (touched, rows)."""
-    threads, count = numba.get_num_threads(), int(binned.numbering[1][-1])
-    states = workspace.array("backward", threads * BACKWARD_NUMBERS, np.float32)
+    workers, count = threads(), int(binned.numbering[1][-1])
+    states = workspace.array("backward", workers * BACKWARD_NUMBERS, np.float32)
     rows = workspace.array("rows", max(1, count) * lay.RECORD, np.float32)
     touched = workspace.array("touched", max(1, count), np.uint8)
     touched[:] = 0
-    composite_backward(
-        threads,
-        _counter(),
+    launch(
+        composite_backward,
+        view.tiles,
         view.width,
         view.height,
         binned.tile_starts,
@@ -254,7 +237,7 @@ def render_backward(
         binned.entries,
         binned.records,
         binned.planes,
-        states.reshape(threads, -1),
+        states.reshape(workers, -1),
         background,
         image_grad,
         alpha_grad,
@@ -266,14 +249,8 @@ def render_backward(
 
 def sum_rows(binned: Binned, touched: Array, rows: Array, sums: Array) -> None:
     """Add the rows to 16 numbers of each Gaussian."""
-    add_rows(
-        numba.get_num_threads(),
-        _counter(),
-        binned.numbering,
-        touched,
-        rows,
-        sums,
-    )
+    chunks = binned.numbering[1].size - 1
+    launch(add_rows, chunks, binned.numbering, touched, rows, sums)
 
 
 def gaussian_gradients(
@@ -288,21 +265,17 @@ def gaussian_gradients(
 
     Args:
         summed: (touched, rows) of one rendering, or 16 numbers of each Gaussian.
-        depth_gradients: d loss / d z-depth of each Gaussian.
+        depth_gradients: d loss / d z-depth of each Gaussian, or nothing.
     """
-    threads = numba.get_num_threads()
     if isinstance(summed, tuple):
         touched, rows = summed
-        sums = np.zeros(threads * lay.RECORD * LANES, np.float32)
+        sums = np.zeros(threads() * lay.RECORD * LANES, np.float32)
     else:
         touched, rows, sums = np.empty(0, np.uint8), np.empty(0, np.float32), summed
-    project_backward(
-        threads,
-        _counter(),
-        scene.means,
-        scene.quats,
-        scene.scales,
-        scene.opacities,
+    launch(
+        project_backward,
+        binned.numbering[1].size - 1,
+        scene.arrays,
         depth_gradients,
         view.camera,
         binned.keys,

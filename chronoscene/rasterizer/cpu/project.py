@@ -8,16 +8,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import prange
 
 from chronoscene.rasterizer.cpu import layout as lay
 from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
+from chronoscene.rasterizer.cpu.phases import draw
 from chronoscene.rasterizer.cpu.simd import (
     LANES,
     absolute,
     as_float,
     as_int,
-    fetch_add,
     floor,
     load,
     load3,
@@ -126,22 +125,11 @@ def _tile_range(low: Any, high: Any, size: int) -> Any:
     return start, select(last < first, 0, count)
 
 
-@helper
-def _project_group(
-    at,
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    camera,
-    width,
-    height,
-    records,
-    keys,
-    out,
-):
+@inlined
+def _project_group(at, gaussians, camera, size, records, keys, out):
     """Project Gaussians at..at+LANES into records, sort keys and what the caller sees."""
+    means, quats, scales, opacities, colors = gaussians
+    width, height = size
     means2d, radii, depths = out
     x, y, z = load3(means, 3 * at)
     px, py, pz = _to_camera(camera, x, y, z)
@@ -221,7 +209,7 @@ def chunk_of(gaussian, chunks):
 
 
 @helper
-def _chunk_range(chunk, chunks, n):
+def chunk_range(chunk, chunks, n):
     """First Gaussian of a chunk and the end. The last one takes what is left of the division,
     so that none of several is shorter than a vector."""
     first = chunk * lay.CHUNK
@@ -240,66 +228,28 @@ def _number_rows(first, last, records_int, row_starts):
     return row
 
 
-@kernel
-def project(
-    threads,
-    counter,
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    camera,
-    width,
-    height,
-    records,
-    records_int,
-    keys,
-    rows,
-    out,
-):
-    """Project all Gaussians. At least `LANES` of them; arrays are flat.
+@helper
+def project_chunk(chunk, chunks, gaussians, camera, size, records, keys, numbering, out):
+    """Project the Gaussians of a chunk. At least `LANES` of them; arrays are flat.
 
     The last group overlaps the one before, so that no lane is ever outside the arrays.
 
     Args:
-        threads: How many workers to start.
-        counter: One zero; workers take chunks of Gaussians by adding to it.
-        means, quats, scales, opacities, colors: Flat float32.
+        chunk, chunks: Number of the chunk, and of chunks.
+        gaussians: (means, quats, scales, opacities, colors), flat float32.
         camera: `layout.CAMERA` numbers.
-        width, height: Of the image in pixels.
-        records, records_int: Written, `layout.RECORD` numbers each; the same memory.
+        size: (width, height) of the image in pixels.
+        records: Written, `layout.RECORD` numbers each: (as float32, as int32) of the same memory.
         keys: Written, int32: the bits of the depth, -1 if there is nothing to draw.
-        rows: (first row of each Gaussian in its chunk, rows of each chunk), written: as many as
-            the rectangle around it has tiles. int32, int64
+        numbering: (first row of each Gaussian in its chunk, number of rows of each chunk one place
+            later), written: as many as the rectangle around it has tiles. int32, int64
         out: (means2d, radii as float bits, depths), written, zero where culled.
     """
-    n = opacities.size
-    row_starts, chunk_rows = rows
-    chunks = chunk_rows.size
-    for _ in prange(threads):
-        while True:
-            chunk = fetch_add(counter, 1)
-            if chunk >= chunks:
-                break
-            first, last = _chunk_range(chunk, chunks, n)
-            for i in range(first, last, LANES):
-                at = min(i, last - LANES)
-                _project_group(
-                    at,
-                    means,
-                    quats,
-                    scales,
-                    opacities,
-                    colors,
-                    camera,
-                    width,
-                    height,
-                    records,
-                    keys,
-                    out,
-                )
-            chunk_rows[chunk] = _number_rows(first, last, records_int, row_starts)
+    first, last = chunk_range(chunk, chunks, keys.size)
+    for i in range(first, last, LANES):
+        _project_group(min(i, last - LANES), gaussians, camera, size, records[0], keys, out)
+    row_starts, row_bases = numbering
+    row_bases[chunk + 1] = _number_rows(first, last, records[1], row_starts)
 
 
 @helper
@@ -323,24 +273,22 @@ def _rows_of(gaussian, last, chunk, numbering):
 
 
 @kernel
-def add_rows(threads, counter, numbering, touched, rows, sums):
+def add_rows(worker, control, numbering, touched, rows, sums):
     """Add the rows of each Gaussian to its 16 numbers in ``sums``; see `project_backward`."""
     n, chunks = sums.size // lay.RECORD, numbering[1].size - 1
-    for _ in prange(threads):
-        while True:
-            chunk = fetch_add(counter, 1)
-            if chunk >= chunks:
-                break
-            first, last = _chunk_range(chunk, chunks, n)
-            for i in range(first, last):
-                row, end = _rows_of(i, last, chunk, numbering)
-                _add_rows(row, end, touched, rows, sums, lay.RECORD * i)
+    chunk = draw(control, 0)
+    while chunk < chunks:
+        first, last = chunk_range(chunk, chunks, n)
+        for i in range(first, last):
+            row, end = _rows_of(i, last, chunk, numbering)
+            _add_rows(row, end, touched, rows, sums, lay.RECORD * i)
+        chunk = draw(control, 0)
 
 
 @kernel
-def set_colors(threads, values, channels, first, records):
+def set_colors(values, channels, first, records):
     """Put up to three of the channels of each Gaussian into its record, zeros for missing ones."""
-    for i in prange(records.size // lay.RECORD):
+    for i in range(records.size // lay.RECORD):
         for c in range(3):
             value = np.float32(0.0)
             if first + c < channels:
@@ -362,21 +310,10 @@ def _quaternion_gradient(w: Any, x: Any, y: Any, z: Any, d: Any) -> Any:
     )
 
 
-@helper
-def _backward_group(
-    at,
-    sums,
-    sums_at,
-    means,
-    quats,
-    scales,
-    opacities,
-    depth_gradients,
-    camera,
-    keys,
-    grads,
-):
+@inlined
+def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys, grads):
     """Gradients of Gaussians at..at+LANES from their sums over pixels."""
+    means, quats, scales, opacities, _ = gaussians
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_means2d = grads
     f = load_records(sums, sums_at)
     x, y, z = load3(means, 3 * at)
@@ -422,7 +359,9 @@ def _backward_group(
     gjx = select((tx > camera[lay.X_MIN]) & (tx < camera[lay.X_MAX]), _dot(d0, m2), 0.0)
     gjy = select((ty > camera[lay.Y_MIN]) & (ty < camera[lay.Y_MAX]), _dot(d1, m2), 0.0)
     gpx, gpy = fx * gmx - rz * gjx, fy * gmy - rz * gjy
-    gpz = load(depth_gradients, at) - tx * gpx - ty * gpy - rz * (_dot(da, a) + _dot(db, b))
+    gpz = zero - tx * gpx - ty * gpy - rz * (_dot(da, a) + _dot(db, b))
+    if depth_gradients.size > 0:
+        gpz = gpz + load(depth_gradients, at)
 
     # N = R_gaussian diag(s); d loss / d N = rotation^T (d0, d1, d2).
     n0 = (
@@ -504,58 +443,33 @@ def _backward_group(
 
 @kernel
 def project_backward(
-    threads,
-    counter,
-    means,
-    quats,
-    scales,
-    opacities,
-    depth_gradients,
-    camera,
-    keys,
-    numbering,
-    touched,
-    rows,
-    sums,
-    grads,
+    worker, control, gaussians, depth_gradients, camera, keys, numbering, touched, rows, sums, grads
 ):
     """Reduce the rows of all Gaussians in fixed order and turn them into gradients.
 
     Args:
-        threads, counter, means, quats, scales, opacities, camera, keys: As in `project`.
-        depth_gradients: d loss / d z-depth that did not come through the projection.
+        worker, control: See `team.launch`; a job is a chunk of Gaussians.
+        gaussians, camera, keys: As in `project_chunk`.
+        depth_gradients: d loss / d z-depth that did not come through the projection; or nothing.
         numbering: (first row of each Gaussian in its chunk, first row of each chunk and the end).
         touched: Whether a row was written.
         rows: Sums over the pixels of a tile. Without any, ``sums`` are taken as they are.
-        sums: Scratch, 16 * LANES per thread; without rows, 16 for each Gaussian.
+        sums: Scratch, 16 * LANES per worker; without rows, 16 for each Gaussian.
         grads: (means, quats, scales, opacities, colors, means2d), written.
     """
-    n, chunks = opacities.size, numbering[1].size - 1
-    for t in prange(threads):
-        while True:
-            chunk = fetch_add(counter, 1)
-            if chunk >= chunks:
-                break
-            first, last = _chunk_range(chunk, chunks, n)
-            for i in range(first, last, LANES):
-                at = min(i, last - LANES)
-                place = lay.RECORD * at
-                if rows.size > 0:
-                    place = lay.RECORD * LANES * t
-                    sums[place : place + lay.RECORD * LANES] = np.float32(0.0)
-                    for lane in range(LANES):
-                        row, end = _rows_of(at + lane, last, chunk, numbering)
-                        _add_rows(row, end, touched, rows, sums, place + lay.RECORD * lane)
-                _backward_group(
-                    at,
-                    sums,
-                    place,
-                    means,
-                    quats,
-                    scales,
-                    opacities,
-                    depth_gradients,
-                    camera,
-                    keys,
-                    grads,
-                )
+    n, chunks = keys.size, numbering[1].size - 1
+    scratch = lay.RECORD * LANES * worker
+    chunk = draw(control, 0)
+    while chunk < chunks:
+        first, last = chunk_range(chunk, chunks, n)
+        for i in range(first, last, LANES):
+            at = min(i, last - LANES)
+            place = lay.RECORD * at
+            if rows.size > 0:
+                place = scratch
+                sums[place : place + lay.RECORD * LANES] = np.float32(0.0)
+                for lane in range(LANES):
+                    row, end = _rows_of(at + lane, last, chunk, numbering)
+                    _add_rows(row, end, touched, rows, sums, place + lay.RECORD * lane)
+            _backward_group(at, sums, place, gaussians, depth_gradients, camera, keys, grads)
+        chunk = draw(control, 0)

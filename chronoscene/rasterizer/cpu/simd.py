@@ -483,14 +483,28 @@ prefetch_write = _make_prefetch(1)
 
 
 @intrinsic
-def fetch_add(typingctx: Any, array: Any, amount: Any) -> Any:
-    """Add to the first element of an int64 array as one atomic step; what it was before."""
+def fetch_add(typingctx: Any, array: Any, offset: Any, amount: Any) -> Any:
+    """Add to an element of an int64 array as one atomic step; what it was before.
+
+    What this thread wrote before is seen by a thread that sees the sum.
+    """
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = _address(context, builder, sig.args[0], args[0], ir.Constant(ir.IntType(64), 0))
-        return builder.atomic_rmw("add", address, args[1], "monotonic")
+        address = _address(context, builder, sig.args[0], args[0], args[1])
+        return builder.atomic_rmw("add", address, args[2], "acq_rel")
 
-    return types.int64(array, types.int64), codegen
+    return types.int64(array, types.intp, types.int64), codegen
+
+
+@intrinsic
+def load_shared(typingctx: Any, array: Any, offset: Any) -> Any:
+    """An element of an int64 array that other threads change, as it is now."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = _address(context, builder, sig.args[0], args[0], args[1])
+        return builder.load_atomic(address, "acquire", 8)
+
+    return types.int64(array, types.intp), codegen
 
 
 def _make_load_columns(count: int) -> Callable:

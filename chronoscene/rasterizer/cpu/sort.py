@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from chronoscene.rasterizer.cpu.kernel import helper, kernel
+from chronoscene.rasterizer.cpu.kernel import helper
+from chronoscene.rasterizer.cpu.phases import draw, finish, wait_for
 
 DIGIT_BITS = 11
+SORT_PHASES = 3 + 3 * 3  # keys have 31 bits
 
 
 @helper
@@ -43,17 +44,6 @@ def _count_digits(pairs, first, last, shift, mask, counts):
 
 
 @helper
-def _offsets(counts, digits):
-    """Turn counts [threads, digits] into places: by digit, within a digit by thread."""
-    total = 0
-    for digit in range(digits):
-        for t in range(counts.shape[0]):
-            count = counts[t, digit]
-            counts[t, digit] = total
-            total += count
-
-
-@helper
 def _scatter(pairs, first, last, shift, mask, places, target):
     for i in range(first, last):
         pair = pairs[i]
@@ -62,59 +52,97 @@ def _scatter(pairs, first, last, shift, mask, places, target):
         places[digit] += 1
 
 
-@kernel
-def sort_by_depth(threads, keys, counts, pairs, spare):
-    """Sort the indices of keys that are not negative by key, then by index.
-
-    Args:
-        threads: How many workers to start; each takes one contiguous part.
-        keys: Bits of positive float depths, or negative. int32 [N]
-        counts: Scratch. int64 [threads, 2048]
-        pairs: Scratch. int64 [N]
-        spare: Scratch. int64 [N]
-
-    Returns:
-        How many, and whether the result is in ``spare`` rather than ``pairs``. The low 32 bits
-        of an element are an index.
-    """
-    n = keys.size
-    for t in prange(threads):
-        _find_range(keys, n * t // threads, n * (t + 1) // threads, counts[t])
+@helper
+def _merge_ranges(counts, result):
+    """Turn the counts of the parts into places. Result: total, smallest key, bits of the range."""
     total, base, top = 0, np.int64(0x7FFFFFFF), np.int64(-1)
-    for t in range(threads):
-        base, top = min(base, counts[t, 1]), max(top, counts[t, 2])
-        count = counts[t, 0]
-        counts[t, 0] = total
+    for part in range(counts.shape[0]):
+        count = counts[part, 0]
+        base, top = min(base, counts[part, 1]), max(top, counts[part, 2])
+        counts[part, 0] = total
         total += count
-    for t in prange(threads):
-        _compact(keys, n * t // threads, n * (t + 1) // threads, base, counts[t, 0], pairs)
     bits = 0
     while top - base >> bits > 0:
         bits += 1
+    result[0], result[1], result[2] = total, base, bits
+
+
+@helper
+def _digit_offsets(counts, digits):
+    """Turn counts [parts, digits] into places: by digit, within a digit by part."""
+    total = 0
+    for digit in range(digits):
+        for part in range(counts.shape[0]):
+            count = counts[part, digit]
+            counts[part, digit] = total
+            total += count
+
+
+@helper
+def sort_phases(control, phase, keys, counts, pairs, spare, result):
+    """Sort the indices of keys that are not negative by key, then by index.
+
+    Takes part in up to `SORT_PHASES` phases.
+
+    Args:
+        control, phase: See `phases`; the first phase that is free.
+        keys: Bits of positive float depths, or negative. int32 [N]
+        counts: Scratch; the work is cut into as many parts as it has rows. int64 [parts, 2048]
+        pairs, spare: Scratch; the order is in the low 32 bits of one of them. int64 [N]
+        result: Written: how many, scratch, scratch. int64 [3]
+
+    Returns:
+        The next free phase, and whether the order is in ``spare``.
+    """
+    n, parts = keys.size, counts.shape[0]
+    part = draw(control, phase)
+    while part < parts:
+        _find_range(keys, n * part // parts, n * (part + 1) // parts, counts[part])
+        finish(control, phase)
+        part = draw(control, phase)
+    wait_for(control, phase, parts)
+    if draw(control, phase + 1) == 0:
+        _merge_ranges(counts, result)
+        finish(control, phase + 1)
+    wait_for(control, phase + 1, 1)
+    part = draw(control, phase + 2)
+    while part < parts:
+        first, last = n * part // parts, n * (part + 1) // parts
+        _compact(keys, first, last, result[1], counts[part, 0], pairs)
+        finish(control, phase + 2)
+        part = draw(control, phase + 2)
+    wait_for(control, phase + 2, parts)
+    phase += 3
+    total, bits = result[0], result[2]
     passes = (bits + DIGIT_BITS - 1) // DIGIT_BITS
     source, target = pairs, spare
     for p in range(passes):
         width = (bits + passes - 1) // passes
-        shift, mask = 32 + p * width, (1 << width) - 1
-        for t in prange(threads):
-            _count_digits(
-                source,
-                total * t // threads,
-                total * (t + 1) // threads,
-                shift,
-                mask,
-                counts[t],
-            )
-        _offsets(counts, mask + 1)
-        for t in prange(threads):
-            _scatter(
-                source,
-                total * t // threads,
-                total * (t + 1) // threads,
-                shift,
-                mask,
-                counts[t],
-                target,
-            )
+        _sort_pass(control, phase, source, target, total, 32 + p * width, (1 << width) - 1, counts)
         source, target = target, source
-    return total, passes % 2 == 1
+        phase += 3
+    return phase, passes % 2 == 1
+
+
+@helper
+def _sort_pass(control, phase, source, target, total, shift, mask, counts):
+    """Three phases: move the pairs to the places of one digit."""
+    parts = counts.shape[0]
+    part = draw(control, phase)
+    while part < parts:
+        first, last = total * part // parts, total * (part + 1) // parts
+        _count_digits(source, first, last, shift, mask, counts[part])
+        finish(control, phase)
+        part = draw(control, phase)
+    wait_for(control, phase, parts)
+    if draw(control, phase + 1) == 0:
+        _digit_offsets(counts, mask + 1)
+        finish(control, phase + 1)
+    wait_for(control, phase + 1, 1)
+    part = draw(control, phase + 2)
+    while part < parts:
+        first, last = total * part // parts, total * (part + 1) // parts
+        _scatter(source, first, last, shift, mask, counts[part], target)
+        finish(control, phase + 2)
+        part = draw(control, phase + 2)
+    wait_for(control, phase + 2, parts)

@@ -33,6 +33,9 @@ class Workspace:
 
     def __init__(self) -> None:
         self._arrays: dict[str, NDArray[Any]] = {}
+        self.pairs_per_gaussian = 3.0
+        """Room for (Gaussian, tile) pairs; most Gaussians touch one or two tiles. It grows with
+        need. Memory that is not used is not touched."""
 
     def array(self, name: str, size: int, dtype: type) -> NDArray[Any]:
         """Array of ``size`` elements with any content."""

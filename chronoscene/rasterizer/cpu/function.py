@@ -1,0 +1,211 @@
+"""One image as a function that torch can differentiate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from chronoscene.rasterizer.cpu import pipeline, workspace
+from chronoscene.rasterizer.cpu.project import set_colors
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What to render besides the tensors, and where to put what the projection finds."""
+
+    view: pipeline.View
+    visible: tuple[pipeline.Array, pipeline.Array, pipeline.Array]
+    render_depth: bool
+
+
+class _Lease:
+    """A workspace in use; goes back when it is dropped."""
+
+    def __init__(self) -> None:
+        self.workspace = workspace.acquire()
+        self.binned: pipeline.Binned | None = None
+
+    def __del__(self) -> None:
+        workspace.release(self.workspace)
+
+
+class Render(torch.autograd.Function):
+    """(image [H, W, D], opacity [H, W, 1], weighted depth or None) of one camera."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        means2d: Tensor | None,
+        background: Tensor | None,
+        request: Request,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        lease = _Lease()
+        inputs = (means, quats, scales, opacities, colors)
+        job = _Job(inputs, background, request)
+        image, alphas, weighted = job.forward(lease)
+        ctx.set_materialize_grads(False)
+        ctx.request = request
+        ctx.save_for_backward(*inputs, background, alphas)
+        ctx.lease = lease if any(ctx.needs_input_grad) else None
+        return image, alphas, weighted
+
+    @staticmethod
+    def backward(ctx: Any, *output_grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        *inputs, background, alphas = ctx.saved_tensors
+        job = _Job(tuple(inputs), background, ctx.request)
+        lease, ctx.lease = ctx.lease, None
+        if lease is None:  # a second backward pass through the same graph
+            lease = _Lease()
+            job.forward(lease)
+        image_grad, alpha_grad, weighted_grad = output_grads
+        if image_grad is None:
+            image_grad = torch.zeros(*alphas.shape[:2], inputs[-1].shape[1])
+        grads = job.backward(lease, image_grad, alpha_grad, weighted_grad)
+        background_grad = None
+        if background is not None and ctx.needs_input_grad[6]:
+            background_grad = _background_gradient(image_grad, alphas)
+        return (*grads, background_grad, None)
+
+
+def _background_gradient(image_grad: Tensor, alphas: Tensor) -> Tensor:
+    """Summed by numpy, whose order does not depend on the number of threads. [D]"""
+    light = (image_grad * (1 - alphas)).numpy()
+    return torch.from_numpy(light.sum(axis=(0, 1), dtype=np.float64).astype(np.float32))
+
+
+class _Job:
+    """One image with any number of channels, three at a time."""
+
+    def __init__(
+        self, inputs: tuple[Tensor, ...], background: Tensor | None, request: Request
+    ) -> None:
+        self.means, self.quats, self.scales, self.opacities, self.colors = inputs
+        self.request, self.view = request, request.view
+        self.count, self.channels = self.colors.shape
+        self.total = self.channels + request.render_depth
+        self.groups = max(1, -(-self.total // 3))
+        self.direct = self.total == 3 and not request.render_depth
+        self.background = np.zeros(3 * self.groups, np.float32)
+        if background is not None:
+            self.background[: self.channels] = background.detach().numpy()
+
+    def forward(self, lease: _Lease) -> tuple[Tensor, Tensor, Tensor | None]:
+        height, width = self.view.height, self.view.width
+        lease.binned = pipeline.bin_gaussians(
+            lease.workspace, self._scene(), self.view, self.request.visible
+        )
+        images = torch.empty(self.groups, height, width, 3)
+        alphas = torch.empty(height, width, 1)
+        for group in range(self.groups):
+            self._load_colors(lease, group)
+            pipeline.render(
+                lease.workspace,
+                lease.binned,
+                self.view,
+                self.background[3 * group : 3 * group + 3],
+                images[group].numpy().reshape(-1),
+                alphas.numpy().reshape(-1),
+            )
+        if self.direct:
+            return images[0], alphas, None
+        values = torch.cat(list(images), dim=-1)
+        weighted = values[..., self.channels : self.total].clone()
+        return (
+            values[..., : self.channels].contiguous(),
+            alphas,
+            weighted if self.request.render_depth else None,
+        )
+
+    def backward(
+        self,
+        lease: _Lease,
+        image_grad: Tensor,
+        alpha_grad: Tensor | None,
+        weighted_grad: Tensor | None,
+    ) -> tuple[Tensor, ...]:
+        """Gradients of means, quats, scales, opacities, colors and means2d."""
+        assert lease.binned is not None
+        outputs = tuple(
+            torch.empty(self.count, k) if k > 1 else torch.empty(self.count)
+            for k in (3, 4, 3, 1, 3, 2)
+        )
+        grads = tuple(x.numpy().reshape(-1) for x in outputs)
+        depth_grads = np.empty(0, np.float32)
+        if self.direct:
+            summed: Any = self._sum_pixels(lease, 0, image_grad, alpha_grad)
+        else:
+            if weighted_grad is not None:
+                image_grad = torch.cat([image_grad, weighted_grad], dim=-1)
+            image_grad = pad(image_grad, (0, 3 * self.groups - image_grad.shape[-1]))
+            summed, values = self._sum_groups(lease, image_grad, alpha_grad)
+            if self.request.render_depth:
+                depth_grads = values[:, self.channels].copy()
+        pipeline.gaussian_gradients(
+            lease.binned, self._scene(), self.view, summed, depth_grads, grads
+        )
+        means, quats, scales, opacities, colors, means2d = outputs
+        if not self.direct:
+            colors = torch.from_numpy(values[:, : self.channels].copy())
+        return means, quats, scales, opacities, colors, means2d
+
+    def _sum_groups(
+        self, lease: _Lease, image_grad: Tensor, alpha_grad: Tensor | None
+    ) -> tuple[pipeline.Array, pipeline.Array]:
+        """16 sums of each Gaussian over all groups, and the gradients of all channels."""
+        assert lease.binned is not None
+        sums = np.zeros((self.count, 16), np.float32)
+        values = np.zeros((self.count, 3 * self.groups), np.float32)
+        for group in range(self.groups):
+            self._load_colors(lease, group)
+            part = image_grad[..., 3 * group : 3 * group + 3]
+            summed = self._sum_pixels(lease, group, part, alpha_grad)
+            pipeline.sum_rows(lease.binned, *summed, sums.reshape(-1))
+            values[:, 3 * group : 3 * group + 3] = sums[:, 6:9]
+            sums[:, 6:9] = 0
+            alpha_grad = None  # counted once
+        return sums.reshape(-1), values
+
+    def _sum_pixels(
+        self, lease: _Lease, group: int, image_grad: Tensor, alpha_grad: Tensor | None
+    ) -> tuple[pipeline.Array, pipeline.Array]:
+        assert lease.binned is not None
+        nothing = np.empty(0, np.float32)
+        return pipeline.render_backward(
+            lease.workspace,
+            lease.binned,
+            self.view,
+            self.background[3 * group : 3 * group + 3],
+            image_grad.contiguous().numpy().reshape(-1),
+            nothing if alpha_grad is None else alpha_grad.contiguous().numpy().reshape(-1),
+        )
+
+    def _scene(self) -> pipeline.Gaussians:
+        """Flat arrays; colours that do not go straight into the records are left out."""
+        colors = self.colors if self.direct else torch.zeros(self.count, 3)
+        tensors = (self.means, self.quats, self.scales, self.opacities, colors)
+        return pipeline.Gaussians(*(x.detach().numpy().reshape(-1) for x in tensors))
+
+    def _load_colors(self, lease: _Lease, group: int) -> None:
+        if self.direct:
+            return
+        assert lease.binned is not None
+        values = self.colors.detach()
+        if self.request.render_depth:
+            depths = torch.from_numpy(self.request.visible[2])
+            values = torch.cat([values, depths[:, None]], dim=1)
+        set_colors(
+            values.contiguous().numpy().reshape(-1),
+            self.total,
+            3 * group,
+            lease.binned.records,
+        )
