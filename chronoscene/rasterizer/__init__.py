@@ -49,7 +49,7 @@ def rasterize(
 
     Differentiable in means, quats, scales, opacities, colors and backgrounds. A Gaussian outside
     the depth range or the image, with an opacity below 1/255 (negative ones too), with a
-    quaternion of length 0, or with any number that is not finite is culled: it changes nothing
+    quaternion of no length, or with any number that is not finite is culled: it changes nothing
     and gets gradient zero.
 
     Convention:

@@ -11,6 +11,10 @@ ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 """A pixel is finished before the Gaussian that would bring its transmittance to this or below."""
 
+QUATERNION_MIN = 1e-20
+"""A quaternion whose largest component is smaller has no direction, and its gradient, which grows
+with one over its length, no bound: the Gaussian is culled."""
+
 CLAMP_MARGIN = 0.3
 """The Jacobian of the projection is taken at a position at most this many half image widths
 (heights) outside the image; farther out the linearisation is meaningless."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from chronoscene.errors import BackendError
 from chronoscene.rasterizer import reference
-from chronoscene.rasterizer.constants import ALPHA_MIN
+from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
 from chronoscene.rasterizer.types import RasterInfo, Rasterization
 
 
@@ -99,7 +99,7 @@ def _without_bad_rows(*arrays: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
     """Gaussians with nan, without a rotation or too faint to see, made invisible and harmless."""
     means, quats, scales, opacities, colors = arrays
     finite = torch.stack([torch.isfinite(x.reshape(len(x), -1)).all(-1) for x in arrays]).all(0)
-    good = finite & (quats != 0).any(-1) & (opacities > ALPHA_MIN)
+    good = finite & (quats.abs().amax(-1) >= QUATERNION_MIN) & (opacities > ALPHA_MIN)
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
     rows = good[:, None]
     return (

@@ -19,6 +19,7 @@ from chronoscene.rasterizer.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     CLAMP_MARGIN,
+    QUATERNION_MIN,
     TRANSMITTANCE_MIN,
 )
 from chronoscene.rasterizer.types import RasterInfo, Rasterization
@@ -73,6 +74,7 @@ def rasterize(
             extents = _extents(everything.covariances, opacities)
             visible = _visible(everything, extents, width, height, near_plane, far_plane)
             visible &= torch.isfinite(colors).all(dim=-1)
+            visible &= quats.abs().amax(dim=-1) >= QUATERNION_MIN
             _fill_info(info, c, everything, extents, visible)
             # A stable sort: Gaussians at equal depth are drawn in the order of the input.
             order = torch.argsort(torch.where(visible, everything.depths, torch.inf), stable=True)

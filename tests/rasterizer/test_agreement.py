@@ -89,6 +89,7 @@ def test_opaque_gaussians_end_pixels(tools: SimpleNamespace, check_agreement: Ch
         {"scales": [2.0, 2.0, 1e-7]},
         {"scales": [30.0, 0.05, 0.05]},
         {"scales": [1e4, 1e4, 1e4]},
+        {"quats": [1e-18, 2e-18, 0.0, 1e-18]},
         {"quats": [1e-25, 2e-25, 0.0, 1e-25]},
         {"quats": [1e18, -2e18, 3e17, 0.0]},
         {"quats": [0.0, 0.0, 0.0, 0.0]},

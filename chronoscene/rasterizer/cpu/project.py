@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
 from chronoscene.rasterizer.cpu import layout as lay
 from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
 from chronoscene.rasterizer.cpu.phases import draw
@@ -37,7 +38,6 @@ from chronoscene.rasterizer.cpu.vecmath import log2
 
 _HUGE = 1e30
 _LEVEL_MIN = lay.LEVEL_MIN
-_ALPHA_MIN = 1.0 / 255.0
 
 
 @inlined
@@ -51,12 +51,12 @@ def _to_camera(camera: Any, x: Any, y: Any, z: Any) -> Any:
 
 @inlined
 def _unit(w: Any, x: Any, y: Any, z: Any) -> Any:
-    """Unit quaternion and one over the length; scaled first, so that no square underflows."""
+    """Unit quaternion, one over its length, largest component; scaled lest squares underflow."""
     largest = maximum(maximum(absolute(w), absolute(x)), maximum(absolute(y), absolute(z)))
     scale = 1.0 / largest
     w, x, y, z = w * scale, x * scale, y * scale, z * scale
     inverse = 1.0 / sqrt(w * w + (x * x + (y * y + z * z)))
-    return w * inverse, x * inverse, y * inverse, z * inverse, inverse * scale
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse * scale, largest
 
 
 @inlined
@@ -134,7 +134,7 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     x, y, z = load3(means, 3 * at)
     px, py, pz = _to_camera(camera, x, y, z)
     w, qx, qy, qz = load4(quats, 4 * at)
-    w, qx, qy, qz, _ = _unit(w, qx, qy, qz)
+    w, qx, qy, qz, _, longest = _unit(w, qx, qy, qz)
     s = load3(scales, 3 * at)
     r = _rotation(w, qx, qy, qz)
     rz = 1.0 / pz
@@ -155,10 +155,11 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     cr, cg, cb = load3(colors, 3 * at)
     # Comparisons with nan are false; the last line catches infinite colours.
     visible = (pz >= camera[lay.NEAR]) & (pz <= camera[lay.FAR])
-    visible = visible & (opacity > _ALPHA_MIN) & (opacity < _HUGE) & (reach > 0.0)
+    visible = visible & (opacity > ALPHA_MIN) & (opacity < _HUGE) & (reach > 0.0)
     visible = visible & (ex > 0.0) & (ex < _HUGE) & (ey > 0.0) & (ey < _HUGE)
     visible = visible & (mx + ex > 0.0) & (mx - ex < width)
     visible = visible & (my + ey > 0.0) & (my - ey < height) & (xx_given_y > 0.0)
+    visible = visible & (longest >= QUATERNION_MIN)
     visible = visible & (absolute(cr) + absolute(cg) + absolute(cb) < _HUGE)
 
     # A little more than the ellipse: what is left out here must lie outside it after rounding.
@@ -319,7 +320,7 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     x, y, z = load3(means, 3 * at)
     px, py, pz = _to_camera(camera, x, y, z)
     w, qx, qy, qz = load4(quats, 4 * at)
-    w, qx, qy, qz, inverse = _unit(w, qx, qy, qz)
+    w, qx, qy, qz, inverse, _ = _unit(w, qx, qy, qz)
     s = load3(scales, 3 * at)
     r = _rotation(w, qx, qy, qz)
     rz = 1.0 / pz
