@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from chronoscene.synth.compiled import inner
 from chronoscene.synth.noise import fbm, smooth
 from chronoscene.synth.seeds import rng_for
 
@@ -60,11 +60,11 @@ MOODS: tuple[Light, ...] = (
     ),
     Light(
         "cool autumn morning", "autumn", 25.0, 27.0, (1.35, 1.38, 1.45), (0.24, 0.34, 0.52),
-        (0.52, 0.60, 0.68), 0.65, 1 / 1300, 0.86, (0.91, 0.99, 1.13),
+        (0.52, 0.60, 0.68), 0.65, 1 / 1900, 0.86, (0.91, 0.99, 1.13),
     ),
     Light(
         "overcast spring", "spring", 95.0, 48.0, (0.35, 0.34, 0.33), (0.62, 0.66, 0.70),
-        (0.58, 0.61, 0.64), 0.95, 1 / 900, 1.10, (0.97, 1.0, 1.03),
+        (0.58, 0.61, 0.64), 0.95, 1 / 1400, 1.10, (0.97, 1.0, 1.03),
     ),
     Light(
         "winter noon", "winter", -95.0, 19.0, (1.95, 1.66, 1.28), (0.16, 0.26, 0.50),
@@ -136,7 +136,7 @@ def sky_args(light: Light) -> SkyArgs:
     )
 
 
-@njit(cache=True)
+@inner
 def sky_radiance(dx, dy, dz, a, detail):  # type: ignore[no-untyped-def]
     """Radiance of the sky in a unit direction; ``detail`` False leaves the clouds out."""
     up = max(dz, 0.0)

@@ -9,9 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from chronoscene.synth.compiled import inner, kernel
 from chronoscene.synth.light import sky_radiance
 from chronoscene.synth.tables import MISS
 
@@ -30,7 +31,7 @@ class Probes(NamedTuple):
     """0 inside of objects. [X, Y, Z]"""
 
 
-@njit(cache=True)
+@inner
 def probe_light(probes, x, y, z, dx, dy, dz, slope):  # type: ignore[no-untyped-def]
     """Indirect radiance around a point for a direction; ``slope`` 2/3 gives diffuse light."""
     nx, ny, nz = probes.valid.shape
@@ -54,7 +55,7 @@ def probe_light(probes, x, y, z, dx, dy, dz, slope):  # type: ignore[no-untyped-
     return r * inverse, g * inverse, b * inverse
 
 
-@njit(cache=True, parallel=True)
+@kernel
 def probe_values(  # type: ignore[no-untyped-def]
     rays, t, tri, uv, lit, tables, mean_albedo, sky, count
 ):

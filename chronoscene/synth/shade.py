@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
+from chronoscene.synth.compiled import inner, kernel
 from chronoscene.synth.light import sky_radiance
 from chronoscene.synth.noise import mix
 from chronoscene.synth.probes import probe_light
@@ -18,7 +19,7 @@ from chronoscene.synth.tables import MISS, hit_normals
 from chronoscene.synth.textures import albedo
 
 
-@njit(cache=True, parallel=True)
+@kernel
 def camera_rays(world_from_cam, k, width, row0, rows, ss):  # type: ignore[no-untyped-def]
     """Rays with unit z in the camera, so that the hit parameter is z-depth. [n, 6]
 
@@ -39,7 +40,7 @@ def camera_rays(world_from_cam, k, width, row0, rows, ss):  # type: ignore[no-un
     return rays
 
 
-@njit(cache=True, parallel=True)
+@kernel
 def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ignore[no-untyped-def]
     """Rays to the sun for all samples; whether each is needed.
 
@@ -79,7 +80,7 @@ def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ig
     return out, need
 
 
-@njit(cache=True)
+@inner
 def surface_albedo(tables, tri, x, y, z, fw):  # type: ignore[no-untyped-def]
     """Texture of a triangle at a world point seen with pixels of width ``fw``."""
     patch = tables.tri_patch[tri]
@@ -91,7 +92,7 @@ def surface_albedo(tables, tri, x, y, z, fw):  # type: ignore[no-untyped-def]
     return albedo(style, u, v, x, y, z, p[9], p[10], tables.patch_seed[patch], fw)
 
 
-@njit(cache=True)
+@inner
 def _reflected(x, y, z, n, d, style, facing, lit, sky, probes):  # type: ignore[no-untyped-def]
     """Mirror-like part of the light: sky or surroundings, and the sun's highlight."""
     k = 2.0 * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
@@ -109,7 +110,7 @@ def _reflected(x, y, z, n, d, style, facing, lit, sky, probes):  # type: ignore[
     return strength * r, strength * g, strength * b, strength
 
 
-@njit(cache=True)
+@inner
 def _base(ray, t, tri, u, v, tables, fw_unit):  # type: ignore[no-untyped-def]
     """Albedo of a hit for samples of the given width at unit distance."""
     dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
@@ -120,7 +121,7 @@ def _base(ray, t, tri, u, v, tables, fw_unit):  # type: ignore[no-untyped-def]
     return surface_albedo(tables, tri, ray[0] + t * dx, ray[1] + t * dy, ray[2] + t * dz, fw)
 
 
-@njit(cache=True)
+@inner
 def _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes):  # type: ignore[no-untyped-def]
     """Radiance along a ray that hit a surface of albedo ``base``; ``lit`` is 0..1."""
     dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
@@ -152,7 +153,7 @@ def _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes):  # type: ignor
     return r * air + hr * (1.0 - air), g * air + hg * (1.0 - air), b * air + hb * (1.0 - air)
 
 
-@njit(cache=True)
+@inner
 def _sky(ray, sky):  # type: ignore[no-untyped-def]
     """Radiance of the sky along a ray."""
     dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
@@ -160,7 +161,7 @@ def _sky(ray, sky):  # type: ignore[no-untyped-def]
     return sky_radiance(dx / length, dy / length, dz / length, sky, True)
 
 
-@njit(cache=True)
+@inner
 def _share(lit, first, count):  # type: ignore[no-untyped-def]
     """Share of samples that the sun reaches."""
     total = 0.0
@@ -169,7 +170,7 @@ def _share(lit, first, count):  # type: ignore[no-untyped-def]
     return total / count
 
 
-@njit(cache=True)
+@inner
 def _uniform(tri, first, end, tables):  # type: ignore[no-untyped-def]
     """Whether all samples of a pixel lie on one opaque patch."""
     if tri[first] == MISS:
@@ -183,7 +184,7 @@ def _uniform(tri, first, end, tables):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True)
+@inner
 def _tone(x):  # type: ignore[no-untyped-def]
     """Filmic curve (a rational fit with toe and shoulder), then the sRGB transfer function."""
     x = max(0.0, x)
@@ -192,7 +193,7 @@ def _tone(x):  # type: ignore[no-untyped-def]
     return 12.92 * y if y <= 0.0031308 else 1.055 * y ** (1.0 / 2.4) - 0.055
 
 
-@njit(cache=True, parallel=True)
+@kernel
 def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # type: ignore[no-untyped-def]
     """Displayed colours of pixels. [pixels, 3] uint8
 
@@ -242,7 +243,7 @@ def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # ty
     return out
 
 
-@njit(cache=True, parallel=True)
+@kernel
 def albedo_at(points, tri, tables, fw):  # type: ignore[no-untyped-def]
     """Albedo of hit points at given pixel widths; zero where nothing was hit. [n, 3]"""
     out = np.zeros((len(points), 3))

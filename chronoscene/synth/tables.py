@@ -6,8 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from chronoscene.synth.compiled import inner
 
 Array = NDArray[np.float64]
 MISS = 0xFFFFFFFF
@@ -28,7 +29,7 @@ class Tables(NamedTuple):
     styles: Array
 
 
-@njit(cache=True)
+@inner
 def hit_normals(tables, tri, u, v, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Flat and smooth unit normals of a hit, both turned towards the viewer."""
     a, b, c = tables.corners[tri, 0], tables.corners[tri, 1], tables.corners[tri, 2]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from chronoscene.synth.compiled import inner
 from chronoscene.synth.noise import (
     colors,
     fade,
@@ -21,7 +20,7 @@ from chronoscene.synth.noise import (
 )
 
 
-@njit(cache=True)
+@inner
 def flat_roof_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Bitumen sheets or gravel. Numbers: sheet width, gravel (0 or 1)."""
     c0, c1, c2 = colors(s)
@@ -39,7 +38,7 @@ def flat_roof_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     return weather(color, u, v, seed, fw, 0.25)
 
 
-@njit(cache=True)
+@inner
 def tiles_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Roof tiles, v up the slope; c0 and c1 tiles, c2 moss. Numbers: width, height, moss."""
     c0, c1, c2 = colors(s)
@@ -62,7 +61,7 @@ def tiles_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     return mix(color, c2, 0.7 * moss)
 
 
-@njit(cache=True)
+@inner
 def asphalt_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Road, u along it. Numbers: marking (0 none, 1 lanes, 2 zebra, 3 parking lot), parking."""
     c0, c1, paint = colors(s)
@@ -85,7 +84,7 @@ def asphalt_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     return mix(color, paint, mark * worn)
 
 
-@njit(cache=True)
+@inner
 def _marking(s, u, v, su, sv, fw):  # type: ignore[no-untyped-def]
     """Share of paint on the road."""
     kind = int(s[10])
@@ -108,7 +107,7 @@ def _marking(s, u, v, su, sv, fw):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@njit(cache=True)
+@inner
 def paving_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Slabs. Numbers: length, height, bond shift, pattern (0 plain, 1 bands, 2 rings), scale."""
     c0, c1, c2 = colors(s)
@@ -137,7 +136,7 @@ def paving_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     return scaled(color, 1.0 + 0.2 * fbm(u, v, 4.5, 4, seed + 1, fw))
 
 
-@njit(cache=True)
+@inner
 def grass_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     """Meadow in world axes; c0 and c1 grass, c2 bare soil. Numbers: wear, litter, stripes."""
     c0, c1, c2 = colors(s)
@@ -159,7 +158,7 @@ def grass_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     return color
 
 
-@njit(cache=True)
+@inner
 def soil_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Bare ground with stones and ruts. Numbers: stones, ruts."""
     c0, c1, c2 = colors(s)
@@ -174,7 +173,7 @@ def soil_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     return scaled(color, 1.0 - s[11] * 0.4 * rut)
 
 
-@njit(cache=True)
+@inner
 def fields_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     """Countryside in world axes: parcels with furrows, hedges, woods. Numbers: litness."""
     c0, c1, c2 = colors(s)
@@ -199,7 +198,7 @@ def fields_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     return mix(color, dark, wood)
 
 
-@njit(cache=True)
+@inner
 def water_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     c0, c1, _ = colors(s)
     return mix(c0, c1, smooth(-0.4, 0.6, fbm(x, y, 0.9, 4, seed, fw)))

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from chronoscene.synth.compiled import inner
 from chronoscene.synth.noise import (
     colors,
     fade,
@@ -21,7 +20,7 @@ from chronoscene.synth.noise import (
 )
 
 
-@njit(cache=True)
+@inner
 def plain_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Noise only. Numbers: strength, size."""
     c0, c1, _ = colors(s)
@@ -29,7 +28,7 @@ def plain_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     return scaled(mix(c0, c1, smooth(-0.5, 0.6, n)), max(0.2, 1.0 + s[10] * n))
 
 
-@njit(cache=True)
+@inner
 def plaster_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Plaster with a dirty base and spots where it came off (c1). Numbers: wear, storey, rows."""
     c0, c1, c2 = colors(s)
@@ -44,7 +43,7 @@ def plaster_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     return color
 
 
-@njit(cache=True)
+@inner
 def brick_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Running bond; c0 and c1 bricks, c2 mortar. Numbers: length, height, band period."""
     c0, c1, c2 = colors(s)
@@ -63,7 +62,7 @@ def brick_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     return weather(color, u, v, seed, fw, 0.16)
 
 
-@njit(cache=True)
+@inner
 def panel_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Cladding panels with dark joints (c2). Numbers: width, height, share of c1, gloss bands."""
     c0, c1, c2 = colors(s)
@@ -77,7 +76,7 @@ def panel_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     return weather(color, u, v, seed, fw, 0.12)
 
 
-@njit(cache=True)
+@inner
 def concrete_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Cast concrete. Numbers: formwork width, height."""
     c0, c1, _ = colors(s)
@@ -90,7 +89,7 @@ def concrete_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     return weather(scaled(color, 1.0 - 0.6 * hole), u, v, seed, fw, 0.2)
 
 
-@njit(cache=True)
+@inner
 def glass_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Window: frame c0, room c1, curtain c2. Numbers: frame width, panes across, panes up."""
     c0, c1, c2 = colors(s)
@@ -112,7 +111,7 @@ def glass_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     return mix(c0, room, max(0.0, inside - bars))
 
 
-@njit(cache=True)
+@inner
 def sign_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Board c0 with letters c1 made of random strokes, border c2."""
     c0, c1, c2 = colors(s)
@@ -146,7 +145,7 @@ def sign_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     return mix(color, c2, min(1.0, max(0.0, border)))
 
 
-@njit(cache=True)
+@inner
 def door_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Door leaf c0 with sunk panels, glass c1 above, frame c2."""
     c0, c1, c2 = colors(s)
@@ -157,7 +156,7 @@ def door_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     return mix(color, c2, min(1.0, max(0.0, border)))
 
 
-@njit(cache=True)
+@inner
 def corrugated_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Sheet metal with ribs, rust (c1) and a lettered band (c2). Numbers: pitch, rust, band."""
     c0, c1, c2 = colors(s)

@@ -3,17 +3,13 @@
 Each function gets the style row, texture coordinates in metres, the patch extents, a seed and the
 pixel width ``fw`` on the surface, and returns a linear RGB triple. The kinds are the constants
 below; `albedo` chooses among them.
-
-Numba's cache of a compiled function looks at the file of that function alone: after a change here,
-delete ``__pycache__``, or the shader goes on with the old textures.
 """
 
 from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from chronoscene.synth.compiled import inner
 from chronoscene.synth.noise import (
     colors,
     fade,
@@ -53,7 +49,7 @@ PLAIN, PLASTER, BRICK, PANEL, CONCRETE, TILES, FLAT_ROOF, ASPHALT, PAVING, GRASS
 SOIL, LEAVES, WOOD, PAINT, CORRUGATED, FIELDS, GLASS, SIGN, WATER, SOLAR, DOOR = range(10, 21)
 
 
-@njit(cache=True)
+@inner
 def _leaves(s, x, y, z, seed, fw):  # type: ignore[no-untyped-def]
     """Foliage: cells of leaf size in clumps of light and dark. Numbers: leaf size, accents."""
     c0, c1, c2 = colors(s)
@@ -72,7 +68,7 @@ def _leaves(s, x, y, z, seed, fw):  # type: ignore[no-untyped-def]
     return scaled(color, max(0.2, 0.9 + 0.45 * clump + 0.2 * coarse + 0.6 * near * (pick - 0.5)))
 
 
-@njit(cache=True)
+@inner
 def _wood(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Boards along u. Numbers: board width, gap."""
     c0, c1, _ = colors(s)
@@ -82,7 +78,7 @@ def _wood(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     return scaled(color, 1.0 - 0.75 * pulse(v, s[10], s[11], fw))
 
 
-@njit(cache=True)
+@inner
 def _paint(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Smooth paint with darker edges and dust; c1 is a stripe. Numbers: dust, stripe share."""
     c0, c1, c2 = colors(s)
@@ -94,14 +90,14 @@ def _paint(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     return mix(color, c2, min(1.0, max(0.0, dust)))
 
 
-@njit(cache=True)
+@inner
 def _solar(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     c0, c1, c2 = colors(s)
     color = mix(c0, c1, max(pulse(u, 0.16, 0.02, fw), pulse(v, 0.16, 0.02, fw)))
     return mix(color, c2, max(pulse(u + 0.02, 1.0, 0.05, fw), pulse(v + 0.02, 1.6, 0.05, fw)))
 
 
-@njit(cache=True)
+@inner
 def albedo(s, u, v, x, y, z, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Linear albedo of a point.
 
