@@ -60,7 +60,7 @@ def rasterize(
         background = None if backgrounds is None else backgrounds[c].float()
         image, alpha, weighted = Render.apply(
             *gaussians,
-            pad(leaf[c], (0, 0, 0, padded - count)) if wants_grad else None,
+            _slot(leaf, c, padded) if wants_grad else None,
             background,
             Request(view, info.of(c), render_depth),
         )
@@ -82,6 +82,17 @@ def _stack(parts: list[Tensor]) -> Tensor:
     return parts[0][None] if len(parts) == 1 else torch.stack(parts)
 
 
+def _slot(leaf: Tensor, c: int, padded: int) -> Tensor:
+    """What receives the gradient of one camera's means2d, with ``padded`` rows.
+
+    The usual single camera gets the leaf itself: taking a part of it costs two copies on the way
+    back.
+    """
+    part = leaf if leaf.shape[0] == 1 else leaf[c]
+    missing = padded - leaf.shape[1]
+    return pad(part, (0, 0, 0, missing)) if missing else part
+
+
 def _prepare(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
 ) -> tuple[Tensor, ...]:
@@ -92,11 +103,12 @@ def _prepare(
             opacities = torch.where(finite, opacities, 0)
             colors = torch.where(finite[:, None], colors, 0)
     missing = max(0, LANES - means.shape[0])
-    arrays: tuple[Tensor, ...] = (means, quats, scales, opacities[:, None], colors)
     if missing:
-        arrays = tuple(pad(x, (0, 0, 0, missing)) for x in arrays)
-    m, q, s, o, c = (x.float().contiguous() for x in arrays)
-    return m, q, s, o[:, 0], c
+        opacities = pad(opacities, (0, missing))
+        means, quats, scales, colors = (
+            pad(x, (0, 0, 0, missing)) for x in (means, quats, scales, colors)
+        )
+    return tuple(x.float().contiguous() for x in (means, quats, scales, opacities, colors))
 
 
 @dataclass(frozen=True, slots=True)

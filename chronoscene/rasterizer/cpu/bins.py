@@ -124,6 +124,31 @@ def _tile_offsets(counts, tile_starts):
 
 
 @helper
+def _order_tiles(tile_starts, tile_order):
+    """Tiles with many entries first, so that the last ones to be taken are short. A counting sort
+    by a quarter of the number's logarithm."""
+    tiles = tile_order.size
+    counts = np.zeros(257, np.int64)
+    for tile in range(tiles):
+        counts[256 - _weight(tile_starts[tile + 1] - tile_starts[tile])] += 1
+    for bucket in range(1, 257):
+        counts[bucket] += counts[bucket - 1]
+    for tile in range(tiles - 1, -1, -1):
+        bucket = 256 - _weight(tile_starts[tile + 1] - tile_starts[tile])
+        counts[bucket] -= 1
+        tile_order[counts[bucket]] = tile
+
+
+@helper
+def _weight(count):
+    """Four times the logarithm to base 2, roughly; 0 for 0."""
+    octave = 0
+    while count >> octave > 0:
+        octave += 1
+    return 4 * octave + ((count << 3 >> octave) & 3 if octave > 0 else 0)
+
+
+@helper
 def _scatter_part(first, last, places, listed, entries):
     list_tile, list_gaussian, list_blocks, list_row = listed
     entry_gaussian, entry_blocks, entry_row = entries
@@ -183,7 +208,8 @@ def bin_gaussians(
         sorting: (counts, pairs, spare, result) of `sort.sort_phases`. The last has a fourth number
             that is set to 1 if there was not enough room to list the pairs.
         parts: (where each part may write and the end, where it stopped). int64
-        tiles: (scratch by part and tile int64, start of each tile and the end int64, listed
+        tiles: (scratch by part and tile int64, start of each tile and the end int64, order of
+            tiles int32, listed
             (tile, gaussian, blocks, row), entries (gaussian, blocks, row)); the last is the result.
             int32, blocks uint64
     """
@@ -208,7 +234,7 @@ def bin_gaussians(
     wait_for(control, 1, 1)
 
     starts, ends = parts
-    counts, tile_starts, listed, entries = tiles
+    counts, tile_starts, tile_order, listed, entries = tiles
     scene = (records[0], records[1], row_bases)
     if not _list_phase(
         control, phase, starts, ends, order, result[0], (width, tiles_x), scene, counts, listed
@@ -217,6 +243,7 @@ def bin_gaussians(
         return
     if draw(control, phase + 1) == 0:
         _tile_offsets(counts, tile_starts)
+        _order_tiles(tile_starts, tile_order)
         finish(control, phase + 1)
     wait_for(control, phase + 1, 1)
     part = draw(control, phase + 2)

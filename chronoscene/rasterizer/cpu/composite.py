@@ -213,6 +213,7 @@ def composite(
     height,
     tile_starts,
     tile_stops,
+    tile_order,
     gaussians,
     blocks,
     records,
@@ -229,6 +230,7 @@ def composite(
         width, height: Of the image in pixels.
         tile_starts: First entry of each tile, and the end of the last. int64 [tiles + 1]
         tile_stops: Written: where compositing stopped. int64 [tiles]
+        tile_order: Order in which to take the tiles. int32 [tiles]
         gaussians: Gaussian of each entry, readable a little past the end. int32
         blocks: Blocks of each entry; cut down to those that were alive. uint64
         records: See `layout`.
@@ -241,8 +243,9 @@ def composite(
     tiles = tile_stops.size
     transmittance, _ = planes
     state = states[worker]
-    tile = draw(control, 0)
-    while tile < tiles:
+    job = draw(control, 0)
+    while job < tiles:
+        tile = tile_order[job]
         left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
         plane, start, end = _PIXELS * tile, tile_starts[tile], tile_starts[tile + 1]
         live = _start_tile(left, top, width, height, state, planes, plane, end)
@@ -271,7 +274,7 @@ def composite(
             image,
             alphas,
         )
-        tile = draw(control, 0)
+        job = draw(control, 0)
 
 
 @helper
@@ -384,6 +387,7 @@ def composite_backward(
     height,
     tile_starts,
     tile_stops,
+    tile_order,
     entries,
     records,
     planes,
@@ -397,7 +401,8 @@ def composite_backward(
     """Sums over pixels of every entry, from the gradients of image and opacity.
 
     Args:
-        worker, control, width, height, tile_starts, tile_stops: As `composite` left them.
+        worker, control, width, height: As in `composite`.
+        tile_starts, tile_stops, tile_order: As `composite` left them.
         entries: (gaussian, blocks, place of its row) of each entry; as `composite` left them.
         records, planes: As `composite` left them.
         states: Scratch, `BACKWARD_NUMBERS` per worker.
@@ -409,8 +414,9 @@ def composite_backward(
     tiles_x = (width + lay.TILE - 1) // lay.TILE
     tiles = tile_stops.size
     state = states[worker]
-    tile = draw(control, 0)
-    while tile < tiles:
+    job = draw(control, 0)
+    while job < tiles:
+        tile = tile_order[job]
         left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
         start, stop = tile_starts[tile], tile_stops[tile]
         _start_backward(
@@ -436,4 +442,4 @@ def composite_backward(
             rows,
             state,
         )
-        tile = draw(control, 0)
+        job = draw(control, 0)

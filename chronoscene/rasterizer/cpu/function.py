@@ -55,6 +55,7 @@ class Render(torch.autograd.Function):
         image, alphas, weighted = job.forward(lease)
         ctx.set_materialize_grads(False)
         ctx.request = request
+        ctx.slot = (-1, 2) if means2d is None else means2d.shape
         ctx.save_for_backward(*inputs, background, alphas)
         ctx.lease = lease if any(ctx.needs_input_grad) else None
         return image, alphas, weighted
@@ -74,7 +75,8 @@ class Render(torch.autograd.Function):
         background_grad = None
         if background is not None and ctx.needs_input_grad[6]:
             background_grad = _background_gradient(image_grad, alphas)
-        return (*grads, background_grad, None)
+        *gaussian_grads, means2d_grad = grads
+        return (*gaussian_grads, means2d_grad.reshape(ctx.slot), background_grad, None)
 
 
 def _background_gradient(image_grad: Tensor, alphas: Tensor) -> Tensor:

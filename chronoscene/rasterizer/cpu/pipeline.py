@@ -74,6 +74,7 @@ class Binned:
     """First row of each Gaussian in its chunk, first row of each chunk and the end of all."""
     tile_starts: Array
     tile_stops: Array
+    tile_order: Array
     entries: tuple[Array, Array, Array]
     """Gaussian, blocks and row of each (Gaussian, tile) pair, by tile, then by depth; with room
     beyond the last."""
@@ -134,6 +135,7 @@ def bin_gaussians(
         np.zeros(4, np.int64),
     )
     ends, tile_starts = np.empty(parts, np.int64), w("tile_starts", view.tiles + 1, np.int64)
+    tile_order = w("tile_order", view.tiles, np.int32)
     while True:
         starts = np.arange(parts + 1) * int(workspace.pairs_per_gaussian * (n // parts + 1))
         listed, entries = _lists(workspace, int(starts[-1]))
@@ -150,7 +152,7 @@ def bin_gaussians(
             visible,
             sorting,
             (starts, ends),
-            (counts, tile_starts, listed, entries),
+            (counts, tile_starts, tile_order, listed, entries),
             phases=BIN_PHASES,
         )
         if sorting[3][3] == 0:
@@ -162,7 +164,9 @@ def bin_gaussians(
     total, pixels = int(tile_starts[-1]), view.tiles * lay.TILE_PIXELS
     planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
     tile_stops = w("tile_stops", view.tiles, np.int64)
-    return Binned(keys, records, numbering, tile_starts, tile_stops, entries, total, planes)
+    return Binned(
+        keys, records, numbering, tile_starts, tile_stops, tile_order, entries, total, planes
+    )
 
 
 def _lists(
@@ -202,6 +206,7 @@ def render(
         view.height,
         binned.tile_starts,
         binned.tile_stops,
+        binned.tile_order,
         binned.entries[0],
         binned.entries[1],
         binned.records,
@@ -224,8 +229,8 @@ def render_backward(
     """Sums over pixels by entry: (touched, rows)."""
     workers, count = threads(), int(binned.numbering[1][-1])
     states = workspace.array("backward", workers * BACKWARD_NUMBERS, np.float32)
-    rows = workspace.array("rows", max(1, count) * lay.RECORD, np.float32)
-    touched = workspace.array("touched", max(1, count), np.uint8)
+    rows = workspace.array("rows", (count + 1) * lay.RECORD, np.float32)  # see project.py
+    touched = workspace.array("touched", count + 1, np.uint8)
     touched[:] = 0
     launch(
         composite_backward,
@@ -234,6 +239,7 @@ def render_backward(
         view.height,
         binned.tile_starts,
         binned.tile_stops,
+        binned.tile_order,
         binned.entries,
         binned.records,
         binned.planes,

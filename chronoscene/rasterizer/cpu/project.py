@@ -28,6 +28,8 @@ from chronoscene.rasterizer.cpu.simd import (
     minimum,
     select,
     splat,
+    splat16,
+    splat16_int,
     sqrt,
     store,
     store_columns,
@@ -253,14 +255,22 @@ def project_chunk(chunk, chunks, gaussians, camera, size, records, keys, numberi
     row_bases[chunk + 1] = _number_rows(first, last, records[1], row_starts)
 
 
-@helper
-def _add_rows(row, end, touched, rows, sums, at):
-    """Add rows row..end, in this order, to 16 numbers at ``sums[at]``."""
-    total = load16(sums, at)
-    for r in range(row, end):
+@inlined
+def _sum_rows(row: int, end: int, touched: Any, rows: Any, total: Any) -> Any:
+    """16 numbers plus rows row..end, in this order. The row after the last may be read.
+
+    Most Gaussians have one or two rows: these are added without a branch, which would often be
+    mispredicted.
+    """
+    wanted = (end > row) & (touched[row] != 0)
+    total = total + select(splat16_int(np.int32(wanted)) > 0, load16(rows, lay.RECORD * row), 0.0)
+    row += end > row
+    wanted = (end > row) & (touched[row] != 0)
+    total = total + select(splat16_int(np.int32(wanted)) > 0, load16(rows, lay.RECORD * row), 0.0)
+    for r in range(row + 1, end):
         if touched[r] != 0:
             total = total + load16(rows, lay.RECORD * r)
-    store(sums, at, total)
+    return total
 
 
 @helper
@@ -282,7 +292,8 @@ def add_rows(worker, control, numbering, touched, rows, sums):
         first, last = chunk_range(chunk, chunks, n)
         for i in range(first, last):
             row, end = _rows_of(i, last, chunk, numbering)
-            _add_rows(row, end, touched, rows, sums, lay.RECORD * i)
+            at = lay.RECORD * i
+            store(sums, at, _sum_rows(row, end, touched, rows, load16(sums, at)))
         chunk = draw(control, 0)
 
 
@@ -468,9 +479,9 @@ def project_backward(
             place = lay.RECORD * at
             if rows.size > 0:
                 place = scratch
-                sums[place : place + lay.RECORD * LANES] = np.float32(0.0)
                 for lane in range(LANES):
                     row, end = _rows_of(at + lane, last, chunk, numbering)
-                    _add_rows(row, end, touched, rows, sums, place + lay.RECORD * lane)
+                    total = _sum_rows(row, end, touched, rows, splat16(0.0))
+                    store(sums, place + lay.RECORD * lane, total)
             _backward_group(at, sums, place, gaussians, depth_gradients, camera, keys, grads)
         chunk = draw(control, 0)

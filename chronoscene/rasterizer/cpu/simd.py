@@ -291,7 +291,8 @@ def _make_splat(kind: str, lanes: int) -> Callable:
 
 splat = _make_splat("f32", LANES)
 splat_int = _make_splat("i32", LANES)
-splat8 = _make_splat("f32", 8)
+splat16 = _make_splat("f32", 16)
+splat16_int = _make_splat("i32", 16)
 
 
 def make_constant(values: list[int] | list[float]) -> Callable:
