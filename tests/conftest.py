@@ -6,11 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from PIL import Image
 
 import chronoscene  # noqa: F401  (loads zlib before pycolmap)
 
 import pycolmap  # isort: skip
+
+# How long an example takes is not a property of the code on a machine that others use too.
+settings.register_profile("untimed", parent=settings.default, deadline=None)
+settings.load_profile("untimed")
 
 FOUR_IMAGES = {"a/0001.png": 0, "a/0002.png": 0, "b/0001.png": 1, "b/0003.png": 1}
 """Image name to period; file names alone are ambiguous."""

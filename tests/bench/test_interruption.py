@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -55,14 +56,14 @@ def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_pat
     try:
         wait_for(done.is_file)
         before = done.read_bytes()
-        partial = wait_for(lambda: list(runs.glob("ring/*/.seed1.*.partial/config.json")))
+        half_done = wait_for(lambda: list(runs.glob("ring/*/.seed1.*.partial/config.json")))
         (worker,) = workers_of(process.pid)
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
     # The worker notices that its bench is gone; it must not write into the next one's folder.
     wait_for(lambda: not Path(f"/proc/{worker}").exists(), 30)
-    assert partial[0].parent.exists()
+    assert half_done[0].parent.exists()
     again = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "1 of 2 runs are finished and kept" in again.stdout
     assert done.read_bytes() == before
@@ -78,7 +79,13 @@ def test_an_interrupted_bench_leaves_no_process_and_no_half_run(number, scene_fo
     runs = tmp_path / "runs"
     command = [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs), "0.01", "100000"]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        # A shell starts jobs in the background with Ctrl-C ignored, and children inherit that.
+        preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),
     )
     wait_for(lambda: list(runs.glob("ring/*/.seed0.*.partial/config.json")))
     (worker,) = workers_of(process.pid)
