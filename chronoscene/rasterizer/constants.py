@@ -11,7 +11,7 @@ ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
 """A pixel is finished before the Gaussian that would bring its transmittance to this or below."""
 
-QUATERNION_MIN = 1e-20
+QUATERNION_MIN = 2.0**-66
 """A quaternion whose largest component is smaller has no direction, and its gradient, which grows
 with one over its length, no bound: the Gaussian is culled."""
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from chronoscene.rasterizer import Rasterization, rasterize, reference
+from chronoscene.rasterizer.constants import NEAR_PLANE
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 
@@ -103,13 +104,16 @@ def _steady_pixels(scene: SmallScene, band: float) -> torch.Tensor:
     return steady
 
 
-def _steady_order(scene: SmallScene) -> bool:
-    """Whether no two depths are so close that float32 may swap them."""
+def _well_posed(scene: SmallScene) -> bool:
+    """Whether float32 and float64 see the same Gaussians in the same order: no two depths are so
+    close that rounding may swap them, no depth is at a plane, no opacity at the threshold."""
+    if (np.abs(255 * scene.opacities - 1) < 1e-5).any():
+        return False
     centres = np.concatenate([scene.means, np.ones_like(scene.means[:, :1])], axis=1)
     for viewmat in scene.viewmats.astype(np.float64):
         z = np.sort((centres.astype(np.float64) @ viewmat.T)[:, 2])
         gaps = np.diff(z)
-        if ((gaps < 1e-5) & (gaps > 0)).any():
+        if ((gaps < 1e-5) & (gaps > 0)).any() or (np.abs(z - NEAR_PLANE) < 1e-5).any():
             return False
     return True
 
@@ -265,7 +269,7 @@ def tools() -> SimpleNamespace:
         compare=compare,
         random_scene=random_scene,
         scenes=scenes,
-        steady_order=_steady_order,
+        well_posed=_well_posed,
         steady_pixels=_steady_pixels,
         thresholds=_thresholds,
     )

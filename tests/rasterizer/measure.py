@@ -34,7 +34,7 @@ def main(count: int) -> None:
     )
     @given(tools.scenes())
     def measure(scene: Any) -> None:
-        if not tools._steady_order(scene):
+        if not tools._well_posed(scene):
             return
         comparison = tools.compare(scene)
         for name in comparison.expected:

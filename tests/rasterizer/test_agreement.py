@@ -23,7 +23,7 @@ Check = Callable[..., Any]
 @given(data=st.data())
 def test_random_scenes(data: st.DataObject, tools: SimpleNamespace, check_agreement: Check) -> None:
     scene = data.draw(tools.scenes())
-    assume(tools.steady_order(scene))
+    assume(tools.well_posed(scene))
     check_agreement(scene)
 
 
