@@ -49,8 +49,12 @@ def _columns(mx: Any, my: Any, tile_y: int, record: Any, at: int, width: int) ->
     """
     top = _block_rows() + np.float32(32 * tile_y - my)
     bottom = top + 3.0
-    shear, half, rightmost = record[at + 9], record[at + 10], record[at + 11]
-    axis_yy, reach = record[at + 4], record[at + 5] - _LEVEL_MIN
+    shear, half, rightmost = (
+        record[at + lay.SHEAR],
+        record[at + lay.HALF_WIDTH],
+        record[at + lay.RIGHTMOST],
+    )
+    axis_yy, reach = record[at + lay.AXIS_YY], record[at + lay.LEVEL] - _LEVEL_MIN
     yr = minimum(maximum(top, rightmost), bottom)
     yl = minimum(maximum(top, -rightmost), bottom)
     vr, vl = yr * axis_yy, yl * axis_yy

@@ -1,86 +1,39 @@
-"""Compositing of one tile after the other, front to back, and its gradient, back to front.
-
-A vector holds the pixels of one block (half of one where vectors are narrow). Pixel planes of a
-tile are ordered by block, so that a vector is one aligned load.
-"""
+"""Compositing, tile by tile, front to back."""
 
 # mypy: allow-untyped-defs
 # Numba infers the types of kernels.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from chronoscene.rasterizer.constants import ALPHA_MAX, TRANSMITTANCE_MIN
 from chronoscene.rasterizer.cpu import layout as lay
-from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
+from chronoscene.rasterizer.cpu.kernel import helper, kernel
 from chronoscene.rasterizer.cpu.phases import draw
 from chronoscene.rasterizer.cpu.simd import (
     LANES,
     any_lane,
-    as_float,
-    as_int,
     load,
-    load_pixels,
-    make_constant,
     minimum,
     prefetch,
-    prefetch_write,
     select,
     splat,
     splat_int,
     store,
     store_pixels,
-    store_sums,
     store_where,
     trailing_zeros,
 )
+from chronoscene.rasterizer.cpu.tile import AHEAD, PART_ROWS, PARTS, offset, whitened
 from chronoscene.rasterizer.cpu.vecmath import ROUND, exp2
 
-_AHEAD = 6  # entries by which records are asked for in advance
-_PARTS = 16 // LANES  # vectors per block
-_PART_ROWS = LANES // 4
 _PIXELS = lay.TILE_PIXELS
-_STATE = 64  # numbers per block going forward: light, red, green, blue
-_BACK = 96  # going backward: light, behind, gradient of red, green, blue, end of what counts
-_STEPS, _BACK_STEPS = 64 * _STATE, 64 * _BACK  # where the 24 numbers of `_whitened` are
-FORWARD_NUMBERS, BACKWARD_NUMBERS = _STEPS + 32, _BACK_STEPS + 32
+_STATE = 64  # numbers per block: light, red, green, blue
+_STEPS = 64 * _STATE  # where the numbers of `tile.whitened` are
+FORWARD_NUMBERS = _STEPS + 32
 """Scratch of one worker."""
 _LEVEL_MIN = lay.LEVEL_MIN
-
-_lane_x = make_constant([i % 4 + 0.5 for i in range(LANES)])
-_lane_y = make_constant([i // 4 + 0.5 for i in range(LANES)])
-_block_steps = make_constant([4.0 * i for i in range(8)])
-
-
-@inlined
-def _whitened(records: Any, at: int, left: Any, top: Any, state: Any, steps: int) -> Any:
-    """Level of a Gaussian, and (u, v) of the pixels of a tile's first block.
-
-    How u and v change from block to block goes into 24 numbers of ``state``: u by column, u by
-    row, v by row. Adding them costs less than multiplying anew: additions have units of their own.
-    """
-    axis_xx, axis_xy, axis_yy = records[at + 2], records[at + 3], records[at + 4]
-    store(state, steps, _block_steps() * axis_xx)
-    store(state, steps + 8, _block_steps() * axis_xy)
-    store(state, steps + 16, _block_steps() * axis_yy)
-    dx = _lane_x() + (left - records[at])
-    dy = _lane_y() + (top - records[at + 1])
-    return splat(records[at + 5]), dx * axis_xx + dy * axis_xy, dy * axis_yy
-
-
-@inlined
-def _offset(u0: Any, v0: Any, block: Any, part: int, state: Any, steps: int) -> Any:
-    """(u, v) of the pixels of part of a block."""
-    row = block >> 3
-    u = u0 + state[steps + (block & 7)] + state[steps + 8 + row]
-    v = v0 + state[steps + 16 + row]
-    if _PARTS > 1:  # the second half is two pixels below
-        u = u + state[steps + 9] * np.float32(0.5 * part)
-        v = v + state[steps + 17] * np.float32(0.5 * part)
-    return u, v
 
 
 @helper
@@ -111,7 +64,7 @@ def _start_tile(left, top, width, height, state, planes, plane, end):
 def _any_light(state, at):
     """Whether any pixel of a block is alive."""
     alive = False
-    for part in range(_PARTS):
+    for part in range(PARTS):
         alive |= any_lane(load(state, at + LANES * part) > 0.0)
     return alive
 
@@ -129,21 +82,21 @@ def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records
     for entry in range(start, end):
         bits = blocks[entry] & live
         blocks[entry] = bits
-        prefetch(records, lay.RECORD * gaussians[entry + _AHEAD])
+        prefetch(records, lay.RECORD * gaussians[entry + AHEAD])
         if bits == 0:
             if live == 0:
                 return entry
             continue
         record = lay.RECORD * gaussians[entry]
-        level, u0, v0 = _whitened(records, record, left, top, state, _STEPS)
-        red, green = splat(records[record + 6]), splat(records[record + 7])
-        blue = splat(records[record + 8])
+        level, u0, v0 = whitened(records, record, left, top, state, _STEPS)
+        red, green = splat(records[record + lay.COLOR]), splat(records[record + lay.COLOR + 1])
+        blue = splat(records[record + lay.COLOR + 2])
         while bits != 0:
             block = trailing_zeros(bits)
             bits &= bits - np.uint64(1)
-            for part in range(_PARTS):
+            for part in range(PARTS):
                 at = _STATE * block + LANES * part
-                u, v = _offset(u0, v0, block, part, state, _STEPS)
+                u, v = offset(u0, v0, block, part, state, _STEPS)
                 rest = level - v * v
                 power = rest - u * u
                 alpha = minimum(exp2(power, power + ROUND), ALPHA_MAX)
@@ -174,7 +127,7 @@ def _write_tile(left, top, width, height, plane, state, transmittance, backgroun
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
         at = _STATE * block
-        for part in range(_PARTS):
+        for part in range(PARTS):
             i = at + LANES * part
             light, kept = (
                 load(state, i),
@@ -187,8 +140,8 @@ def _write_tile(left, top, width, height, plane, state, transmittance, backgroun
             store(state, i + 32, load(state, i + 32) + light * green)
             store(state, i + 48, load(state, i + 48) + light * blue)
         if x + 4 <= width and y + 4 <= height:
-            for part in range(_PARTS):
-                i, pixel = at + LANES * part, (y + _PART_ROWS * part) * width + x
+            for part in range(PARTS):
+                i, pixel = at + LANES * part, (y + PART_ROWS * part) * width + x
                 store_pixels(
                     image,
                     3 * pixel,
@@ -273,173 +226,5 @@ def composite(
             (background[0], background[1], background[2]),
             image,
             alphas,
-        )
-        job = draw(control, 0)
-
-
-@helper
-def _start_backward(
-    left, top, width, height, plane, planes, image_grad, alpha_grad, background, state
-):
-    """State of a tile: final light, the background behind it, gradients of the channels."""
-    transmittance, last = planes
-    red, green, blue = background
-    for block in range(64):
-        x, y = left + 4 * (block % 8), top + 4 * (block // 8)
-        at = _BACK * block
-        if x >= width or y >= height:
-            continue
-        if x + 4 <= width and y + 4 <= height:
-            for part in range(_PARTS):
-                i, pixel = at + LANES * part, (y + _PART_ROWS * part) * width + x
-                r, g, b = load_pixels(image_grad, 3 * pixel, 3 * width, 3)
-                store(state, i + 32, r)
-                store(state, i + 48, g)
-                store(state, i + 64, b)
-                behind = r * red + (g * green + b * blue)
-                if alpha_grad.size > 0:
-                    behind = behind - load_pixels(alpha_grad, pixel, width, 1)[0]
-                store(state, i + 16, behind)
-        else:
-            for k in range(16):
-                r = g = b = a = np.float32(0.0)
-                if x + k % 4 < width and y + k // 4 < height:
-                    pixel = (y + k // 4) * width + x + k % 4
-                    r, g = image_grad[3 * pixel], image_grad[3 * pixel + 1]
-                    b = image_grad[3 * pixel + 2]
-                    if alpha_grad.size > 0:
-                        a = alpha_grad[pixel]
-                state[at + 32 + k], state[at + 48 + k], state[at + 64 + k] = r, g, b
-                state[at + 16 + k] = r * red + g * green + b * blue - a
-        for part in range(_PARTS):
-            i, k = at + LANES * part, plane + 16 * block + LANES * part
-            store(state, i, load(transmittance, k))
-            store(state, i + 80, as_float(load(last, k)))
-
-
-@helper
-def _backward_tile(start, stop, left, top, entries, records, touched, rows, state):
-    """Rows of the entries of a tile, from the last to the first.
-
-    With T the light before a Gaussian and B the gradient-weighted colour behind it as seen with
-    unit light: d loss / d alpha = T (c . grad - B); behind the next one in front,
-    B' = B + alpha (c . grad - B).
-    """
-    gaussians, blocks, places = entries
-    for k in range(stop - start):
-        entry = stop - 1 - k
-        bits = blocks[entry]
-        ahead = max(entry - _AHEAD, 0)
-        prefetch(records, lay.RECORD * gaussians[ahead])
-        prefetch_write(rows, lay.RECORD * places[ahead])
-        if bits == 0:
-            continue
-        record = lay.RECORD * gaussians[entry]
-        level, u0, v0 = _whitened(records, record, left, top, state, _BACK_STEPS)
-        red, green = splat(records[record + 6]), splat(records[record + 7])
-        blue = splat(records[record + 8])
-        s = su = sv = suu = suv = svv = sr = sg = sb = splat(np.float32(0.0))
-        number = splat_int(entry)
-        while bits != 0:
-            block = trailing_zeros(bits)
-            bits &= bits - np.uint64(1)
-            for part in range(_PARTS):
-                at = _BACK * block + LANES * part
-                u, v = _offset(u0, v0, block, part, state, _BACK_STEPS)
-                rest = level - v * v
-                power = rest - u * u
-                raw = exp2(power, power + ROUND)
-                counts = (power >= _LEVEL_MIN) & (number < as_int(load(state, at + 80)))
-                alpha = select(counts, minimum(raw, ALPHA_MAX), 0.0)
-                light = load(state, at) / (1.0 - alpha)
-                behind = load(state, at + 16)
-                gr, gg, gb = (
-                    load(state, at + 32),
-                    load(state, at + 48),
-                    load(state, at + 64),
-                )
-                difference = gr * red + (gg * green + (gb * blue - behind))
-                weight = alpha * light
-                step = alpha * difference
-                store(state, at, light)
-                store(state, at + 16, step + behind)
-                sr = sr + weight * gr
-                sg = sg + weight * gg
-                sb = sb + weight * gb
-                g = select(raw <= ALPHA_MAX, step * light, 0.0)
-                gu, gv = g * u, g * v
-                s = s + g
-                su = su + gu
-                sv = sv + gv
-                suu = suu + gu * u
-                suv = suv + gu * v
-                svv = svv + gv * v
-        place = places[entry]
-        touched[place] = 1
-        store_sums(rows, lay.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
-
-
-@kernel
-def composite_backward(
-    worker,
-    control,
-    width,
-    height,
-    tile_starts,
-    tile_stops,
-    tile_order,
-    entries,
-    records,
-    planes,
-    states,
-    background,
-    image_grad,
-    alpha_grad,
-    touched,
-    rows,
-):
-    """Sums over pixels of every entry, from the gradients of image and opacity.
-
-    Args:
-        worker, control, width, height: As in `composite`.
-        tile_starts, tile_stops, tile_order: As `composite` left them.
-        entries: (gaussian, blocks, place of its row) of each entry; as `composite` left them.
-        records, planes: As `composite` left them.
-        states: Scratch, `BACKWARD_NUMBERS` per worker.
-        background: Three numbers.
-        image_grad, alpha_grad: [H * W * 3], [H * W] or nothing
-        touched: Zeros; 1 is written where a row is. uint8
-        rows: Written, 16 numbers per entry; see `layout`.
-    """
-    tiles_x = (width + lay.TILE - 1) // lay.TILE
-    tiles = tile_stops.size
-    state = states[worker]
-    job = draw(control, 0)
-    while job < tiles:
-        tile = tile_order[job]
-        left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
-        start, stop = tile_starts[tile], tile_stops[tile]
-        _start_backward(
-            left,
-            top,
-            width,
-            height,
-            _PIXELS * tile,
-            planes,
-            image_grad,
-            alpha_grad,
-            (background[0], background[1], background[2]),
-            state,
-        )
-        _backward_tile(
-            start,
-            stop,
-            np.float32(left),
-            np.float32(top),
-            entries,
-            records,
-            touched,
-            rows,
-            state,
         )
         job = draw(control, 0)

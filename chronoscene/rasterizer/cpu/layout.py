@@ -1,8 +1,4 @@
-"""Numbers on which the CPU kernels agree. Numba reads them when a kernel is compiled.
-
-Changing one needs the kernels' caches removed (``__pycache__`` of this folder): Numba does not
-notice a changed global of another module.
-"""
+"""Numbers on which the CPU kernels agree. Numba reads them when a kernel is compiled."""
 
 from __future__ import annotations
 
@@ -27,8 +23,9 @@ SHEAR, HALF_WIDTH, RIGHTMOST = 9, 10, 11  # see bins.py
 TILES_X, TILES_Y = 12, 13  # int: first tile + (number of tiles << 16), per axis
 ROW = 14  # int: first row of sums in the backward pass, counted from that of the chunk
 
-# One row of sums of a (Gaussian, tile) pair in the backward pass, over pixels, with
-# g = d loss / d log(alpha) / ln(2)-free, in the order of `composite.backward_tile`.
+# One row of sums over the pixels of a tile, for a (Gaussian, tile) pair. With
+# g = alpha * d loss / d alpha: sums of g, g u, g v, g u^2, g u v, g v^2, and of the weight times
+# the gradient of each channel.
 SUM, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_COLOR = 0, 1, 2, 3, 4, 5, 6
 
 LOG2_E = math.log2(math.e)

@@ -12,16 +12,12 @@ from chronoscene.rasterizer.constants import CLAMP_MARGIN
 from chronoscene.rasterizer.cpu import layout as lay
 from chronoscene.rasterizer.cpu.bins import BIN_PHASES
 from chronoscene.rasterizer.cpu.bins import bin_gaussians as bin_all
-from chronoscene.rasterizer.cpu.composite import (
-    BACKWARD_NUMBERS,
-    FORWARD_NUMBERS,
-    composite,
-    composite_backward,
-)
-from chronoscene.rasterizer.cpu.project import add_rows, project_backward
+from chronoscene.rasterizer.cpu.composite import FORWARD_NUMBERS, composite
+from chronoscene.rasterizer.cpu.composite_backward import BACKWARD_NUMBERS, composite_backward
 from chronoscene.rasterizer.cpu.simd import LANES
 from chronoscene.rasterizer.cpu.sort import DIGIT_BITS
 from chronoscene.rasterizer.cpu.team import launch, threads
+from chronoscene.rasterizer.cpu.unproject import add_rows, project_backward
 from chronoscene.rasterizer.cpu.workspace import Workspace
 
 Array = NDArray[Any]
