@@ -115,6 +115,28 @@ def test_rendering_without_gradients_gives_equal_images(tools: SimpleNamespace) 
     assert torch.equal(plain.image, scene.render("cpu")[0].image)
 
 
+def test_second_derivatives_are_refused_not_wrong(tools: SimpleNamespace) -> None:
+    result, inputs = tools.random_scene(30, 20, 20).render("cpu")
+    loss = (result.image**2).sum()
+    (gradient,) = torch.autograd.grad(loss, inputs["means"], create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        gradient.sum().backward()
+
+
+def test_arrays_may_be_strided_and_read_only(tools: SimpleNamespace) -> None:
+    scene = tools.random_scene(60, 40, 40)
+    expected = scene.render("cpu")[0].image
+    inputs: dict[str, Any]
+    inputs = {name: x.detach() for name, x in scene.tensors(torch.float32).items()}
+    inputs["means"] = inputs["means"].T.contiguous().T
+    inputs["colors"] = torch.cat([inputs["colors"], inputs["colors"]], dim=1)[:, :3]
+    inputs["opacities"] = torch.stack([inputs["opacities"]] * 2, dim=1)[:, 0]
+    inputs.update(viewmats=torch.tensor(scene.viewmats), Ks=torch.tensor(scene.Ks))
+    with torch.inference_mode():
+        image = rasterize(**inputs, width=40, height=40).image
+    assert torch.equal(image, expected)
+
+
 def test_only_asked_gradients(tools: SimpleNamespace) -> None:
     """Gradients of some inputs do not need those of others."""
     scene = tools.random_scene(60, 40, 40)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from chronoscene.rasterizer.cpu import pipeline, workspace
@@ -61,6 +62,7 @@ class Render(torch.autograd.Function):
         return image, alphas, weighted
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *output_grads: Tensor | None) -> tuple[Tensor | None, ...]:
         *inputs, background, alphas = ctx.saved_tensors
         job = _Job(tuple(inputs), background, ctx.request)
