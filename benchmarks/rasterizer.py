@@ -11,6 +11,7 @@ size, in the same run.
 from __future__ import annotations
 
 import argparse
+import os
 import platform
 import time
 from collections.abc import Callable
@@ -137,7 +138,9 @@ def main() -> None:
     options = parser.parse_args()
     available = available_threads()
     threads = sorted({1, min(2, available), available})
-    print(f"{processor()}, {available} threads, torch {torch.__version__}; milliseconds\n")
+    policy = os.environ.get("OMP_WAIT_POLICY", "default")
+    print(f"{processor()}, {available} threads, torch {torch.__version__}")
+    print(f"OpenMP wait policy {policy}; milliseconds\n")
     best = table(SIZES[: options.largest], threads, options.repeats)
     if not options.no_reference:
         scene = surfaces(*SIZES[0])
