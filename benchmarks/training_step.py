@@ -1,0 +1,186 @@
+"""Where the milliseconds of a training step of ChronoGS go.
+
+    python benchmarks/training_step.py SCENE [--train 1500] [--steps 200]
+    python benchmarks/training_step.py SCENE --model RUN/checkpoint
+
+Trains on a scene until the model is of a realistic size, then times every part of ordinary steps:
+neither the rounds that grow and prune, nor the reading of photos from disk. ``--model`` starts
+from a checkpoint instead. Prints milliseconds per step by part, median and minimum over the steps,
+with one thread and with all. On a machine with other work look at the minimum.
+
+The parts are timed inside real steps; what torch's autograd and Python need between them is the
+line "rest".
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count, islice
+from pathlib import Path
+from typing import Any
+
+# Before torch: it says how idle threads wait.
+import chronoscene  # noqa: F401
+
+# isort: split
+import numpy as np
+import torch
+
+from chronogs.config import ChronoGSConfig
+from chronogs.method import ChronoGS
+from chronogs.presets import PRESETS
+from chronoscene.bench.identity import code_version, processor_name
+from chronoscene.bench.protocol import Part, make_parts
+from chronoscene.formats import read_scene
+from chronoscene.images import ImageStore
+from chronoscene.rasterizer.cpu.function import Render
+from chronoscene.threads import available_threads, set_threads
+from chronoscene.training import losses, volume_loss
+from chronoscene.training._decode_function import Decode
+from chronoscene.training.anchor_model import AnchorModel
+from chronoscene.training.anchor_training import AnchorTrainer
+from chronoscene.training.density import DensityStatistics
+from chronoscene.training.optimizer import Adam
+
+PARTS: tuple[tuple[str, Any, str], ...] = (
+    ("frustum culling", AnchorModel, "visible"),
+    ("decode", Decode, "forward"),
+    ("rasterize", Render, "forward"),
+    ("loss", losses._PhotometricLoss, "forward"),
+    ("volume term", volume_loss._MeanVolume, "forward"),
+    ("volume term, backward", volume_loss._MeanVolume, "backward"),
+    ("loss, backward", losses._PhotometricLoss, "backward"),
+    ("rasterize, backward", Render, "backward"),
+    ("decode, backward", Decode, "backward"),
+    ("density statistics", DensityStatistics, "update"),
+    ("Adam", Adam, "step"),
+)
+"""What is timed: name, owner, function."""
+
+
+class Stopwatch:
+    """Seconds of each part, collected within one step."""
+
+    def __init__(self) -> None:
+        self.seconds: defaultdict[str, float] = defaultdict(float)
+
+    def wrap(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function, timed."""
+
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                self.seconds[name] += time.perf_counter() - start
+
+        return timed
+
+
+@contextmanager
+def timed_parts(watch: Stopwatch) -> Iterator[None]:
+    """Replace the functions of `PARTS` by timed ones for a while."""
+    originals = [(owner, name, owner.__dict__[name]) for _, owner, name in PARTS]
+    for (label, owner, name), (_, _, original) in zip(PARTS, originals, strict=True):
+        static = isinstance(original, staticmethod)
+        function = watch.wrap(label, original.__func__ if static else original)
+        setattr(owner, name, staticmethod(function) if static else function)
+    try:
+        yield
+    finally:
+        for owner, name, original in originals:
+            setattr(owner, name, original)
+
+
+def train(part: Part, preset: str, steps: int, seed: int) -> AnchorTrainer:
+    """Train as the harness does for some steps of the preset's schedule."""
+    config = ChronoGSConfig(**PRESETS[preset])
+    method = ChronoGS(config)
+    method.setup(part.train, seed=seed, device="cpu")
+    for index in range(steps):
+        method.step(index, index / config.iterations)
+    assert method._trainer is not None
+    return method._trainer
+
+
+def resume(part: Part, preset: str, model: Path, seed: int) -> AnchorTrainer:
+    """A trainer of the model of a checkpoint, with an optimiser that starts anew."""
+    config = ChronoGSConfig(**PRESETS[preset])
+    method = ChronoGS(config)
+    method.load(model, device="cpu")
+    periods = np.stack([method.weights(period) for period in range(part.train.num_periods)])
+    return AnchorTrainer(
+        config,
+        method.model,
+        part.train,
+        voxel_size=0.01,  # of no consequence: nothing grows here
+        seed=seed,
+        rates=method.rates(part.train.camera_extent),
+        weights=torch.from_numpy(periods),
+    )
+
+
+def measure(trainer: AnchorTrainer, steps: int) -> dict[str, list[float]]:
+    """Milliseconds of each part in each step, all with statistics for growth and none with growth.
+
+    The learning rates are those of the middle of the training.
+    """
+    watch, found = Stopwatch(), defaultdict[str, list[float]](list)
+    ordinary = (i for i in count(1) if (i + 1) % trainer.config.density_interval)
+    progress = 0.9 * trainer.config.density_until
+    with timed_parts(watch):
+        for index in islice(ordinary, steps):
+            watch.seconds.clear()
+            begin = time.perf_counter()
+            trainer.step(index, progress * index / (index + 1))
+            whole = time.perf_counter() - begin
+            rest = whole - sum(watch.seconds.values())
+            for name, seconds in {**watch.seconds, "rest": rest, "step": whole}.items():
+                found[name].append(1e3 * seconds)
+    return found
+
+
+def report(columns: dict[str, dict[str, list[float]]]) -> None:
+    """Print a line per part, and for each column the median and the minimum."""
+    print(f"{'ms per step: median, minimum':<30}" + "".join(f"{name:>20}" for name in columns))
+    for part in [name for name, _, _ in PARTS] + ["rest", "step"]:
+        cells = []
+        for found in columns.values():
+            times = sorted(found.get(part, [0.0]))
+            cells.append(f"{times[len(times) // 2]:10.2f}{times[0]:10.2f}")
+        print(f"{part:<30}" + "".join(cells))
+
+
+def main() -> None:
+    """Train, or load; then time the parts with one thread and with all."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--model", type=Path, help="checkpoint folder to start from")
+    parser.add_argument("--preset", default="balanced", choices=sorted(PRESETS))
+    parser.add_argument("--train", type=int, default=1_500, help="steps before, without --model")
+    parser.add_argument("--steps", type=int, default=200, help="timed steps")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    scene = read_scene(args.scene)
+    (part,) = make_parts(scene, ImageStore(scene), "joint")
+    if args.model:
+        trainer = resume(part, args.preset, args.model, args.seed)
+    else:
+        trainer = train(part, args.preset, args.train, args.seed)
+    view = part.train.views[0]
+    print(f"{processor_name()}, torch {torch.__version__}, commit {code_version()}")
+    print(f"{scene.name}, {view.width}x{view.height}, {len(trainer.model)} anchors")
+    columns = {}
+    for threads in sorted({1, available_threads()}):
+        set_threads(threads)
+        measure(trainer, 10)  # compile, touch memory
+        columns[f"{threads} thread(s)"] = measure(trainer, args.steps)
+    report(columns)
+
+
+if __name__ == "__main__":
+    main()
