@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
-import shutil
-import tempfile
 from collections.abc import Iterable
 from datetime import date
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from chronoscene.checks import check_choice
 from chronoscene.colmap import Model, PosedImage, read_model, write_model
 from chronoscene.errors import SceneError
+from chronoscene.formats.writing import ImageSource, Progress, place_images, staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame
 from chronoscene.splits import (
     DEFAULT_RULE,
@@ -45,8 +43,6 @@ WORLD = "sparse/world.json"
 
 MOST_PERIODS = 100_000
 """Far beyond any real scene: more come from a mistaken id, and would fill the memory."""
-
-ImageSource = Literal["copy", "link", "none"]
 
 
 def matches(path: Path) -> bool:
@@ -163,10 +159,18 @@ def read_periods(path: Path, count: int) -> tuple[Period, ...]:
         )
     if not (path / PERIODS).exists():
         return tuple(Period(i, str(i)) for i in range(count))
-    items = _read_json(path / PERIODS, list)
+    return parse_periods(path / PERIODS, _read_json(path / PERIODS, list), count)
+
+
+def parse_periods(place: Path, items: list[Any], count: int) -> tuple[Period, ...]:
+    """Periods from the content of ``periods.json``.
+
+    Raises:
+        SceneError: If they are damaged or not those with the ids 0 to ``count - 1``.
+    """
     if [item.get("id") if isinstance(item, dict) else None for item in items] != [*range(count)]:
-        raise _json_error(path / PERIODS, f"objects with ids 0..{count - 1} in order", "others")
-    return tuple(_parse_period(path / PERIODS, item) for item in items)
+        raise _json_error(place, f"objects with ids 0..{count - 1} in order", "others")
+    return tuple(_parse_period(place, item) for item in items)
 
 
 def _parse_period(place: Path, item: dict[str, Any]) -> Period:
@@ -195,7 +199,15 @@ def read_world(path: Path) -> WorldFrame:
     place = path / WORLD
     if not place.exists():
         return WorldFrame()
-    data = _read_json(place, dict)
+    return parse_world(place, _read_json(place, dict))
+
+
+def parse_world(place: Path, data: dict[str, Any]) -> WorldFrame:
+    """World frame from the content of ``world.json``.
+
+    Raises:
+        SceneError: If it is damaged.
+    """
     _check_keys(place, data, {"unit", "crs", "offset"})
     unit, crs, offset = data.get("unit", "unknown"), data.get("crs"), data.get("offset", [0, 0, 0])
     check_choice(f"{place}: unit", str(unit), ("metre", "unknown"), error=SceneError)
@@ -230,41 +242,34 @@ def _json_error(place: Path, expected: str, found: str) -> SceneError:
     return SceneError(place, expected=expected, found=found, todo="see DATASET.md")
 
 
-def write(scene: Scene, out: Path, *, image_source: ImageSource = "copy") -> Path:
+def write(
+    scene: Scene,
+    out: Path,
+    *,
+    image_source: ImageSource = "copy",
+    progress: Progress | None = None,
+) -> Path:
     """Write a scene in this format; the folder appears complete or not at all.
 
     Args:
         scene: Any scene, of whatever format.
         out: Folder that does not exist yet, or is empty.
-        image_source: ``copy`` the images, make hard ``link``s where the disk can (else copies),
-            or write ``none``.
+        image_source: What to do with the images; see `IMAGE_SOURCES`.
+        progress: Called after each image.
 
     Raises:
         SceneError: If ``out`` is in use, or an image is missing.
     """
     out = Path(out)
-    check_choice("image_source", image_source, ("copy", "link", "none"))
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise SceneError(
-            out, expected="a new or empty folder", found="one in use", todo="choose another folder"
-        )
     for frame in scene.frames:
-        _check_writable_name(out, frame)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
-        staged = Path(temporary) / "scene"
-        (staged / MODEL).mkdir(parents=True)
-        write_model(staged / MODEL, scene.frames, scene.points)
-        _write_texts(scene, staged)
-        if image_source != "none":
-            _write_images(scene, staged / "images", link=image_source == "link")
-        if out.exists():
-            out.rmdir()
-        staged.rename(out)
+        check_writable_name(out, frame)
+    with staged_folder(out) as staged:
+        write_texts(scene, staged)
+        place_images(scene, staged / "images", image_source=image_source, progress=progress)
     return out
 
 
-def _check_writable_name(place: Path, frame: Frame) -> None:
+def check_writable_name(place: Path, frame: Frame) -> None:
     """Refuse a name that would leave the folder or that one line of text cannot hold."""
     check_name(place, frame.name)
     entries, _ = parse_split_text(format_split_text({frame.name: frame.period}))
@@ -277,30 +282,26 @@ def _check_writable_name(place: Path, frame: Frame) -> None:
         )
 
 
-def _write_texts(scene: Scene, root: Path) -> None:
+def write_texts(scene: Scene, root: Path) -> None:
+    """Write all files of the format but the images into an existing folder."""
+    (root / MODEL).mkdir(parents=True)
+    write_model(root / MODEL, scene.frames, scene.points)
     tests = [f.name for f in scene.frames if f.split == "test"]
-    periods = [{"id": p.id, "label": p.label, "date": p.date} for p in scene.periods]
-    world = scene.world
     files = {
         SPLIT: format_split_text({f.name: f.period for f in scene.frames}),
         TEST: "".join(f"{name}\n" for name in tests),
-        PERIODS: json.dumps(periods, indent=1, ensure_ascii=False) + "\n",
-        WORLD: json.dumps({"unit": world.unit, "crs": world.crs, "offset": world.offset}) + "\n",
+        PERIODS: json.dumps(period_items(scene.periods), indent=1, ensure_ascii=False) + "\n",
+        WORLD: json.dumps(world_item(scene.world)) + "\n",
     }
     for name, text in files.items():
         (root / name).write_text(text, encoding="utf-8", newline="\n")
 
 
-def _write_images(scene: Scene, root: Path, *, link: bool) -> None:
-    for frame in scene.frames:
-        source, target = scene.image_path(frame), root / frame.name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if not source.is_file():
-            raise SceneError(source, expected="an image", found="nothing", todo="copy it there")
-        if link:
-            try:
-                os.link(source, target)
-                continue
-            except OSError:
-                pass  # another disk, or one without links
-        shutil.copyfile(source, target)
+def period_items(periods: Iterable[Period]) -> list[dict[str, Any]]:
+    """Periods as they stand in ``periods.json``; `parse_periods` reads them."""
+    return [{"id": p.id, "label": p.label, "date": p.date} for p in periods]
+
+
+def world_item(world: WorldFrame) -> dict[str, Any]:
+    """A world frame as it stands in ``world.json``; `parse_world` reads it."""
+    return {"unit": world.unit, "crs": world.crs, "offset": list(world.offset)}

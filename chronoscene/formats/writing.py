@@ -1,0 +1,114 @@
+"""What all writers share: folders that appear complete or not at all, and images placed in them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import SceneError
+from chronoscene.scene import Scene
+
+ImageSource = Literal["copy", "link", "symlink", "none"]
+
+IMAGE_SOURCES: tuple[ImageSource, ...] = ("copy", "link", "symlink", "none")
+"""``copy``; hard ``link`` where the disk can, else copy; absolute ``symlink``; no images."""
+
+Progress = Callable[[int, int], None]
+"""Called with the number of images done and their total."""
+
+
+@contextmanager
+def staged_folder(out: Path) -> Iterator[Path]:
+    """A temporary folder beside ``out``, renamed to it if the block ends well, else deleted.
+
+    Raises:
+        SceneError: If ``out`` is a file or has content, or the disk refuses.
+    """
+    try:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise SceneError(
+                out,
+                expected="a new or empty folder",
+                found="one in use",
+                todo="choose another folder",
+            )
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
+            staged = Path(temporary) / "scene"
+            staged.mkdir()
+            yield staged
+            if out.exists():
+                out.rmdir()
+            staged.rename(out)
+    except OSError as error:
+        raise SceneError(
+            error.filename or out,
+            expected="a place that can be written to",
+            found=error.strerror or str(error),
+            todo="choose another folder, or make room",
+        ) from error
+
+
+def place_images(
+    scene: Scene,
+    root: Path,
+    *,
+    image_source: ImageSource = "copy",
+    progress: Progress | None = None,
+) -> None:
+    """Put the images of a scene below ``root``, under their names.
+
+    Raises:
+        SceneError: If an image is missing.
+        ConfigError: If there is no such image source.
+    """
+    check_choice("image_source", image_source, IMAGE_SOURCES)
+    if image_source == "none":
+        return
+    for done, frame in enumerate(scene.frames, start=1):
+        place_image(scene.image_path(frame), root / frame.name, image_source)
+        if progress is not None:
+            progress(done, len(scene.frames))
+
+
+def place_image(source: Path, target: Path, image_source: ImageSource) -> None:
+    """Copy or link one image.
+
+    Raises:
+        SceneError: If it is missing.
+    """
+    if not source.is_file():
+        raise SceneError(source, expected="an image", found="nothing", todo="copy it there")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if image_source == "symlink":
+        target.symlink_to(source.resolve())
+        return
+    if image_source == "link":
+        try:
+            os.link(source.resolve(), target)
+            return
+        except OSError:
+            pass  # another disk, or one without links
+    shutil.copyfile(source, target)
+
+
+def renamed(scene: Scene, names: Mapping[str, str]) -> Scene:
+    """The same scene with other image names: frames sorted again, tracks following them.
+
+    The files keep their names, so `Scene.image_path` of the result is of no use.
+    """
+    new = [replace(frame, name=names[frame.name]) for frame in scene.frames]
+    order = sorted(range(len(new)), key=lambda i: new[i].name)
+    rank = np.empty(len(new), np.int32)
+    rank[order] = np.arange(len(new), dtype=np.int32)
+    points = replace(scene.points, track_frame=rank[scene.points.track_frame])
+    return replace(scene, frames=tuple(new[i] for i in order), points=points)
