@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from chronoscene.validation.raw_model import RawImages, RawPoints
 
+DENSE = 1_000_000
+"""Ids over a range of about so many numbers are looked up in a table."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
@@ -27,27 +30,44 @@ class Observations:
         """Whether both image and keypoint exist. [M]"""
         return self.keypoint >= 0
 
-    def by_image(self, count: int) -> Iterator[tuple[int, NDArray[np.int64]]]:
-        """Index of each of ``count`` images that has valid observations, and their rows."""
-        image = np.where(self.valid, self.image, -1)
-        order = np.argsort(image, kind="stable")
-        ends = np.searchsorted(image[order], np.arange(count + 1))
-        for i in range(count):
+    def by_image(self, images: RawImages) -> Iterator[tuple[int, NDArray[np.int64]]]:
+        """Index of each image that has valid observations, and their rows.
+
+        Rows come in the order of the keypoints, which lie image by image: no sorting. Of several
+        observations at one keypoint, which is an error of its own, one is taken.
+        """
+        row = np.full(len(images.keypoint_point), -1, np.int64)
+        rows = np.flatnonzero(self.valid)
+        row[self.keypoint[rows]] = rows
+        used = row >= 0
+        before = np.concatenate([[0], np.cumsum(used)])
+        row, ends = row[used], before[images.keypoint_start]
+        for i in range(len(images)):
             if ends[i] < ends[i + 1]:
-                yield i, order[ends[i] : ends[i + 1]]
+                yield i, row[ends[i] : ends[i + 1]]
 
 
 def observe(images: RawImages, points: RawPoints) -> Observations:
     """Look up what the tracks refer to."""
     point = np.repeat(np.arange(len(points)), np.diff(points.track_start))
-    order = np.argsort(images.ids, kind="stable")
-    ids = images.ids[order]
-    if not len(ids):
+    if not len(images):
         nothing = np.full(len(point), -1, np.int64)
         return Observations(point, nothing, nothing)
-    slot = np.minimum(np.searchsorted(ids, points.track_image), len(ids) - 1)
-    image = np.where(ids[slot] == points.track_image, order[slot], -1)
+    image = _look_up(images.ids, points.track_image)
     first = images.keypoint_start[:-1][image]
     length = np.diff(images.keypoint_start)[image]
     inside = (image >= 0) & (points.track_keypoint >= 0) & (points.track_keypoint < length)
     return Observations(point, image, np.where(inside, first + points.track_keypoint, -1))
+
+
+def _look_up(ids: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index of each wanted id, -1 for none. Of equal ids the first counts."""
+    low, high = int(ids.min()), int(ids.max())
+    if high - low < 2 * DENSE + 4 * len(ids):  # a table is ten times quicker than a search
+        table = np.full(high - low + 2, -1, np.int64)
+        table[ids[::-1] - low] = np.arange(len(ids))[::-1]
+        inside = (wanted >= low) & (wanted <= high)
+        return table[np.where(inside, wanted - low, high - low + 1)]
+    order = np.argsort(ids, kind="stable")
+    slot = np.minimum(np.searchsorted(ids[order], wanted), len(ids) - 1)
+    return np.where(ids[order[slot]] == wanted, order[slot], -1)

@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from chronoscene.errors import ImageError
-from chronoscene.images import image_size, load_rgb
+from chronoscene.exif import ExifData, exif_of
+from chronoscene.images import load_rgb
 
 THUMBNAIL = 32
 """Pixels along each side of a thumbnail."""
 
-_ORIENTATION_TAG = 0x0112
+END_MARKS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND"}
+"""What ends a file. Compressed JPEG data cannot contain its mark."""
+
+TAIL = 4096
+"""Bytes at the end of a file in which its mark is looked for."""
+
+_HEADER_THREADS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +45,15 @@ class Header:
     """Pillow's name of the kind of pixels."""
     orientation: int = 1
     """EXIF orientation; 1 is upright."""
+    kind: str = ""
+    """Pillow's name of the file format."""
+    deep: bool = False
+    """Whether it has more than 8 bits per channel."""
+    moving: bool = False
+    """Whether it has several frames."""
+    cut_off: bool = False
+    """Whether it ends before its end."""
+    exif: ExifData = field(default_factory=ExifData)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,24 +68,64 @@ class Pixels:
     """Mean colours, 0..255. [32, 32, 3]"""
 
 
-def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
-    """Headers of some images below a folder."""
-    with _quiet():
-        return {name: read_header(folder / name) for name in names}
+def read_headers(folder: Path, names: Sequence[str]) -> dict[str, Header]:
+    """Headers of some images below a folder, in several threads: a disk may be slow."""
+    with _quiet(), ThreadPoolExecutor(_HEADER_THREADS) as pool:
+        paths = [folder / name for name in names]
+        return dict(zip(names, pool.map(read_header, paths, chunksize=64), strict=True))
 
 
 def read_header(path: Path) -> Header:
     """Header of one image; never raises for what is in the file."""
     try:
-        if os.path.getsize(path) == 0:
-            return Header("an empty file")
-        size = image_size(path)
-        with Image.open(path) as image:
-            return Header(None, size, image.mode, _orientation(image))
-    except ImageError as error:
-        return Header(_without_path(error.found, path))
-    except OSError as error:
-        return Header(error.strerror or "an error")
+        with path.open("rb") as file:
+            if os.fstat(file.fileno()).st_size == 0:
+                return Header("an empty file")
+            with Image.open(file) as image:
+                return _header(path, file, image)
+    except Exception as error:  # damaged files make Pillow raise almost anything
+        return Header(_problem(error))
+
+
+def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
+    exif = exif_of(image)
+    width, height = image.size
+    kind = image.format or ""
+    if kind == "TIFF" and exif.orientation >= 5:  # Pillow tells the size after turning
+        width, height = height, width
+    return Header(
+        problem=None,
+        size=(width, height),
+        mode=image.mode,
+        orientation=exif.orientation,
+        kind=kind,
+        deep=_is_deep(image),
+        moving=kind not in ("MPO", "TIFF") and bool(getattr(image, "is_animated", False)),
+        cut_off=_is_cut_off(path, file, kind),
+        exif=exif,
+    )
+
+
+def _is_deep(image: Image.Image) -> bool:
+    """Whether there are more than 8 bits per channel in the file."""
+    if image.mode in ("F", "I") or image.mode.startswith("I;"):
+        return True
+    tile = image.tile[0] if getattr(image, "tile", None) else ()
+    return any(";16" in str(argument) for argument in tile[3:])
+
+
+def _is_cut_off(path: Path, file: BinaryIO, kind: str) -> bool:
+    """Whether the mark at the end of the file is missing and its pixels cannot be decoded.
+
+    Without the mark the file may still be whole: phones append what they like. Only such files are
+    decoded.
+    """
+    mark = END_MARKS.get(kind)
+    if mark is None:
+        return False
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - TAIL))
+    return mark not in file.read() and read_pixels_of(path).problem is not None
 
 
 def hash_files(
@@ -107,17 +164,16 @@ def read_pixels_of(path: Path) -> Pixels:
         rgb = load_rgb(path)
     except ImageError as error:
         return Pixels(_without_path(error.found, path))
+    except Exception as error:  # damaged files make Pillow raise almost anything
+        return Pixels(_problem(error))
     digest = hashlib.sha256(repr(rgb.shape).encode() + rgb.tobytes()).digest()
     small = Image.fromarray(rgb).resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
     return Pixels(None, digest, np.asarray(small, np.float32))
 
 
-def _orientation(image: Image.Image) -> int:
-    try:
-        value = image.getexif().get(_ORIENTATION_TAG, 1)
-    except Exception:  # damaged EXIF raises almost anything, and says nothing about the pixels
-        return 1
-    return value if isinstance(value, int) else 1
+def _problem(error: Exception) -> str:
+    known = error.strerror if isinstance(error, OSError) else None
+    return known or re.sub(r"<_io\.[^>]*>", "it", str(error)) or type(error).__name__
 
 
 def _without_path(text: str, path: Path) -> str:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from chronoscene.colmap import MODEL_FILES
 from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name
+from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.scene import Camera
 from chronoscene.splits import (
     IMAGE_SUFFIXES,
@@ -41,7 +42,7 @@ from chronoscene.validation.pixels import (
     read_pixels,
 )
 from chronoscene.validation.raw_model import FORMS, RawImages, RawModel, RawPoints, read_raw_model
-from chronoscene.validation.reprojection import Reprojection, reproject
+from chronoscene.validation.reprojection import Reprojection, good_poses, reproject
 
 T = TypeVar("T")
 Track = Callable[[Sequence[T], str], Iterable[T]]
@@ -49,6 +50,9 @@ Track = Callable[[Sequence[T], str], Iterable[T]]
 
 MODEL_PLACES = (MODEL, "sparse", "colmap/sparse/0", "dense/sparse", "dense/0/sparse", "")
 """Where a model is looked for; only the first is right."""
+
+FEWEST = 10
+"""Observations of an image from which the median of its errors means something."""
 
 LARGEST_SIDE = 10**6
 """Pixels; a camera that claims more is a damaged record."""
@@ -153,12 +157,38 @@ class RawScene:
         return observe(self.images, self.points)
 
     @cached_property
+    def centres(self) -> NDArray[np.float64]:
+        """Camera centres in the world, NaN for poses that are not good. [I, 3]"""
+        if self.images is None:
+            return np.zeros((0, 3))
+        with np.errstate(all="ignore"):  # absurd translations become infinite
+            rotations = rotation_from_quaternion(self.images.quaternions)
+            centres = -np.einsum("nji,nj->ni", rotations, self.images.translations)
+        centres[~(good_poses(self.images) & np.isfinite(centres).all(axis=1))] = np.nan
+        return centres
+
+    @cached_property
     def reprojections(self) -> list[Reprojection] | None:
         """Of the images with a usable camera, a finite pose and observations."""
         images, points, seen = self.images, self.points, self.observations
         if self.cameras is None or images is None or points is None or seen is None:
             return None
         return list(reproject(self.usable_cameras, images, points, seen))
+
+    @cached_property
+    def image_errors(self) -> NDArray[np.float64]:
+        """Median reprojection error of each image in pixels, of the points in front of it.
+
+        NaN for images with fewer than `FEWEST` points, and for cameras with distortion. [I]
+        """
+        errors = np.full(len(self.images or ()), np.nan)
+        for seen in self.reprojections or ():
+            assert self.images is not None
+            camera = self.usable_cameras[int(self.images.camera_ids[seen.image])]
+            front = seen.error[seen.depth > 0]
+            if camera.is_pinhole and len(front) >= FEWEST:
+                errors[seen.image] = np.median(front)
+        return errors
 
     # Periods and split.
 
@@ -232,6 +262,18 @@ class RawScene:
         return np.array([index[periods[n]] if n in periods else -1 for n in names], np.int64)
 
     @cached_property
+    def point_periods(self) -> NDArray[np.bool_]:
+        """Whether an image of a period sees the point; columns as `period_ids`. [P, T]"""
+        points, seen = self.points, self.observations
+        table = np.zeros((len(points or ()), len(self.period_ids)), bool)
+        if seen is None:
+            return table
+        period = np.append(self.image_periods, -1)[seen.image]
+        rows = (period >= 0) & seen.valid
+        table[seen.point[rows], period[rows]] = True
+        return table
+
+    @cached_property
     def period_ids(self) -> list[int]:
         """Ids of the periods that have images, sorted; there may be gaps."""
         return sorted(set((self.periods or {}).values()))
@@ -263,8 +305,7 @@ class RawScene:
     @cached_property
     def headers(self) -> dict[str, Header]:
         """Headers of the present images."""
-        tracked = self._track(self.present, "image headers")
-        return read_headers(self.root / "images", tracked)
+        return read_headers(self.root / "images", self.present)
 
     @cached_property
     def readable(self) -> list[str]:

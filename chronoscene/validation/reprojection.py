@@ -19,6 +19,8 @@ class Reprojection(NamedTuple):
 
     image: int
     """Index into the images."""
+    rows: NDArray[np.int64]
+    """Indices into the observations. [m]"""
     depth: NDArray[np.float64]
     """World units along the optical axis. [m]"""
     error: NDArray[np.float64]
@@ -40,17 +42,18 @@ def reproject(
     Distortion is not applied: errors mean something for pinhole cameras only.
     """
     good = good_poses(images)
-    for image, rows in seen.by_image(len(images)):
+    finite = np.isfinite(points.xyz).all(axis=1)[seen.point]
+    for image, rows in seen.by_image(images):
         camera = cameras.get(int(images.camera_ids[image]))
         if camera is None or not good[image]:
             continue
-        xyz = points.xyz[seen.point[rows]]
+        rows = rows[finite[rows]]
         target = images.keypoint_xy[seen.keypoint[rows]]
-        finite = np.isfinite(xyz).all(axis=1) & np.isfinite(target).all(axis=1)
         with np.errstate(all="ignore"):  # infinite for absurd poses
-            depth, projected = _project(images, image, camera.K, xyz[finite])
-            error = np.linalg.norm(projected - target[finite], axis=1)
-        yield Reprojection(image, depth, error)
+            depth, projected = _project(images, image, camera.K, points.xyz[seen.point[rows]])
+            error = np.linalg.norm(projected - target, axis=1)
+        known = np.isfinite(target).all(axis=1)
+        yield Reprojection(image, rows[known], depth[known], error[known])
 
 
 def _project(

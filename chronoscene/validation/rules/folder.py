@@ -11,6 +11,7 @@ from chronoscene.formats import chronoscene as our_format
 from chronoscene.validation.finding import Hit, shown
 from chronoscene.validation.raw_model import model_files
 from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.reader_check import reader_complaint
 from chronoscene.validation.rule import rule
 
 
@@ -109,10 +110,10 @@ def bad_world_json(scene: RawScene) -> Iterator[Hit]:
     last=True,
 )
 def reader_refuses(scene: RawScene) -> Iterator[Hit]:
-    try:
-        our_format.read(scene.root)
-    except ChronoSceneError as error:
-        yield _hit(scene, error, "scene")
+    assert scene.model is not None
+    error = reader_complaint(scene.root, scene.model)
+    if error is not None:
+        yield Hit(error.place, error.expected, error.found, error.todo)
 
 
 def _hit(scene: RawScene, error: ChronoSceneError, place: str) -> Hit:

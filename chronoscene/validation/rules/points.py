@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chronoscene.validation.finding import NOTHING, Hit, counted, shown
 from chronoscene.validation.raw_model import RawPoints
@@ -120,7 +119,8 @@ def track_disagrees(scene: RawScene) -> Iterator[Hit]:
     needs=("observations", "periods"),
 )
 def period_without_points(scene: RawScene) -> Iterator[Hit]:
-    total = len(seen := _seen(scene))
+    seen = scene.point_periods
+    total = len(seen)
     for column, period in enumerate(scene.period_ids):
         if total and not seen[:, column].any():
             yield Hit(f"period {period}", "points that its images see", f"0 of {total}")
@@ -136,7 +136,7 @@ def period_without_points(scene: RawScene) -> Iterator[Hit]:
     needs=("observations", "periods"),
 )
 def points_of_one_period(scene: RawScene) -> Iterator[Hit]:
-    seen = _seen(scene)
+    seen = scene.point_periods
     if not len(seen) or seen.shape[1] < 2:
         return
     number = seen.sum(axis=1)
@@ -157,7 +157,7 @@ def points_of_one_period(scene: RawScene) -> Iterator[Hit]:
     needs=("observations", "periods"),
 )
 def period_unconnected(scene: RawScene) -> Iterator[Hit]:
-    seen = _seen(scene)
+    seen = scene.point_periods
     if np.count_nonzero(seen.any(axis=0)) < 2:
         return  # nothing to be connected with
     shared = seen.sum(axis=1) > 1
@@ -221,17 +221,6 @@ def no_training_points(scene: RawScene) -> Iterator[Hit]:
     if len(scene.points or ()) and not train[seen.image[seen.valid]].any():
         found = f"0 of {len(scene.points or ())}"
         yield Hit(scene.model_file("points3D"), "points that training images see", found)
-
-
-def _seen(scene: RawScene) -> NDArray[np.bool_]:
-    """Whether an image of a period sees the point; columns as `RawScene.period_ids`. [P, T]"""
-    seen, points = scene.observations, scene.points
-    assert seen is not None and points is not None
-    table = np.zeros((len(points), len(scene.period_ids)), bool)
-    rows = seen.valid
-    period = scene.image_periods[seen.image[rows]]
-    table[seen.point[rows][period >= 0], period[period >= 0]] = True
-    return table
 
 
 def _some_points(

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.raw_model import RawImages
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.reprojection import good_poses
 from chronoscene.validation.rule import rule
@@ -70,22 +67,13 @@ def quaternion_not_unit(scene: RawScene) -> Iterator[Hit]:
     needs=("images",),
 )
 def far_from_origin(scene: RawScene) -> Iterator[Hit]:
-    images = scene.images
-    assert images is not None
-    good = good_poses(images)
-    if np.count_nonzero(good) < 2:
+    centres = scene.centres[~np.isnan(scene.centres).any(axis=1)]
+    if len(centres) < 2:
         return
-    with np.errstate(all="ignore"):  # absurd translations become infinite and compare as false
-        centres = camera_centres(images)[good]
+    with np.errstate(over="ignore"):
         middle = np.median(centres, axis=0)
         extent = float(np.median(np.linalg.norm(centres - middle, axis=1)))
         distance = float(np.linalg.norm(middle))
     if extent > 0 and distance > FAR * extent:
         found = f"cameras {distance:.3g} away from it, within {extent:.3g} of their median"
         yield Hit(scene.model_file("images"), "cameras near the origin of the world", found)
-
-
-def camera_centres(images: RawImages) -> NDArray[np.float64]:
-    """Camera centres in the world; meaningless where `good_poses` is false. [I, 3]"""
-    rotations = rotation_from_quaternion(images.quaternions)
-    return -np.einsum("nji,nj->ni", rotations, images.translations)

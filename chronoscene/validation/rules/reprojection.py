@@ -20,9 +20,6 @@ ERROR_SHARE, LEAST_ERROR = 0.01, 4.0
 """Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
 pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
 
-FEWEST = 10
-"""Observations of an image from which the median of its errors means something."""
-
 
 @rule(
     "CS511",
@@ -36,16 +33,22 @@ FEWEST = 10
 def observations_outside(scene: RawScene) -> Iterator[Hit]:
     seen, images = scene.observations, scene.images
     assert seen is not None and images is not None
-    xy = images.keypoint_xy[seen.keypoint[seen.valid]]
-    camera_ids = images.camera_ids[seen.image[seen.valid]]
-    for camera in scene.usable_cameras.values():
-        mine = xy[camera_ids == camera.camera_id]
-        inside = ((mine >= 0) & (mine <= [camera.width, camera.height])).all(axis=1)
-        outside = int(np.count_nonzero(~inside))
-        if outside > MOST_OUTSIDE * len(mine):
-            place = f"{scene.model_file('cameras')} (camera {camera.camera_id})"
-            expected = f"observations within {camera.width} x {camera.height}"
-            yield Hit(place, expected, f"{outside} of {len(mine)} outside", count=outside)
+    slot = {camera_id: i for i, camera_id in enumerate(scene.usable_cameras)}
+    sizes = [(c.width, c.height) for c in scene.usable_cameras.values()]
+    limits = np.array([*sizes, (np.inf, np.inf)])  # the last one for cameras that are unusable
+    camera = np.array([slot.get(c, len(slot)) for c in images.camera_ids.tolist()], np.int64)
+    rows = seen.valid
+    camera = camera[seen.image[rows]]
+    xy = images.keypoint_xy[seen.keypoint[rows]]
+    inside = ((xy >= 0) & (xy <= limits[camera])).all(axis=1)
+    total = np.bincount(camera, minlength=len(limits))
+    outside = np.bincount(camera[~inside], minlength=len(limits))
+    for camera_id, i in slot.items():
+        if outside[i] > MOST_OUTSIDE * total[i]:
+            place = f"{scene.model_file('cameras')} (camera {camera_id})"
+            expected = f"observations within {sizes[i][0]} x {sizes[i][1]}"
+            found = f"{outside[i]} of {total[i]} outside"
+            yield Hit(place, expected, found, count=int(outside[i]))
 
 
 @rule(
@@ -60,9 +63,9 @@ def observations_outside(scene: RawScene) -> Iterator[Hit]:
 )
 def points_behind_cameras(scene: RawScene) -> Iterator[Hit]:
     total = behind = 0
-    for _, depth, _ in scene.reprojections or ():
-        total += len(depth)
-        behind += int(np.count_nonzero(~(depth > 0)))
+    for seen in scene.reprojections or ():
+        total += len(seen.depth)
+        behind += int(np.count_nonzero(~(seen.depth > 0)))
     if behind > MOST_BEHIND * total:
         found = f"{behind} of {total} observations behind the camera"
         yield Hit(scene.model_file("images"), "points in front of the cameras", found)
@@ -79,13 +82,16 @@ def points_behind_cameras(scene: RawScene) -> Iterator[Hit]:
 )
 def pose_disagrees(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
-    for image, depth, error in scene.reprojections or ():
-        camera = scene.usable_cameras[int(scene.images.camera_ids[image])]
-        if not camera.is_pinhole or np.count_nonzero(depth > 0) < FEWEST:
-            continue
-        limit = max(LEAST_ERROR, ERROR_SHARE * float(np.hypot(camera.width, camera.height)))
-        median = float(np.median(error[depth > 0]))
+    for image in np.flatnonzero(~np.isnan(scene.image_errors)):
+        limit, median = pose_limit(scene, image), scene.image_errors[image]
         if not median <= limit:
             place = scene.image_place(scene.images.names[image])
             expected = f"a median reprojection error below {limit:.3g} px"
             yield Hit(place, expected, f"{median:.3g} px")
+
+
+def pose_limit(scene: RawScene, image: int) -> float:
+    """Reprojection error in pixels beyond which the pose of an image does not fit."""
+    assert scene.images is not None
+    camera = scene.usable_cameras[int(scene.images.camera_ids[image])]
+    return max(LEAST_ERROR, ERROR_SHARE * float(np.hypot(camera.width, camera.height)))

@@ -1,0 +1,233 @@
+"""What cameras and drones write into their photos: when, where, with which lens.
+
+Nothing of it is trusted: whatever is absent, damaged or absurd is None. Only the header of a file
+is read.
+
+Sources: Exif 2.32 (CIPA DC-008) for the tags; the names of DJI's XMP attributes are as the makers'
+photos have them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from PIL import Image
+
+_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
+_MAKE, _MODEL, _ORIENTATION = 0x010F, 0x0110, 0x0112
+_TAKEN, _DIGITISED = 0x9003, 0x9004
+_FOCAL, _FOCAL_35, _WIDTH, _HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
+
+LONGEST_XMP = 1_000_000
+"""Bytes of XMP that are looked at."""
+
+LONGEST_NAME = 100
+"""Characters of a maker's name that are kept."""
+
+EARLIEST = 1990
+"""Year; clocks that were never set say less."""
+
+
+@dataclass(frozen=True, slots=True)
+class DroneData:
+    """What DJI drones add in XMP."""
+
+    relative_altitude: float | None = None
+    """Metres above the place of take-off, by the barometer."""
+    absolute_altitude: float | None = None
+    """Metres."""
+    gimbal_yaw: float | None = None
+    """Degrees from north, clockwise."""
+    gimbal_pitch: float | None = None
+    """Degrees; -90 looks straight down."""
+    gimbal_roll: float | None = None
+    rtk_flag: int | None = None
+    """50 for a fixed solution, 34 for a floating one, 16 for none, 0 for a failure."""
+    rtk_std: tuple[float, float, float] | None = None
+    """Standard deviations of longitude, latitude and height in metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExifData:
+    """What a photo says about itself; None for what it does not say."""
+
+    date: datetime | None = None
+    """When it was taken, by the clock of the camera, without a time zone."""
+    latitude: float | None = None
+    """Degrees, north positive (WGS 84)."""
+    longitude: float | None = None
+    """Degrees, east positive (WGS 84)."""
+    altitude: float | None = None
+    """Metres, below the reference negative."""
+    altitude_ref: Literal["above", "below"] | None = None
+    """As stated; whether the reference is the sea or the ellipsoid differs from maker to maker."""
+    focal_mm: float | None = None
+    focal_35mm: float | None = None
+    """Focal length on 36 x 24 mm film with the same view, in millimetres."""
+    make: str | None = None
+    model: str | None = None
+    orientation: int = 1
+    """1..8; 1 is upright."""
+    width: int | None = None
+    """Pixels, by the tag: the file itself may have been scaled since."""
+    height: int | None = None
+    drone: DroneData | None = None
+
+    @property
+    def has_position(self) -> bool:
+        """Whether latitude and longitude are known."""
+        return self.latitude is not None and self.longitude is not None
+
+
+def read_exif(path: Path) -> ExifData:
+    """What the header of a photo says; nothing for a file that is no image.
+
+    Never raises for what is in the file.
+    """
+    try:
+        with warnings.catch_warnings(), Image.open(path) as image:
+            warnings.simplefilter("ignore")
+            return exif_of(image)
+    except Exception:  # Pillow raises almost anything for damaged files
+        return ExifData()
+
+
+def exif_of(image: Image.Image) -> ExifData:
+    """What the header of an open image says. Never raises for what is in the file."""
+    try:
+        tags = image.getexif()
+        if not tags and "xmp" not in image.info:
+            return ExifData()
+        main: Mapping[int, Any] = dict(tags)
+        exif, gps = (_ifd(tags, key) for key in (_EXIF_IFD, _GPS_IFD))
+        return _parse(main, exif, gps, _drone(image.info.get("xmp")))
+    except Exception:  # damaged metadata raises almost anything, and says nothing about the pixels
+        return ExifData()
+
+
+def _ifd(tags: Image.Exif, key: int) -> Mapping[int, Any]:
+    try:
+        return tags.get_ifd(key)
+    except Exception:  # one damaged directory must not hide the others
+        return {}
+
+
+def _parse(
+    main: Mapping[int, Any],
+    exif: Mapping[int, Any],
+    gps: Mapping[int, Any],
+    drone: DroneData | None,
+) -> ExifData:
+    latitude = _degrees(gps.get(2), gps.get(1), "S", 90.0)
+    longitude = _degrees(gps.get(4), gps.get(3), "W", 180.0)
+    if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
+        latitude = longitude = None  # without a fix some write zeros
+    altitude, below = _number(gps.get(6)), _integer(gps.get(5)) in (1, 3)
+    orientation = _integer(main.get(_ORIENTATION)) or 1
+    return ExifData(
+        date=_date(exif.get(_TAKEN)) or _date(exif.get(_DIGITISED)),
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude if altitude is None or not below else -altitude,
+        altitude_ref=None if altitude is None else "below" if below else "above",
+        focal_mm=_positive(exif.get(_FOCAL)),
+        focal_35mm=_positive(exif.get(_FOCAL_35)),
+        make=_text(main.get(_MAKE)),
+        model=_text(main.get(_MODEL)),
+        orientation=orientation if 1 <= orientation <= 8 else 1,
+        width=_size(exif.get(_WIDTH)),
+        height=_size(exif.get(_HEIGHT)),
+        drone=drone,
+    )
+
+
+def _drone(xmp: Any) -> DroneData | None:
+    """DJI's attributes, by their names: XMP from a file is not given to an XML parser."""
+    if not isinstance(xmp, bytes) or b"drone-dji:" not in xmp[:LONGEST_XMP]:
+        return None
+    text = xmp[:LONGEST_XMP].decode("utf-8", "replace")
+
+    def value(name: str) -> float | None:
+        pattern = rf"drone-dji:{name}\s*(?:=\s*[\"']|>)\s*([-+0-9.eE]{{1,40}})"
+        found = re.search(pattern, text)
+        return _number(found[1]) if found else None
+
+    deviations = [value(f"RtkStd{axis}") for axis in ("Lon", "Lat", "Hgt")]
+    known = [deviation for deviation in deviations if deviation is not None]
+    return DroneData(
+        relative_altitude=value("RelativeAltitude"),
+        absolute_altitude=value("AbsoluteAltitude"),
+        gimbal_yaw=value("GimbalYawDegree"),
+        gimbal_pitch=value("GimbalPitchDegree"),
+        gimbal_roll=value("GimbalRollDegree"),
+        rtk_flag=_integer(value("RtkFlag")),
+        rtk_std=(known[0], known[1], known[2]) if len(known) == 3 else None,
+    )
+
+
+def _date(value: Any) -> datetime | None:
+    text = _text(value) or ""
+    found = re.match(r"(\d{4})\D(\d{2})\D(\d{2})\D(\d{2})\D(\d{2})\D(\d{2})", text, re.ASCII)
+    if not found:
+        return None
+    try:
+        date = datetime(*map(int, found.groups()))  # type: ignore[arg-type]
+    except ValueError:
+        return None
+    return date if date.year >= EARLIEST else None
+
+
+def _degrees(value: Any, ref: Any, negative: str, limit: float) -> float | None:
+    """Degrees, minutes and seconds as one signed number."""
+    if not isinstance(value, tuple | list) or not 1 <= len(value) <= 3:
+        return None
+    parts = [_number(part) for part in value]
+    degrees = 0.0
+    for i, part in enumerate(parts):
+        if part is None or part < 0:
+            return None
+        degrees += part / 60**i
+    if degrees > limit:
+        return None
+    return -degrees if (_text(ref) or "").upper().startswith(negative) else degrees
+
+
+def _number(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _positive(value: Any) -> float | None:
+    number = _number(value)
+    return number if number is not None and number > 0 else None
+
+
+def _integer(value: Any) -> int | None:
+    if isinstance(value, bytes) and len(value) == 1:
+        return value[0]
+    number = _number(value)
+    return int(number) if number is not None and number == int(number) else None
+
+
+def _size(value: Any) -> int | None:
+    number = _integer(value)
+    return number if number is not None and number > 0 else None
+
+
+def _text(value: Any) -> str | None:
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", "replace")
+    if not isinstance(value, str):
+        return None
+    text = "".join(c for c in value if c.isprintable()).strip()
+    return text[:LONGEST_NAME] or None

@@ -1,0 +1,63 @@
+"""Whether the reader takes a scene, without reading its millions of observations a second time.
+
+The rules on points and tracks check what the reader asks of them. What is left is COLMAP's own
+opinion on cameras, rigs, frames, names and poses, and the small text files: these are given to the
+reader as they are, in a temporary folder, with a binary model whose keypoints and points are left
+out.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import tempfile
+from pathlib import Path
+
+from chronoscene.errors import ChronoSceneError
+from chronoscene.formats import chronoscene as our_format
+from chronoscene.validation.raw_model import RawImages, RawModel
+
+TEXTS = (our_format.SPLIT, our_format.TEST, our_format.PERIODS, our_format.WORLD)
+UNCHANGED = ("cameras.bin", "rigs.bin", "frames.bin")
+
+_HEAD = struct.Struct("<i7di")
+_NOTHING = bytes(8)
+"""No keypoints, or no points."""
+
+
+def reader_complaint(root: Path, model: RawModel) -> ChronoSceneError | None:
+    """What the reader says against a scene, with places relative to its folder."""
+    if set(model.files.values()) != {"cameras.bin", "images.bin", "points3D.bin"}:
+        return _complaint(root)  # text is small
+    assert model.images is not None
+    with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
+        skeleton = Path(temporary)
+        folder = skeleton / our_format.MODEL
+        folder.mkdir(parents=True)
+        for place in TEXTS + tuple(f"{our_format.MODEL}/{file}" for file in UNCHANGED):
+            if (root / place).is_file():
+                shutil.copyfile(root / place, skeleton / place)
+        (folder / "images.bin").write_bytes(_without_keypoints(model.images))
+        (folder / "points3D.bin").write_bytes(_NOTHING)
+        return _complaint(skeleton)
+
+
+def _without_keypoints(images: RawImages) -> bytes:
+    records = [struct.pack("<Q", len(images))]
+    poses = zip(images.quaternions.tolist(), images.translations.tolist(), strict=True)
+    for i, (quaternion, translation) in enumerate(poses):
+        camera_id = int(images.camera_ids[i])
+        records.append(_HEAD.pack(int(images.ids[i]), *quaternion, *translation, camera_id))
+        records.append(images.names[i].encode("utf-8", "surrogateescape") + b"\0" + _NOTHING)
+    return b"".join(records)
+
+
+def _complaint(root: Path) -> ChronoSceneError | None:
+    try:
+        our_format.read(root)
+    except ChronoSceneError as error:
+        top = os.path.join(root, "")
+        place = error.place.removeprefix(top) if error.place.startswith(top) else "scene"
+        return type(error)(place, expected=error.expected, found=error.found, todo=error.todo)
+    return None
