@@ -1,6 +1,6 @@
 """Where the milliseconds of a training step of ChronoGS go.
 
-    python benchmarks/training_step.py SCENE [--train 1500] [--steps 200]
+    python benchmarks/training_step.py SCENE [--train 1500] [--anchors 31000] [--steps 200]
     python benchmarks/training_step.py SCENE --model RUN/checkpoint
 
 Trains on a scene until the model is of a realistic size, then times every part of ordinary steps:
@@ -33,6 +33,7 @@ import torch
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronogs.presets import PRESETS
+from chronoscene.allocator import keep_freed_memory
 from chronoscene.bench.identity import code_version, processor_name
 from chronoscene.bench.protocol import Part, make_parts
 from chronoscene.formats import read_scene
@@ -96,9 +97,9 @@ def timed_parts(watch: Stopwatch) -> Iterator[None]:
             setattr(owner, name, original)
 
 
-def train(part: Part, preset: str, steps: int, seed: int) -> AnchorTrainer:
+def train(part: Part, preset: str, steps: int, anchors: int, seed: int) -> AnchorTrainer:
     """Train as the harness does for some steps of the preset's schedule."""
-    config = ChronoGSConfig(**PRESETS[preset])
+    config = ChronoGSConfig(**{**PRESETS[preset], "max_anchors": anchors})
     method = ChronoGS(config)
     method.setup(part.train, seed=seed, device="cpu")
     for index in range(steps):
@@ -162,15 +163,17 @@ def main() -> None:
     parser.add_argument("--model", type=Path, help="checkpoint folder to start from")
     parser.add_argument("--preset", default="balanced", choices=sorted(PRESETS))
     parser.add_argument("--train", type=int, default=1_500, help="steps before, without --model")
+    parser.add_argument("--anchors", type=int, default=31_000, help="limit, without --model")
     parser.add_argument("--steps", type=int, default=200, help="timed steps")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
+    keep_freed_memory()
     scene = read_scene(args.scene)
     (part,) = make_parts(scene, ImageStore(scene), "joint")
     if args.model:
         trainer = resume(part, args.preset, args.model, args.seed)
     else:
-        trainer = train(part, args.preset, args.train, args.seed)
+        trainer = train(part, args.preset, args.train, args.anchors, args.seed)
     view = part.train.views[0]
     print(f"{processor_name()}, torch {torch.__version__}, commit {code_version()}")
     print(f"{scene.name}, {view.width}x{view.height}, {len(trainer.model)} anchors")

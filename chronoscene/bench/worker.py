@@ -17,6 +17,7 @@ from json import dumps
 from pathlib import Path
 from typing import Any
 
+from chronoscene.allocator import keep_freed_memory
 from chronoscene.bench import results
 from chronoscene.bench.display import ProgressDisplay
 from chronoscene.bench.files import csv_text, folder_bytes
@@ -75,6 +76,7 @@ class Machine:
 def run_job(job: Job, *, parent: int | None = None) -> None:
     """Train, save, render and score; writes into ``job.staging`` only."""
     started = datetime.now(UTC).isoformat(timespec="seconds")
+    keep_freed_memory()
     spec, staging = load_spec(job.method), Path(job.staging)
     machine = Machine(pick_device(job.device, spec), set_threads(job.threads))
     write_text_atomic(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")

@@ -23,7 +23,7 @@ from chronoscene.methods import View
 from chronoscene.rasterizer import rasterize
 from chronoscene.rasterizer.types import Rasterization
 from chronoscene.training.anchor_config import HEADS, AnchorConfig
-from chronoscene.training.decode import Decoded, HeadWeights, decode
+from chronoscene.training.decode import Decoded, HeadWeights, decode, decode_living
 from chronoscene.training.view import camera_centre_tensor, camera_tensors
 from chronoscene.training.visibility import visible_anchors
 
@@ -216,27 +216,33 @@ class AnchorModel:
             centre: Camera centre that gives the viewing direction. [3]
             visible: Ascending indices, int64. [M]
         """
+        inputs, base_dim = self._decode_arguments(period_weights, centre, visible)
+        return decode(*inputs, base_dim=base_dim, period_dim=self.layout.period_dim)
+
+    def decode_living(
+        self, period_weights: Tensor, centre: Tensor, visible: Tensor
+    ) -> tuple[Decoded, Tensor]:
+        """`decode` without the Gaussians that are switched off.
+
+        Returns:
+            decoded: The L Gaussians with an opacity above 0.
+            positions: Their places in the output of `decode`, ascending. int64 [L]
+        """
+        inputs, base_dim = self._decode_arguments(period_weights, centre, visible)
+        return decode_living(*inputs, base_dim=base_dim, period_dim=self.layout.period_dim)
+
+    def _decode_arguments(
+        self, period_weights: Tensor, centre: Tensor, visible: Tensor
+    ) -> tuple[tuple[Any, ...], int]:
+        """What both functions above hand to the kernels, and the length of the base feature."""
         layout, features, base_dim = self.layout, self.features, self.layout.base_dim
         if layout.direction == "full":  # a second base feature that nothing trains
             offset = self.anchors - centre
             features = torch.cat([features[:, :base_dim], offset, features[:, base_dim:]], dim=1)
             base_dim += 3
-        opacity, covariance, color = [self._kernel_head(name) for name in HEADS]
-        return decode(
-            self.anchors,
-            self.offsets,
-            features,
-            self._scales_in_use(),
-            self.global_features,
-            period_weights,
-            opacity,
-            covariance,
-            color,
-            centre,
-            visible,
-            base_dim=base_dim,
-            period_dim=layout.period_dim,
-        )
+        tensors = (self.anchors, self.offsets, features, self._scales_in_use())
+        heads = [self._kernel_head(name) for name in HEADS]
+        return (*tensors, self.global_features, period_weights, *heads, centre, visible), base_dim
 
     def _scales_in_use(self) -> Tensor:
         """Log-scales with zeros where a rule says that the frame's unit counts. [A, 6]"""
@@ -286,7 +292,7 @@ def draw(
     render_depth: bool = False,
     check_finite: bool = True,
 ) -> Rasterization:
-    """Rasterize decoded Gaussians; those with an opacity of 0 or less are culled there."""
+    """Rasterize decoded Gaussians."""
     viewmats, Ks = camera_tensors(view, decoded.means.device)
     return rasterize(
         decoded.means,
@@ -323,10 +329,10 @@ def draw_model(
     """
     visible = torch.from_numpy(model.visible(view)).to(model.device)
     centre = camera_centre_tensor(view, model.device)
-    decoded = model.decode(geometry_weights, centre, visible)
+    decoded, positions = model.decode_living(geometry_weights, centre, visible)
     if appearance_weights is not None:
         colors = model.decode(appearance_weights, centre, visible).colors
-        decoded = decoded._replace(colors=colors)
+        decoded = decoded._replace(colors=colors[positions])
     return draw(decoded, view, background, render_depth=True)
 
 

@@ -17,7 +17,6 @@ from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer.types import RasterInfo
 from chronoscene.training.anchor_config import AnchorConfig
 from chronoscene.training.anchor_model import PER_ANCHOR, AnchorModel, draw
-from chronoscene.training.decode import Decoded
 from chronoscene.training.density import (
     AnchorArrays,
     DensityRules,
@@ -139,7 +138,7 @@ class AnchorTrainer:
         return progress * (index + 1) / index if index > 0 else 1.0 / self.config.iterations
 
     def _learn(self, view: TrainingView, position: int, visible: np.ndarray, done: float) -> float:
-        decoded = self.model.decode(
+        decoded, positions = self.model.decode_living(
             self.weights[view.period], self._seen_from(view), torch.from_numpy(visible)
         )
         raster = draw(decoded, view, self.background, check_finite=False)
@@ -150,7 +149,7 @@ class AnchorTrainer:
             loss = loss + self.config.scale_weight * volume
         loss.backward()
         if self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN:
-            self._count(view, visible, decoded, raster.info)
+            self._count(view, visible, positions, decoded.opacities, raster.info)
         return float(loss.detach())
 
     def _seen_from(self, view: TrainingView) -> Tensor:
@@ -166,7 +165,8 @@ class AnchorTrainer:
         self,
         view: TrainingView,
         visible: np.ndarray,
-        decoded: Decoded,
+        positions: Tensor,
+        opacities: Tensor,
         info: RasterInfo,
     ) -> None:
         assert info.means2d.grad is not None
@@ -174,7 +174,8 @@ class AnchorTrainer:
             self.statistics = DensityStatistics(len(self.model), self.model.layout.offsets)
         self.statistics.update(
             visible,
-            decoded.opacities.detach().cpu().numpy(),
+            positions.cpu().numpy(),
+            opacities.detach().cpu().numpy(),
             info.radii[0].cpu().numpy(),
             info.means2d.grad[0].cpu().numpy(),
             view.width,

@@ -70,6 +70,7 @@ class DensityStatistics:
     def update(
         self,
         visible: NDArray[np.int64],
+        positions: NDArray[np.int64],
         opacities: Float,
         radii: NDArray[np.int32],
         means2d_grad: Float,
@@ -80,15 +81,17 @@ class DensityStatistics:
 
         Args:
             visible: Anchors that were decoded. [M]
-            opacities: Decoded opacities, which may be negative. [M * k]
-            radii: 0 where a Gaussian was culled. [M * k, 2]
-            means2d_grad: d loss / d centre in pixels. [M * k, 2]
+            positions: Which of their M * k Gaussians are switched on, ascending. [L]
+            opacities: Opacities of those. [L]
+            radii: 0 where a Gaussian was culled. [L, 2]
+            means2d_grad: d loss / d centre in pixels. [L, 2]
             width: Image width in pixels: gradients count in units of half an image.
             height: Image height in pixels.
         """
         _accumulate(
             visible,
-            opacities.reshape(len(visible), -1),
+            positions,
+            opacities,
             radii,
             means2d_grad,
             0.5 * width,
@@ -113,9 +116,14 @@ class DensityStatistics:
             setattr(self, name, getattr(self, name)[mask])
 
 
+_CHUNK = 512
+"""Anchors whose Gaussians one task looks up together."""
+
+
 @njit(cache=True, parallel=True)
 def _accumulate(
     visible: NDArray[np.int64],
+    positions: NDArray[np.int64],
     opacities: Float,
     radii: NDArray[np.int32],
     grad: Float,
@@ -128,24 +136,27 @@ def _accumulate(
     hits: Float,
 ) -> None:
     # Anchors are visible once, so no two rows write to the same place.
-    k = opacities.shape[1]
-    for m in prange(len(visible)):
-        a = visible[m]
-        total, moved = np.float32(0.0), np.float32(0.0)
-        for j in range(k):
-            if opacities[m, j] > 0.0:
-                total += opacities[m, j]
-                row = m * k + j
+    k = grad_sum.shape[1]
+    for chunk in prange((len(visible) + _CHUNK - 1) // _CHUNK):
+        first, stop = chunk * _CHUNK, min((chunk + 1) * _CHUNK, len(visible))
+        row = np.searchsorted(positions, first * k)
+        for m in range(first, stop):
+            a = visible[m]
+            total, moved = np.float32(0.0), np.float32(0.0)
+            while row < len(positions) and positions[row] < (m + 1) * k:
+                total += opacities[row]
                 if radii[row, 0] > 0 and radii[row, 1] > 0:
                     gx = grad[row, 0] * half_width
                     gy = grad[row, 1] * half_height
                     norm = np.float32(np.sqrt(gx * gx + gy * gy))
                     moved += norm
+                    j = positions[row] - m * k
                     grad_sum[a, j] += norm
                     hits[a, j] += np.float32(1.0)
-        opacity_sum[a] += total
-        motion[a] += moved
-        visits[a] += np.float32(1.0)
+                row += 1
+            opacity_sum[a] += total
+            motion[a] += moved
+            visits[a] += np.float32(1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

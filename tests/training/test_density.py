@@ -144,10 +144,11 @@ def test_the_paper_prunes_anchors_that_do_not_move() -> None:
 
 def test_statistics_of_a_view() -> None:
     statistics = DensityStatistics(3, 2)
-    opacities = np.array([0.5, -0.2, 0.25, 0.5], np.float32)
-    radii = np.array([[1, 1], [3, 3], [0, 4], [2, 2]], np.int32)
-    grads = np.array([[3e-3, 4e-3], [9.0, 9.0], [9.0, 9.0], [0.0, 1e-3]], np.float32)
-    statistics.update(np.array([0, 2]), opacities, radii, grads, 20, 40)
+    positions = np.array([0, 2, 3])  # the second Gaussian of the first anchor is off
+    opacities = np.array([0.5, 0.25, 0.5], np.float32)
+    radii = np.array([[1, 1], [0, 4], [2, 2]], np.int32)
+    grads = np.array([[3e-3, 4e-3], [9.0, 9.0], [0.0, 1e-3]], np.float32)
+    statistics.update(np.array([0, 2]), positions, opacities, radii, grads, 20, 40)
     np.testing.assert_array_equal(statistics.visits, [1, 0, 1])
     np.testing.assert_allclose(statistics.opacity_sum, [0.5, 0, 0.75])
     # Gradients count in half images: 10 pixels across, 20 down. Off or culled ones do not count.
@@ -155,6 +156,34 @@ def test_statistics_of_a_view() -> None:
     np.testing.assert_allclose(
         statistics.grad_sum, [[np.hypot(0.03, 0.08), 0], [0, 0], [0, 0.02]], rtol=1e-6
     )
+
+
+def test_statistics_of_many_anchors() -> None:
+    """As counted one by one, whatever the anchors that a task takes together."""
+    rng = np.random.default_rng(0)
+    anchors, k = 1_700, 3
+    visible = np.flatnonzero(rng.random(anchors) < 0.9)
+    positions = np.flatnonzero(rng.random(len(visible) * k) < 0.3)
+    count = len(positions)
+    opacities = rng.random(count, dtype=np.float32)
+    radii = rng.integers(0, 2, (count, 2)).astype(np.int32)
+    grads = rng.normal(size=(count, 2)).astype(np.float32)
+    statistics = DensityStatistics(anchors, k)
+    statistics.update(visible, positions, opacities, radii, grads, 2, 2)
+    seen = radii.min(axis=1) > 0
+    owner = visible[positions // k]
+    norms = np.hypot(grads[:, 0], grads[:, 1])
+    np.testing.assert_array_equal(statistics.visits, np.isin(np.arange(anchors), visible))
+    np.testing.assert_allclose(
+        statistics.opacity_sum, np.bincount(owner, opacities, anchors), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        statistics.motion, np.bincount(owner[seen], norms[seen], anchors), rtol=1e-6
+    )
+    expected = np.zeros((anchors, k))
+    expected[owner[seen], positions[seen] % k] = norms[seen]
+    np.testing.assert_allclose(statistics.grad_sum, expected, rtol=1e-6)
+    np.testing.assert_array_equal(statistics.hits, expected > 0)
 
 
 def test_counters_follow_their_anchors() -> None:
