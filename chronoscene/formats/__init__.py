@@ -1,5 +1,11 @@
-"""Dataset formats. Each is one module with ``NAME``, ``MARKS``, ``matches``, ``read`` and,
-where we can, ``write``; `FORMATS` lists the modules."""
+"""Dataset formats, one module each; `FORMATS` lists them.
+
+A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and where it makes sense
+
+- ``write(scene, out, image_source=..., progress=...)``;
+- ``PERIOD_BY``, the values that ``read(path, period_by=...)`` knows, where periods can be chosen;
+- ``remarks(path)``, what a folder has that does not become part of the scene.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.checks import check_choice
-from chronoscene.errors import SceneError
+from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Scene
 
-FORMATS = {"chronoscene": "chronoscene.formats.chronoscene"}
+FORMATS = {
+    "chronoscene": "chronoscene.formats.chronoscene",
+    "cl-splats": "chronoscene.formats.cl_splats",
+    "colmap-folders": "chronoscene.formats.colmap_folders",
+    "matrixcity": "chronoscene.formats.matrixcity",
+    "nerfstudio": "chronoscene.formats.nerfstudio",
+    "neusc": "chronoscene.formats.neusc",
+    "wat": "chronoscene.formats.wat",
+}
 """Format name to the module that reads it."""
 
 
@@ -48,7 +62,7 @@ def detect_format(path: Path) -> str:
             path,
             expected="a folder of one format",
             found=f"marks of {' and '.join(matching)}",
-            todo="name the format",
+            todo="name the one that is meant with --format (stats: --dataset-format)",
         )
     looked_for = "; ".join(f"{name}: {module.MARKS}" for name, module in modules.items())
     content = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
@@ -80,18 +94,37 @@ def find_scenes(path: Path, *, format: str | None = None) -> list[Path]:
     return [path]
 
 
-def read_scene(path: str | Path, *, format: str | None = None) -> Scene:
+def read_scene(
+    path: str | Path, *, format: str | None = None, period_by: str | None = None
+) -> Scene:
     """Read a scene folder. Writes nothing into it.
 
     Args:
         path: Folder of one scene.
         format: Name of its format; None to find out.
+        period_by: How images are grouped into periods, where the format leaves a choice.
 
     Raises:
         SceneError: If the folder is of no known format, or damaged.
-        ConfigError: If there is no such format.
+        ConfigError: If there is no such format, or no such grouping in it.
     """
     path = Path(path)
     name = format if format is not None else detect_format(path)
-    scene: Scene = load_format(name).read(path)
+    module = load_format(name)
+    if period_by is None:
+        scene: Scene = module.read(path)
+        return scene
+    if not hasattr(module, "PERIOD_BY"):
+        raise ConfigError(
+            "--period-by",
+            expected=f"no such option for {name}, which says its periods itself",
+            found=repr(period_by),
+            todo="leave it out",
+        )
+    scene = module.read(path, period_by=period_by)
     return scene
+
+
+def writable_formats() -> tuple[str, ...]:
+    """Names of the formats that can be written, sorted."""
+    return tuple(name for name in format_names() if hasattr(load_format(name), "write"))

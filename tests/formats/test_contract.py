@@ -1,7 +1,6 @@
-"""What every dataset format must do. A new format adds a builder of its sample here."""
+"""What every dataset format must do. A new format adds a builder of its sample to conftest.py."""
 
 import hashlib
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +11,6 @@ from chronoscene.formats import FORMATS, detect_format, load_format, read_scene
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.scene import Scene
 from chronoscene.splits import split_hash
-
-Builder = Callable[[], Path]
-
-
-@pytest.fixture
-def builders(make_scene_folder) -> dict[str, Builder]:
-    """Format name to a function that makes a small valid scene of two periods or more."""
-    return {"chronoscene": make_scene_folder}
 
 
 @pytest.fixture(params=sorted(FORMATS))

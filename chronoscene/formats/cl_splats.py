@@ -1,0 +1,145 @@
+"""CL-Splats: a COLMAP model with ``day_<n>_`` in the image names, or a rendered level.
+
+- Real scenes: ``images/day_<n>_...`` and ``sparse/0``. The time step is n, 0 for other names; every
+  8th image of all in name order is a test image, as in its own loader.
+- Rendered levels: ``transforms_train.json`` for the base, and the same in the folders ``add``,
+  ``delete``, ``move``, ``multi``, each of which shows one change of the base. All are in one world.
+  The base and every change are a period each; with ``--period-by change:add`` the base and that
+  change alone. ``transforms_test.json`` holds test images; without any, the default split holds.
+  A level has no points but those of ``points3d.ply``.
+
+Source: Ackermann et al., CL-Splats, ICCV 2025; layout as in ``jan-ackermann/cl-splats``.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from chronoscene.formats.colmap_layout import find_model, make_scene, read_images, scan
+from chronoscene.formats.grouping import group_labels, natural_key, rule_error
+from chronoscene.formats.ply import read_points
+from chronoscene.formats.transforms import (
+    CameraTable,
+    Shot,
+    check_distinct,
+    image_name,
+    matrix,
+    pose_from_opengl,
+    read_frames,
+    read_object,
+)
+from chronoscene.formats.transforms import make_scene as scene_from_shots
+from chronoscene.scene import Points, Scene
+from chronoscene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
+
+NAME = "cl-splats"
+MARKS = "images/day_<n>_* and a COLMAP model, or transforms_train.json here and in add/, move/, ..."
+"""What `matches` looks for."""
+
+BASE = "base"
+CHANGES = ("add", "delete", "move", "multi")
+
+PERIOD_BY = ("step", *(f"change:{change}" for change in CHANGES))
+"""Time steps (default), or the base and one change of a rendered level."""
+
+TRAIN, TEST = "transforms_train.json", "transforms_test.json"
+POINTS = "points3d.ply"
+
+_DAY = re.compile(r"day_([0-9]{1,9})_")
+
+
+def matches(path: Path) -> bool:
+    """Whether a folder is a real scene or a rendered level."""
+    return _is_level(path) or _is_real(path)
+
+
+def _is_level(path: Path) -> bool:
+    return (path / TRAIN).is_file() and any((path / c / TRAIN).is_file() for c in CHANGES)
+
+
+def _is_real(path: Path) -> bool:
+    return find_model(path) is not None and any(map(_DAY.match, scan(path / "images")[1]))
+
+
+def read(path: Path, *, period_by: str = "step") -> Scene:
+    """Read a scene.
+
+    Raises:
+        SceneError: If it is damaged.
+        ConfigError: If ``period_by`` is not in `PERIOD_BY`, or the change is not there.
+    """
+    path = Path(path)
+    if (path / TRAIN).exists():
+        return _read_level(path, period_by)
+    if period_by != "step":
+        raise rule_error(period_by, ["step"])
+    model = read_images(path, path / "images")
+    steps = {image.name: _step(image.name) for image in model.images}
+    order = sorted(set(steps.values()), key=natural_key)
+    return make_scene(
+        path,
+        path / "images",
+        model,
+        group_labels(steps, order),
+        set(sorted(steps)[::TEST_EVERY]),
+        rule=f"every {TEST_EVERY}th image of all in name order (index 0, {TEST_EVERY}, ...)",
+        format=NAME,
+    )
+
+
+def _step(name: str) -> str:
+    match = _DAY.match(name)
+    return f"day {int(match[1]) if match else 0}"
+
+
+def _read_level(path: Path, period_by: str) -> Scene:
+    present = [change for change in CHANGES if (path / change / TRAIN).is_file()]
+    rules = ["step", *(f"change:{change}" for change in present)]
+    if period_by not in rules:
+        raise rule_error(period_by, rules)
+    changes = present if period_by == "step" else [period_by.removeprefix("change:")]
+    cameras = CameraTable()
+    shots: list[Shot] = []
+    labels: dict[str, str] = {}
+    tests: set[str] = set()
+    for label in (BASE, *changes):
+        folder = "" if label == BASE else label
+        for file in (TRAIN, TEST):
+            if file == TEST and not (path / folder / TEST).exists():
+                continue
+            new = _read_file(path, folder, file, cameras)
+            shots += new
+            labels |= {shot.name: label for shot in new}
+            tests |= {shot.name for shot in new if file == TEST}
+    check_distinct(path, shots)
+    grouped = group_labels(labels, [BASE, *changes])
+    return scene_from_shots(
+        path,
+        shots,
+        grouped,
+        tests or default_tests(grouped[0]),
+        points=read_points(path / POINTS) if (path / POINTS).exists() else Points.empty(),
+        rule=TEST if tests else DEFAULT_RULE,
+        format=NAME,
+    )
+
+
+def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list[Shot]:
+    place = path / folder / file
+    data = read_object(place)
+    shots = []
+    for i, frame in enumerate(read_frames(place, data)):
+        where = f"{place}: frames[{i}]"
+        name = image_name(where, folder, frame.get("file_path"), suffix=".png")
+        pose = pose_from_opengl(where, matrix(where, frame.get("transform_matrix")))
+        keys = {key: value for key, value in data.items() if key != "frames"} | frame
+        shots.append(Shot(name, cameras.camera(where, keys, path / name), pose))
+    return shots
+
+
+def remarks(path: Path) -> list[str]:
+    """What is there and not part of a scene."""
+    if _is_level(path) and not (path / POINTS).exists():
+        return [f"the level has no {POINTS}: the scene has no points"]
+    return []

@@ -1,0 +1,229 @@
+"""MatrixCity: rendered blocks of a city, raw or with prepared poses.
+
+- Raw: ``<block>/transforms.json`` with ``rot_mat`` for each frame, a camera-to-world matrix in
+  metres whose rotation is scaled by 1/100; the image is ``<block>/<frame_index, 4 digits>.png``.
+- Prepared: ``transforms_train.json`` and ``transforms_test.json`` (usually in ``pose/<block>/``),
+  translations in units of 100 m. Raw files win where both are there.
+
+Scenes are in metres. Blocks may be in folders; those named ``test`` hold test images, and
+``train_dense`` is left out beside ``train``. One city has one date: blocks are one period, unless
+every block is in a further folder, as in ``<period>/<block>/transforms.json``, or
+``--period-by folder`` says that the first folders are the periods.
+
+There are no points: the offered clouds are separate downloads.
+
+Source: Li et al., MatrixCity, ICCV 2023; layout as in ``city-super/MatrixCity`` at ``778775c``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from chronoscene.errors import SceneError
+from chronoscene.formats.colmap_layout import scan
+from chronoscene.formats.grouping import Grouped, group_labels, natural_key, rule_error
+from chronoscene.formats.transforms import (
+    CameraTable,
+    Shot,
+    head_has,
+    image_name,
+    json_error,
+    make_scene,
+    matrix,
+    pose_from_opengl,
+    read_frames,
+    read_object,
+)
+from chronoscene.images import image_size
+from chronoscene.scene import Period, Points, Scene, WorldFrame
+from chronoscene.splits import DEFAULT_RULE, default_tests
+
+NAME = "matrixcity"
+MARKS = "transforms.json with rot_mat, here or in blocks, or pose/<block>/transforms_train.json"
+"""What `matches` looks for."""
+
+PERIOD_BY = ("one", "folder")
+"""All blocks in one period, or one period for each first folder."""
+
+RAW = "transforms.json"
+PREPARED = ("transforms_train.json", "transforms_test.json")
+RAW_KEY = '"rot_mat"'
+
+ROTATION_SCALE = 100.0
+PREPARED_UNIT = 100.0
+"""Metres."""
+
+PARTS_OF_A_CITY = ("train", "test", "train_dense", "pose", "aerial", "street")
+"""Folders that say what images are for, or how they were flown: neither blocks nor periods."""
+
+DEEPEST = 4
+MOST_FOLDERS = 5000
+"""Folders that are looked at, so that a wrong path does not take forever."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseFile:
+    """A file with the poses of a block."""
+
+    folder: str
+    """Below the scene folder; "" for the scene folder."""
+    name: str
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        return PurePosixPath(self.folder).parts
+
+    @property
+    def labels(self) -> list[str]:
+        """Folders that may name a period or a block."""
+        return [part for part in self.parts if part not in PARTS_OF_A_CITY]
+
+    @property
+    def is_test(self) -> bool:
+        return self.name == PREPARED[1] or "test" in self.parts
+
+
+def matches(path: Path) -> bool:
+    """Whether there is a raw file, or a prepared one in a folder ``pose``."""
+    return any(
+        file.name == RAW or "pose" in file.parts for files, _ in _walk(path) for file in files
+    )
+
+
+def read(path: Path, *, period_by: str | None = None) -> Scene:
+    """Read a scene.
+
+    Raises:
+        SceneError: If a file is damaged, or images have no poses.
+        ConfigError: If ``period_by`` is not in `PERIOD_BY`.
+    """
+    path = Path(path)
+    cameras = CameraTable()
+    shots: dict[str, Shot] = {}
+    labels: dict[str, list[str]] = {}
+    tests: set[str] = set()
+    for file in _pose_files(path):
+        for shot in _read_file(path, file, cameras):
+            shots.setdefault(shot.name, shot)
+            labels.setdefault(shot.name, file.labels)
+            if file.is_test:
+                tests.add(shot.name)
+    grouped = _group(path, labels, period_by)
+    scene = make_scene(
+        path,
+        list(shots.values()),
+        grouped,
+        tests or default_tests(grouped[0]),
+        points=Points.empty(),
+        rule="the files of test images" if tests else DEFAULT_RULE,
+        format=NAME,
+    )
+    return replace(scene, world=WorldFrame("metre"))
+
+
+def remarks(path: Path) -> list[str]:
+    """What is there and not part of a scene."""
+    return ["the poses come without points, so the scene has none"]
+
+
+def _walk(path: Path) -> Iterator[tuple[list[PoseFile], str | None]]:
+    """Every folder of a tree, in natural order: its pose files, and its name if it is orphaned.
+
+    An orphan is a block with numbered images and no file of poses.
+    """
+    waiting, visited = [""], 0
+    while waiting and visited < MOST_FOLDERS:
+        folder, visited = waiting.pop(), visited + 1
+        here = path / folder
+        try:
+            folders, images = scan(here)
+        except OSError:
+            continue  # a folder that may not be looked into
+        if head_has(here / RAW, RAW_KEY):
+            yield [PoseFile(folder, RAW)], None
+            continue
+        prepared = [PoseFile(folder, name) for name in PREPARED if (here / name).is_file()]
+        numbered = any(re.fullmatch(r"[0-9]{4,}\.png", name) for name in images)
+        yield prepared, folder if numbered else None
+        if len(PurePosixPath(folder).parts) < DEEPEST:
+            below = sorted(folders, key=natural_key, reverse=True)
+            waiting += [str(PurePosixPath(folder) / name) for name in below]
+
+
+def _pose_files(path: Path) -> list[PoseFile]:
+    """The files to read: raw ones if there are any; no ``train_dense`` beside ``train``.
+
+    Raises:
+        SceneError: If there are none, or a raw file is missing.
+    """
+    found, orphans = [], []
+    for files, orphan in _walk(path):
+        found += files
+        orphans += [orphan] if orphan is not None else []
+    raw = [file for file in found if file.name == RAW]
+    if not found or (orphans and len(raw) == len(found)):
+        raise SceneError(
+            path / orphans[0] if found else path,
+            expected=f"{RAW} with {RAW_KEY} beside the images" if found else MARKS,
+            found="none",
+            todo="copy it there again, or remove the block" if found else "give another folder",
+        )
+    chosen = raw or found
+    if any("train" in file.parts for file in chosen):
+        chosen = [file for file in chosen if "train_dense" not in file.parts]
+    return chosen
+
+
+def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[Shot]:
+    place = path / file.folder / file.name
+    data = read_object(place)
+    shots: list[Shot] = []
+    for i, frame in enumerate(read_frames(place, data)):
+        where = f"{place}: frames[{i}]"
+        if file.name == RAW:
+            world_from_cam = matrix(where, frame.get("rot_mat"))
+            world_from_cam[:3, :3] *= ROTATION_SCALE
+            file_path: object = _raw_file_path(where, frame)
+        else:
+            world_from_cam = matrix(where, frame.get("transform_matrix"))
+            world_from_cam[:3, 3] *= PREPARED_UNIT
+            file_path = frame.get("file_path")
+        name = image_name(where, file.folder, file_path, suffix=".png")
+        keys = {key: value for key, value in data.items() if key != "frames"} | frame
+        if "w" not in keys or "h" not in keys:  # images of a block are of one size
+            known = shots[0].camera if shots else None
+            size = (known.width, known.height) if known else image_size(path / name)
+            keys |= {"w": size[0], "h": size[1]}
+        camera = cameras.camera(where, keys, path / name)
+        shots.append(Shot(name, camera, pose_from_opengl(where, world_from_cam)))
+    return shots
+
+
+def _raw_file_path(where: str, frame: dict[str, Any]) -> str:
+    index = frame.get("frame_index")
+    if type(index) is not int or not 0 <= index < 10**9:
+        raise json_error(where, "a frame_index 0, 1, ...", repr(index)[:40])
+    return f"{index:04d}.png"
+
+
+def _group(path: Path, labels: dict[str, list[str]], by: str | None) -> Grouped:
+    """Periods of images by the folders of their files."""
+    if by is None:
+        by = "folder" if all(len(parts) >= 2 for parts in labels.values()) else "one"
+    if by == "one":
+        return dict.fromkeys(labels, 0), (Period(0, "0"),)
+    if by != "folder":
+        raise rule_error(by, PERIOD_BY)
+    if not all(labels.values()):
+        raise SceneError(
+            path,
+            expected="every block in a folder of its period",
+            found="one without",
+            todo="leave --period-by out, or give the folder above",
+        )
+    first = {name: parts[0] for name, parts in labels.items()}
+    return group_labels(first, sorted(set(first.values()), key=natural_key))

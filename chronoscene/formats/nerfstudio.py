@@ -1,0 +1,329 @@
+"""nerfstudio and instant-ngp: ``transforms.json``, with the period as an extra key of each frame.
+
+- A frame's ``period`` (0..T-1) decides; else the distinct values of its ``time``; else all
+  frames are of one period. Readers of the format ignore keys that they do not know.
+- Frames in ``test_filenames`` or ``val_filenames`` are test images. Frames that are in no list are
+  left out where there is a ``train_filenames``, as nerfstudio does.
+- ``applied_transform`` and ``applied_scale`` say what was done to the original world; both are
+  undone, so scenes are in the original world. ``ply_file_path`` is in the world of the file.
+- nerfstudio's own centring and scaling of poses are not applied: they belong to training.
+
+Source: the data parser of ``nerfstudio-project/nerfstudio``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chronoscene.errors import ConfigError, SceneError
+from chronoscene.formats.chronoscene import (
+    MOST_PERIODS,
+    check_name,
+    parse_periods,
+    parse_world,
+    period_items,
+    world_item,
+)
+from chronoscene.formats.grouping import (
+    OPTION,
+    TABLE,
+    Grouped,
+    group_by_table,
+    group_times,
+    rule_error,
+)
+from chronoscene.formats.ply import read_points, write_points
+from chronoscene.formats.transforms import (
+    MODEL_KEYS,
+    CameraTable,
+    Shot,
+    check_distinct,
+    head_has,
+    image_name,
+    json_error,
+    make_scene,
+    matrix,
+    nearest_rotation,
+    number,
+    opengl_from_pose,
+    pose_from_opengl,
+    read_frames,
+    read_object,
+)
+from chronoscene.formats.writing import ImageSource, Progress, place_images, staged_folder
+from chronoscene.geometry import Sim3
+from chronoscene.scene import Camera, Period, Points, Scene, WorldFrame
+from chronoscene.splits import DEFAULT_RULE, default_tests
+
+NAME = "nerfstudio"
+FILE = "transforms.json"
+MARKS = FILE
+"""What `matches` looks for."""
+
+PERIOD_BY = ("period", "time", "gap:X", "count:N", "table:FILE")
+"""The key ``period`` or ``time``, groups of times, or a CSV file with columns file and period."""
+
+RAW_MATRIXCITY = '"rot_mat"'
+"""A key of the raw files of MatrixCity, which have the same name."""
+
+POINTS = "sparse_points.ply"
+
+
+def matches(path: Path) -> bool:
+    """Whether a folder has a ``transforms.json`` that is no raw file of MatrixCity."""
+    place = path / FILE
+    if (path / "sparse/split.txt").exists() or not place.is_file():
+        return False
+    return not head_has(place, RAW_MATRIXCITY)
+
+
+def read(path: Path, *, period_by: str | None = None) -> Scene:
+    """Read a scene.
+
+    Raises:
+        SceneError: If the file is damaged or contradicts itself.
+        ConfigError: If ``period_by`` is not in `PERIOD_BY`.
+    """
+    path = Path(path)
+    place = path / FILE
+    data = read_object(place)
+    frames = read_frames(place, data)
+    shots = _read_shots(path, data, frames)
+    extras = {shot.name: frame for shot, frame in zip(shots, frames, strict=True)}
+    shots, tests, rule = _apply_lists(place, data, shots)
+    grouped = _group(place, data, {shot.name: extras[shot.name] for shot in shots}, period_by)
+    scene = make_scene(
+        path,
+        shots,
+        grouped,
+        default_tests(grouped[0]) if tests is None else tests,
+        points=_read_points(path, data),
+        rule=rule,
+        format=NAME,
+    )
+    world = data.get("world")
+    return replace(
+        _to_original(place, data, scene),
+        world=parse_world(place, world) if isinstance(world, dict) else WorldFrame(),
+    )
+
+
+def remarks(path: Path) -> list[str]:
+    """What is there and not part of a scene."""
+    data = read_object(path / FILE)
+    frames = read_frames(path / FILE, data)
+    found = [
+        f"{what} of {count} frames are not read"
+        for key, what in (("mask_path", "masks"), ("depth_file_path", "depth maps"))
+        if (count := sum(key in frame for frame in frames))
+    ]
+    kept, _, _ = _apply_lists(path / FILE, data, _read_shots(path, data, frames))
+    if len(kept) < len(frames):
+        found.append(f"{len(frames) - len(kept)} frames are in no list of names, and left out")
+    return found
+
+
+def _read_shots(path: Path, data: Mapping[str, Any], frames: list[dict[str, Any]]) -> list[Shot]:
+    cameras, shots = CameraTable(), []
+    shared = {key: value for key, value in data.items() if key != "frames"}
+    for i, frame in enumerate(frames):
+        place = f"{path / FILE}: frames[{i}]"
+        name = image_name(place, "", frame.get("file_path"))
+        world_from_cam = matrix(place, frame.get("transform_matrix"), (3, 4))
+        image_id = frame.get("colmap_im_id")
+        shots.append(
+            Shot(
+                name=name,
+                camera=cameras.camera(place, {**shared, **frame}, path / name),
+                cam_from_world=pose_from_opengl(place, world_from_cam),
+                image_id=image_id if type(image_id) is int else 0,
+            )
+        )
+    check_distinct(path / FILE, shots)
+    return shots
+
+
+def _apply_lists(
+    place: Path, data: Mapping[str, Any], shots: list[Shot]
+) -> tuple[list[Shot], set[str] | None, str]:
+    """Frames that are used, and the test images with the rule in words; None for the default."""
+    lists = {key: _names(place, data, f"{key}_filenames") for key in ("train", "val", "test")}
+    if all(names is None for names in lists.values()):
+        return shots, None, DEFAULT_RULE
+    tests = (lists["val"] or set()) | (lists["test"] or set())
+    train = lists["train"]
+    if train is not None:
+        if both := sorted(train & tests):
+            raise json_error(place, "train and test lists without common names", repr(both[0]))
+        shots = [shot for shot in shots if shot.name in train | tests]
+        if not shots:
+            raise json_error(place, "frames that are in the lists of names", "none")
+    return shots, tests, "the lists of file names in transforms.json"
+
+
+def _names(place: Path, data: Mapping[str, Any], key: str) -> set[str] | None:
+    names = data.get(key)
+    if names is None:
+        return None
+    if not isinstance(names, list):
+        raise json_error(place, f"a list {key}", type(names).__name__)
+    return {image_name(f"{place}: {key}", "", name) for name in names}
+
+
+def _group(
+    place: Path, data: Mapping[str, Any], frames: Mapping[str, Mapping[str, Any]], by: str | None
+) -> Grouped:
+    """Periods of the frames by the keys that they have, or as the option says."""
+    if by is None:
+        by = next(
+            (key for key in ("period", "time") if any(key in f for f in frames.values())), "one"
+        )
+        if by == "one":
+            return dict.fromkeys(frames, 0), (Period(0, "0"),)
+    if by.startswith(TABLE):
+        return group_by_table(sorted(frames), Path(by.removeprefix(TABLE)))
+    if by == "period":
+        return _group_by_ids(place, data, frames)
+    if by == "time" or by.startswith(("gap:", "count:")):
+        times = {name: _time(place, name, frame) for name, frame in frames.items()}
+        distinct = len(set(times.values()))
+        if by == "time" and distinct > max(1, len(times) // 2):
+            raise ConfigError(
+                OPTION,
+                expected="times that the frames of a period share",
+                found=f"{distinct} times of {len(times)} frames in {place}",
+                todo="group them with count:N or gap:X",
+            )
+        return group_times(times, f"count:{distinct}" if by == "time" else by)
+    raise rule_error(by, PERIOD_BY)
+
+
+def _time(place: Path, name: str, frame: Mapping[str, Any]) -> float:
+    time = number(f"{place}: {name}", frame, "time")
+    if time is None:
+        raise json_error(f"{place}: {name}", "a time of every frame", "none")
+    return time
+
+
+def _group_by_ids(
+    place: Path, data: Mapping[str, Any], frames: Mapping[str, Mapping[str, Any]]
+) -> Grouped:
+    ids = {name: frame.get("period") for name, frame in frames.items()}
+    for name, value in ids.items():
+        if type(value) is not int or not 0 <= value < MOST_PERIODS:
+            raise json_error(f"{place}: {name}", "a period 0, 1, ...", repr(value)[:40])
+    used = sorted({value for value in ids.values() if value is not None})
+    if used != list(range(len(used))):
+        raise json_error(place, f"periods 0..{len(used) - 1} without gaps", str(used)[:60])
+    table = data.get("periods")
+    periods = (
+        parse_periods(place, table, len(used))
+        if isinstance(table, list)
+        else tuple(Period(i, str(i)) for i in used)
+    )
+    return {name: value for name, value in ids.items() if value is not None}, periods
+
+
+def _read_points(path: Path, data: Mapping[str, Any]) -> Points:
+    file = data.get("ply_file_path")
+    if file is None:
+        return Points.empty()
+    return read_points(path / image_name(f"{path / FILE}: ply_file_path", "", file))
+
+
+def _to_original(place: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
+    """Undo ``applied_transform`` and ``applied_scale``."""
+    scale = number(place, data, "applied_scale")
+    applied = data.get("applied_transform")
+    if scale is None and applied is None:
+        return scene
+    scale = 1.0 if scale is None else scale
+    if scale <= 0:
+        raise json_error(place, "a positive applied_scale", f"{scale:g}")
+    full = np.eye(4) if applied is None else matrix(f"{place}: applied_transform", applied, (3, 4))
+    rotation = nearest_rotation(f"{place}: applied_transform", full[:3, :3])
+    original_from_file = Sim3(scale, rotation, scale * full[:3, 3]).inverse()
+    frames = [
+        replace(f, cam_from_world=original_from_file.apply_to_pose(f.cam_from_world))
+        for f in scene.frames
+    ]
+    points = replace(scene.points, xyz=original_from_file.apply(scene.points.xyz))
+    return replace(scene.with_frames(frames), points=points)
+
+
+def write(
+    scene: Scene,
+    out: Path,
+    *,
+    image_source: ImageSource = "copy",
+    progress: Progress | None = None,
+) -> Path:
+    """Write a scene in this format; the folder appears complete or not at all.
+
+    Each frame has its ``period``, and ``time`` = period / (T - 1) for loaders of dynamic scenes.
+    Labels, dates and the world frame go to the extra keys ``periods`` and ``world``. Tracks and ids
+    of points have no place in this format.
+
+    Raises:
+        SceneError: If ``out`` is in use, an image is missing, or the format lacks a camera model.
+    """
+    out = Path(out)
+    for frame in scene.frames:
+        check_name(out, frame.name)
+    text = json.dumps(_document(scene), indent=1, ensure_ascii=False) + "\n"
+    with staged_folder(out) as staged:
+        (staged / FILE).write_text(text, encoding="utf-8", newline="\n")
+        if len(scene.points):
+            write_points(staged / POINTS, scene.points)
+        place_images(scene, staged / "images", image_source=image_source, progress=progress)
+    return out
+
+
+def _document(scene: Scene) -> dict[str, Any]:
+    tests = [f"images/{f.name}" for f in scene.frames if f.split == "test"]
+    return {
+        **({"ply_file_path": POINTS} if len(scene.points) else {}),
+        "train_filenames": [f"images/{f.name}" for f in scene.frames if f.split == "train"],
+        "val_filenames": tests,
+        "test_filenames": tests,
+        "periods": period_items(scene.periods),
+        "world": world_item(scene.world),
+        "frames": [
+            {
+                "file_path": f"images/{frame.name}",
+                "transform_matrix": opengl_from_pose(frame.cam_from_world).tolist(),
+                "colmap_im_id": frame.image_id,
+                "period": frame.period,
+                "time": frame.period / max(1, scene.num_periods - 1),
+                **_camera_keys(frame.camera),
+            }
+            for frame in scene.frames
+        ],
+    }
+
+
+def _camera_keys(camera: Camera) -> dict[str, Any]:
+    if camera.model not in MODEL_KEYS:
+        raise SceneError(
+            f"camera {camera.camera_id}",
+            expected=f"a camera model that nerfstudio has: {', '.join(MODEL_KEYS)}",
+            found=camera.model,
+            todo="run chronoscene undistort first",
+        )
+    K = camera.K
+    return {
+        "camera_model": camera.model,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": K[0, 0].item(),
+        "fl_y": K[1, 1].item(),
+        "cx": K[0, 2].item(),
+        "cy": K[1, 2].item(),
+        **dict(zip(MODEL_KEYS[camera.model], camera.distortion, strict=True)),
+    }

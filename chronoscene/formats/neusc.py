@@ -1,0 +1,138 @@
+"""NeuSC / 5Pointz: internet photos of many dates, ``dense/images`` and ``dense/sparse``.
+
+Dates stand at the beginning of the file names (``2012-05-03_...``). Photos whose name begins with
+``none`` have no date and are left out, as are those in ``trash.txt``, and those that are not in
+``train.txt`` where there is one. Hundreds of dates must be grouped into periods: by year, unless
+told otherwise.
+
+The authors publish no list of test images; the evaluation in their configuration takes every 10th
+image of ``train.txt``. We take the images 0, 10, 20, ... of that list (else of all in name order)
+for testing, and train on none of them.
+
+Cameras come from the COLMAP model. ``annots/cam_dict.npy`` has them too, but it is a pickle, which
+can run any code when it is loaded: it is never opened.
+
+Source: Lin et al., Neural Scene Chronology, CVPR 2023; layout as in ``zju3dv/NeuSC`` at
+``66e234a``.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import date
+from pathlib import Path, PurePosixPath
+
+from chronoscene.colmap import Model
+from chronoscene.errors import SceneError
+from chronoscene.formats.colmap_layout import find_model, keep_images, make_scene, read_images
+from chronoscene.formats.grouping import group_dates
+from chronoscene.scene import Scene
+from chronoscene.splits import NameIndex, parse_test_text, read_text
+
+NAME = "neusc"
+MARKS = "dense/images/ and a COLMAP model in dense/sparse/"
+"""What `matches` looks for."""
+
+PERIOD_BY = ("year", "month", "day", "gap:DAYS", "count:N")
+"""How dates become periods; by year unless told otherwise."""
+
+TEST_EVERY = 10
+
+LISTS = ("annots", "")
+"""Folders where the lists may be: the scripts write to the second and read from the first."""
+
+
+def matches(path: Path) -> bool:
+    """Whether a folder has an undistorted model below ``dense/``."""
+    return (path / "dense/images").is_dir() and find_model(path / "dense") is not None
+
+
+def read(path: Path, *, period_by: str = "year") -> Scene:
+    """Read a scene.
+
+    Raises:
+        SceneError: If it is damaged, or a name has no date.
+        ConfigError: If ``period_by`` is not in `PERIOD_BY`.
+    """
+    path = Path(path)
+    model = read_images(path / "dense", path / "dense/images")
+    used = _used_names(path, model)
+    dates = {name: when for name in used if (when := _date(path, name)) is not None}
+    if not dates:
+        raise SceneError(
+            path / "dense/images",
+            expected="images with a date in their names",
+            found="none that train.txt and trash.txt leave",
+            todo="see DATASET.md, Other formats",
+        )
+    dated = [name for name in used if name in dates]
+    return make_scene(
+        path,
+        path / "dense/images",
+        keep_images(model, dates.keys()),
+        group_dates(dates, period_by),
+        set(dated[::TEST_EVERY]),
+        rule=f"every {TEST_EVERY}th image of the list (index 0, {TEST_EVERY}, ...)",
+        format=NAME,
+    )
+
+
+def remarks(path: Path) -> list[str]:
+    """What is there and not part of a scene."""
+    model = read_images(path / "dense", path / "dense/images")
+    left_out = len(model.images) - len([n for n in _used_names(path, model) if _date(path, n)])
+    found = []
+    if left_out:
+        found.append(f"{left_out} images are without date, not in train.txt, or in trash.txt")
+    if (path / "semantic_maps").is_dir():
+        found.append("semantic_maps/ (sky, people) is not read")
+    return found
+
+
+def _used_names(path: Path, model: Model) -> list[str]:
+    """Registered images in the order of ``train.txt``, or of their names, without the trash."""
+    names = [image.name for image in model.images]
+    trash = set(_listed(path, "trash.txt", names) or [])
+    train = _listed(path, "train.txt", names)
+    return [name for name in (names if train is None else train) if name not in trash]
+
+
+def _listed(path: Path, file: str, names: list[str]) -> list[str] | None:
+    """Registered images that a list names, in its order; None where there is no such list."""
+    place = next(
+        (path / folder / file for folder in LISTS if (path / folder / file).exists()), None
+    )
+    if place is None:
+        return None
+    index = NameIndex(names)
+    listed: dict[str, None] = {}
+    for entry in parse_test_text(read_text(place)):
+        found = index.find(entry.name)
+        if len(found) > 1:
+            raise SceneError(
+                f"{place}:{entry.line}",
+                expected="a name that fits one image",
+                found=repr(entry.name),
+                todo="write the full name",
+            )
+        listed.update(dict.fromkeys(found))
+    return list(listed)
+
+
+def _date(path: Path, name: str) -> date | None:
+    """Date at the beginning of a file name; None where it says ``none``."""
+    prefix = PurePosixPath(name).name.split("_")[0]
+    if prefix.lower() == "none":
+        return None
+    match = re.fullmatch("([0-9]{4})-([0-9]{1,2})-([0-9]{1,2})", prefix)
+    try:
+        if match is not None:
+            return date(*map(int, match.groups()))
+    except ValueError:
+        pass  # no such day; reported below
+    raise SceneError(
+        path / "dense/images" / name,
+        expected='a file name that begins with a date as in "2012-05-03_", or with "none_"',
+        found=repr(prefix),
+        todo="rename the image in the model, or list it in trash.txt",
+    )

@@ -1,0 +1,315 @@
+"""Poses and cameras from ``transforms.json`` and its relatives; shared by several formats.
+
+Files of this family hold camera-to-world matrices with OpenGL axes (+x right, +y up, looking along
+-z) and intrinsics for all frames or for each. What they say is not trusted: numbers are checked,
+and image paths must stay inside the scene folder.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import posixpath
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.errors import SceneError
+from chronoscene.images import image_size
+from chronoscene.scene import Camera, Frame, Period, Points, Scene
+from chronoscene.splits import read_text, split_of
+
+LARGEST_SIDE = 1_000_000
+"""Pixels; beyond any image."""
+
+MODEL_KEYS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+"""Camera models that such a file can name, with their distortion in COLMAP's order."""
+
+_LIST_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Order of ``distortion_params``."""
+
+_NOT_RIGID = 1e-3
+"""Deviation from a rotation beyond which a matrix is refused; below, the nearest is taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """One frame of such a file."""
+
+    name: str
+    """Path below the scene folder."""
+    camera: Camera
+    cam_from_world: NDArray[np.float64]
+    """[4, 4]"""
+    image_id: int = 0
+    """0 where the file does not say."""
+
+
+def read_object(place: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        SceneError: If the file is missing or holds something else.
+    """
+    try:
+        data = json.loads(read_text(place))
+    except (ValueError, RecursionError) as error:
+        raise json_error(place, "JSON", str(error)) from error
+    if not isinstance(data, dict):
+        raise json_error(place, "a JSON object", type(data).__name__)
+    return data
+
+
+def read_frames(place: Path, data: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The list ``frames``, which has at least one object."""
+    frames = data.get("frames")
+    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
+        raise json_error(place, "a list of frames", "none")
+    return frames
+
+
+def json_error(place: object, expected: str, found: str) -> SceneError:
+    """Something wrong in a file of this family."""
+    return SceneError(place, expected=expected, found=found, todo="see DATASET.md, Other formats")
+
+
+def head_has(path: Path, text: str, *, length: int = 65536) -> bool:
+    """Whether the first bytes of a file have a text."""
+    try:
+        with path.open("rb") as file:
+            return text.encode() in file.read(length)
+    except OSError:
+        return False
+
+
+def image_name(place: object, folder: str, file_path: object, *, suffix: str = "") -> str:
+    """Path of an image below the scene folder.
+
+    Args:
+        place: For the message.
+        folder: Folder of the file, below the scene folder; "" if it is directly there.
+        file_path: What the file says, relative to its folder.
+        suffix: Extension to add where there is none.
+
+    Raises:
+        SceneError: If the path is absolute, leads out of the scene folder, or is no text.
+    """
+    if not isinstance(file_path, str) or not file_path.strip() or "\0" in file_path:
+        raise json_error(place, "a file_path", repr(file_path))
+    given = file_path.replace("\\", "/")
+    name = posixpath.normpath(posixpath.join(folder, given))
+    outside = name in (".", "..") or name.startswith(("../", "/"))
+    if outside or given.startswith("/") or PureWindowsPath(given).drive:
+        raise json_error(place, "a file_path inside the scene folder", repr(file_path))
+    return name if PurePosixPath(name).suffix or not suffix else name + suffix
+
+
+def number(place: object, data: Mapping[str, Any], key: str) -> float | None:
+    """A finite number, or None where the key is absent or null."""
+    value = data.get(key)
+    if value is None:
+        return None
+    try:
+        valid = type(value) in (int, float) and math.isfinite(value)
+        if valid:
+            return float(value)
+    except OverflowError:
+        pass
+    raise json_error(place, f"a finite number as {key}", repr(value)[:40])
+
+
+def matrix(place: object, value: object, rows: tuple[int, ...] = (4,)) -> NDArray[np.float64]:
+    """A finite matrix with four columns and one of the given numbers of rows, filled up to 4x4."""
+    try:
+        array = np.asarray(value, np.float64)
+    except (ValueError, TypeError, OverflowError):
+        array = np.zeros(0)
+    if array.shape not in [(n, 4) for n in rows] or not np.isfinite(array).all():
+        raise json_error(place, f"a matrix of {' or '.join(map(str, rows))} x 4 numbers", "another")
+    full = np.eye(4)
+    full[: len(array)] = array
+    if full[3].tolist() != [0, 0, 0, 1]:
+        raise json_error(place, "a last row 0 0 0 1", str(full[3].tolist()))
+    return full
+
+
+def nearest_rotation(place: object, block: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation nearest to a matrix that is one up to rounding. [3, 3]
+
+    Raises:
+        SceneError: If it is none: scaled, mirrored or skewed.
+    """
+    u, _, vt = np.linalg.svd(block)
+    rotation: NDArray[np.float64] = u @ vt
+    if np.abs(rotation - block).max() > _NOT_RIGID or np.linalg.det(rotation) < 0:
+        raise json_error(place, "a rotation in the camera-to-world matrix", "another matrix")
+    return rotation
+
+
+def pose_from_opengl(place: object, world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """``cam_from_world`` with OpenCV axes of a camera-to-world matrix with OpenGL axes. [4, 4]"""
+    rotation = nearest_rotation(place, world_from_cam[:3, :3]) * [1.0, -1.0, -1.0]
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ world_from_cam[:3, 3]
+    return pose
+
+
+def opengl_from_pose(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of `pose_from_opengl`. [4, 4]"""
+    rotation = cam_from_world[:3, :3]
+    world_from_cam = np.eye(4)
+    world_from_cam[:3, :3] = rotation.T * [1.0, -1.0, -1.0]
+    world_from_cam[:3, 3] = -rotation.T @ cam_from_world[:3, 3]
+    return world_from_cam
+
+
+class CameraTable:
+    """Cameras of a file; frames with equal intrinsics share one."""
+
+    def __init__(self) -> None:
+        self._ids: dict[tuple[Any, ...], int] = {}
+
+    def camera(self, place: object, data: Mapping[str, Any], image: Path) -> Camera:
+        """Camera of a frame.
+
+        Args:
+            place: For messages.
+            data: Keys of the file, overridden by those of the frame.
+            image: Where the size is found if the file does not say it.
+        """
+        width, height = _size(place, data, image)
+        fx, fy = _focals(place, data, width, height)
+        cx, cy = number(place, data, "cx"), number(place, data, "cy")
+        model, distortion = _model(place, data)
+        if model.startswith("SIMPLE_") or model == "RADIAL":
+            if fx != fy:
+                raise json_error(place, f"equal fl_x and fl_y of a {model}", f"{fx}, {fy}")
+            focals: tuple[float, ...] = (fx,)
+        else:
+            focals = (fx, fy)
+        centre = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+        params = (*focals, *centre, *distortion)
+        key = (model, width, height, params)
+        return Camera(self._ids.setdefault(key, len(self._ids) + 1), *key)
+
+
+def _size(place: object, data: Mapping[str, Any], image: Path) -> tuple[int, int]:
+    width, height = number(place, data, "w"), number(place, data, "h")
+    if width is None or height is None:
+        return image_size(image)
+    for value in (width, height):
+        if not (1 <= value <= LARGEST_SIDE and value == int(value)):
+            raise json_error(place, "w and h in whole pixels", f"{width:g} x {height:g}")
+    return int(width), int(height)
+
+
+def _focals(place: object, data: Mapping[str, Any], width: int, height: int) -> tuple[float, float]:
+    fx = number(place, data, "fl_x") or _from_angle(place, data, "camera_angle_x", width)
+    fy = number(place, data, "fl_y") or _from_angle(place, data, "camera_angle_y", height) or fx
+    fx = fx or fy
+    if fx is None or fy is None or min(fx, fy) <= 0:
+        raise json_error(place, "a positive fl_x, or camera_angle_x in radians", f"{fx}, {fy}")
+    return fx, fy
+
+
+def _from_angle(place: object, data: Mapping[str, Any], key: str, pixels: int) -> float | None:
+    """Focal length of a field of view over a number of pixels."""
+    angle = number(place, data, key)
+    if angle is None:
+        return None
+    if not 0 < angle < math.pi:
+        raise json_error(place, f"{key} between 0 and pi", f"{angle:g}")
+    return pixels / 2 / math.tan(angle / 2)
+
+
+def _model(place: object, data: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
+    """Camera model and distortion; the named model, or one that has all that is not zero."""
+    values = _distortion(place, data)
+    named = data.get("camera_model")
+    if named is not None and named not in MODEL_KEYS:
+        raise json_error(place, f"a camera_model {', '.join(MODEL_KEYS)}", repr(named)[:40])
+    used = {key for key, value in values.items() if value}
+    fisheye = named == "OPENCV_FISHEYE" or bool(data.get("is_fisheye"))
+    if named is None:
+        named = "OPENCV" if used else "PINHOLE"
+    if fisheye:
+        named = "OPENCV_FISHEYE"
+    if not used <= set(MODEL_KEYS[named]) and not fisheye:
+        named = "OPENCV"
+    if named == "OPENCV" and used - {"k3"} <= set(MODEL_KEYS["OPENCV"]) and "k3" in used:
+        ks = (values[key] for key in ("k1", "k2", "p1", "p2", "k3"))
+        return "FULL_OPENCV", (*ks, 0.0, 0.0, 0.0)
+    if wrong := sorted(used - set(MODEL_KEYS[named])):
+        raise json_error(place, f"distortion of {named}", ", ".join(wrong))
+    return named, tuple(values[key] for key in MODEL_KEYS[named])
+
+
+def _distortion(place: object, data: Mapping[str, Any]) -> dict[str, float]:
+    listed = data.get("distortion_params")
+    if listed is not None:
+        if not isinstance(listed, list) or len(listed) > len(_LIST_ORDER):
+            raise json_error(place, f"distortion_params {', '.join(_LIST_ORDER)}", "others")
+        data = dict(zip(_LIST_ORDER, listed, strict=False))
+    return {key: number(place, data, key) or 0.0 for key in _LIST_ORDER}
+
+
+def make_scene(
+    path: Path,
+    shots: Sequence[Shot],
+    grouped: tuple[Mapping[str, int], Sequence[Period]],
+    tests: set[str],
+    *,
+    points: Points,
+    rule: str,
+    format: str,
+) -> Scene:
+    """A scene from shots of different names.
+
+    Where all names are below ``images/``, that is the folder of images, and cut off the names.
+    """
+    prefix = "images/" if all(shot.name.startswith("images/") for shot in shots) else ""
+    ids = [shot.image_id for shot in shots]
+    known = min(ids) > 0 and max(ids) < 2**31 and len(set(ids)) == len(ids)
+    ordered = sorted(shots, key=lambda shot: shot.name)
+    frames = tuple(
+        Frame(
+            name=shot.name.removeprefix(prefix),
+            image_id=shot.image_id if known else i,
+            camera=shot.camera,
+            cam_from_world=shot.cam_from_world,
+            period=grouped[0][shot.name],
+            split=split_of(shot.name, tests),
+        )
+        for i, shot in enumerate(ordered, start=1)
+    )
+    return Scene(
+        name=path.resolve().name,
+        root=path,
+        images_root=path / prefix if prefix else path,
+        frames=frames,
+        points=points,
+        periods=tuple(grouped[1]),
+        split_rule=rule,
+        format=format,
+    )
+
+
+def check_distinct(place: object, shots: Sequence[Shot]) -> None:
+    """Refuse two frames of one image."""
+    seen: set[str] = set()
+    for shot in shots:
+        if shot.name in seen:
+            raise json_error(place, "each image once", f"{shot.name!r} twice")
+        seen.add(shot.name)
