@@ -12,11 +12,14 @@ from chronoscene.errors import ChronoSceneError
 
 COMMANDS = {
     "bench": "chronoscene.cli.bench:command",
+    "convert": "chronoscene.cli.convert:command",
     "methods": "chronoscene.cli.methods:command",
     "score": "chronoscene.cli.score:command",
+    "split": "chronoscene.cli.split:command",
     "stats": "chronoscene.cli.stats:command",
     "synth": "chronoscene.cli.synth:command",
     "table": "chronoscene.cli.table:command",
+    "undistort": "chronoscene.cli.undistort:command",
     "validate": "chronoscene.cli.validate:command",
 }
 """Command name to ``module:attribute``."""

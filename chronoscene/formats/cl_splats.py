@@ -34,7 +34,7 @@ from chronoscene.scene import Points, Scene
 from chronoscene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
 
 NAME = "cl-splats"
-MARKS = "images/day_<n>_* and a COLMAP model, or transforms_train.json here and in add/, move/, ..."
+MARKS = "images/day_<n>_* and sparse/0/, or transforms_train.json here and in add/, move/, ..."
 """What `matches` looks for."""
 
 BASE = "base"

@@ -44,7 +44,7 @@ from chronoscene.splits import (
 )
 
 NAME = "colmap-folders"
-MARKS = "images/<period>/ and a COLMAP model in sparse/0/"
+MARKS = "images/<period>/ and sparse/0/"
 """What `matches` looks for."""
 
 PERIOD_BY = ("folder", "table:FILE")

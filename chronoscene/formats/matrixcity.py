@@ -43,7 +43,7 @@ from chronoscene.scene import Period, Points, Scene, WorldFrame
 from chronoscene.splits import DEFAULT_RULE, default_tests
 
 NAME = "matrixcity"
-MARKS = "transforms.json with rot_mat, here or in blocks, or pose/<block>/transforms_train.json"
+MARKS = "transforms.json with rot_mat, or pose/<block>/transforms_train.json"
 """What `matches` looks for."""
 
 PERIOD_BY = ("one", "folder")

@@ -2,6 +2,7 @@
 
 - A frame's ``period`` (0..T-1) decides; else the distinct values of its ``time``; else all
   frames are of one period. Readers of the format ignore keys that they do not know.
+- Frames whose image is missing are left out: the fox of instant-ngp comes with such frames.
 - Frames in ``test_filenames`` or ``val_filenames`` are test images. Frames that are in no list are
   left out where there is a ``train_filenames``, as nerfstudio does.
 - ``applied_transform`` and ``applied_scale`` say what was done to the original world; both are
@@ -96,7 +97,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     frames = read_frames(place, data)
     shots = _read_shots(path, data, frames)
     extras = {shot.name: frame for shot, frame in zip(shots, frames, strict=True)}
-    shots, tests, rule = _apply_lists(place, data, shots)
+    shots, tests, rule = _apply_lists(place, data, _with_image(path, shots))
     grouped = _group(place, data, {shot.name: extras[shot.name] for shot in shots}, period_by)
     scene = make_scene(
         path,
@@ -123,10 +124,27 @@ def remarks(path: Path) -> list[str]:
         for key, what in (("mask_path", "masks"), ("depth_file_path", "depth maps"))
         if (count := sum(key in frame for frame in frames))
     ]
-    kept, _, _ = _apply_lists(path / FILE, data, _read_shots(path, data, frames))
-    if len(kept) < len(frames):
-        found.append(f"{len(frames) - len(kept)} frames are in no list of names, and left out")
+    shots = _with_image(path, _read_shots(path, data, frames))
+    if len(shots) < len(frames):
+        found.append(f"{len(frames) - len(shots)} frames are left out, as their image is missing")
+    kept, _, _ = _apply_lists(path / FILE, data, shots)
+    if len(kept) < len(shots):
+        found.append(f"{len(shots) - len(kept)} frames are left out, as no list names them")
     return found
+
+
+def _with_image(path: Path, shots: list[Shot]) -> list[Shot]:
+    """The frames whose image is there.
+
+    Raises:
+        SceneError: If none is.
+    """
+    there = [shot for shot in shots if (path / shot.name).is_file()]
+    if not there:
+        raise SceneError(
+            path / shots[0].name, expected="an image", found="nothing", todo="copy the images there"
+        )
+    return there
 
 
 def _read_shots(path: Path, data: Mapping[str, Any], frames: list[dict[str, Any]]) -> list[Shot]:

@@ -30,7 +30,7 @@ from chronoscene.scene import Scene
 from chronoscene.splits import NameIndex, parse_test_text, read_text
 
 NAME = "neusc"
-MARKS = "dense/images/ and a COLMAP model in dense/sparse/"
+MARKS = "dense/images/ and dense/sparse/"
 """What `matches` looks for."""
 
 PERIOD_BY = ("year", "month", "day", "gap:DAYS", "count:N")

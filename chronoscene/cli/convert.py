@@ -1,0 +1,99 @@
+"""``chronoscene convert``: a scene of any format in another one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from chronoscene.cli.output import emit
+from chronoscene.cli.progress import image_bar
+from chronoscene.convert import convert
+from chronoscene.formats import format_names, load_format, writable_formats
+from chronoscene.formats.writing import ImageSource
+from chronoscene.scene import Scene
+from chronoscene.splits import split_hash
+
+LINKS: dict[str | None, ImageSource] = {None: "copy", "hard": "link", "sym": "symlink"}
+
+
+def _period_help() -> str:
+    known = {name: getattr(load_format(name), "PERIOD_BY", ()) for name in format_names()}
+    rules = "; ".join(f"{name}: {', '.join(by)}" for name, by in known.items() if by)
+    return f"How images become periods, where the format leaves a choice. {rules}."
+
+
+@click.command("convert")
+@click.argument("source", type=click.Path(path_type=Path), metavar="SRC")
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--format",
+    "source_format",
+    type=click.Choice(format_names()),
+    help="Format of SRC.  [default: found out]",
+)
+@click.option(
+    "--to",
+    "target",
+    type=click.Choice(writable_formats()),
+    default="chronoscene",
+    show_default=True,
+    help="Format of OUT.",
+)
+@click.option("--period-by", metavar="RULE", help=_period_help())
+@click.option(
+    "--link",
+    type=click.Choice(["hard", "sym"]),
+    help="Link the images instead of copying them.",
+)
+def command(
+    source: Path,
+    out: Path,
+    source_format: str | None,
+    target: str,
+    period_by: str | None,
+    link: str | None,
+) -> None:
+    """Write the scene SRC, of any known format, into the new folder OUT.
+
+    SRC is left alone; OUT appears complete or not at all. What gets lost on the way is said.
+    DATASET.md describes the formats.
+    """
+    with image_bar("images") as progress:
+        done = convert(
+            source,
+            out,
+            source_format=source_format,
+            target=target,
+            period_by=period_by,
+            image_source=LINKS[link],
+            progress=progress,
+        )
+    scene = done.scene
+    lines = [f"{out}: {target} from {scene.format}, {describe(scene)}"]
+    lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
+    lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")
+    emit("\n".join(lines) + "\n", None)
+    for warning in done.warnings:
+        click.secho(f"note: {warning}", fg="yellow", err=True)
+
+
+def describe(scene: Scene) -> str:
+    """Counts of a scene on one line."""
+    cameras = len({frame.camera.camera_id for frame in scene.frames})
+    counts = (
+        (len(scene.frames), "image"),
+        (cameras, "camera"),
+        (len(scene.points), "point"),
+        (scene.num_periods, "period"),
+    )
+    return ", ".join(f"{n} {what}{'s' * (n != 1)}" for n, what in counts)
+
+
+def describe_period(scene: Scene, period: int) -> str:
+    """Label and counts of a period on one line."""
+    train = len(scene.select(split="train", period=period))
+    test = len(scene.select(split="test", period=period))
+    label = scene.periods[period].label
+    name = f"period {period}" + (f" ({label})" if label != str(period) else "")
+    return f"{name}: {train} train, {test} test"

@@ -1,0 +1,167 @@
+"""``chronoscene split``: choose the test images of a scene anew."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from chronoscene.cli.convert import describe_period
+from chronoscene.cli.output import emit
+from chronoscene.cli.progress import image_bar
+from chronoscene.convert import check_outside
+from chronoscene.errors import ConfigError
+from chronoscene.files import write_text_atomic
+from chronoscene.formats import chronoscene as our_format
+from chronoscene.formats import format_names, read_scene
+from chronoscene.split_making import (
+    FRACTION,
+    STRATEGIES,
+    NewSplit,
+    SplitSettings,
+    Strategy,
+    make_split,
+)
+
+
+@click.command("split")
+@click.argument("source", type=click.Path(path_type=Path), metavar="SCENE")
+@click.argument("out", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "--strategy",
+    type=click.Choice(STRATEGIES),
+    default="stratified",
+    show_default=True,
+    help="stratified: one of every 8 images in name order, in each period. blocked: all cameras of "
+    "some blocks of space, the same in all periods. date: the images of each period that were "
+    "taken last. periods: all images of some periods.",
+)
+@click.option("--fraction", type=float, help=f"Share of test images.  [default: {FRACTION}]")
+@click.option("--every", type=int, metavar="N", help="The same as --fraction 1/N.")
+@click.option(
+    "--offset",
+    type=int,
+    default=0,
+    show_default=True,
+    help="stratified: index of the first test image in each period.",
+)
+@click.option(
+    "--seed",
+    type=int,
+    help="stratified: draw one image of each run instead of its first. blocked: which blocks.",
+)
+@click.option("--blocks", type=int, metavar="N", help="blocked: number of blocks in all.")
+@click.option("--period", "periods", type=int, multiple=True, help="periods: id to hold out.")
+@click.option(
+    "--scene-out",
+    type=click.Path(path_type=Path),
+    help="Also write the scene with the new split into this new folder, its images hard-linked "
+    "where the disk can.",
+)
+@click.option(
+    "--dataset-format",
+    type=click.Choice(format_names()),
+    help="Format of the scene.  [default: found out]",
+)
+def command(
+    source: Path,
+    out: Path | None,
+    strategy: Strategy,
+    fraction: float | None,
+    every: int | None,
+    offset: int,
+    seed: int | None,
+    blocks: int | None,
+    periods: tuple[int, ...],
+    scene_out: Path | None,
+    dataset_format: str | None,
+) -> None:
+    """Choose new test images of SCENE and write their names to the file OUT.
+
+    OUT is a test.txt as DATASET.md describes it; what made it stands beside it as JSON. SCENE is
+    left alone: --scene-out writes a copy that has the split.
+    """
+    _check_targets(source, out, scene_out)
+    scene = read_scene(source, format=dataset_format)
+    split = make_split(
+        scene,
+        SplitSettings(
+            strategy=strategy,
+            fraction=_fraction(fraction, every),
+            offset=offset,
+            seed=seed,
+            blocks=blocks,
+            periods=periods,
+        ),
+    )
+    for frame in split.scene.frames:
+        our_format.check_writable_name(source, frame)
+    if scene_out is not None:
+        with image_bar("images") as progress:
+            our_format.write(split.scene, scene_out, image_source="link", progress=progress)
+        _write(split, scene_out / our_format.TEST)
+    if out is not None:
+        _write(split, out)
+    emit(report(split), None)
+
+
+def _fraction(fraction: float | None, every: int | None) -> float:
+    if fraction is not None and every is not None:
+        raise click.UsageError("give --fraction or --every, not both")
+    if every is not None and every < 2:
+        raise click.BadParameter("2 or more is needed", param_hint="--every")
+    return 1 / every if every is not None else FRACTION if fraction is None else fraction
+
+
+def _check_targets(source: Path, out: Path | None, scene_out: Path | None) -> None:
+    """Refuse to write into the scene, over an existing file, or nowhere."""
+    if out is None and scene_out is None:
+        raise click.UsageError("give a file OUT, or --scene-out")
+    for target in (out, scene_out):
+        if target is not None:
+            check_outside(source, target)
+    for file in (out, out and _json_beside(out)):
+        if file is not None and file.exists():
+            raise ConfigError(
+                file, expected="a new file", found="an existing one", todo="choose another name"
+            )
+
+
+def _json_beside(out: Path) -> Path:
+    return out.with_name(f"{out.stem}.json")
+
+
+def _write(split: NewSplit, out: Path) -> None:
+    names = "".join(f"{f.name}\n" for f in split.scene.select(split="test"))
+    record = json.dumps(split.record(), indent=1, ensure_ascii=False) + "\n"
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(out, names)
+        write_text_atomic(_json_beside(out), record)
+    except OSError as error:
+        raise ConfigError(
+            out,
+            expected="a file that can be written",
+            found=error.strerror or "an error",
+            todo="choose another place",
+        ) from error
+
+
+def report(split: NewSplit) -> str:
+    """Counts, distances and hash, for people."""
+    scene = split.scene
+    lines = [f"{scene.name}: {split.settings.strategy}"]
+    lines += [f"  {describe_period(scene, period.id)}" for period in scene.periods]
+    for what, pair in (
+        ("nearest training camera", split.nearest),
+        ("  of the same period", split.nearest_same_period),
+    ):
+        if pair is not None:
+            lines.append(f"{what}: median {pair[0]:.4g}, smallest {pair[1]:.4g} world units")
+    for period in scene.periods:
+        for kind in ("train", "test"):
+            if not scene.select(split=kind, period=period.id):
+                lines.append(f"note: period {period.id} has no {kind} images")
+    lines.append(f"split hash {split.hash}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,71 @@
+"""``chronoscene undistort``: a scene whose cameras are all PINHOLE."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from chronoscene.cli.convert import describe
+from chronoscene.cli.output import emit
+from chronoscene.cli.progress import image_bar
+from chronoscene.convert import check_outside
+from chronoscene.formats import format_names, read_scene
+from chronoscene.splits import split_hash
+from chronoscene.undistort import CameraChange, Undistortion, undistort
+
+
+@click.command("undistort")
+@click.argument("source", type=click.Path(path_type=Path), metavar="SCENE")
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--center", is_flag=True, help="Crop the images so that the principal point is in the centre."
+)
+@click.option(
+    "--threads",
+    type=click.IntRange(1),
+    help="Images worked on at the same time.  [default: one per processor]",
+)
+@click.option(
+    "--dataset-format",
+    type=click.Choice(format_names()),
+    help="Format of the scene.  [default: found out]",
+)
+def command(
+    source: Path, out: Path, center: bool, threads: int | None, dataset_format: str | None
+) -> None:
+    """Write SCENE into the new folder OUT with undistorted images and PINHOLE cameras.
+
+    Observations of points move along; poses, periods and split stay. Images of cameras without
+    distortion are copied. SCENE is left alone. OUT is in the ChronoScene format.
+    """
+    check_outside(source, out)
+    scene = read_scene(source, format=dataset_format)
+    with image_bar("images") as progress:
+        done = undistort(scene, out, center=center, threads=threads, progress=progress)
+    emit(report(done), None)
+
+
+def report(done: Undistortion) -> str:
+    """Sizes and losses, for people."""
+    lines = [f"{done.scene.root}: {describe(done.scene)}"]
+    lines += [f"  {_describe_change(change)}" for change in done.changes[:20]]
+    if len(done.changes) > 20:
+        lines.append(f"  ... and {len(done.changes) - 20} more cameras")
+    if done.observations_lost:
+        lines.append(
+            f"{done.observations_lost} observations outside of the new images, and "
+            f"{done.points_lost} points without any other, were dropped"
+        )
+    lines.append(f"split hash {split_hash(done.scene)}")
+    return "\n".join(lines) + "\n"
+
+
+def _describe_change(change: CameraChange) -> str:
+    source, target = change.source, change.target
+    fx, fy, cx, cy = target.params
+    what = "images copied" if change.is_copy else "images resampled"
+    return (
+        f"camera {target.camera_id}: {source.model} {source.width} x {source.height} -> PINHOLE "
+        f"{target.width} x {target.height}, f {fx:.2f} {fy:.2f}, c {cx:.2f} {cy:.2f}; {what}"
+    )

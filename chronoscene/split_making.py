@@ -1,0 +1,338 @@
+"""New splits of a scene: stratified, in blocks of space, by date of capture, or whole periods.
+
+A strategy gives the names of the test images. `make_split` applies one and says how near the test
+views are to the training views, because near ones make a split easy.
+
+- ``stratified``: in each period, images in name order are cut into runs of equal length, and each
+  run gives one test image. Test views are everywhere, and each has training views beside it.
+- ``blocked``: the places of all cameras are cut into blocks of equally many, the same blocks for
+  all periods, and whole blocks are for testing. No camera of any period trains inside a test block.
+- ``date``: in each period, the images that were taken last are for testing. Whole days are held out
+  where a period has several.
+- ``periods``: all images of some periods are for testing; methods see nothing of these periods.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial import cKDTree
+
+from chronoscene.errors import ConfigError, SceneError
+from chronoscene.geometry import camera_centre
+from chronoscene.scene import Frame, Scene
+from chronoscene.splits import split_hash, split_of
+
+Strategy = Literal["stratified", "blocked", "date", "periods"]
+
+STRATEGIES: tuple[Strategy, ...] = ("stratified", "blocked", "date", "periods")
+
+FRACTION = 1 / 8
+
+_EXIF_IFD = 0x8769
+_CAPTURE_TAGS = (0x9003, 0x9004)
+"""DateTimeOriginal, DateTimeDigitized."""
+
+
+@dataclass(frozen=True, slots=True)
+class SplitSettings:
+    """How to choose test images."""
+
+    strategy: Strategy = "stratified"
+    fraction: float = FRACTION
+    """Of the images of each period (``blocked``: of all images) for testing."""
+    offset: int = 0
+    """``stratified`` without a seed: index of the first test image of each period."""
+    seed: int | None = None
+    """``stratified``: draw one image of each run, instead of its first. ``blocked``: which blocks
+    are for testing; None is 0."""
+    blocks: int | None = None
+    """``blocked``: number of blocks; None for two test blocks, or more if periods need them."""
+    periods: tuple[int, ...] = ()
+    """``periods``: ids of those that are held out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NewSplit:
+    """A scene with its new split, and what is to be known about it."""
+
+    scene: Scene
+    settings: SplitSettings
+    hash: str
+    nearest: tuple[float, float] | None
+    """Median and smallest distance from a test camera to the nearest training camera, in world
+    units; None where one of the two kinds is missing."""
+    nearest_same_period: tuple[float, float] | None
+    """The same among training cameras of the same period."""
+
+    def record(self) -> dict[str, Any]:
+        """All of it but the scene, for a JSON file."""
+
+        def pair(values: tuple[float, float] | None) -> dict[str, float] | None:
+            return None if values is None else {"median": values[0], "min": values[1]}
+
+        return {
+            "schema_version": 1,
+            "scene": self.scene.name,
+            **asdict(self.settings),
+            "periods": list(self.settings.periods),
+            "split_hash": self.hash,
+            "counts": [
+                {
+                    "id": period.id,
+                    "label": period.label,
+                    "train": len(self.scene.select(split="train", period=period.id)),
+                    "test": len(self.scene.select(split="test", period=period.id)),
+                }
+                for period in self.scene.periods
+            ],
+            "distance_to_nearest_training_camera": pair(self.nearest),
+            "distance_to_nearest_training_camera_of_the_period": pair(self.nearest_same_period),
+        }
+
+
+def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
+    """Split a scene anew.
+
+    Raises:
+        ConfigError: If the settings do not fit the scene.
+        SceneError: If dates are needed and an image has none.
+    """
+    _check(settings)
+    tests = _CHOOSE[settings.strategy](scene, settings)
+    if len(tests) == len(scene.frames):
+        raise ConfigError(
+            "split",
+            expected="training images",
+            found="none left",
+            todo="hold out less",
+        )
+    frames = [replace(f, split=split_of(f.name, tests)) for f in scene.frames]
+    new = replace(scene.with_frames(frames), split_rule=f"{settings.strategy} split")
+    return NewSplit(
+        scene=new,
+        settings=settings,
+        hash=split_hash(new),
+        nearest=_distances(new, same_period=False),
+        nearest_same_period=_distances(new, same_period=True),
+    )
+
+
+def _check(settings: SplitSettings) -> None:
+    wrong = None
+    if not 0 < settings.fraction < 1:
+        wrong = ("--fraction", "a number between 0 and 1", settings.fraction)
+    elif not 0 <= settings.offset < 1 / settings.fraction:
+        wrong = ("--offset", "0 or more, and less than 1 / fraction", settings.offset)
+    elif settings.seed is not None and settings.seed < 0:
+        wrong = ("--seed", "0 or more", settings.seed)
+    elif settings.blocks is not None and settings.blocks < 2:
+        wrong = ("--blocks", "2 or more", settings.blocks)
+    if wrong is not None:
+        place, expected, found = wrong
+        raise ConfigError(place, expected=expected, found=str(found), todo="give another value")
+
+
+def _by_period(scene: Scene) -> list[tuple[Frame, ...]]:
+    """Frames of each period, in name order."""
+    return [scene.select(period=period.id) for period in scene.periods]
+
+
+def stratified(scene: Scene, settings: SplitSettings) -> set[str]:
+    """One image of each run of ``1 / fraction`` images, in every period."""
+    rng = None if settings.seed is None else np.random.default_rng(settings.seed)
+    length = 1 / settings.fraction
+    tests = set()
+    for frames in _by_period(scene):
+        for run in range(math.ceil(len(frames) * settings.fraction - 1e-9)):
+            first = math.floor(run * length + 1e-9)
+            last = min(len(frames), math.floor((run + 1) * length + 1e-9))
+            index = first + settings.offset if rng is None else int(rng.integers(first, last))
+            if index < len(frames):
+                tests.add(frames[index].name)
+    return tests
+
+
+def blocked(scene: Scene, settings: SplitSettings) -> set[str]:
+    """The images of whole blocks of camera positions."""
+    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
+    count = settings.blocks or max(2, round(2 / settings.fraction))
+    if count > len(centres):
+        raise ConfigError(
+            "--blocks",
+            expected=f"at most one block for each of {len(centres)} images",
+            found=str(count),
+            todo="ask for fewer blocks",
+        )
+    block = cut_into_blocks(centres, count)
+    periods = np.array([f.period for f in scene.frames])
+    wanted = max(1, round(settings.fraction * count))
+    chosen = choose_blocks(block, periods, wanted, settings.seed or 0)
+    return {f.name for f, b in zip(scene.frames, block.tolist(), strict=True) if b in chosen}
+
+
+def cut_into_blocks(centres: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Block of each camera; blocks are boxes in space with equally many cameras.
+
+    The cameras are cut across the longest side of their box, again and again; a cut parts them in
+    proportion to the blocks that each side is to have. [N, 3] -> [N]
+    """
+    block = np.zeros(len(centres), np.int64)
+
+    def cut(members: NDArray[np.int64], first: int, number: int) -> None:
+        if number == 1:
+            block[members] = first
+            return
+        places = centres[members]
+        axis = int(np.argmax(np.ptp(places, axis=0)))
+        order = members[np.argsort(places[:, axis], kind="stable")]
+        left = number // 2
+        middle = round(len(members) * left / number)
+        cut(order[:middle], first, left)
+        cut(order[middle:], first + left, number - left)
+
+    cut(np.arange(len(centres)), 0, count)
+    return block
+
+
+def choose_blocks(
+    block: NDArray[np.int64], periods: NDArray[np.int64], wanted: int, seed: int
+) -> set[int]:
+    """Blocks for testing: first those that bring test images to most periods without any.
+
+    Among equals, a random order decides. No block is taken that would leave a period without
+    training images. More than ``wanted`` are taken only while periods have no test image.
+
+    Args:
+        block: Block of each image. [N]
+        periods: Period of each image. [N]
+        wanted: Number of blocks.
+        seed: Of the random order.
+    """
+    order = np.random.default_rng(seed).permutation(int(block.max()) + 1).tolist()
+    has = {b: set(periods[block == b].tolist()) for b in order}
+    missing, chosen = set(periods.tolist()), set[int]()
+    while len(chosen) < wanted or missing:
+        left = [
+            b for b in order if b not in chosen and _leaves_training(block, periods, chosen | {b})
+        ]
+        best = max(left, key=lambda b: len(has[b] & missing), default=None)
+        if best is None or (len(chosen) >= wanted and not has[best] & missing):
+            break
+        chosen.add(best)
+        missing -= has[best]
+    return chosen
+
+
+def _leaves_training(
+    block: NDArray[np.int64], periods: NDArray[np.int64], chosen: set[int]
+) -> bool:
+    return len(set(periods[~np.isin(block, list(chosen))].tolist())) == len(set(periods.tolist()))
+
+
+def latest(scene: Scene, settings: SplitSettings) -> set[str]:
+    """The images of each period that were taken last."""
+    times = capture_times(scene)
+    tests = set()
+    for frames in _by_period(scene):
+        ordered = sorted(frames, key=lambda f: (times[f.name], f.name))
+        days = sorted({times[f.name].date() for f in ordered})
+        if len(days) > 1:
+            tests |= _last_days(
+                [(times[f.name].date(), f.name) for f in ordered], settings.fraction
+            )
+        else:
+            held_out = max(1, round(settings.fraction * len(ordered)))
+            tests |= {f.name for f in ordered[len(ordered) - held_out :]}
+    return tests
+
+
+def _last_days(dated: Sequence[tuple[Any, str]], fraction: float) -> set[str]:
+    """Images of the last days, as many days as come nearest to the fraction; one at least."""
+    days = sorted({day for day, _ in dated})
+    after = [sum(day >= first for day, _ in dated) for first in days[1:]]
+    nearest = min(range(len(after)), key=lambda i: (abs(after[i] - fraction * len(dated)), -i))
+    return {name for day, name in dated if day >= days[1 + nearest]}
+
+
+def capture_times(scene: Scene) -> dict[str, datetime]:
+    """When each image was taken: its EXIF block says, else the beginning of its file name.
+
+    Raises:
+        SceneError: If an image has neither.
+    """
+    times = {f.name: _capture_time(scene.image_path(f)) for f in scene.frames}
+    if lost := [name for name, time in times.items() if time is None]:
+        raise SceneError(
+            scene.root,
+            expected="a date of capture of every image: EXIF DateTimeOriginal, or a file name that "
+            "begins with 2023-04-17 or 20230417",
+            found=f"none for {len(lost)} of {len(times)} images, {lost[0]!r} for example",
+            todo="choose another strategy, or hold out whole periods (--strategy periods)",
+        )
+    return {name: time for name, time in times.items() if time is not None}
+
+
+def _capture_time(path: Path) -> datetime | None:
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif().get_ifd(_EXIF_IFD)
+    except Exception:  # Pillow raises anything for damaged EXIF; the name may still have a date
+        exif = {}
+    for tag in _CAPTURE_TAGS:
+        try:
+            return datetime.strptime(str(exif.get(tag, "")).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+        except ValueError:
+            continue
+    return _time_in_name(PurePosixPath(path.name).name)
+
+
+def _time_in_name(name: str) -> datetime | None:
+    match = re.match("((?:19|20)[0-9]{2})-?([0-9]{2})-?([0-9]{2})(?![0-9])", name)
+    try:
+        return datetime(*map(int, match.groups())) if match else None  # type: ignore[arg-type]
+    except ValueError:
+        return None
+
+
+def whole_periods(scene: Scene, settings: SplitSettings) -> set[str]:
+    """All images of the periods that are held out."""
+    known = {period.id for period in scene.periods}
+    if not settings.periods or not set(settings.periods) <= known:
+        raise ConfigError(
+            "--period",
+            expected=f"ids of periods to hold out, 0..{len(known) - 1}",
+            found=", ".join(map(str, settings.periods)) or "none",
+            todo="give --period ID, once for each",
+        )
+    return {f.name for f in scene.frames if f.period in settings.periods}
+
+
+_CHOOSE: Mapping[Strategy, Callable[[Scene, SplitSettings], set[str]]] = {
+    "stratified": stratified,
+    "blocked": blocked,
+    "date": latest,
+    "periods": whole_periods,
+}
+
+
+def _distances(scene: Scene, *, same_period: bool) -> tuple[float, float] | None:
+    """Median and smallest distance from a test camera to the nearest training camera."""
+    groups = [p.id for p in scene.periods] if same_period else [None]
+    found: list[float] = []
+    for period in groups:
+        test = scene.select(split="test", period=period)
+        train = scene.select(split="train", period=period)
+        if test and train:
+            a, b = (camera_centre(np.stack([f.cam_from_world for f in s])) for s in (test, train))
+            found += cKDTree(b).query(a)[0].tolist()
+    return (float(np.median(found)), float(np.min(found))) if found else None
