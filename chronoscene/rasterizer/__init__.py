@@ -93,7 +93,8 @@ def rasterize(
     check_inputs(arrays, backgrounds, width, height)
     check_options(near_plane, far_plane, eps2d)
     if check_finite:
-        check_finite_inputs(arrays)
+        colored = {} if backgrounds is None else {"backgrounds": backgrounds}
+        check_finite_inputs({**arrays, **colored})
     return import_module(BACKENDS[backend]).rasterize(
         *arrays.values(),
         width,

@@ -15,6 +15,24 @@ QUATERNION_MIN = 2.0**-66
 """A quaternion whose largest component is smaller has no direction, and its gradient, which grows
 with one over its length, no bound: the Gaussian is culled."""
 
+VALUE_MAX = 1e30
+"""A Gaussian with a colour or an opacity of this size or more is culled: the squares and sums in
+the gradient must stay within float32."""
+
+EXTENT_MAX = 1e15
+"""So is one whose half extent on the screen is this many pixels or more."""
+
+DEPTH_MAX = 1e18
+"""The far plane is at most here and the near plane at least at one over this: what is divided by
+depth, and depth itself where it is rendered, must stay within float32 with its square."""
+
+SIZE_MAX = 65536
+"""Largest width and height in pixels: at this distance from the corner of the image float32 still
+places a centre within 0.004 pixels."""
+
+RADIUS_MAX = 2_000_000_000
+"""Larger radii are reported as this: they are int32."""
+
 CLAMP_MARGIN = 0.3
 """The Jacobian of the projection is taken at a position at most this many half image widths
 (heights) outside the image; farther out the linearisation is meaningless."""

@@ -18,6 +18,7 @@ from torch import Tensor
 from chronoscene.errors import BackendError
 from chronoscene.rasterizer import reference
 from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
+from chronoscene.rasterizer.recentring import recentred
 from chronoscene.rasterizer.types import RasterInfo, Rasterization
 
 
@@ -46,6 +47,7 @@ def rasterize(
         "eps2d": eps2d,
         "backgrounds": None if backgrounds is None else backgrounds.float(),
     }
+    means, viewmats = recentred(means, viewmats)
     arrays = tuple(x.float() for x in (means, quats, scales, opacities, colors))
     cameras = (viewmats.float(), Ks.float(), width, height)
     if means.shape[0] == 0:  # gsplat launches no kernel for nothing

@@ -19,8 +19,11 @@ from chronoscene.rasterizer.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     CLAMP_MARGIN,
+    EXTENT_MAX,
     QUATERNION_MIN,
+    RADIUS_MAX,
     TRANSMITTANCE_MIN,
+    VALUE_MAX,
 )
 from chronoscene.rasterizer.types import RasterInfo, Rasterization
 
@@ -32,7 +35,7 @@ class _Projected:
     """Gaussians on the screen of one camera. M is N, or the number of visible ones."""
 
     means2d: Tensor  # [M, 2]
-    covariances: Tensor  # [M, 2, 2]
+    axes: Tensor  # [M, 2, 3], the rows a, b of J M: the covariance is axes axes^T + eps2d I
     depths: Tensor  # [M]
 
 
@@ -41,7 +44,7 @@ class _Splats:
     """Visible Gaussians of one camera from front to back. V of N."""
 
     means2d: Tensor  # [V, 2]
-    covariances: Tensor  # [V, 2, 2]
+    axes: Tensor  # [V, 2, 3]
     opacities: Tensor  # [V]
     values: Tensor  # [V, D], the depth appended if asked for
     extents: Tensor  # [V, 2]
@@ -68,12 +71,13 @@ def rasterize(
     info = _new_info(means, viewmats.shape[0], (means, quats, scales, opacities, colors))
     images, alphas, depths = [], [], []
     for c, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
-        camera = (viewmat, K, width, height, eps2d)
+        camera = (viewmat, K, width, height)
         with torch.no_grad():
             everything = _project(means, quats, scales, *camera)
-            extents = _extents(everything.covariances, opacities)
+            extents = _extents(everything.axes, opacities, eps2d)
             visible = _visible(everything, extents, width, height, near_plane, far_plane)
-            visible &= torch.isfinite(colors).all(dim=-1)
+            visible &= _determinants(everything.axes, eps2d) > 0
+            visible &= (colors.abs() < VALUE_MAX).all(dim=-1) & (opacities < VALUE_MAX)
             visible &= quats.abs().amax(dim=-1) >= QUATERNION_MIN
             _fill_info(info, c, everything, extents, visible)
             # A stable sort: Gaussians at equal depth are drawn in the order of the input.
@@ -85,8 +89,8 @@ def rasterize(
             values = torch.cat([values, projected.depths[:, None]], dim=1)
         # The leaf has the values, the projection the gradient; both receive it in backward().
         means2d = info.means2d[c, index] + (projected.means2d - projected.means2d.detach())
-        splats = _Splats(means2d, projected.covariances, opacities[index], values, extents[index])
-        image, transmittance = _composite(splats, width, height)
+        splats = _Splats(means2d, projected.axes, opacities[index], values, extents[index])
+        image, transmittance = _composite(splats, width, height, eps2d)
         alphas.append(1 - transmittance)
         if render_depth:
             image, weighted = image[..., :-1], image[..., -1:]
@@ -117,12 +121,14 @@ def _fill_info(
     info: RasterInfo, c: int, projected: _Projected, extents: Tensor, visible: Tensor
 ) -> None:
     info.means2d.data[c, visible] = projected.means2d[visible]
-    info.radii[c, visible] = torch.ceil(extents[visible]).clamp(max=2**31 - 128).int()
+    info.radii[c, visible] = torch.ceil(extents[visible]).clamp(max=RADIUS_MAX).int()
     info.depths[c, visible] = projected.depths[visible]
 
 
 def _rotation(quats: Tensor) -> Tensor:
     """Rotation matrices of quaternions wxyz of any length. [M, 4] -> [M, 3, 3]"""
+    # Scaled first, lest squares overflow or underflow; the length has no influence.
+    quats = quats / quats.detach().abs().amax(dim=-1, keepdim=True)
     w, x, y, z = (quats / torch.linalg.vector_norm(quats, dim=-1, keepdim=True)).unbind(-1)
     return torch.stack(
         [
@@ -148,9 +154,8 @@ def _project(
     K: Tensor,
     width: int,
     height: int,
-    eps2d: float,
 ) -> _Projected:
-    """Centres in pixels and covariances J R Sigma R^T J^T + eps2d I."""
+    """Centres in pixels and the axes of the Gaussians as J shows them."""
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = (means @ rotation.T + translation).unbind(-1)
@@ -166,15 +171,20 @@ def _project(
         dim=-2,
     )
     axes = jacobian @ rotation @ _rotation(quats) * scales[:, None, :]  # [M, 2, 3]
-    blur = eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
-    return _Projected(means2d, axes @ axes.mT + blur, z)
+    return _Projected(means2d, axes, z)
 
 
-def _extents(covariances: Tensor, opacities: Tensor) -> Tensor:
+def _extents(axes: Tensor, opacities: Tensor, eps2d: float) -> Tensor:
     """Half width and height of the ellipse where alpha reaches the threshold; may be nan. [M, 2]"""
     level = 2 * torch.log(opacities / ALPHA_MIN)
-    variances = torch.diagonal(covariances, dim1=-2, dim2=-1)
+    variances = (axes**2).sum(-1) + eps2d
     return torch.sqrt(level[:, None] * variances)
+
+
+def _determinants(axes: Tensor, eps2d: float) -> Tensor:
+    """Of the covariances: |a x b|^2 + eps2d (|a|^2 + |b|^2) + eps2d^2; nothing cancels. [M]"""
+    area = torch.linalg.cross(axes[:, 0], axes[:, 1])
+    return (area**2).sum(-1) + eps2d * (axes**2).sum((-2, -1)) + eps2d**2
 
 
 def _visible(
@@ -187,19 +197,20 @@ def _visible(
 ) -> Tensor:
     """Between the planes, finite, and with an ellipse that meets the image. [M]"""
     (u, v), (du, dv), z = projected.means2d.unbind(-1), extents.unbind(-1), projected.depths
-    determinants = torch.linalg.det(projected.covariances)
     meets = (u + du > 0) & (u - du < width) & (v + dv > 0) & (v - dv < height)
-    finite = torch.isfinite(extents).all(-1) & torch.isfinite(determinants) & (determinants > 0)
     # Comparisons with nan are false, so a Gaussian that cannot be projected is not visible.
-    return meets & finite & (extents > 0).all(-1) & (z >= near_plane) & (z <= far_plane)
+    sized = ((extents > 0) & (extents < EXTENT_MAX)).all(-1)
+    return meets & sized & (z >= near_plane) & (z <= far_plane)
 
 
-def _composite(splats: _Splats, width: int, height: int) -> tuple[Tensor, Tensor]:
+def _composite(splats: _Splats, width: int, height: int, eps2d: float) -> tuple[Tensor, Tensor]:
     """Values over nothing [H, W, D] and what light is left [H, W, 1]."""
     rows = []
     for top in range(0, height, TILE):
         tiles = [
-            _composite_tile(splats, left, top, min(TILE, width - left), min(TILE, height - top))
+            _composite_tile(
+                splats, left, top, min(TILE, width - left), min(TILE, height - top), eps2d
+            )
             for left in range(0, width, TILE)
         ]
         rows.append(torch.cat(tiles, dim=1))
@@ -207,7 +218,9 @@ def _composite(splats: _Splats, width: int, height: int) -> tuple[Tensor, Tensor
     return values[..., :-1], values[..., -1:]
 
 
-def _composite_tile(splats: _Splats, left: int, top: int, width: int, height: int) -> Tensor:
+def _composite_tile(
+    splats: _Splats, left: int, top: int, width: int, height: int, eps2d: float
+) -> Tensor:
     """Values and transmittance of a rectangle of pixels. [height, width, D + 1]"""
     with torch.no_grad():
         low, high = splats.means2d - splats.extents, splats.means2d + splats.extents
@@ -220,8 +233,7 @@ def _composite_tile(splats: _Splats, left: int, top: int, width: int, height: in
     ys = torch.arange(top, top + height, dtype=means2d.dtype, device=means2d.device) + 0.5
     pixels = torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1).reshape(-1, 1, 2)
     offsets = pixels - means2d  # [P, V, 2]
-    conics = torch.linalg.inv(splats.covariances[index])
-    distances = torch.einsum("pvi,vij,pvj->pv", offsets, conics, offsets)
+    distances = _distances(offsets, splats.axes[index], eps2d)
     alphas = splats.opacities[index] * torch.exp(-0.5 * distances)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp(max=ALPHA_MAX), 0)
     with torch.no_grad():
@@ -233,6 +245,16 @@ def _composite_tile(splats: _Splats, left: int, top: int, width: int, height: in
     weights = alphas * transmittance[:, :-1]
     values = weights @ splats.values[index]
     return torch.cat([values, transmittance[:, -1:]], dim=1).reshape(height, width, -1)
+
+
+def _distances(offsets: Tensor, axes: Tensor, eps2d: float) -> Tensor:
+    """d^T (A A^T + eps2d I)^-1 d with A of rows a, b and d = (x, y). [P, V, 2], [V, 2, 3] -> [P, V]
+
+    By the adjugate it is (|x b - y a|^2 + eps2d |d|^2) / determinant, again without cancelling.
+    """
+    across = offsets[..., :1] * axes[:, 1] - offsets[..., 1:] * axes[:, 0]
+    squares = (across**2).sum(-1) + eps2d * (offsets**2).sum(-1)
+    return squares / _determinants(axes, eps2d)
 
 
 def _expected_depth(weighted: Tensor, alphas: Tensor) -> Tensor:

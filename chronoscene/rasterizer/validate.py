@@ -7,6 +7,7 @@ from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
+from chronoscene.rasterizer.constants import DEPTH_MAX, EXTENT_MAX, SIZE_MAX
 
 
 def check_inputs(
@@ -21,9 +22,12 @@ def check_inputs(
         height: Image height in pixels.
     """
     for name, size in (("width", width), ("height", height)):
-        if size < 1:
+        if not 1 <= size <= SIZE_MAX:
             raise ShapeError(
-                name, expected="at least 1 pixel", found=str(size), todo="correct the argument"
+                name,
+                expected=f"1 to {SIZE_MAX} pixels",
+                found=str(size),
+                todo="correct the argument, or render a larger image in parts",
             )
     for name, array in arrays.items():
         if not array.is_floating_point():
@@ -43,22 +47,22 @@ def check_inputs(
 
 
 def check_options(near_plane: float, far_plane: float, eps2d: float) -> None:
-    """Raise a ShapeError unless 0 < near < far and the blur is not negative."""
-    if not 0 < near_plane < far_plane:
+    """Raise a ShapeError unless 0 < near < far, within limits, and the blur is not negative."""
+    if not 1 / DEPTH_MAX <= near_plane < far_plane <= DEPTH_MAX:
         raise ShapeError(
             "near_plane, far_plane",
-            expected="0 < near_plane < far_plane",
+            expected=f"{1 / DEPTH_MAX:g} <= near_plane < far_plane <= {DEPTH_MAX:g}",
             found=f"{near_plane}, {far_plane}",
             todo="correct the arguments",
         )
-    if not 0 <= eps2d < float("inf"):
+    if not 0 <= eps2d < EXTENT_MAX:
         raise ShapeError(
-            "eps2d", expected="at least 0", found=str(eps2d), todo="correct the argument"
+            "eps2d", expected=f"0 to {EXTENT_MAX:g}", found=str(eps2d), todo="correct the argument"
         )
 
 
 def check_finite_inputs(arrays: dict[str, Tensor]) -> None:
-    """Raise a ShapeError that names the first nan or infinite element, or a bad focal length.
+    """Raise a ShapeError that names the first nan or infinite element, or a camera that is none.
 
     A sum is finite only if every element is, and costs a fraction of an elementwise test; that
     test is run only if the sum is not finite, since large finite elements may overflow it.
@@ -83,4 +87,12 @@ def check_finite_inputs(arrays: dict[str, Tensor]) -> None:
             expected="positive focal lengths",
             found=str(focals[camera].tolist()),
             todo="mirror the camera by its pose, not by its intrinsics",
+        )
+    volumes = torch.linalg.det(arrays["viewmats"].detach()[:, :3, :3].double())
+    for camera in torch.nonzero(volumes == 0)[:1, 0].tolist():
+        raise ShapeError(
+            f"viewmats[{camera}]",
+            expected="a rotation in the upper left 3 x 3",
+            found="a singular matrix",
+            todo="pass world-to-camera transforms [C, 4, 4]",
         )

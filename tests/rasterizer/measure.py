@@ -5,25 +5,16 @@ python tests/rasterizer/measure.py [scenes]
 
 from __future__ import annotations
 
-import importlib.util
 import sys
-from pathlib import Path
 from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, settings
-
-
-def _conftest() -> Any:
-    path = Path(__file__).parent / "conftest.py"
-    spec = importlib.util.spec_from_file_location("rasterizer_conftest", path)
-    assert spec is not None and spec.loader is not None
-    module = sys.modules["rasterizer_conftest"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+from rasterizer_cases.comparison import compare
+from rasterizer_cases.scenes import scenes, well_posed
 
 
 def main(count: int) -> None:
-    tools, worst = _conftest(), dict[str, float]()
+    worst = dict[str, float]()
 
     @settings(
         max_examples=count,
@@ -32,11 +23,11 @@ def main(count: int) -> None:
         phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )
-    @given(tools.scenes())
+    @given(scenes())
     def measure(scene: Any) -> None:
-        if not tools._well_posed(scene):
+        if not well_posed(scene):
             return
-        comparison = tools.compare(scene)
+        comparison = compare(scene)
         for name in comparison.expected:
             if name != "radii":
                 error = comparison.error(name, 1e-3)

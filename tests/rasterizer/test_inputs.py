@@ -40,9 +40,13 @@ def arguments() -> dict[str, Any]:
         ("Ks", torch.eye(3), r"Ks: expected shape \[1, 3, 3\], found \[3, 3\]"),
         ("backgrounds", torch.zeros(3), r"backgrounds: expected shape \[1, 3\], found \[3\]"),
         ("means", torch.zeros(5, 3, dtype=torch.int64), r"means: expected floating point"),
-        ("width", 0, r"width: expected at least 1 pixel, found 0"),
-        ("near_plane", 0.0, r"expected 0 < near_plane < far_plane, found 0\.0"),
-        ("eps2d", -1.0, r"eps2d: expected at least 0, found -1\.0"),
+        ("width", 0, r"width: expected 1 to 65536 pixels, found 0"),
+        ("height", 65537, r"height: expected 1 to 65536 pixels, found 65537"),
+        ("near_plane", 0.0, r"expected 1e-18 <= near_plane < far_plane <= 1e\+18, found 0\.0"),
+        ("near_plane", float("nan"), r"expected 1e-18 <= near_plane < far_plane .* found nan"),
+        ("far_plane", float("inf"), r"expected 1e-18 <= near_plane < far_plane .* inf"),
+        ("eps2d", -1.0, r"eps2d: expected 0 to 1e\+15, found -1\.0"),
+        ("eps2d", float("nan"), r"eps2d: expected 0 to 1e\+15, found nan"),
     ],
 )
 def test_wrong_arguments(arguments: dict[str, Any], name: str, value: Any, message: str) -> None:

@@ -13,9 +13,11 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from chronoscene.errors import BackendError
+from chronoscene.rasterizer.constants import VALUE_MAX
 from chronoscene.rasterizer.cpu import pipeline
 from chronoscene.rasterizer.cpu.function import Render, Request
 from chronoscene.rasterizer.cpu.simd import LANES
+from chronoscene.rasterizer.recentring import recentred
 from chronoscene.rasterizer.types import RasterInfo, Rasterization
 
 __all__ = ["rasterize"]
@@ -46,6 +48,8 @@ def rasterize(
             found=str(means.device),
             todo="move them with .cpu() or choose backend='auto'",
         )
+    if means.dtype == torch.float64:
+        means, viewmats = recentred(means, viewmats)
     gaussians = _prepare(means, quats, scales, opacities, colors)
     count, padded, cameras = means.shape[0], gaussians[0].shape[0], viewmats.shape[0]
     wants_grad = torch.is_grad_enabled() and any(x.requires_grad for x in gaussians)
@@ -98,10 +102,10 @@ def _prepare(
 ) -> tuple[Tensor, ...]:
     """Contiguous float32, at least `LANES` rows: added rows have opacity 0."""
     if colors.shape[1] != 3:  # the kernel tests three channels itself
-        finite = torch.isfinite(colors).all(dim=1)
-        if not bool(finite.all()):
-            opacities = torch.where(finite, opacities, 0)
-            colors = torch.where(finite[:, None], colors, 0)
+        usable = (colors.abs() < VALUE_MAX).all(dim=1)
+        if not bool(usable.all()):
+            opacities = torch.where(usable, opacities, 0)
+            colors = torch.where(usable[:, None], colors, 0)
     missing = max(0, LANES - means.shape[0])
     if missing:
         opacities = pad(opacities, (0, missing))

@@ -17,10 +17,15 @@ from chronoscene.rasterizer.cpu.simd import absolute, maximum, minimum, sqrt
 
 @inlined
 def _to_camera(camera: Any, x: Any, y: Any, z: Any) -> Any:
+    """R (x - c). The centre c of the camera has a rest that float32 cannot hold: subtracted after
+    c, it leaves no more error than x itself has, however far from the origin both are."""
+    x = (x - camera[lay.CENTRE]) - camera[lay.CENTRE_REST]
+    y = (y - camera[lay.CENTRE + 1]) - camera[lay.CENTRE_REST + 1]
+    z = (z - camera[lay.CENTRE + 2]) - camera[lay.CENTRE_REST + 2]
     return (
-        camera[0] * x + (camera[1] * y + (camera[2] * z + camera[9])),
-        camera[3] * x + (camera[4] * y + (camera[5] * z + camera[10])),
-        camera[6] * x + (camera[7] * y + (camera[8] * z + camera[11])),
+        camera[0] * x + (camera[1] * y + camera[2] * z),
+        camera[3] * x + (camera[4] * y + camera[5] * z),
+        camera[6] * x + (camera[7] * y + camera[8] * z),
     )
 
 
@@ -77,17 +82,31 @@ def _image_row(focal: Any, ratio: Any, m: Any, depth_row: Any) -> Any:
 
 
 @inlined
-def _ellipse(a: Any, b: Any, blur: Any) -> Any:
-    """Shear xy/yy, variance of x given y, variance of y, of Sigma = (a, b)(a, b)^T + blur I.
+def cross(a: Any, b: Any) -> Any:
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
 
-    The variance of x given y is the squared length of what is left of (a, sqrt(blur), 0) after
-    its projection on (b, 0, sqrt(blur)): a sum of squares, exact for needles too, where
-    xx - xy^2 / yy would cancel.
+
+@inlined
+def _ellipse(a: Any, b: Any, blur: Any) -> Any:
+    """Shear xy/yy, variance of x given y, variance of y, of Sigma = (a, b)(a, b)^T + blur I; and
+    a - shear b.
+
+    With e = b / sqrt(yy) and n = a x e the variance of x given y is |n|^2 + blur (|a|^2 / yy + 1),
+    a sum of squares, where xx - xy^2 / yy would cancel. For needles a and b are large and almost
+    parallel: a - shear b would cancel too, and is e x n + blur a / yy.
     """
     yy = dot(b, b) + blur
-    shear = dot(a, b) / yy
-    d = (a[0] - shear * b[0], a[1] - shear * b[1], a[2] - shear * b[2])
-    return shear, dot(d, d) + blur * (1.0 + shear * shear), yy
+    inverse = 1.0 / sqrt(yy)
+    e = (b[0] * inverse, b[1] * inverse, b[2] * inverse)
+    n = cross(a, e)
+    share = blur * inverse * inverse
+    d = cross(e, n)
+    rest = (d[0] + share * a[0], d[1] + share * a[1], d[2] + share * a[2])
+    return dot(a, e) * inverse, dot(n, n) + (share * dot(a, a) + blur), yy, rest
 
 
 @inlined
@@ -102,7 +121,7 @@ def project_axes(camera: Any, position: Any, quaternion: Any, scales: Any) -> An
 
     Returns:
         z-depth; (x / z, y / z); the same held within the limits of the Jacobian; rotation;
-        rows of rotation and scale in the camera's frame; rows of J times these; `_ellipse`.
+        last row of rotation and scale in the camera's frame; rows of J times these; `_ellipse`.
     """
     px, py, pz = _to_camera(camera, position[0], position[1], position[2])
     inverse = 1.0 / pz
@@ -116,4 +135,4 @@ def project_axes(camera: Any, position: Any, quaternion: Any, scales: Any) -> An
     a = _image_row(camera[lay.FX] * inverse, jx, m0, m2)
     b = _image_row(camera[lay.FY] * inverse, jy, m1, m2)
     ellipse = _ellipse(a, b, camera[lay.BLUR])
-    return pz, (tx, ty), (jx, jy), r, (m0, m1, m2), (a, b), ellipse
+    return pz, (tx, ty), (jx, jy), r, m2, (a, b), ellipse

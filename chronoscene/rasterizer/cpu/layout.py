@@ -33,7 +33,7 @@ LEVEL_MIN = math.log2(ALPHA_MIN)  # LEVEL - u^2 - v^2 is at least this where alp
 WHITEN = math.sqrt(0.5 * LOG2_E)  # u and v over WHITEN are standard deviations
 
 # Camera numbers in one float32 array.
-ROTATION, TRANSLATION, FX, FY, CX, CY = 0, 9, 12, 13, 14, 15
+ROTATION, CENTRE, FX, FY, CX, CY = 0, 9, 12, 13, 14, 15  # centre in the world
 X_MIN, X_MAX, Y_MIN, Y_MAX = (
     16,
     17,
@@ -41,7 +41,8 @@ X_MIN, X_MAX, Y_MIN, Y_MAX = (
     19,
 )  # limits of x / z and y / z for the Jacobian
 NEAR, FAR, BLUR = 20, 21, 22
-CAMERA = 24
+CENTRE_REST = 23  # what float32 cannot hold of the centre
+CAMERA = 26
 
 CULLED_KEY = 0xFFFFFFFF
 CHUNK = 1024  # Gaussians that a thread takes at a time

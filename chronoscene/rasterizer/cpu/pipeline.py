@@ -96,7 +96,9 @@ def make_view(
     )
     camera = np.zeros(lay.CAMERA, np.float32)
     camera[lay.ROTATION : lay.ROTATION + 9] = viewmat[:3, :3].reshape(-1)
-    camera[lay.TRANSLATION : lay.TRANSLATION + 3] = viewmat[:3, 3]
+    centre = _centre(viewmat)
+    camera[lay.CENTRE : lay.CENTRE + 3] = centre
+    camera[lay.CENTRE_REST : lay.CENTRE_REST + 3] = centre - camera[lay.CENTRE : lay.CENTRE + 3]
     camera[lay.FX], camera[lay.FY], camera[lay.CX], camera[lay.CY] = fx, fy, cx, cy
     camera[lay.X_MIN], camera[lay.X_MAX] = (
         -cx / fx - margin_x,
@@ -108,6 +110,14 @@ def make_view(
     )
     camera[lay.NEAR], camera[lay.FAR], camera[lay.BLUR] = near, far, eps2d
     return View(camera, width, height)
+
+
+def _centre(viewmat: Array) -> Array:
+    """Where the camera stands, also if rounding has left the rotation not quite one."""
+    try:
+        return -np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3])
+    except np.linalg.LinAlgError:  # nan: all is culled
+        return np.full(3, np.nan)
 
 
 def _parts(count: int) -> int:

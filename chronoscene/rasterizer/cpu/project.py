@@ -9,7 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
+from chronoscene.rasterizer.constants import (
+    ALPHA_MIN,
+    EXTENT_MAX,
+    QUATERNION_MIN,
+    RADIUS_MAX,
+    VALUE_MAX,
+)
 from chronoscene.rasterizer.cpu import layout as lay
 from chronoscene.rasterizer.cpu.geometry import project_axes, unit
 from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
@@ -34,7 +40,7 @@ from chronoscene.rasterizer.cpu.simd import (
 )
 from chronoscene.rasterizer.cpu.vecmath import log2
 
-_HUGE = 1e30
+_RADIUS_MAX = float(RADIUS_MAX)
 _LEVEL_MIN = lay.LEVEL_MIN
 
 
@@ -56,7 +62,7 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     means2d, radii, depths = out
     w, x, y, z = load4(quats, 4 * at)
     w, x, y, z, _, longest = unit(w, x, y, z)
-    pz, (tx, ty), _, _, _, _, (shear, xx_given_y, yy) = project_axes(
+    pz, (tx, ty), _, _, _, _, (shear, xx_given_y, yy, _) = project_axes(
         camera, load3(means, 3 * at), (w, x, y, z), load3(scales, 3 * at)
     )
     xx = xx_given_y + shear * shear * yy
@@ -67,14 +73,15 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     reach = (level - _LEVEL_MIN) * (2.0 / lay.LOG2_E)
     ex, ey = sqrt(reach * xx), sqrt(reach * yy)
     cr, cg, cb = load3(colors, 3 * at)
-    # Comparisons with nan are false; the last line catches infinite colours.
+    # Comparisons with nan are false.
     visible = (pz >= camera[lay.NEAR]) & (pz <= camera[lay.FAR])
-    visible = visible & (opacity > ALPHA_MIN) & (opacity < _HUGE) & (reach > 0.0)
-    visible = visible & (ex > 0.0) & (ex < _HUGE) & (ey > 0.0) & (ey < _HUGE)
+    visible = visible & (opacity > ALPHA_MIN) & (opacity < VALUE_MAX) & (reach > 0.0)
+    visible = visible & (ex > 0.0) & (ex < EXTENT_MAX) & (ey > 0.0) & (ey < EXTENT_MAX)
     visible = visible & (mx + ex > 0.0) & (mx - ex < width)
     visible = visible & (my + ey > 0.0) & (my - ey < height) & (xx_given_y > 0.0)
     visible = visible & (longest >= QUATERNION_MIN)
-    visible = visible & (absolute(cr) + absolute(cg) + absolute(cb) < _HUGE)
+    visible = visible & (absolute(cr) < VALUE_MAX) & (absolute(cg) < VALUE_MAX)
+    visible = visible & (absolute(cb) < VALUE_MAX)
 
     # A little more than the ellipse: what is left out here must lie outside it after rounding.
     tx0, ntx = _tile_range(mx - ex * 1.001 - 0.01, mx + ex * 1.001 + 0.01, width)
@@ -107,8 +114,8 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     )
     store(keys, at, select(drawn, as_int(pz), -1))
     store_columns(means2d, 2 * at, (select(visible, mx, 0.0), select(visible, my, 0.0)))
-    rx = to_int(minimum(zero - floor(zero - ex), 2e9))
-    ry = to_int(minimum(zero - floor(zero - ey), 2e9))
+    rx = to_int(minimum(zero - floor(zero - ex), _RADIUS_MAX))
+    ry = to_int(minimum(zero - floor(zero - ey), _RADIUS_MAX))
     store_columns(
         radii,
         2 * at,

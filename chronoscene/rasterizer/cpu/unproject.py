@@ -122,7 +122,7 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     w, qx, qy, qz = load4(quats, 4 * at)
     w, qx, qy, qz, inverse, _ = unit(w, qx, qy, qz)
     s = load3(scales, 3 * at)
-    pz, (tx, ty), (jx, jy), r, (_, _, m2), (a, b), (shear, xx_given_y, yy) = project_axes(
+    pz, (tx, ty), (jx, jy), r, m2, (_, b), (shear, xx_given_y, yy, d) = project_axes(
         camera, load3(means, 3 * at), (w, qx, qy, qz), s
     )
     rz = 1.0 / pz
@@ -137,12 +137,16 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     suu, suv, svv = f[lay.SUM_UU] * scale, f[lay.SUM_UV] * scale, f[lay.SUM_VV] * scale
     gmx = i * su
     gmy = k * sv - shear * gmx
-    # Twice d loss / d Sigma: [[hxx, hxy], [hxy, hyy]].
-    hxx = i * i * suu
-    hxy = i * k * suv - shear * hxx
-    hyy = k * k * svv - shear * (i * k * suv + hxy)
-    da = (hxx * a[0] + hxy * b[0], hxx * a[1] + hxy * b[1], hxx * a[2] + hxy * b[2])
-    db = (hxy * a[0] + hyy * b[0], hxy * a[1] + hyy * b[1], hxy * a[2] + hyy * b[2])
+    # A (a, b) = (i d, k b) with d = a - shear b: the gradients of a and b from those of the
+    # whitened rows, in terms of d lest they cancel for needles.
+    huu, huv, hvv = i * i * suu, i * k * suv, k * k * svv
+    da = (huu * d[0] + huv * b[0], huu * d[1] + huv * b[1], huu * d[2] + huv * b[2])
+    db = (
+        huv * d[0] + hvv * b[0] - shear * da[0],
+        huv * d[1] + hvv * b[1] - shear * da[1],
+        huv * d[2] + hvv * b[2] - shear * da[2],
+    )
+    turning = huu * dot(d, d) + 2.0 * huv * dot(d, b) + hvv * dot(b, b)  # da . a + db . b
 
     d0 = (fx * da[0], fx * da[1], fx * da[2])
     d1 = (fy * db[0], fy * db[1], fy * db[2])
@@ -155,7 +159,7 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     gjx = select((tx > camera[lay.X_MIN]) & (tx < camera[lay.X_MAX]), dot(d0, m2), 0.0)
     gjy = select((ty > camera[lay.Y_MIN]) & (ty < camera[lay.Y_MAX]), dot(d1, m2), 0.0)
     gpx, gpy = fx * gmx - rz * gjx, fy * gmy - rz * gjy
-    gpz = zero - tx * gpx - ty * gpy - rz * (dot(da, a) + dot(db, b))
+    gpz = zero - tx * gpx - ty * gpy - rz * turning
     if depth_gradients.size > 0:
         gpz = gpz + load(depth_gradients, at)
 

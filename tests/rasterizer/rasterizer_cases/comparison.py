@@ -1,0 +1,160 @@
+"""A backend beside the reference: outputs and all gradients on the same numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from chronoscene.rasterizer import reference
+
+from .scenes import SmallScene
+
+
+@contextmanager
+def thresholds(**values: float) -> Iterator[None]:
+    """The reference with other constants."""
+    before = {name: getattr(reference, name) for name in values}
+    try:
+        for name, value in values.items():
+            setattr(reference, name, value)
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(reference, name, value)
+
+
+def steady_pixels(scene: SmallScene, band: float) -> torch.Tensor:
+    """Pixels whose colour does not depend on a threshold being passed by a hair. [C, H, W, 1]
+
+    The image jumps where alpha crosses 1/255 and where the transmittance crosses its end; rounding
+    decides on which side such a pixel falls. They are found by moving the thresholds by more than
+    rounding can.
+    """
+    with torch.no_grad():
+        base = scene.render("reference", torch.float64)[0]
+        steady = torch.ones_like(base.alphas, dtype=torch.bool)
+        for name in ("ALPHA_MIN", "TRANSMITTANCE_MIN"):
+            for factor in (1 - band, 1 + band):
+                with thresholds(**{name: getattr(reference, name) * factor}):
+                    other = scene.render("reference", torch.float64)[0]
+                moved = (other.image != base.image).any(-1, keepdim=True)
+                steady &= ~(moved | (other.alphas != base.alphas))
+    return steady
+
+
+@dataclass
+class Comparison:
+    """A backend beside the reference; arrays by name, float64."""
+
+    scene: SmallScene
+    got: dict[str, np.ndarray]
+    expected: dict[str, np.ndarray]
+    steady: np.ndarray
+
+    def error(self, name: str, floor: float) -> float:
+        """Largest difference, relative to the largest magnitude."""
+        got, expected = self.got[name], self.expected[name]
+        if got.size == 0:
+            return 0.0
+        assert np.isfinite(got).all(), name
+        scale = max(floor, np.abs(expected).max())
+        if name == "grad quats":
+            scale = max(scale, self._turning().max())
+        return float(np.abs(got - expected).max() / scale)
+
+    def _turning(self) -> np.ndarray:
+        """Size of the terms whose difference is the gradient of a rotation. [N]
+
+        They cancel altogether for a sphere; what is left is their rounding.
+        """
+        stretching = np.abs(self.expected["grad scales"] * self.scene.scales).sum(-1)
+        length = np.linalg.norm(self.scene.quats.astype(np.float64), axis=-1)
+        return np.where(length > 0, stretching / np.maximum(length, 1e-37), 0.0)
+
+
+def run(
+    scene: SmallScene, backend: str, dtype: torch.dtype, device: str, steady: torch.Tensor
+) -> dict[str, np.ndarray]:
+    """Outputs and gradients of a loss that weighs every steady pixel at random."""
+    result, inputs = scene.render(backend, dtype, device)
+    generator = torch.Generator().manual_seed(0)
+    outputs = {"image": result.image, "alphas": result.alphas}
+    if result.depths is not None:
+        outputs["depths"] = result.depths
+    loss = torch.zeros((), dtype=dtype, device=device)
+    weights = steady.to(dtype)
+    if result.depths is not None:  # the depth of what is hardly there is not well defined
+        weights = weights * (result.alphas.detach().cpu() > 0.1)
+    for output in outputs.values():
+        draw = torch.randn(output.shape, generator=generator).to(dtype)
+        loss = loss + (output * (draw * weights).to(device)).sum()
+    loss.backward()
+    arrays = {name: (x.detach().cpu() * weights).double().numpy() for name, x in outputs.items()}
+    arrays["means2d"] = result.info.means2d.detach().cpu().double().numpy()
+    arrays["radii"] = result.info.radii.cpu().double().numpy()
+    arrays["z"] = result.info.depths.cpu().double().numpy()
+    assert result.info.means2d.grad is not None
+    arrays["grad means2d"] = result.info.means2d.grad.cpu().double().numpy()
+    for name, x in inputs.items():
+        assert x.grad is not None
+        arrays["grad " + name] = x.grad.double().numpy()
+    return arrays
+
+
+def compare(
+    scene: SmallScene,
+    backend: str = "cpu",
+    device: str = "cpu",
+    *,
+    truth: SmallScene | None = None,
+    band: float = 1e-4,
+) -> Comparison:
+    """Run a backend, and the reference in float64 on the same numbers.
+
+    Args:
+        scene: Its arrays say in which type the backend receives them.
+        backend, device: What to compare with the reference.
+        truth: What the reference gets instead.
+        band: How far, relatively, the thresholds are moved to find the pixels to leave out.
+    """
+    truth = truth or scene
+    steady = steady_pixels(truth, band)
+    dtype = torch.float64 if scene.means.dtype == np.float64 else torch.float32
+    return Comparison(
+        truth,
+        got=run(scene, backend, dtype, device, steady),
+        expected=run(truth, "reference", torch.float64, "cpu", steady),
+        steady=steady.numpy(),
+    )
+
+
+def rounding(scene: SmallScene, band: float, *, ties: bool) -> Comparison:
+    """The reference beside itself with every input moved by up to one unit of its last float32
+    place: the error that float32 inputs have before anything is computed.
+
+    Of four draws the largest difference is kept, put where `Comparison.error` finds it.
+    """
+    steady = steady_pixels(scene, band)
+    expected = run(scene, "reference", torch.float64, "cpu", steady)
+    worst = dict(expected)
+    for seed in range(4):
+        other = run(_moved(scene, seed, ties), "reference", torch.float64, "cpu", steady)
+        for name, base in expected.items():
+            if base.size and np.abs(other[name] - base).max() > np.abs(worst[name] - base).max():
+                worst[name] = other[name]
+    return Comparison(scene, worst, expected, steady.numpy())
+
+
+def _moved(scene: SmallScene, seed: int, ties: bool) -> SmallScene:
+    g = np.random.default_rng(seed)
+    names = ["quats", "scales", "opacities", "colors", "Ks"]
+    names += [] if ties else ["means", "viewmats"]
+    moved = {}
+    for name in names:
+        array = getattr(scene, name).astype(np.float64)
+        moved[name] = array * (1 + 2.0**-23 * g.uniform(-1, 1, array.shape))
+    return scene.with_(**moved)
