@@ -102,7 +102,7 @@ def read_exif(path: Path) -> ExifData:
 def exif_of(image: Image.Image) -> ExifData:
     """What the header of an open image says. Never raises for what is in the file."""
     try:
-        tags = image.getexif()
+        tags = Image.Image.getexif(image)  # the one of PNG files would decode the pixels
         if not tags and "xmp" not in image.info:
             return ExifData()
         main: Mapping[int, Any] = dict(tags)

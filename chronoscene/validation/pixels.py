@@ -110,8 +110,8 @@ def _is_deep(image: Image.Image) -> bool:
     """Whether there are more than 8 bits per channel in the file."""
     if image.mode in ("F", "I") or image.mode.startswith("I;"):
         return True
-    tile = image.tile[0] if getattr(image, "tile", None) else ()
-    return any(";16" in str(argument) for argument in tile[3:])
+    tiles = getattr(image, "tile", None) or ((),)
+    return any(";16" in str(argument) for argument in tiles[0][3:])
 
 
 def _is_cut_off(path: Path, file: BinaryIO, kind: str) -> bool:

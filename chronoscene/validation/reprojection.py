@@ -42,7 +42,7 @@ def reproject(
     Distortion is not applied: errors mean something for pinhole cameras only.
     """
     good = good_poses(images)
-    finite = np.isfinite(points.xyz).all(axis=1)[seen.point]
+    finite = np.asarray(np.isfinite(points.xyz).all(axis=1))[seen.point]
     for image, rows in seen.by_image(images):
         camera = cameras.get(int(images.camera_ids[image]))
         if camera is None or not good[image]:
@@ -50,13 +50,13 @@ def reproject(
         rows = rows[finite[rows]]
         target = images.keypoint_xy[seen.keypoint[rows]]
         with np.errstate(all="ignore"):  # infinite for absurd poses
-            depth, projected = _project(images, image, camera.K, points.xyz[seen.point[rows]])
+            depth, projected = project(images, image, camera.K, points.xyz[seen.point[rows]])
             error = np.linalg.norm(projected - target, axis=1)
         known = np.isfinite(target).all(axis=1)
         yield Reprojection(image, rows[known], depth[known], error[known])
 
 
-def _project(
+def project(
     images: RawImages, image: int, K: NDArray[np.float64], xyz: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Depth [m] and pixel position [m, 2] of points."""

@@ -1,7 +1,7 @@
 """A small good scene, copied for each test, and the means to break it."""
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.colmap import read_reconstruction
-from chronoscene.geometry import quaternion_from_rotation
+from chronoscene.geometry import quaternion_from_rotation, rotation_from_quaternion
 from chronoscene.validation.report import SceneReport
 from chronoscene.validation.run import validate_scene
 
@@ -19,6 +19,9 @@ PERIODS = {f"{'ab'[period]}{i:03d}.png": period for period in (0, 1) for i in ra
 TESTS = ("a003.png", "b003.png")
 WIDTH, HEIGHT = 64, 48
 POINTS = 40
+
+Change = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""World-to-camera rotation and translation to others."""
 
 USUAL = frozenset({"CS507"})
 """Remarks on the good scene itself."""
@@ -59,6 +62,25 @@ class SceneFolder:
             words[i] = text
         lines[row] = " ".join(words)
         self.write(place, lines)
+
+    def change_poses(self, change: Change, rows: Iterable[int]) -> None:
+        """Apply a function of rotation and translation to the poses of some images."""
+        lines = self.lines("sparse/0/images.txt")
+        for row in rows:
+            words = lines[2 * row].split()
+            rotation = rotation_from_quaternion([float(w) for w in words[1:5]])
+            rotation, translation = change(rotation, np.array([float(w) for w in words[5:8]]))
+            pose = [*quaternion_from_rotation(rotation), *translation]
+            lines[2 * row] = " ".join([words[0], *(f"{x:.17g}" for x in pose), *words[8:]])
+        self.write("sparse/0/images.txt", lines)
+
+    def save(self, name: str, image: Image.Image, *, as_name: str | None = None, **options) -> None:
+        """Give an image other content, and perhaps another name everywhere."""
+        self.path(f"images/{name}").unlink()
+        image.save(self.path(f"images/{as_name or name}"), **options)
+        if as_name is not None:
+            for place in ("sparse/0/images.txt", "sparse/split.txt"):
+                self.replace(place, name, as_name)
 
     def to_binary(self, *, classic: bool = True) -> None:
         """Turn the text model into a binary one, with the three classic files or all five."""
@@ -149,3 +171,9 @@ def good_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene(good_folder: Path, tmp_path: Path) -> SceneFolder:
     """A copy of the good scene, to be broken."""
     return SceneFolder(shutil.copytree(good_folder, tmp_path / "scene"))
+
+
+@pytest.fixture
+def make_scene(make_scene_folder: Callable[..., Path]) -> Callable[..., SceneFolder]:
+    """Factory of scenes of other sizes, made by COLMAP's generator."""
+    return lambda *args, **options: SceneFolder(make_scene_folder(*args, **options))

@@ -10,8 +10,9 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.validation.finding import Hit, shown
-from chronoscene.validation.pixels import Pixels
+from chronoscene.validation.pixels import THUMBNAIL, Pixels
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
 
@@ -23,6 +24,17 @@ aerial photos of one flight by 30 and more."""
 FEATURELESS = 4.0
 """Standard deviation of a thumbnail below which it looks like any other one."""
 
+SAME_PLACE = 1e-3
+"""Distance of two cameras, in typical depths of the scene, below which they are in one place: it
+moves points by a pixel or two in an image of 1600."""
+
+SAME_DIRECTION = 2e-3
+"""Difference of two rotation matrices; about a tenth of a degree."""
+
+ROUNDING = 1.01
+"""So much more is let through to the exact comparison."""
+
+_BLOCK = 8
 _ROWS = 256
 
 
@@ -95,30 +107,98 @@ def image_twice(scene: RawScene) -> Iterator[Hit]:
 def near_leak(scene: RawScene) -> Iterator[Hit]:
     assert scene.periods is not None and scene.tests is not None and scene.pixels is not None
     role = {n: (period, n in scene.tests) for n, period in scene.periods.items()}
-    for a, b, distance in near_pairs(scene.pixels):
-        if a not in role or b not in role or role[a] == role[b]:
-            continue
+    for a, b, distance in near_pairs({n: p for n, p in scene.pixels.items() if n in role}, role):
         place, other = (b, a) if role[b][1] and not role[a][1] else (a, b)
         found = f"a thumbnail {distance:.2g} grey levels from that of {shown([other])}"
-        yield Hit(f"images/{place}", "an image of its own", found)
+        yield Hit(f"images/{place}", "an image of its own", found + _apart(scene, a, b))
 
 
-def near_pairs(pixels: Mapping[str, Pixels]) -> Iterator[tuple[str, str, float]]:
-    """Pairs of images whose thumbnails differ by less than `NEAR`, but not equal ones."""
+def _apart(scene: RawScene, a: str, b: str) -> str:
+    """What the poses of two images say about their likeness."""
+    names = scene.images.names if scene.images else ()
+    if a not in names or b not in names:
+        return ""
+    shift = np.linalg.norm(scene.centres[names.index(a)] - scene.centres[names.index(b)])
+    extent = typical_depth(scene)
+    if not np.isfinite(shift) or not extent:
+        return ""
+    if shift <= SAME_PLACE * extent:
+        return ", taken from the same place"
+    return f", though their cameras are {shift / extent:.2g} times the depth of the scene apart"
+
+
+@rule(
+    "CS605",
+    "pose-leak",
+    "warning",
+    what="A test image has the pose of a training image of its period, so it measures memory "
+    "rather than new views.",
+    remedy="take one of the two out, or move the test image to the training images",
+    bad="a burst of three photos, of which the second is in `test.txt`",
+    needs=("images", "tests"),
+)
+def pose_leak(scene: RawScene) -> Iterator[Hit]:
+    images, tests, periods = scene.images, scene.tests, scene.periods
+    assert images is not None and tests is not None and periods is not None
+    near = SAME_PLACE * typical_depth(scene)
+    posed = np.flatnonzero(~np.isnan(scene.centres).any(axis=1))
+    rotations = rotation_from_quaternion(images.quaternions[posed])
+    role = [(periods.get(images.names[i]), images.names[i] in tests) for i in posed.tolist()]
+    for a, b in close_pairs(scene.centres[posed], near) if near else ():
+        alike = np.linalg.norm(rotations[a] - rotations[b]) <= SAME_DIRECTION
+        if alike and role[a][0] == role[b][0] is not None and role[a][1] != role[b][1]:
+            test, train = (a, b) if role[a][1] else (b, a)
+            found = f"that of {shown([images.names[posed[train]]])}"
+            yield Hit(scene.image_place(images.names[posed[test]]), "a pose of its own", found)
+
+
+def typical_depth(scene: RawScene) -> float:
+    """Median distance of the points from the cameras that see them; 0 if unknown."""
+    depths = [s.depth[(s.depth > 0) & np.isfinite(s.depth)] for s in scene.reprojections or ()]
+    every = np.concatenate([np.zeros(0), *depths])
+    return float(np.median(every)) if len(every) else 0.0
+
+
+def close_pairs(places: NDArray[np.float64], near: float) -> Iterator[tuple[int, int]]:
+    """Pairs of positions at most ``near`` apart; only those that lie near along x are compared."""
+    order = np.argsort(places[:, 0], kind="stable")
+    x = places[order, 0]
+    last = np.searchsorted(x, x + near, "right")
+    for i, end in enumerate(last.tolist()):
+        rest = order[i + 1 : end]
+        close = np.linalg.norm(places[rest] - places[order[i]], axis=1) <= near
+        yield from ((int(order[i]), int(j)) for j in rest[close])
+
+
+def near_pairs(
+    pixels: Mapping[str, Pixels], role: Mapping[str, object]
+) -> Iterator[tuple[str, str, float]]:
+    """Pairs of images of different roles whose thumbnails differ by less than `NEAR`, not equal.
+
+    The difference of means over blocks is never above that of the pixels, so most pairs are
+    settled by a sixty-fourth of the numbers, and none is lost.
+    """
     kept = {n: p.thumbnail for n, p in pixels.items() if p.thumbnail is not None}
     names = [n for n, thumbnail in kept.items() if thumbnail.std(axis=(0, 1)).max() >= FEATURELESS]
     if len(names) < 2:
         return
-    table = np.stack([np.ravel(kept[n]) for n in names]).astype(np.float32)
-    table -= table.mean(axis=0)  # smaller numbers, smaller rounding errors below
+    full = np.stack([np.ravel(kept[n]) for n in names])
+    side = THUMBNAIL // _BLOCK
+    blocks = full.reshape(len(names), side, _BLOCK, side, _BLOCK, 3).mean(axis=(2, 4))
+    table = blocks.reshape(len(names), -1)
+    table = table - table.mean(axis=0)  # smaller numbers, smaller rounding errors below
     norms = (table * table).sum(axis=1)
+    _, group = np.unique([repr(role[n]) for n in names], return_inverse=True)
     for first in range(0, len(names), _ROWS):
         rows = slice(first, first + _ROWS)
-        squares = norms[rows, None] + norms - 2 * table[rows] @ table.T
-        for i, j in zip(*np.nonzero(squares < NEAR**2 * table.shape[1]), strict=True):
-            a, b = names[first + i], names[j]
-            if first + i < j and pixels[a].digest != pixels[b].digest:
-                yield a, b, _distance(table[first + i], table[j])
+        squares = norms[rows, None] + norms[first:] - 2 * table[rows] @ table[first:].T
+        near = squares < (NEAR**2 * table.shape[1]) * ROUNDING
+        near &= group[rows, None] != group[first:]
+        i, j = np.nonzero(np.triu(near, 1))
+        for a, b in zip((first + i).tolist(), (first + j).tolist(), strict=True):
+            distance = _distance(full[a], full[b])
+            if distance < NEAR and pixels[names[a]].digest != pixels[names[b]].digest:
+                yield names[a], names[b], distance
 
 
 def _distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:

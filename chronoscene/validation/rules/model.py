@@ -13,6 +13,9 @@ from chronoscene.validation.finding import Hit, quote
 from chronoscene.validation.raw_scene import RawScene, is_safe
 from chronoscene.validation.rule import rule
 
+MOST_IDS = 2**31 - 1
+"""COLMAP's databases count up to here."""
+
 
 @rule(
     "CS101",
@@ -144,6 +147,23 @@ def unknown_camera(scene: RawScene) -> Iterator[Hit]:
         place = scene.image_place(scene.images.names[i])
         found = f"camera {scene.images.camera_ids[i]}"
         yield Hit(place, "a camera of the model", found)
+
+
+@rule(
+    "CS109",
+    "id-out-of-range",
+    "error",
+    what="The id of a camera or image is one that COLMAP cannot have.",
+    remedy="give it an id from 1 on, and correct what refers to it",
+    bad="image id -1; camera id 4294967295",
+    needs=("model",),
+)
+def id_out_of_range(scene: RawScene) -> Iterator[Hit]:
+    cameras = [camera.camera_id for camera in scene.cameras or ()]
+    images = scene.images.ids.tolist() if scene.images else []
+    for stem, ids in (("cameras", cameras), ("images", images)):
+        for wrong in sorted({i for i in ids if not 0 <= i < MOST_IDS}):
+            yield Hit(scene.model_file(stem), f"ids from 0 to {MOST_IDS - 1}", f"id {wrong}")
 
 
 @rule(

@@ -9,12 +9,25 @@ import re
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 
+import numpy as np
+from numpy.typing import NDArray
+
 from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.splits import TEST_EVERY
 from chronoscene.validation.finding import Hit, counted, quote, shown
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.images import GREY_MODES
+
+VOXEL, NEAR = 0.001, 0.2
+"""World units; constants of the released code, and of 3D Gaussian splatting."""
+
+LOST = 0.1
+"""Share of points or observations that is worth a word."""
+
+CROWDED = 10
+"""Points lie on surfaces: on a square of side a, n points are about a / sqrt(n) apart. Where that
+is so many voxels, no two of them share one."""
 
 OFF_CENTRE = 0.5
 """Pixels; half a pixel is a difference of convention, not of the lens."""
@@ -149,6 +162,42 @@ def official_default_split(scene: RawScene) -> Iterator[Hit]:
     without = f", none in period {', '.join(map(str, empty))}" if empty else ""
     found = f"{counted(len(theirs), 'other test image')}{without}"
     yield Hit(TEST, "the same split in the official code", found)
+
+
+@rule(
+    "CS707",
+    "official-units",
+    "info",
+    what="The scene is in small units for the released code, whose voxels have an edge of 0.001 "
+    "world units; the code of 3D Gaussian splatting drops what is nearer to the camera than 0.2.",
+    remedy="nothing to do here; scale the scene up, or set the voxel size, for the released code",
+    bad="a city in units of 100 m",
+    needs=("points",),
+)
+def official_units(scene: RawScene) -> Iterator[Hit]:
+    points = scene.points
+    assert points is not None
+    xyz = points.xyz[np.isfinite(points.xyz).all(axis=1)]
+    if _is_small(xyz):
+        cells = len(np.unique(np.round(xyz / VOXEL), axis=0))
+        if cells < (1 - LOST) * len(xyz):
+            found = f"{cells} for {len(xyz)} points"
+            yield Hit(scene.model_file("points3D"), f"a voxel of {VOXEL:g} for each point", found)
+    depth = np.concatenate([np.zeros(0), *(s.depth for s in scene.reprojections or ())])
+    near = int(np.count_nonzero((depth > 0) & (depth < NEAR)))
+    if near > LOST * len(depth):
+        found = f"{near} of {len(depth)} nearer"
+        expected = f"observations {NEAR:g} world units or more from the camera"
+        yield Hit(scene.model_file("points3D"), expected, found, count=near)
+
+
+def _is_small(xyz: NDArray[np.float64]) -> bool:
+    """Whether so many points could share voxels at all: saves the sorting of large scenes."""
+    if len(xyz) < 2:
+        return False
+    with np.errstate(over="ignore"):
+        low, high = np.percentile(xyz, [5, 95], axis=0)
+        return bool(np.max(high - low) < VOXEL * len(xyz) ** 0.5 * CROWDED)
 
 
 def _cut(name: str) -> str:

@@ -14,6 +14,15 @@ from chronoscene.validation.rules.split import problem_hit
 FEW = 5
 """Training views below which a period can hardly be reconstructed."""
 
+UNEVEN = 3
+"""Ratio between the test views of a period and its share of them."""
+
+FEWEST_OFF = 3
+"""Test views too few or too many that are worth a word."""
+
+UNEQUAL = 10
+"""Ratio between the training views of two periods."""
+
 
 @rule(
     "CS401",
@@ -118,6 +127,46 @@ def single_period(scene: RawScene) -> Iterator[Hit]:
 def no_test_view(scene: RawScene) -> Iterator[Hit]:
     if scene.periods and not scene.tests:
         yield Hit(TEST, "test views", "none that names an image of the model")
+
+
+@rule(
+    "CS408",
+    "test-share",
+    "warning",
+    what="The test views are spread unevenly: a period has far fewer or far more of them than its "
+    "share, so a mean over all views speaks for other periods than the scene.",
+    remedy="take every n-th image of each period, with one n, into test.txt",
+    bad="20 of 100 images are test views in period 0, 2 of 100 in period 1",
+    needs=("tests",),
+)
+def test_share(scene: RawScene) -> Iterator[Hit]:
+    views = _views(scene)
+    if any(train == 0 for train, _ in views.values()):
+        return  # an error already
+    total, tests = sum(map(sum, views.values())), sum(test for _, test in views.values())
+    for period, (train, test) in views.items():
+        fair = tests * (train + test) / max(1, total)
+        uneven = test * UNEVEN < fair or test > fair * UNEVEN
+        if test and uneven and abs(test - fair) >= FEWEST_OFF:
+            expected = f"about {fair:.0f} test views of {train + test} images"
+            yield Hit(f"period {period}", expected, str(test))
+
+
+@rule(
+    "CS409",
+    "periods-unequal",
+    "info",
+    what="A period has less than a tenth of the training views of another one.",
+    remedy="nothing to do; sample the periods equally in training, and look at each period's score",
+    bad="900 images of 2023, 60 of 2016",
+    needs=("tests",),
+)
+def periods_unequal(scene: RawScene) -> Iterator[Hit]:
+    train = {period: views[0] for period, views in _views(scene).items()}
+    most = max(train.values(), default=0)
+    for period, number in train.items():
+        if 0 < number * UNEQUAL < most:
+            yield Hit(f"period {period}", f"a tenth of {most} training views", str(number))
 
 
 def _views(scene: RawScene) -> dict[int, tuple[int, int]]:

@@ -82,7 +82,7 @@ def points_behind_cameras(scene: RawScene) -> Iterator[Hit]:
 )
 def pose_disagrees(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
-    for image in np.flatnonzero(~np.isnan(scene.image_errors)):
+    for image in np.flatnonzero(~np.isnan(scene.image_errors)).tolist():
         limit, median = pose_limit(scene, image), scene.image_errors[image]
         if not median <= limit:
             place = scene.image_place(scene.images.names[image])

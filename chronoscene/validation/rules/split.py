@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from chronoscene.formats.chronoscene import SPLIT
 from chronoscene.splits import Problem, ProblemKind
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.finding import Hit, counted
 from chronoscene.validation.raw_scene import RawScene, TextFile
 from chronoscene.validation.rule import rule
 
@@ -154,3 +154,20 @@ def split_duplicate(scene: RawScene) -> Iterator[Hit]:
 )
 def split_unknown(scene: RawScene) -> Iterator[Hit]:
     return problem_hits(SPLIT, scene.split_problems, "unknown")
+
+
+@rule(
+    "CS310",
+    "split-line-ends",
+    "info",
+    what="Lines of `split.txt` end as in Windows; tools that cut at blanks read a carriage return "
+    "as part of the period.",
+    remedy="nothing to do here; save it with Unix line ends for other tools",
+    bad="`a.jpg 0` with `\\r\\n` behind it",
+    needs=("split_text",),
+)
+def split_line_ends(scene: RawScene) -> Iterator[Hit]:
+    assert scene.split_text is not None
+    if lines := scene.split_text.text.count("\r"):
+        found = f"carriage returns in {counted(lines, 'line')}"
+        yield Hit(SPLIT, "Unix line ends", found, count=lines)

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.validation.pixels import Pixels
-from chronoscene.validation.rules.duplicates import near_pairs
+from chronoscene.validation.rules.duplicates import close_pairs, near_pairs
 
 TEST = "sparse/0/test.txt"
 
@@ -22,11 +22,12 @@ def copy_pixels(scene, source, target):
     )
 
 
-def copy_as_jpeg(scene, source, target):
-    """Nearly the same pixels; the name does not matter to Pillow."""
+def copy_through_jpeg(scene, source, target):
+    """Nearly the same pixels."""
     smooth = Image.open(scene.path(f"images/{source}")).resize((8, 6)).resize((64, 48))
     smooth.save(scene.path(f"images/{source}"))
-    smooth.save(scene.path(f"images/{target}"), "JPEG", quality=80)
+    smooth.save(file := io.BytesIO(), "JPEG", quality=80)
+    Image.open(file).save(scene.path(f"images/{target}"))
 
 
 def test_equal_files_in_train_and_test(scene):
@@ -60,7 +61,7 @@ def test_one_photo_twice(scene):
 
 @pytest.mark.parametrize("target", ["a003.png", "b000.png"])
 def test_photo_saved_again(scene, target):
-    copy_as_jpeg(scene, "a000.png", target)
+    copy_through_jpeg(scene, "a000.png", target)
     assert {f.code for f in scene.validate().findings} == {"CS507"}
     scene.expect("CS604", found="grey levels from that of", decode=True)
 
@@ -80,7 +81,9 @@ def test_near_pairs_over_blocks_of_rows():
     for a, b in ((3, 4), (10, 590), (300, 599)):
         near = pixels[f"{a:03d}"].thumbnail + np.float32(0.5)
         pixels[f"{b:03d}"] = Pixels(None, pixels[f"{b:03d}"].digest, near)
-    found = sorted(near_pairs(pixels))
+    role = {name: i % 2 for i, name in enumerate(pixels)}
+    role["590"] = role["299"] = 2
+    found = sorted(near_pairs(pixels, role))
     assert [(a, b) for a, b, _ in found] == [("003", "004"), ("010", "590"), ("300", "599")]
     assert [d for *_, d in found] == pytest.approx([0.5] * 3, abs=1e-3)
 
@@ -88,7 +91,7 @@ def test_near_pairs_over_blocks_of_rows():
 def test_featureless_images_are_not_compared():
     grey = np.full((32, 32, 3), 128, np.float32)
     pixels = {n: Pixels(None, n.encode(), grey + i) for i, n in enumerate("ab")}
-    assert list(near_pairs(pixels)) == []
+    assert list(near_pairs(pixels, {"a": 0, "b": 1})) == []
 
 
 def test_saved_twice_is_not_equal_bytes():
@@ -98,3 +101,31 @@ def test_saved_twice_is_not_equal_bytes():
         image.save(file := io.BytesIO(), "PNG", compress_level=level)
         files.append(file.getvalue())
     assert files[0] != files[1]  # or the tests above would test nothing
+
+
+def test_test_image_with_the_pose_of_a_training_image(scene):
+    lines = scene.lines("sparse/0/images.txt")
+    pose = lines[0].split()[1:8]
+    words = lines[6].split()
+    lines[6] = " ".join([words[0], *pose, *words[8:]])
+    lines[7] = lines[1]
+    scene.write("sparse/0/images.txt", lines)
+    scene.expect("CS605", place="(a003.png)", found="that of 'a000.png'")
+
+
+def test_one_pose_in_two_periods_is_a_tripod(scene):
+    lines = scene.lines("sparse/0/images.txt")
+    words = lines[20].split()
+    lines[20] = " ".join([words[0], *lines[0].split()[1:8], *words[8:]])
+    lines[21] = lines[1]
+    scene.write("sparse/0/images.txt", lines)
+    assert {f.code for f in scene.validate().findings} == {"CS507"}
+
+
+def test_close_pairs_are_all_found():
+    rng = np.random.default_rng(0)
+    places = rng.uniform(size=(200, 3))
+    distance = np.linalg.norm(places[:, None] - places, axis=2)
+    expected = {(i, j) for i, j in zip(*np.nonzero(distance <= 0.1), strict=True) if i < j}
+    found = list(close_pairs(places, 0.1))
+    assert {tuple(sorted(pair)) for pair in found} == expected and len(found) == len(expected) > 10

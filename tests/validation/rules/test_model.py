@@ -203,3 +203,17 @@ def test_control_characters_do_not_reach_the_terminal(scene):
     path.write_bytes(path.read_bytes().replace(b"a000.png", b"\x1b[31m.pn", 1))
     report = scene.expect("CS112", also={"CS201", "CS202", "CS305", "CS309"})
     assert "\x1b" not in "".join(map(str, report.findings))
+
+
+@pytest.mark.parametrize(("stem", "found"), [("cameras", "id 4294967295"), ("images", "id -1")])
+def test_id_out_of_range(scene, stem, found):
+    wrong = found.split()[1]
+    if stem == "cameras":
+        scene.replace("sparse/0/cameras.txt", "1 PINHOLE", f"{wrong} PINHOLE")
+        scene.replace("sparse/0/images.txt", " 1 a", f" {wrong} a")
+        scene.replace("sparse/0/images.txt", " 1 b", f" {wrong} b")
+    else:
+        scene.edit_fields("sparse/0/images.txt", 0, {0: wrong})
+        for row in range(40):
+            scene.edit_fields("sparse/0/points3D.txt", row, {8: wrong})
+    scene.expect("CS109", place=f"sparse/0/{stem}.txt", found=found)

@@ -53,3 +53,26 @@ def test_single_period(scene):
 def test_summary_counts_views(scene):
     periods = scene.validate().summary.periods
     assert [(p.id, p.images, p.train, p.test) for p in periods] == [(0, 7, 6, 1), (1, 7, 6, 1)]
+
+
+def names(**numbers):
+    """Image names to periods: so many images of period 0 by ``a``, of period 1 by ``b``."""
+    return {f"{p}{i:03d}.png": "ab".index(p) for p, n in numbers.items() for i in range(n)}
+
+
+def test_test_share(make_scene):
+    tests = [f"a{i:03d}" for i in range(12)] + ["b000"]
+    scene = make_scene(names(a=40, b=40), tests=tests)
+    report = scene.expect("CS408", place="period 1", found="1", also={"CS705"})
+    finding = next(f for f in report.findings if f.code == "CS408")
+    assert finding.expected == "about 6 test views of 40 images"
+
+
+def test_few_test_views_of_few_images_are_silent(make_scene):
+    scene = make_scene(names(a=40, b=8), tests=[f"a{i:03d}" for i in range(10)] + ["b000"])
+    assert {f.code for f in scene.validate().findings} == {"CS507", "CS705"}
+
+
+def test_periods_unequal(make_scene):
+    scene = make_scene(names(a=70, b=7), tests=[f"a{i:03d}" for i in range(9)] + ["b000"])
+    scene.expect("CS409", place="period 1", found="6", also={"CS705"})

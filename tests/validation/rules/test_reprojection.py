@@ -1,20 +1,6 @@
 import numpy as np
 
-from chronoscene.geometry import quaternion_from_rotation, rotation_from_quaternion
-
 CAMERAS, IMAGES = "sparse/0/cameras.txt", "sparse/0/images.txt"
-
-
-def change_poses(scene, change, rows):
-    """Apply a function of rotation and translation to the poses of some images."""
-    lines = scene.lines(IMAGES)
-    for row in rows:
-        words = lines[2 * row].split()
-        rotation = rotation_from_quaternion([float(w) for w in words[1:5]])
-        rotation, translation = change(rotation, np.array([float(w) for w in words[5:8]]))
-        pose = [*quaternion_from_rotation(rotation), *translation]
-        lines[2 * row] = " ".join([words[0], *(f"{x:.17g}" for x in pose), *words[8:]])
-    scene.write(IMAGES, lines)
 
 
 def test_observations_outside(scene):
@@ -28,12 +14,12 @@ def test_observations_outside(scene):
 
 def test_opengl_poses(scene):
     flip = np.diag([1.0, -1.0, -1.0])
-    change_poses(scene, lambda r, t: (flip @ r, flip @ t), range(14))
+    scene.change_poses(lambda r, t: (flip @ r, flip @ t), range(14))
     scene.expect("CS512", place=IMAGES, found="560 of 560 observations behind")
 
 
 def test_camera_to_world_pose_of_one_image(scene):
-    change_poses(scene, lambda r, t: (r.T, -r.T @ t), [4])
+    scene.change_poses(lambda r, t: (r.T, -r.T @ t), [4])
     report = scene.validate()
     found = [f for f in report.findings if f.code == "CS513"]
     assert [f.place for f in found] == [f"{IMAGES} (a004.png)"]
@@ -41,7 +27,7 @@ def test_camera_to_world_pose_of_one_image(scene):
 
 
 def test_small_errors_are_silent(scene):
-    change_poses(scene, lambda r, t: (r, t + np.array([0.1, 0, 0])), [4])
+    scene.change_poses(lambda r, t: (r, t + np.array([0.1, 0, 0])), [4])
     assert "CS513" not in {f.code for f in scene.validate().findings}
 
 

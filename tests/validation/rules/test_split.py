@@ -84,3 +84,8 @@ def test_split_duplicate(scene):
 def test_split_unknown(scene):
     scene.write(SPLIT, [*scene.lines(SPLIT), "nobody.png 1"])
     scene.expect("CS309", place=f"{SPLIT}:15", found="'nobody.png'")
+
+
+def test_split_line_ends(scene):
+    scene.write(SPLIT, b"".join(f"{line}\r\n".encode() for line in scene.lines(SPLIT)))
+    scene.expect("CS310", place=SPLIT, found="carriage returns in 14 lines")

@@ -1,0 +1,141 @@
+"""Whether a period has a frame of its own: mirrored, scaled or moved against the others.
+
+A period whose poses belong to another frame disagrees with the points that it shares with the
+others. Two explanations are tried: axes of world and camera that were negated, and a similarity,
+found from the same points as the period's own cameras place them.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.geometry import rotation_from_quaternion
+from chronoscene.validation.alignment import Similarity, fit_robustly
+from chronoscene.validation.raw_scene import RawScene
+
+Array = NDArray[np.float64]
+
+MOST_RAYS = 20_000
+"""Observations of a period that are looked at."""
+
+FEWEST_POINTS = 10
+"""Points that a period must place by itself."""
+
+LEAST_PARALLAX = 1e-4
+"""Smallest eigenvalue of the mean of ``I - d d^T`` over the rays of a point: sine squared of about
+half a degree."""
+
+FITS = 0.02
+"""Median distance after the similarity, as a share of the extent of the points."""
+
+AXES = "xyz"
+
+
+class Rays:
+    """Observations of points by the images of one period (M observations)."""
+
+    def __init__(self, scene: RawScene, period: int) -> None:
+        """Take those whose camera is a pinhole and whose pose is good.
+
+        Args:
+            scene: The scene, with its model.
+            period: Index of the period.
+        """
+        images, points, seen = scene.images, scene.points, scene.observations
+        assert images is not None and points is not None and seen is not None
+        of_period = [r for r in scene.reprojections or () if scene.image_periods[r.image] == period]
+        share = scene.point_periods.sum(axis=1) > 1
+        rows = np.concatenate([np.zeros(0, np.int64), *(r.rows for r in of_period)])
+        rows = rows[share[seen.point[rows]]]
+        # Whole tracks, so that points keep several rays.
+        step = len(rows) // MOST_RAYS + 1
+        rows = rows[seen.point[rows] % step == 0]
+        self.image, self.point = seen.image[rows], seen.point[rows]
+        self.xyz = points.xyz[self.point]
+        self.rotation = rotation_from_quaternion(images.quaternions)[self.image]
+        self.translation = images.translations[self.image]
+        self.centre = scene.centres[self.image]
+        K = np.array([scene.usable_cameras[int(c)].K for c in images.camera_ids[self.image]])
+        self.K = K.reshape(-1, 3, 3)
+        self.xy = images.keypoint_xy[seen.keypoint[rows]]
+
+    def error(self, world: Array, camera: Array) -> float:
+        """Median reprojection error in pixels with some axes of world and camera negated."""
+        local = np.einsum("nij,nj->ni", self.rotation, self.xyz * world) + self.translation
+        local = local * camera
+        with np.errstate(all="ignore"):
+            xy = local[:, :2] / local[:, 2:] * self.K[:, [0, 1], [0, 1]] + self.K[:, :2, 2]
+            distance = np.linalg.norm(xy - self.xy, axis=1)
+        distance[~(local[:, 2] > 0)] = np.inf
+        return float(np.median(distance)) if len(distance) else np.inf
+
+    def place_points(self) -> tuple[NDArray[np.int64], Array]:
+        """Indices and positions of the points by these rays alone, those with enough parallax.
+
+        The position is the nearest to all rays: ``sum(I - d d^T) x = sum((I - d d^T) c)``.
+        """
+        focal, middle = self.K[:, [0, 1], [0, 1]], self.K[:, :2, 2]
+        local = np.column_stack([(self.xy - middle) / focal, np.ones(len(self.xy))])
+        direction = np.einsum("nji,nj->ni", self.rotation, local)
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+        index, slot, count = np.unique(self.point, return_inverse=True, return_counts=True)
+        left, right = np.zeros((len(index), 3, 3)), np.zeros((len(index), 3))
+        np.add.at(left, slot, across)
+        np.add.at(right, slot, np.einsum("nij,nj->ni", across, self.centre))
+        good = np.linalg.eigvalsh(left / count[:, None, None])[:, 0] > LEAST_PARALLAX
+        placed = np.linalg.solve(left[good], right[good][:, :, None])[:, :, 0]
+        return index[good], np.asarray(placed, np.float64)
+
+
+def explain(scene: RawScene, period: int, limit: float) -> str | None:
+    """In words, what brings a period that disagrees with the others into their frame.
+
+    Args:
+        scene: The scene, with its model.
+        period: Index of the period.
+        limit: Reprojection error in pixels that a right explanation leaves at most.
+    """
+    rays = Rays(scene, period)
+    if len(rays.point) < FEWEST_POINTS:
+        return None
+    signs = [np.array(s, np.float64) for s in product((1, -1), repeat=3)]
+    errors = {(i, j): rays.error(a, b) for i, a in enumerate(signs) for j, b in enumerate(signs)}
+    world, camera = min(errors, key=lambda key: errors[key])
+    if errors[world, camera] <= limit:
+        return _negated(signs[world], signs[camera])
+    assert scene.points is not None
+    index, own = rays.place_points()
+    target = scene.points.xyz[index]
+    if len(index) < FEWEST_POINTS:
+        return None
+    found = fit_robustly(own, target, mirror=True)
+    extent = float(np.median(np.linalg.norm(target - np.median(target, axis=0), axis=1)))
+    if found is None or not np.median(found[1]) <= FITS * extent:
+        return None
+    return _moved(found[0], own, target)
+
+
+def _negated(world: Array, camera: Array) -> str:
+    parts = []
+    for what, signs in (("world", world), ("camera", camera)):
+        if (signs < 0).any():
+            axes = " and ".join(AXES[i] for i in np.flatnonzero(signs < 0))
+            parts.append(f"{axes} of the {what} negated")
+    mirrored = "mirrored: " if np.prod(world) < 0 else ""
+    return f"a period {mirrored}it fits with {', '.join(parts)}"
+
+
+def _moved(similarity: Similarity, own: Array, target: Array) -> str:
+    rotation = similarity.matrix / similarity.scale
+    turn = rotation if not similarity.mirrored else -rotation
+    angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    shift = np.linalg.norm(np.median(target, axis=0) - np.median(own, axis=0))
+    mirrored = "mirrored, " if similarity.mirrored else ""
+    return (
+        f"a period in a frame of its own: it fits {mirrored}scaled by {similarity.scale:.4g}, "
+        f"turned by {angle:.3g} degrees and moved by {shift:.3g}"
+    )

@@ -1,0 +1,204 @@
+"""CS22: what the photos say about themselves against what the scene says about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import date, datetime, timedelta
+from itertools import pairwise
+
+import numpy as np
+
+from chronoscene.errors import ChronoSceneError
+from chronoscene.exif import ExifData
+from chronoscene.formats.chronoscene import PERIODS, read_periods
+from chronoscene.validation.finding import Hit, counted
+from chronoscene.validation.positions import GpsFit, fit_gps
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rule import rule
+
+FEWEST_DATES = 3
+"""Photos with a date from which the median date of a period means something."""
+
+DAY = timedelta(days=1)
+"""Periods that are less apart may be mixed up by a time zone."""
+
+MUCH_NEARER = 0.25
+"""Share of the distance to its own period's date within which a photo is of another period."""
+
+SLACK = 31
+"""Days by which the photos may miss the date in ``periods.json``."""
+
+DAYS = (365, 30, 0)
+"""Days from the first to the last that a date with no, one and two hyphens stands for."""
+
+GPS_FAR = 30.0
+"""Metres; receivers in cameras and phones are good to about ten in the open."""
+
+GPS_SIGMAS = 6.0
+"""And so many standard deviations of the fit."""
+
+GPS_LOOSE = 0.5
+"""Standard deviation of the fit, as a share of the spread, beyond which nothing fits at all."""
+
+FILM_DIAGONAL, FILM_WIDTH = 43.2666, 36.0
+"""Millimetres; makers go by one or the other."""
+
+FOCAL_RATIO = 1.4
+"""Undistortion and cropping change the focal length by less."""
+
+
+@rule(
+    "CS221",
+    "exif-period-order",
+    "warning",
+    what="The dates in the photos contradict the order of the periods, or `sparse/periods.json`.",
+    remedy="number the periods by date, or correct the dates; if the cameras' clocks were wrong, "
+    "ignore this rule",
+    bad="the photos of period 0 are of 2023, those of period 1 of 2016",
+    needs=("periods",),
+)
+def exif_period_order(scene: RawScene) -> Iterator[Hit]:
+    medians = _median_dates(scene)
+    ordered = sorted(medians)
+    for earlier, later in pairwise(ordered):
+        if medians[earlier] - medians[later] >= DAY:
+            expected = f"photos later than {medians[earlier]:%Y-%m-%d}, as of period {earlier}"
+            found = f"{medians[later]:%Y-%m-%d} (median)"
+            yield Hit(f"period {later}", expected, found)
+    for period, stated in _stated_dates(scene).items():
+        first = date.fromisoformat(stated + "-01" * (2 - stated.count("-"))).toordinal()
+        last_day = DAYS[stated.count("-")]
+        if (
+            period in medians
+            and not -SLACK <= medians[period].toordinal() - first <= last_day + SLACK
+        ):
+            expected = f"the date of the photos of period {period}, {medians[period]:%Y-%m-%d}"
+            yield Hit(PERIODS, expected, stated)
+
+
+@rule(
+    "CS222",
+    "exif-other-period",
+    "warning",
+    what="The date in a photo is that of another period.",
+    remedy="look at the photo; correct its period in split.txt",
+    bad="a photo of 2023 among those of 2016",
+    needs=("periods",),
+)
+def exif_other_period(scene: RawScene) -> Iterator[Hit]:
+    medians = _median_dates(scene)
+    for name, taken in _dates(scene).items():
+        own = (scene.periods or {})[name]
+        if own not in medians:
+            continue
+        away = abs(taken - medians[own])
+        for other, median in medians.items():
+            apart = abs(median - medians[own])
+            if other != own and apart >= DAY and abs(taken - median) < MUCH_NEARER * away:
+                found = f"{taken:%Y-%m-%d}, as in period {other}"
+                yield Hit(f"images/{name}", f"a date about {medians[own]:%Y-%m-%d}", found)
+                break
+
+
+@rule(
+    "CS223",
+    "exif-position",
+    "warning",
+    what="The GPS position in a photo is far from its camera in the model, after the model was "
+    "laid over the positions of all photos.",
+    remedy="look at the pose: the photo may be registered in a wrong place that looks alike; if "
+    "its receiver was wrong, ignore this rule",
+    bad="a photo of the east facade that was matched to the west facade",
+    needs=("cameras", "images"),
+)
+def exif_position(scene: RawScene) -> Iterator[Hit]:
+    fit = fit_gps(scene)
+    if fit is None:
+        return
+    if fit.sigma > max(GPS_LOOSE * fit.spread, GPS_FAR):
+        found = f"{np.median(fit.distance):.3g} m between them (median)"
+        yield Hit(scene.model_file("images"), "cameras where the photos' GPS has them", found)
+        return
+    far = fit.distance > max(GPS_FAR, GPS_SIGMAS * fit.sigma)
+    whole = _mostly_far(scene, fit, far)
+    yield from whole.values()
+    assert scene.images is not None
+    for image, metres in zip(fit.images[far].tolist(), fit.distance[far], strict=True):
+        if int(scene.image_periods[image]) not in whole:
+            place = scene.image_place(scene.images.names[image])
+            yield Hit(place, "a camera where its GPS has it", f"one {metres:.3g} m away")
+
+
+def _mostly_far(scene: RawScene, fit: GpsFit, far: np.ndarray) -> dict[int, Hit]:
+    """One hit for each period of which most photos are far, by the index of the period."""
+    hits = {}
+    periods = scene.image_periods[fit.images]
+    for index, period in enumerate(scene.period_ids):
+        mine = periods == index
+        if (number := int(np.count_nonzero(far & mine))) > max(1, 0.5 * np.count_nonzero(mine)):
+            metres = np.median(fit.distance[far & mine])
+            found = f"{counted(number, 'camera')} of {np.count_nonzero(mine)} {metres:.3g} m away"
+            hits[index] = Hit(f"period {period}", "cameras where GPS has them", found, count=number)
+    return hits
+
+
+@rule(
+    "CS224",
+    "exif-focal",
+    "warning",
+    what="The focal length of a camera contradicts the photos that were taken with it.",
+    remedy="check the camera: in a scene with little relief COLMAP may settle on a wrong focal "
+    "length; fix it to that of the photos and map again",
+    bad="f = 4000 px with a width of 4000 px; the photos say 20 mm on 36 mm film (2222 px)",
+    needs=("cameras", "images"),
+)
+def exif_focal(scene: RawScene) -> Iterator[Hit]:
+    assert scene.images is not None
+    stated: dict[int, list[float]] = {}
+    pairs = zip(scene.images.names, scene.images.camera_ids.tolist(), strict=True)
+    for name, camera_id in pairs:
+        focal = scene.headers[name].exif.focal_35mm if name in scene.headers else None
+        if focal is not None and camera_id in scene.usable_cameras:
+            stated.setdefault(camera_id, []).append(focal)
+    for camera_id, focals in stated.items():
+        camera, film = scene.usable_cameras[camera_id], float(np.median(focals))
+        long = max(camera.width, camera.height)
+        low, high = sorted(
+            [film * np.hypot(camera.width, camera.height) / FILM_DIAGONAL, film * long / FILM_WIDTH]
+        )
+        focal = float(camera.K[0, 0])
+        if not low / FOCAL_RATIO <= focal <= high * FOCAL_RATIO:
+            place = f"{scene.model_file('cameras')} (camera {camera_id})"
+            expected = f"a focal length about {low:.4g} px ({film:.3g} mm on 36 mm film)"
+            yield Hit(place, expected, f"{focal:.4g} px")
+
+
+def _dates(scene: RawScene) -> dict[str, datetime]:
+    """When the images that have a period were taken."""
+    headers = {n: scene.headers[n] for n in scene.periods or () if n in scene.headers}
+    exif: dict[str, ExifData] = {name: header.exif for name, header in headers.items()}
+    return {name: data.date for name, data in exif.items() if data.date is not None}
+
+
+def _median_dates(scene: RawScene) -> dict[int, datetime]:
+    """Of the periods with enough dates."""
+    by_period: dict[int, list[datetime]] = {}
+    for name, taken in _dates(scene).items():
+        by_period.setdefault((scene.periods or {})[name], []).append(taken)
+    return {
+        period: sorted(dates)[len(dates) // 2]
+        for period, dates in by_period.items()
+        if len(dates) >= FEWEST_DATES
+    }
+
+
+def _stated_dates(scene: RawScene) -> dict[int, str]:
+    """Dates in ``periods.json`` by period; none where the file has its own finding."""
+    ids = scene.period_ids
+    if ids != list(range(len(ids))):
+        return {}
+    try:
+        periods = read_periods(scene.root, len(ids))
+    except ChronoSceneError:
+        return {}
+    return {period.id: period.date for period in periods if period.date is not None}

@@ -1,0 +1,192 @@
+"""CS519 to CS522: the frames of the periods against each other, and of the scene against metres."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.errors import ChronoSceneError
+from chronoscene.formats.chronoscene import WORLD, read_world
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.period_frames import explain
+from chronoscene.validation.positions import fit_gps
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.reprojection import project
+from chronoscene.validation.rule import rule
+from chronoscene.validation.rules.reprojection import pose_limit
+
+MOST_WRONG = 0.5
+"""Share of the images of a period with a pose that does not fit: beyond, the period is at fault."""
+
+DEPTH_RATIO = 10.0
+"""Between the median depths of two periods without shared points: nothing else tells scales."""
+
+UNIT_TOLERANCE = 0.1
+"""Relative difference between the unit and the metre by GPS that its noise can explain."""
+
+NEAREST, FARTHEST = 0.01, 50_000.0
+"""Metres between cameras and points that are plausible."""
+
+APART = 0.05
+"""Share of a period's points that cameras of another one should at least look at."""
+
+OWN = 0.5
+"""Share of a period's points that its own cameras must look at."""
+
+MOST_POINTS, MOST_IMAGES = 3000, 1000
+"""Points and images of all periods together that are compared."""
+
+REACH = 3.0
+"""How far a camera sees, in units of the depth that 95% of its period's points do not exceed."""
+
+
+@rule(
+    "CS519",
+    "period-frame",
+    "warning",
+    what="A period is in a frame of its own: mirrored, scaled, turned or moved against the others.",
+    remedy="bring its poses into the frame of the others, or register all periods together",
+    bad="period 1 was mapped by itself, then scaled to metres; the other periods were not",
+    needs=("images", "periods", "reprojections"),
+)
+def period_frame(scene: RawScene) -> Iterator[Hit]:
+    limits: dict[int, float | None] = {}
+    for index in range(len(scene.period_ids)):
+        mine = np.flatnonzero(scene.image_periods == index)
+        mine = mine[~np.isnan(scene.image_errors[mine]) | _behind(scene, mine)]
+        allowed = np.array([pose_limit(scene, i) for i in mine.tolist()])
+        wrong = np.count_nonzero(~(scene.image_errors[mine] <= allowed))
+        limits[index] = float(np.median(allowed)) if wrong > MOST_WRONG * len(mine) else None
+    if any(limit is None for limit in limits.values()):  # else there is no frame to be in
+        for index, limit in limits.items():
+            explained = None if limit is None else explain(scene, index, limit)
+            if explained is not None:
+                place = f"period {scene.period_ids[index]}"
+                yield Hit(place, "the frame of the other periods", explained)
+    yield from _other_depths(scene)
+
+
+def _behind(scene: RawScene, images: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which images have most of their points behind them."""
+    behind = {
+        r.image
+        for r in scene.reprojections or ()
+        if len(r.depth) and np.count_nonzero(~(r.depth > 0)) > MOST_WRONG * len(r.depth)
+    }
+    return np.isin(images, sorted(behind))
+
+
+def _other_depths(scene: RawScene) -> Iterator[Hit]:
+    """Periods without shared points whose depths are of another order than those of the rest."""
+    seen = scene.point_periods
+    shared = seen[seen.sum(axis=1) > 1].any(axis=0)
+    medians = _depths(scene, 50)
+    for index, period in enumerate(scene.period_ids):
+        others = [d for i, d in medians.items() if i != index]
+        if shared[index] or index not in medians or not others:
+            continue
+        ratio = medians[index] / float(np.median(others))
+        if not 1 / DEPTH_RATIO <= ratio <= DEPTH_RATIO:
+            expected = "a frame scaled like those of the other periods"
+            found = f"points {ratio:.3g} times as far from the cameras, and none shared"
+            yield Hit(f"period {period}", expected, found)
+
+
+def _depths(scene: RawScene, percent: float) -> dict[int, float]:
+    """Percentile of the depths by the index of the period, of the periods that have some."""
+    by_period: dict[int, list[NDArray[np.float64]]] = {}
+    for seen in scene.reprojections or ():
+        front = seen.depth[(seen.depth > 0) & np.isfinite(seen.depth)]
+        if len(front):
+            by_period.setdefault(int(scene.image_periods[seen.image]), []).append(front)
+    return {i: float(np.percentile(np.concatenate(d), percent)) for i, d in by_period.items()}
+
+
+@rule(
+    "CS520",
+    "frame-scale",
+    "warning",
+    what="`sparse/world.json` says metres, but the world is not in metres.",
+    remedy="scale the model, or correct the unit in sparse/world.json",
+    bad='`{"unit": "metre"}` with a model straight from COLMAP\'s mapper',
+    needs=("cameras", "images"),
+)
+def frame_scale(scene: RawScene) -> Iterator[Hit]:
+    try:
+        if read_world(scene.root).unit != "metre":
+            return
+    except ChronoSceneError:
+        return  # has its own rule
+    fit = fit_gps(scene)
+    if fit is not None:
+        scale = fit.metres_from_world.scale
+        tolerance = max(UNIT_TOLERANCE, 3 * fit.sigma / (fit.spread * len(fit.images) ** 0.5))
+        if abs(np.log(scale)) > np.log1p(tolerance):
+            found = f"{scale:.4g} m for one unit, by the GPS of {len(fit.images)} photos"
+            yield Hit(WORLD, "a world in metres", found)
+        return
+    for index, depth in _depths(scene, 50).items():
+        if index >= 0 and not NEAREST <= depth <= FARTHEST:
+            place = f"period {scene.period_ids[index]}"
+            yield Hit(place, "a world in metres", f"points {depth:.3g} m from the cameras (median)")
+
+
+@rule(
+    "CS521",
+    "period-apart",
+    "warning",
+    what="A period looks at another place than the others: hardly any of their points are in the "
+    "views of its cameras, and hardly any of its points in theirs.",
+    remedy="leave the period out, or make it a scene of its own; if the places are the same, its "
+    "frame is another one: register the periods together",
+    bad="the photos of 2016 show the north side, those of 2023 the south side",
+    needs=("images", "periods", "reprojections"),
+)
+def period_apart(scene: RawScene) -> Iterator[Hit]:
+    share = common_view(scene)
+    share[~(np.diag(share) >= OWN)] = np.nan  # cameras that miss their own points tell nothing
+    for index, period in enumerate(scene.period_ids):
+        both = np.fmax(np.delete(share[index], index), np.delete(share[:, index], index))
+        if np.isfinite(both).any() and np.nanmax(both) < APART:
+            found = f"at most {100 * np.nanmax(both):.1f} % of the points in common view"
+            yield Hit(f"period {period}", "views of the place that the others show", found)
+
+
+def common_view(scene: RawScene) -> NDArray[np.float64]:
+    """Share of the points of a period (columns) in the view of a camera of another one (rows).
+
+    Points and images are samples. NaN for periods without points or without cameras. [T, T]
+    """
+    images, points = scene.images, scene.points
+    assert images is not None and points is not None
+    count = len(scene.period_ids)
+    share = np.full((count, count), np.nan)
+    reach = _depths(scene, 95)
+    finite = np.isfinite(points.xyz).all(axis=1)
+    owners = [
+        _sample(finite & scene.point_periods[:, i], MOST_POINTS // count) for i in range(count)
+    ]
+    xyz = points.xyz[np.concatenate([np.zeros(0, np.int64), *owners])]
+    owner = np.repeat(np.arange(count), list(map(len, owners)))
+    known = np.isin(images.camera_ids, list(scene.usable_cameras))
+    known &= ~np.isnan(scene.centres).any(axis=1)
+    for row in sorted(reach.keys() - {-1}):
+        viewed = np.zeros(len(xyz), bool)
+        for image in _sample(known & (scene.image_periods == row), MOST_IMAGES // count).tolist():
+            camera = scene.usable_cameras[int(images.camera_ids[image])]
+            with np.errstate(all="ignore"):
+                depth, xy = project(images, image, camera.K, xyz)
+                inside = ((xy >= 0) & (xy <= [camera.width, camera.height])).all(axis=1)
+            viewed |= inside & (depth > 0) & (depth < REACH * reach[row])
+        for column in range(count):
+            if len(owners[column]):
+                share[row, column] = viewed[owner == column].mean()
+    return share
+
+
+def _sample(mask: NDArray[np.bool_], most: int) -> NDArray[np.int64]:
+    """Indices where a mask is true, about ``most`` of them evenly spread."""
+    index = np.flatnonzero(mask)
+    return index[:: len(index) // max(1, most) + 1]

@@ -1,0 +1,138 @@
+"""CS515 to CS518: what stands out among periods, images and points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from chronoscene.validation.finding import Hit, counted, shown
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rule import rule
+from chronoscene.validation.rules.reprojection import pose_limit
+
+WORSE = 3.0
+"""Ratio of median reprojection errors, of a period to the best one or of an image to its period."""
+
+LEAST_ERROR = 1.0
+"""Pixels; below, everything is well whatever its ratio to the rest."""
+
+FEWEST_IMAGES = 3
+"""Images with an error from which the median of a period means something."""
+
+MOST_DUPLICATES = 0.05
+"""Share of points on top of another one. COLMAP's models were seen with one percent."""
+
+FAR = 100.0
+"""Distance of a point from the middle, in units of the median distance of points and cameras."""
+
+
+@rule(
+    "CS515",
+    "period-error",
+    "warning",
+    what="The reprojection error of a period is far above that of another one.",
+    remedy="register the period again: refine its poses and its camera, or match more images",
+    bad="medians of 0.5 px in period 0 and 3.1 px in period 1",
+    needs=("images", "periods", "reprojections"),
+)
+def period_error(scene: RawScene) -> Iterator[Hit]:
+    assert scene.images is not None
+    medians = period_errors(scene)
+    limit = max(LEAST_ERROR, WORSE * min(medians.values(), default=0.0))
+    for period, median in medians.items():
+        if median > limit:
+            mine = np.flatnonzero(scene.image_periods == scene.period_ids.index(period))
+            known = mine[~np.isnan(scene.image_errors[mine])]
+            worst = known[np.argsort(-scene.image_errors[known])]
+            named = shown([scene.images.names[i] for i in worst])
+            found = f"{median:.3g} px; worst are {named}"
+            yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
+
+
+def period_errors(scene: RawScene) -> dict[int, float]:
+    """Median over the images of a period of their median reprojection errors, in pixels.
+
+    Only of the periods with enough images with points.
+    """
+    medians = {}
+    for index, period in enumerate(scene.period_ids):
+        errors = scene.image_errors[scene.image_periods == index]
+        errors = errors[~np.isnan(errors)]
+        if len(errors) >= FEWEST_IMAGES:
+            medians[period] = float(np.median(errors))
+    return medians
+
+
+@rule(
+    "CS516",
+    "image-error",
+    "warning",
+    what="The reprojection error of an image is far above that of its period.",
+    remedy="check pose and camera of this image, or register it again",
+    bad="3.1 px in one image, 0.5 px in the others",
+    needs=("images", "periods", "reprojections"),
+)
+def image_error(scene: RawScene) -> Iterator[Hit]:
+    assert scene.images is not None
+    medians = period_errors(scene)
+    for image in np.flatnonzero(~np.isnan(scene.image_errors)).tolist():
+        index, error = int(scene.image_periods[image]), float(scene.image_errors[image])
+        period = scene.period_ids[index] if index >= 0 else -1
+        limit = max(LEAST_ERROR, WORSE * medians.get(period, np.inf))
+        if limit < error <= pose_limit(scene, image):  # beyond, it is another rule's
+            place = scene.image_place(scene.images.names[image])
+            yield Hit(place, f"a median error below {limit:.3g} px", f"{error:.3g} px")
+
+
+@rule(
+    "CS517",
+    "duplicate-points",
+    "warning",
+    what=f"More than {MOST_DUPLICATES:.0%} of the points lie exactly on another point.",
+    remedy="merge points that are one (colmap point_triangulator on a model without points)",
+    bad="the points of two runs in one file",
+    needs=("points",),
+)
+def duplicate_points(scene: RawScene) -> Iterator[Hit]:
+    points = scene.points
+    assert points is not None
+    finite = np.isfinite(points.xyz).all(axis=1)
+    # Equal numbers have equal bits (0.0 makes -0.0 positive); sorting one column finds candidates.
+    x = np.sort(points.xyz[finite, 0] + 0.0)
+    if not len(x) or np.count_nonzero(x[1:] == x[:-1]) <= MOST_DUPLICATES * len(x):
+        return
+    twice = len(x) - len(np.unique(points.xyz[finite] + 0.0, axis=0))
+    if twice > MOST_DUPLICATES * len(x):
+        found = f"{twice} of {len(x)} on another one"
+        yield Hit(scene.model_file("points3D"), "points apart from each other", found, count=twice)
+
+
+@rule(
+    "CS518",
+    "far-points",
+    "warning",
+    what="Points are absurdly far from everything else; they stretch every box around the scene.",
+    remedy="filter the points: they come from wrong matches, or from the sky",
+    bad="a point 40 km from a square of 100 m",
+    needs=("images", "points"),
+)
+def far_points(scene: RawScene) -> Iterator[Hit]:
+    points = scene.points
+    assert points is not None
+    xyz, cameras = points.xyz, scene.centres[~np.isnan(scene.centres).any(axis=1)]
+    usable = np.isfinite(xyz).all(axis=1)
+    if not usable.any():
+        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        middle = np.median(xyz[usable], axis=0)
+        distance = np.linalg.norm(xyz - middle, axis=1)
+        typical = np.median(distance[usable])
+        if len(cameras):
+            typical = max(typical, np.median(np.linalg.norm(cameras - middle, axis=1)))
+    far = usable & (distance > FAR * typical)
+    if number := int(np.count_nonzero(far)):
+        ids = ", ".join(map(str, points.ids[far][:3])) + (" ..." if number > 3 else "")
+        found = f"{counted(number, 'point')} up to {distance[far].max():.3g} away (ids {ids})"
+        expected = f"points within {FAR * typical:.3g} of the middle"
+        yield Hit(scene.model_file("points3D"), expected, found, count=number)

@@ -1,0 +1,151 @@
+"""CS14: rigs and frames of COLMAP 3.12 and later."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from chronoscene.validation.finding import Hit, counted, shown
+from chronoscene.validation.raw_rigs import CAMERA, RawFrame, RawRigs, pose_matrix, read_rigs
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.reprojection import good_poses
+from chronoscene.validation.rule import rule
+
+ANGLE = 1e-3
+"""Radians between two statements of one pose that rounding in a text file cannot explain."""
+
+SHIFT = 1e-3
+"""The same for positions, as a share of the extent of the cameras."""
+
+PLACE = "sparse/0"
+
+
+@rule(
+    "CS141",
+    "rigs-partial",
+    "error",
+    what="Of `rigs` and `frames`, which belong together, one is missing.",
+    remedy="copy the missing file, or delete the other one: without both, each image is its own "
+    "frame",
+    bad="`frames.bin` without `rigs.bin`",
+    needs=("model",),
+)
+def rigs_partial(scene: RawScene) -> Iterator[Hit]:
+    assert scene.model is not None
+    form = _form(scene)
+    present = [s for s in ("rigs", "frames") if (scene.model.folder / f"{s}{form}").is_file()]
+    if len(present) == 1:
+        missing = "frames" if present == ["rigs"] else "rigs"
+        place = f"{scene.model_place or '.'}/{missing}{form}"
+        yield Hit(place, f"the file that {present[0]}{form} belongs to", "none")
+
+
+@rule(
+    "CS142",
+    "rigs-inconsistent",
+    "error",
+    what="Rigs, frames, cameras and images of the model refer to what does not exist, or an image "
+    "is in no frame or in two.",
+    remedy="write all five files again together, or delete rigs and frames: then each image is "
+    "its own frame",
+    bad="`frames.bin` of an earlier run, with images that `images.bin` does not have",
+    needs=("cameras", "images"),
+)
+def rigs_inconsistent(scene: RawScene) -> Iterator[Hit]:
+    raw = _read(scene)
+    if raw is None:
+        return
+    assert scene.images is not None and scene.cameras is not None
+    place = f"{scene.model_place or '.'}/frames{_form(scene)}"
+    cameras = {camera.camera_id for camera in scene.cameras}
+    images = dict(zip(scene.images.ids.tolist(), scene.images.names, strict=True))
+    camera_of = dict(zip(images, scene.images.camera_ids.tolist(), strict=False))
+    taken = Counter(image for frame in raw.frames for image in _images(frame))
+    problems = {
+        "rigs over cameras of the model": {
+            f"camera {i} of rig {rig}"
+            for rig, sensors in raw.rigs.items()
+            for kind, i in sensors
+            if kind == CAMERA and i not in cameras
+        },
+        "frames of rigs that exist": {
+            f"rig {f.rig_id} of frame {f.frame_id}" for f in raw.frames if f.rig_id not in raw.rigs
+        },
+        "frames with sensors of their rig": {
+            f"sensor {sensor[1]} of frame {f.frame_id}"
+            for f in raw.frames
+            for sensor, _ in f.data
+            if f.rig_id in raw.rigs and sensor not in raw.rigs[f.rig_id]
+        },
+        "frames with images of the model": {f"image {i}" for i in taken if i not in images},
+        "each image in one frame": {
+            f"{images[i]} in {counted(taken[i], 'frame')}" for i in images if taken[i] != 1
+        },
+        "images under their own camera": {
+            images[i]
+            for frame in raw.frames
+            for sensor, i in frame.data
+            if sensor[0] == CAMERA and camera_of.get(i, sensor[1]) != sensor[1]
+        },
+    }
+    for expected, wrong in problems.items():
+        if wrong:
+            yield Hit(place, expected, shown(sorted(wrong)), count=len(wrong))
+
+
+@rule(
+    "CS143",
+    "rig-pose-differs",
+    "error",
+    what="The pose of an image in `images` is not the one that its frame and rig give. COLMAP "
+    "reads the frames, older readers read the images, so they see two different scenes.",
+    remedy="write the model again with COLMAP, or delete rigs and frames if the poses in images "
+    "are right",
+    bad="poses transformed in `images.bin` only, `frames.bin` left as it was",
+    needs=("images",),
+)
+def rig_pose_differs(scene: RawScene) -> Iterator[Hit]:
+    raw, images = _read(scene), scene.images
+    if raw is None or images is None or not len(images):
+        return
+    row = {image_id: i for i, image_id in enumerate(images.ids.tolist())}
+    good = good_poses(images)
+    extent = np.nanmax(np.ptp(scene.centres, axis=0)) if good.any() else 0.0
+    different = []
+    for frame in raw.frames:
+        for sensor, image_id in frame.data:
+            pose = raw.rigs.get(frame.rig_id, {}).get(sensor)
+            i = row.get(image_id, -1)
+            if sensor[0] != CAMERA or pose is None or i < 0 or not good[i]:
+                continue
+            stated = pose_matrix((*images.quaternions[i], *images.translations[i]))
+            composed = pose_matrix(pose) @ pose_matrix(frame.rig_from_world)
+            if not _same_pose(stated, composed, extent):
+                different.append(images.names[i])
+    if different:
+        found = f"another one for {counted(len(different), 'image')}: {shown(sorted(different))}"
+        place = scene.model_file("images")
+        yield Hit(place, "the poses of rigs and frames", found, count=len(different))
+
+
+def _same_pose(a: np.ndarray, b: np.ndarray, extent: float) -> bool:
+    """False, too, where one is not finite."""
+    turned = np.linalg.norm(a[:3, :3] - b[:3, :3])
+    moved = np.linalg.norm(a[:3, :3].T @ a[:3, 3] - b[:3, :3].T @ b[:3, 3])
+    return bool(turned <= 2 * ANGLE and moved <= SHIFT * extent + 1e-9)
+
+
+def _images(frame: RawFrame) -> list[int]:
+    return [image for (kind, _), image in frame.data if kind == CAMERA]
+
+
+def _form(scene: RawScene) -> str:
+    """The form of the model's files."""
+    assert scene.model is not None
+    return next(iter(scene.model.files.values()))[-4:]
+
+
+def _read(scene: RawScene) -> RawRigs | None:
+    return read_rigs(scene.model.folder, _form(scene)) if scene.model else None
