@@ -60,21 +60,20 @@ def _walk_points(reader: RecordReader) -> RawPoints:
 
     It says the same as `chronoscene.colmap_records.read_points`, several times as quickly.
     """
-    offsets, lengths = [], []
     data, unpack, end = reader.data, COUNT.unpack_from, len(reader.data)
-    at = COUNT.size
+    offsets, at = [COUNT.size], COUNT.size
     for _ in reader.records("point", POINT_HEAD.itemsize):
         if at + POINT_HEAD.itemsize > end:
             raise reader.ends()
         (length,) = unpack(data, at + _LENGTH_AT)
-        offsets.append(at)
-        lengths.append(length)
         at += POINT_HEAD.itemsize + _PAIR * length
         if at > end:
             reader.parts = f"{length} observations"
             raise reader.ends()
+        offsets.append(at)
         reader.at = at
-    return _gather(data, np.array(offsets, np.int64), np.array(lengths, np.int64))
+    begin = np.array(offsets, np.int64)
+    return _gather(data, begin[:-1], (np.diff(begin) - POINT_HEAD.itemsize) // _PAIR)
 
 
 def _gather(data: bytes, offsets: NDArray[np.int64], lengths: NDArray[np.int64]) -> RawPoints:

@@ -13,6 +13,8 @@ from chronoscene.scene import Camera
 from chronoscene.validation.observations import Observations
 from chronoscene.validation.raw_model import RawImages, RawPoints
 
+Array = NDArray[np.float64]
+
 
 class Reprojection(NamedTuple):
     """Of one image, over its m finite observations."""
@@ -25,6 +27,8 @@ class Reprojection(NamedTuple):
     """World units along the optical axis. [m]"""
     error: NDArray[np.float64]
     """Distance in pixels between projection and observation. [m]"""
+    outside: int
+    """Observations that are not within the image."""
 
 
 def good_poses(images: RawImages) -> NDArray[np.bool_]:
@@ -42,25 +46,31 @@ def reproject(
     Distortion is not applied: errors mean something for pinhole cameras only.
     """
     good = good_poses(images)
-    finite = np.asarray(np.isfinite(points.xyz).all(axis=1))[seen.point]
+    # Columns by themselves: numpy is several times slower along a short last axis.
+    xyz = np.ascontiguousarray(points.xyz.T)
+    uv = np.ascontiguousarray(images.keypoint_xy.T)
     for image, rows in seen.by_image(images):
         camera = cameras.get(int(images.camera_ids[image]))
         if camera is None or not good[image]:
             continue
-        rows = rows[finite[rows]]
-        target = images.keypoint_xy[seen.keypoint[rows]]
+        place, (u, v) = xyz[:, seen.point[rows]], uv[:, seen.keypoint[rows]]
         with np.errstate(all="ignore"):  # infinite for absurd poses
-            depth, projected = project(images, image, camera.K, points.xyz[seen.point[rows]])
-            error = np.linalg.norm(projected - target, axis=1)
-        known = np.isfinite(target).all(axis=1)
-        yield Reprojection(image, rows[known], depth[known], error[known])
+            depth, x, y = project(images, image, camera.K, *place)
+            error = np.sqrt((x - u) ** 2 + (y - v) ** 2)
+        # What is not finite in points and keypoints has rules of its own.
+        known = np.isfinite(place).all(axis=0) & np.isfinite(u) & np.isfinite(v)
+        inside = (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
+        outside = int(np.count_nonzero(known & ~inside))
+        if not known.all():
+            rows, depth, error = rows[known], depth[known], error[known]
+        yield Reprojection(image, rows, depth, error, outside)
 
 
 def project(
-    images: RawImages, image: int, K: NDArray[np.float64], xyz: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Depth [m] and pixel position [m, 2] of points."""
-    rotation = rotation_from_quaternion(images.quaternions[image])
-    local = xyz @ rotation.T + images.translations[image]
-    depth = local[:, 2]
-    return depth, local[:, :2] / depth[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
+    images: RawImages, image: int, K: Array, x: Array, y: Array, z: Array
+) -> tuple[Array, Array, Array]:
+    """Depth, and pixel position along x and y, of points at ``x, y, z`` in the world. [m] each"""
+    r = rotation_from_quaternion(images.quaternions[image])
+    t = images.translations[image]
+    right, down, depth = (r[i, 0] * x + r[i, 1] * y + r[i, 2] * z + t[i] for i in range(3))
+    return depth, right / depth * K[0, 0] + K[0, 2], down / depth * K[1, 1] + K[1, 2]

@@ -35,7 +35,7 @@ APART = 0.05
 OWN = 0.5
 """Share of a period's points that its own cameras must look at."""
 
-MOST_POINTS, MOST_IMAGES = 3000, 1000
+MOST_POINTS, MOST_IMAGES = 3000, 300
 """Points and images of all periods together that are compared."""
 
 REACH = 3.0
@@ -177,8 +177,8 @@ def common_view(scene: RawScene) -> NDArray[np.float64]:
         for image in _sample(known & (scene.image_periods == row), MOST_IMAGES // count).tolist():
             camera = scene.usable_cameras[int(images.camera_ids[image])]
             with np.errstate(all="ignore"):
-                depth, xy = project(images, image, camera.K, xyz)
-                inside = ((xy >= 0) & (xy <= [camera.width, camera.height])).all(axis=1)
+                depth, x, y = project(images, image, camera.K, *xyz.T)
+                inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
             viewed |= inside & (depth > 0) & (depth < REACH * reach[row])
         for column in range(count):
             if len(owners[column]):

@@ -198,6 +198,8 @@ def image_without_points(scene: RawScene) -> Iterator[Hit]:
 def observation_not_finite(scene: RawScene) -> Iterator[Hit]:
     seen, images = scene.observations, scene.images
     assert seen is not None and images is not None
+    if np.isfinite(images.keypoint_xy).all():
+        return
     xy = images.keypoint_xy[seen.keypoint[seen.valid]]
     if bad := int(np.count_nonzero(~np.isfinite(xy).all(axis=1))):
         found = f"NaN or infinity in {bad} of {len(xy)} observations"

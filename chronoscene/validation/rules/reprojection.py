@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -28,27 +29,22 @@ pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
     what=f"More than {MOST_OUTSIDE:.0%} of a camera's observations are outside of its image.",
     remedy="give the camera the size at which the keypoints were found",
     bad="a camera scaled to half the size, keypoints still at full size",
-    needs=("cameras", "observations"),
+    needs=("images", "reprojections"),
 )
 def observations_outside(scene: RawScene) -> Iterator[Hit]:
-    seen, images = scene.observations, scene.images
-    assert seen is not None and images is not None
-    slot = {camera_id: i for i, camera_id in enumerate(scene.usable_cameras)}
-    sizes = [(c.width, c.height) for c in scene.usable_cameras.values()]
-    limits = np.array([*sizes, (np.inf, np.inf)])  # the last one for cameras that are unusable
-    camera = np.array([slot.get(c, len(slot)) for c in images.camera_ids.tolist()], np.int64)
-    rows = seen.valid
-    camera = camera[seen.image[rows]]
-    xy = images.keypoint_xy[seen.keypoint[rows]]
-    inside = ((xy >= 0) & (xy <= limits[camera])).all(axis=1)
-    total = np.bincount(camera, minlength=len(limits))
-    outside = np.bincount(camera[~inside], minlength=len(limits))
-    for camera_id, i in slot.items():
-        if outside[i] > MOST_OUTSIDE * total[i]:
+    assert scene.images is not None
+    total: Counter[int] = Counter()
+    outside: Counter[int] = Counter()
+    for seen in scene.reprojections or ():
+        camera_id = int(scene.images.camera_ids[seen.image])
+        total[camera_id] += len(seen.rows)
+        outside[camera_id] += seen.outside
+    for camera_id, number in outside.items():
+        if number > MOST_OUTSIDE * total[camera_id]:
+            camera = scene.usable_cameras[camera_id]
             place = f"{scene.model_file('cameras')} (camera {camera_id})"
-            expected = f"observations within {sizes[i][0]} x {sizes[i][1]}"
-            found = f"{outside[i]} of {total[i]} outside"
-            yield Hit(place, expected, found, count=int(outside[i]))
+            expected = f"observations within {camera.width} x {camera.height}"
+            yield Hit(place, expected, f"{number} of {total[camera_id]} outside", count=number)
 
 
 @rule(
