@@ -38,7 +38,7 @@ LARGEST_SIDE = 32766
 
 WRITABLE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
-_EXIF_FORMATS = (".png", ".jpg", ".jpeg", ".webp")
+_METADATA_FORMATS = (".png", ".jpg", ".jpeg", ".webp")
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,13 +291,13 @@ def _write_image(scene: Scene, root: Path, frame: Frame, change: CameraChange) -
         options = {"quality": JPEG_QUALITY, "subsampling": 0}
     elif suffix == ".webp":
         options = {"lossless": True}
-    if suffix in _EXIF_FORMATS and (exif := _exif(source)):
-        options["exif"] = exif
+    if suffix in _METADATA_FORMATS:
+        options |= _metadata(source)
     Image.fromarray(pixels).save(target, **options)
 
 
-def _exif(path: Path) -> bytes | None:
-    """The EXIF block as it is: dates of capture are in it."""
+def _metadata(path: Path) -> dict[str, bytes]:
+    """EXIF block and colour profile as they are: dates of capture are in the first."""
     with Image.open(path) as image:
-        exif = image.info.get("exif")
-    return exif if isinstance(exif, bytes) else None
+        blocks = {key: image.info.get(key) for key in ("exif", "icc_profile")}
+    return {key: block for key, block in blocks.items() if isinstance(block, bytes)}

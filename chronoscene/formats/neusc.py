@@ -83,7 +83,10 @@ def remarks(path: Path) -> list[str]:
     left_out = len(model.images) - len([n for n in _used_names(path, model) if _date(path, n)])
     found = []
     if left_out:
-        found.append(f"{left_out} images are without date, not in train.txt, or in trash.txt")
+        found.append(
+            f"left out without a date, not in train.txt, or in trash.txt: {left_out} of "
+            f"{len(model.images)} images"
+        )
     if (path / "semantic_maps").is_dir():
         found.append("semantic_maps/ (sky, people) is not read")
     return found

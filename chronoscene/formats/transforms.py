@@ -238,7 +238,7 @@ def _model(place: object, data: Mapping[str, Any]) -> tuple[str, tuple[float, ..
     """Camera model and distortion; the named model, or one that has all that is not zero."""
     values = _distortion(place, data)
     named = data.get("camera_model")
-    if named is not None and named not in MODEL_KEYS:
+    if named is not None and named not in tuple(MODEL_KEYS):
         raise json_error(place, f"a camera_model {', '.join(MODEL_KEYS)}", repr(named)[:40])
     used = {key for key, value in values.items() if value}
     fisheye = named == "OPENCV_FISHEYE" or bool(data.get("is_fisheye"))

@@ -1,0 +1,84 @@
+"""CL-Splats: real scenes and rendered levels."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from chronoscene.errors import ConfigError, ImageError, SceneError
+from chronoscene.formats import read_scene
+from chronoscene.formats.ply import write_points
+
+REAL = [f"day_{day}_{i:02d}.png" for day in (2, 10) for i in range(4)] + ["frame_1.png"]
+
+
+def test_days_are_periods_and_other_names_day_0(colmap_folder):
+    scene = read_scene(colmap_folder(REAL))
+    assert scene.format == "cl-splats"
+    assert [p.label for p in scene.periods] == ["day 0", "day 2", "day 10"]
+    periods = {f.name: f.period for f in scene.frames}
+    assert (periods["frame_1.png"], periods["day_2_00.png"], periods["day_10_00.png"]) == (0, 1, 2)
+
+
+def test_every_8th_of_all_is_for_testing(colmap_folder):
+    tests = [f.name for f in read_scene(colmap_folder(REAL)).select(split="test")]
+    assert tests == [sorted(REAL)[0], sorted(REAL)[8]]
+
+
+def test_levels(level):
+    scene = read_scene(level(("add", "delete", "move", "multi")))
+    assert [p.label for p in scene.periods] == ["base", "add", "delete", "move", "multi"]
+    names = [f.name for f in scene.frames]
+    assert names[:3] == ["add/images/r_0.png", "add/images/r_1.png", "add/images/r_2.png"]
+    assert [f.name for f in scene.select(period=0)] == [f"images/r_{i}.png" for i in range(3)]
+    focal = 32 / math.tan(0.55)
+    np.testing.assert_allclose(scene.frames[0].camera.params, (focal, focal, 32, 24))
+
+
+def test_base_and_one_change(level):
+    folder = level(("add", "move"))
+    scene = read_scene(folder, period_by="change:move")
+    assert [p.label for p in scene.periods] == ["base", "move"]
+    assert {f.name.split("/")[0] for f in scene.frames} == {"images", "move"}
+    with pytest.raises(ConfigError, match="step, change:add, change:move, found 'change:delete'"):
+        read_scene(folder, period_by="change:delete")
+
+
+def test_test_file_decides(level):
+    folder = level(("add",))
+    data = json.loads((folder / "add/transforms_train.json").read_text())
+    test = {**data, "frames": [data["frames"].pop()]}
+    (folder / "add/transforms_train.json").write_text(json.dumps(data))
+    (folder / "add/transforms_test.json").write_text(json.dumps(test))
+    scene = read_scene(folder)
+    assert [f.name for f in scene.select(split="test")] == ["add/images/r_2.png"]
+    assert scene.split_rule == "transforms_test.json"
+
+
+def test_points_of_a_level(level, make_scene_folder):
+    points = read_scene(make_scene_folder()).points
+    folder = level()
+    assert len(read_scene(folder).points) == 0
+    write_points(folder / "points3d.ply", points)
+    np.testing.assert_array_equal(read_scene(folder).points.xyz, points.xyz)
+
+
+@pytest.mark.parametrize(
+    "path", ["../../etc/passwd", "/etc/passwd", "C:/x", "..\\..\\x", "a/../.."]
+)
+def test_hostile_paths_are_refused(level, path):
+    folder = level(("add",))
+    file = folder / "transforms_train.json"
+    data = json.loads(file.read_text())
+    data["frames"][1]["file_path"] = path
+    file.write_text(json.dumps(data))
+    with pytest.raises(SceneError, match=r"frames\[1\]: expected a file_path inside the scene"):
+        read_scene(folder)
+
+
+def test_a_missing_image_whose_size_is_needed(level):
+    folder = level(("add",))
+    (folder / "images/r_1.png").unlink()
+    with pytest.raises(ImageError, match=r"images/r_1\.png: expected an image, found nothing"):
+        read_scene(folder)

@@ -1,0 +1,151 @@
+"""Plain COLMAP, one folder of images per period."""
+
+import dataclasses
+
+import pytest
+
+from chronoscene.errors import ConfigError, SceneError
+from chronoscene.formats import colmap_folders, detect_format, read_scene
+from chronoscene.scene import Period
+
+DATED = ["2016/a.png", "2016/b.png", "2023-04/a.png", "2023-04/c/d.png"]
+
+
+def test_periods_are_the_first_folders_in_natural_order(colmap_folder):
+    names = [f"t{i}/{j}.png" for i in (1, 2, 10) for j in range(2)]
+    scene = read_scene(colmap_folder(names))
+    assert [p.label for p in scene.periods] == ["t1", "t2", "t10"]
+    assert {f.name: f.period for f in scene.frames}["t10/0.png"] == 2
+
+
+def test_folders_that_are_dates_are_dates(colmap_folder):
+    scene = read_scene(colmap_folder(DATED))
+    assert scene.periods == (Period(0, "2016", "2016"), Period(1, "2023-04", "2023-04"))
+    assert scene.frames[3].name == "2023-04/c/d.png" and scene.frames[3].period == 1
+
+
+@pytest.mark.parametrize("form", ["binary", "old", "text"])
+def test_every_form_of_a_model(colmap_folder, form):
+    assert len(read_scene(colmap_folder(DATED, form=form)).points) == 30
+
+
+def test_model_directly_in_sparse(colmap_folder):
+    folder = colmap_folder(DATED)
+    for file in (folder / "sparse/0").iterdir():
+        file.rename(folder / "sparse" / file.name)
+    (folder / "sparse/0").rmdir()
+    assert detect_format(folder) == "colmap-folders"
+    assert len(read_scene(folder).frames) == 4
+
+
+def test_a_test_list_counts(colmap_folder):
+    folder = colmap_folder(DATED, tests=["2016/b", "2023-04/a.png"])
+    tests = [f.name for f in read_scene(folder).select(split="test")]
+    assert tests == ["2016/b.png", "2023-04/a.png"]
+
+
+def test_images_without_folders_are_refused_with_the_way_out(colmap_folder):
+    with pytest.raises(
+        SceneError, match=r"every image in a folder of its period.*--period-by tabl"
+    ):
+        read_scene(colmap_folder(["a.png", "b.png"]), format="colmap-folders")
+
+
+def test_periods_from_a_table(colmap_folder, tmp_path):
+    folder, table = colmap_folder(["a.png", "b.png", "c.png"]), tmp_path / "periods.csv"
+    table.write_text("file,period,note\nc,2016,x\na.png,2023,\nb.png,2016,\nlost.png,1,\n")
+    scene = read_scene(folder, format="colmap-folders", period_by=f"table:{table}")
+    assert [f.period for f in scene.frames] == [1, 0, 0]
+    assert [p.date for p in scene.periods] == ["2016", "2023"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("file,date\na.png,1\n", "expected the columns file and period"),
+        ("", "expected the columns file and period"),
+        ("file,period\na.png,1\n", "a period of every image, 'b.png' too"),
+        ("file,period\na.png,1\nb.png,2\na,2\n", r"periods.csv:4: expected one period of 'a'"),
+    ],
+)
+def test_tables_that_are_refused(colmap_folder, tmp_path, text, message):
+    folder, table = colmap_folder(["a.png", "b.png"]), tmp_path / "periods.csv"
+    table.write_text(text)
+    with pytest.raises(SceneError, match=message):
+        read_scene(folder, format="colmap-folders", period_by=f"table:{table}")
+
+
+def test_unknown_grouping_names_those_that_there_are(colmap_folder):
+    with pytest.raises(ConfigError, match="one of folder, table:FILE, found 'year'"):
+        read_scene(colmap_folder(DATED), period_by="year")
+
+
+def test_no_model_and_no_images(colmap_folder):
+    folder = colmap_folder(DATED)
+    (folder / "images").rename(folder / "photos")
+    with pytest.raises(SceneError, match="no such folder of images"):
+        read_scene(folder, format="colmap-folders")
+    (folder / "sparse/0/points3D.bin").unlink()
+    with pytest.raises(SceneError, match="found no such model"):
+        read_scene(folder, format="colmap-folders")
+
+
+def test_a_model_without_images_is_refused(colmap_folder):
+    folder = colmap_folder(DATED, form="text", points=0)
+    (folder / "sparse/0/images.txt").write_text("")
+    (folder / "sparse/0/frames.txt").unlink()
+    (folder / "sparse/0/rigs.txt").unlink()
+    with pytest.raises(SceneError, match="expected registered images, found none"):
+        read_scene(folder)
+
+
+def test_writing_puts_images_into_folders_of_their_periods(make_scene_folder, tmp_path):
+    names = {"0/a.png": 0, "a.png": 0, "b.png": 1, "sub/a.png": 1}
+    scene = read_scene(make_scene_folder(names))
+    out = colmap_folders.write(scene, tmp_path / "out")
+    again = read_scene(out)
+    assert [f.name for f in again.frames] == ["0/0/a.png", "0/a.png", "1/b.png", "1/sub/a.png"]
+    assert [f.period for f in again.frames] == [0, 0, 1, 1]
+    for old, new in zip(scene.frames, again.frames, strict=True):
+        assert again.image_path(new).read_bytes() == scene.image_path(old).read_bytes()
+
+
+def test_tracks_follow_frames_that_change_places(make_scene_folder, tmp_path):
+    """In name order, b comes after a; as folders of their periods, before it."""
+    scene = read_scene(make_scene_folder({"a.png": 1, "b.png": 0}))
+    again = read_scene(colmap_folders.write(scene, tmp_path / "out"))
+    assert [f.name for f in again.frames] == ["0/b.png", "1/a.png"]
+
+    def observations(scene, names):
+        start = scene.points.track_start
+        return {
+            (pid, names[scene.points.track_frame[j]], *scene.points.track_xy[j])
+            for i, pid in enumerate(scene.points.ids.tolist())
+            for j in range(start[i], start[i + 1])
+        }
+
+    old = observations(scene, [f.name for f in scene.frames])
+    assert observations(again, ["b.png", "a.png"]) == old
+
+
+@pytest.mark.parametrize(
+    ("labels", "folders"),
+    [
+        (["2016", "2023"], ["2016", "2023"]),
+        (["before", "after"], ["0_before", "1_after"]),
+        (["same", "same"], ["0_same", "1_same"]),
+        (["../x", "y"], ["0_..-x", "1_y"]),
+        (["a/b", "c "], ["0_a-b", "1_c-"]),
+        ([".", ".."], ["0_.", "1_.."]),
+    ],
+)
+def test_folders_are_in_the_order_of_the_periods_and_safe(labels, folders):
+    periods = tuple(Period(i, label) for i, label in enumerate(labels))
+    assert colmap_folders.period_folders(periods) == folders
+
+
+def test_written_labels_are_read_again(make_scene_folder, tmp_path):
+    scene = read_scene(make_scene_folder())
+    named = dataclasses.replace(scene, periods=(Period(0, "2016-09"), Period(1, "2023")))
+    again = read_scene(colmap_folders.write(named, tmp_path / "out"))
+    assert [p.label for p in again.periods] == ["2016-09", "2023"]

@@ -1,0 +1,107 @@
+"""NeuSC / 5Pointz: dates, lists, grouping, and pickles that stay closed."""
+
+import numpy as np
+import pytest
+
+from chronoscene.errors import ConfigError, SceneError
+from chronoscene.formats import neusc, read_scene
+
+NAMES = [
+    "2009-08-31_a.png",
+    "2009-09-02_b.png",
+    "2009-9-3_c.png",
+    "2012-05-03_d.png",
+    "2013-11-17_e.png",
+    "none_f.png",
+]
+
+
+def test_years_are_periods_and_photos_without_date_are_left_out(pointz):
+    folder = pointz(NAMES)
+    scene = read_scene(folder)
+    assert [(p.label, p.date) for p in scene.periods] == [
+        ("2009", "2009"),
+        ("2012", "2012"),
+        ("2013", "2013"),
+    ]
+    assert [f.name for f in scene.frames] == NAMES[:5]
+    assert [f.period for f in scene.frames] == [0, 0, 0, 1, 2]
+    assert neusc.remarks(folder) == [
+        "left out without a date, not in train.txt, or in trash.txt: 1 of 6 images"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("by", "periods", "labels"),
+    [
+        ("month", [0, 1, 1, 2, 3], ["2009-08", "2009-09", "2012-05", "2013-11"]),
+        ("day", [0, 1, 2, 3, 4], ["2009-08-31", "2009-09-02", "2009-09-03", *NAMES]),
+        ("gap:1", [0, 1, 1, 2, 3], ["2009-08-31", "2009-09-02 to 2009-09-03"]),
+        ("gap:2", [0, 0, 0, 1, 2], ["2009-08-31 to 2009-09-03", "2012-05-03", "2013-11-17"]),
+        ("count:1", [0, 0, 0, 0, 0], ["2009-08-31 to 2013-11-17"]),
+        ("count:2", [0, 0, 0, 1, 1], ["2009-08-31 to 2009-09-03", "2012-05-03 to 2013-11-17"]),
+    ],
+)
+def test_groupings(pointz, by, periods, labels):
+    scene = read_scene(pointz(NAMES), period_by=by)
+    assert [f.period for f in scene.frames] == periods
+    count = min(len(labels), len(scene.periods), 3 if by == "day" else 9)
+    assert [p.label for p in scene.periods][:count] == labels[:count]
+
+
+@pytest.mark.parametrize("by", ["decade", "gap:", "gap:-1", "gap:nan", "count:0", "count:x"])
+def test_groupings_that_do_not_exist(pointz, by):
+    with pytest.raises(ConfigError, match="one of year, month, day, gap:DAYS, count:N"):
+        read_scene(pointz(NAMES), period_by=by)
+
+
+def test_more_periods_than_dates(pointz):
+    with pytest.raises(ConfigError, match="at most 5 periods, found 6"):
+        read_scene(pointz(NAMES), period_by="count:6")
+
+
+def test_lists(pointz):
+    folder = pointz(NAMES, train=[NAMES[3], NAMES[0], NAMES[4], "2010-01-01_lost.png"])
+    (folder / "trash.txt").write_text(f"{NAMES[4]}\n")
+    scene = read_scene(folder)
+    assert [(f.name, f.split) for f in scene.frames] == [(NAMES[0], "train"), (NAMES[3], "test")]
+
+
+def test_every_10th_of_the_list_is_for_testing(pointz):
+    names = [f"2010-01-{i + 1:02d}_x.png" for i in range(12)]
+    scene = read_scene(pointz(names, train=names[::-1]))
+    assert [f.name for f in scene.select(split="test")] == [names[1], names[11]]
+
+
+def test_tracks_stay_with_their_images(pointz):
+    scene = read_scene(pointz(NAMES))
+    points = scene.points
+    assert points.track_frame.max() < len(scene.frames) == 5
+    assert points.track_start[-1] == len(points.track_xy) == len(points.track_frame)
+    xyz = np.repeat(points.xyz, np.diff(points.track_start), axis=0)
+    for frame, xy, point in zip(points.track_frame, points.track_xy, xyz, strict=True):
+        f = scene.frames[frame]
+        pixel = f.camera.K @ (f.cam_from_world[:3, :3] @ point + f.cam_from_world[:3, 3])
+        np.testing.assert_allclose(pixel[:2] / pixel[2], xy, atol=1e-6)
+
+
+def test_pickles_are_never_loaded(pointz, tmp_path):
+    folder = pointz(NAMES)
+    read_scene(folder)
+    assert neusc.remarks(folder)
+    assert not (tmp_path / "exploded").exists()
+    import pickle
+
+    pickle.loads((folder / "annots/cam_dict.pkl").read_bytes())  # what loading it would have done
+    assert (tmp_path / "exploded").exists()
+
+
+@pytest.mark.parametrize("name", ["2009-02-30_x.png", "IMG_1.png", "20090101_x.png"])
+def test_names_without_a_date_are_refused(pointz, name):
+    with pytest.raises(SceneError, match='begins with a date as in "2012-05-03_"'):
+        read_scene(pointz([*NAMES, name]))
+
+
+def test_lists_that_leave_nothing(pointz):
+    with pytest.raises(SceneError, match=r"none that train\.txt and trash\.txt leave"):
+        read_scene(pointz(NAMES, train=["17", "18"]))

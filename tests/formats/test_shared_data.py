@@ -1,0 +1,85 @@
+"""Every folder of real data is read, or refused with one clear message."""
+
+import pytest
+
+from chronoscene.errors import SceneError
+from chronoscene.formats import detect_format, read_scene
+
+READ = {
+    "plaza": ("chronoscene", 108, 3),
+    "sheffield_scene": ("chronoscene", 80, 2),
+    "fox": ("nerfstudio", 50, 1),
+}
+"""Format, images and periods."""
+
+IMAGES_ONLY = (
+    "belvedere_glacier",
+    "brighton_beach",
+    "copr",
+    "lund_street",
+    "monstree",
+    "sheffield_cross",
+)
+
+BARE_MODELS = ("sceaux_txt", "shared_camera_8of_many", "t265_fisheye_txt")
+
+
+def test_no_folder_is_forgotten(shared_data):
+    known = {*READ, *IMAGES_ONLY, "colmap_models"}
+    assert {p.name for p in shared_data.iterdir() if p.is_dir()} <= known
+
+
+@pytest.mark.parametrize("name", READ)
+def test_scenes_are_read(shared_data, name):
+    scene = read_scene(shared_data / name)
+    assert (scene.format, len(scene.frames), scene.num_periods) == READ[name]
+    assert all(scene.image_path(frame).is_file() for frame in scene.frames)
+
+
+@pytest.mark.parametrize("name", IMAGES_ONLY)
+def test_images_without_poses_are_refused(shared_data, name):
+    with pytest.raises(SceneError) as error:
+        read_scene(shared_data / name)
+    message = str(error.value)
+    assert message.startswith(f"{shared_data / name}: expected a scene of a known format (")
+    assert "found SOURCE.md, " in message and "images/" in message
+    assert message.endswith("give the folder of one scene; DATASET.md describes its files")
+
+
+@pytest.mark.parametrize("name", BARE_MODELS)
+def test_bare_models_are_refused_with_what_to_do(shared_data, name):
+    folder = shared_data / "colmap_models" / name
+    with pytest.raises(SceneError, match="move this COLMAP model to sparse/0 in a folder with im"):
+        detect_format(folder)
+    with pytest.raises(SceneError, match="expected images/ and a COLMAP model in sparse/0 or sp"):
+        read_scene(folder, format="colmap-folders")
+
+
+@pytest.mark.parametrize(("name", "images"), [("sceaux_txt", 11), ("shared_camera_8of_many", 8)])
+def test_bare_models_with_a_table_of_periods(shared_data, tmp_path, name, images):
+    """Moved to where they belong, they are read; the photos themselves need not be there."""
+    (tmp_path / "images").mkdir()
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse/0").symlink_to(shared_data / "colmap_models" / name)
+    model = read_names(tmp_path)
+    assert len(model) == images
+    table = tmp_path / "periods.csv"
+    rows = "".join(f"{name},{i % 2}\n" for i, name in enumerate(model))
+    table.write_text(f"file,period\n{rows}")
+    scene = read_scene(tmp_path, format="colmap-folders", period_by=f"table:{table}")
+    assert [f.period for f in scene.frames] == [i % 2 for i in range(images)]
+    assert scene.frames[0].camera.model == "SIMPLE_RADIAL"
+
+
+def read_names(folder):
+    from chronoscene.colmap import read_model
+
+    return [image.name for image in read_model(folder / "sparse/0").images]
+
+
+def test_commas_in_a_text_model_are_refused(shared_data, tmp_path):
+    (tmp_path / "images/x").mkdir(parents=True)
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse/0").symlink_to(shared_data / "colmap_models/t265_fisheye_txt")
+    with pytest.raises(SceneError, match="expected"):
+        read_scene(tmp_path)
