@@ -60,6 +60,12 @@ class AnchorConfig:
     """Anchors decoded per view. ``radius``: projected footprint touches the image (code);
     ``frustum``: centre inside the image (paper)."""
 
+    # Resolution
+    coarse_until: float = 0.0
+    """Share of the training in which photos are 1/`coarse_factor` of their size; faster there.
+    Not in the papers."""
+    coarse_factor: int = 2
+
     # Loss
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM; L1 gets the rest."""
@@ -155,6 +161,8 @@ _LOWER_BOUNDS: dict[str, float] = {
     "base_dim": 0,
     "hidden_dim": 0,
     "density_interval": 1,
+    "coarse_until": 0.0,
+    "coarse_factor": 1,
     "growth_levels": 0,
     "coarsest_cell": 1,
     "cell_refinement": 1,

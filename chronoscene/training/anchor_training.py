@@ -11,12 +11,14 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer.types import RasterInfo
 from chronoscene.training.anchor_config import AnchorConfig
 from chronoscene.training.anchor_model import PER_ANCHOR, AnchorModel, draw
+from chronoscene.training.coarse import coarser_image, coarser_view
 from chronoscene.training.density import (
     AnchorArrays,
     DensityRules,
@@ -125,10 +127,14 @@ class AnchorTrainer:
         done = self._progress_after(index, progress)
         position = self.sampler.next()
         view = self.train.views[position]
+        photo = self.train.load_image(position)
+        if done <= self.config.coarse_until:
+            factor = self.config.coarse_factor
+            view, photo = coarser_view(view, factor), coarser_image(photo, factor)
         visible = self.model.visible(view)
         if len(visible) == 0:  # nothing to learn from; the image is the background
             return StepReport(loss=float("nan"), primitives=len(self.model))
-        loss = self._learn(view, position, visible, done)
+        loss = self._learn(view, photo, visible, done)
         resized = self._densify_if_due(index, done)
         self._update(done, skip=PER_ANCHOR if resized else ())
         return StepReport(loss=loss, primitives=len(self.model))
@@ -137,12 +143,14 @@ class AnchorTrainer:
         """Share of the training that is over once this step is done."""
         return progress * (index + 1) / index if index > 0 else 1.0 / self.config.iterations
 
-    def _learn(self, view: TrainingView, position: int, visible: np.ndarray, done: float) -> float:
+    def _learn(
+        self, view: TrainingView, photo: NDArray[np.uint8], visible: np.ndarray, done: float
+    ) -> float:
         decoded, positions = self.model.decode_living(
             self.weights[view.period], self._seen_from(view), torch.from_numpy(visible)
         )
         raster = draw(decoded, view, self.background, check_finite=False)
-        target = torch.from_numpy(self.train.load_image(position)).to(self.model.device)
+        target = torch.from_numpy(photo).to(self.model.device)
         loss = photometric_loss(raster.image[0], target, ssim_weight=self.config.ssim_weight)
         if self.config.scale_weight:
             volume = mean_volume(decoded.scales, decoded.opacities)

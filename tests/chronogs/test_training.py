@@ -15,6 +15,7 @@ from chronogs.method import ChronoGS
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import TrainingSet
 from chronoscene.threads import set_threads
+from chronoscene.training import anchor_training
 from chronoscene.training.density import DensityStatistics
 from chronoscene.training.schedule import log_linear
 
@@ -194,3 +195,21 @@ def test_a_view_that_sees_nothing_teaches_nothing(
         torch.testing.assert_close(tensor, before[name], rtol=0, atol=0)
     prediction = made.render(noise_set(3).views[0], 1)
     np.testing.assert_allclose(prediction.rgb[0, 0], [0.1, 0.2, 0.3], atol=1e-7)
+
+
+def test_the_early_part_can_be_coarse(method: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Photos of half the size until the share of the training that is asked for."""
+    made = method(iterations=4, coarse_until=0.5)
+    seen: list[tuple[int, ...]] = []
+    loss = anchor_training.photometric_loss
+
+    def watched(image: torch.Tensor, target: torch.Tensor, **options: float) -> torch.Tensor:
+        assert image.shape == target.shape
+        seen.append(tuple(image.shape[:2]))
+        return loss(image, target, **options)
+
+    monkeypatch.setattr(anchor_training, "photometric_loss", watched)
+    train(made, 4)
+    view = made._trainer.train.views[0]
+    whole, half = (view.height, view.width), (view.height // 2, view.width // 2)
+    assert seen == [half, half, whole, whole]
