@@ -146,7 +146,6 @@ def test_converts_to_every_writable_format(sample, target, tmp_path):
     labels = [period.label for period in again.periods]
     if target == "colmap-folders":  # labels are names of folders there, in natural order
         labels = [label.removeprefix(f"{i}_") for i, label in enumerate(labels)]
-        labels = [label.replace("-", " ") if "day" in label else label for label in labels]
     assert labels == [period.label for period in scene.periods]
     new = {again.image_path(frame).resolve(): frame for frame in again.frames}
     for old in scene.frames:

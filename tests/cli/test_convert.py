@@ -1,0 +1,85 @@
+"""chronoscene convert: what it prints and how it fails."""
+
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from chronoscene.cli import cli, main
+from chronoscene.formats import read_scene
+from chronoscene.splits import split_hash
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, ["convert", *map(str, arguments)])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def test_says_what_was_converted(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    result = run(folder, tmp_path / "out", "--to", "nerfstudio")
+    assert result.exit_code == 0
+    lines = result.stdout.splitlines()
+    assert lines[0] == (
+        f"{tmp_path / 'out'}: nerfstudio from chronoscene, 4 images, 1 camera, 30 points, 2 periods"
+    )
+    assert lines[1:3] == ["  period 0: 1 train, 1 test", "  period 1: 1 train, 1 test"]
+    assert split_hash(read_scene(folder)) in lines[3]
+    assert result.stderr == (
+        "note: nerfstudio has no place for the observations of points, their ids and errors\n"
+    )
+    assert read_scene(tmp_path / "out").format == "nerfstudio"
+
+
+@pytest.mark.parametrize(("kind", "is_link"), [("hard", False), ("sym", True)])
+def test_links(make_scene_folder, tmp_path, kind, is_link):
+    folder = make_scene_folder()
+    assert run(folder, tmp_path / "out", "--link", kind).exit_code == 0
+    image = tmp_path / "out/images/a/0001.png"
+    assert image.samefile(folder / "images/a/0001.png") and image.is_symlink() == is_link
+
+
+def test_options_of_the_source(make_scene_folder, tmp_path):
+    folder = make_scene_folder({"a.png": 0, "b.png": 0})
+    (folder / "sparse/split.txt").unlink()
+    table = tmp_path / "periods.csv"
+    table.write_text("file,period\na.png,2016\nb.png,2023\n")
+    options = ["--format", "colmap-folders", "--period-by", f"table:{table}"]
+    result = run(folder, tmp_path / "out", *options)
+    assert "  period 1 (2023): 0 train, 1 test" in result.stdout
+    assert [p.date for p in read_scene(tmp_path / "out").periods] == ["2016", "2023"]
+
+
+def test_help_lists_formats_and_groupings():
+    text = " ".join(run("--help").stdout.split())
+    for word in ("cl-splats", "neusc: year, month, day, gap:DAYS, count:N", "--link", "table:FILE"):
+        assert word in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{tmp}/absent", "{tmp}/out"], "expected a scene folder, found nothing"),
+        (["{scene}", "{scene}/out"], "expected a place outside of the source"),
+        (["{scene}", "{tmp}"], "expected a new or empty folder"),
+        (["{scene}", "{tmp}/out", "--period-by", "year"], "--period-by: expected no such option"),
+    ],
+)
+def test_errors_are_one_line(make_scene_folder, tmp_path, monkeypatch, capsys, arguments, message):
+    scene = make_scene_folder()
+    words = [a.format(tmp=tmp_path, scene=scene) for a in arguments]
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "convert", *words])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_labels_that_the_output_cannot_encode(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    (folder / "sparse/periods.json").write_text('[{"id": 0, "label": "früher"}, {"id": 1}]')
+    result = CliRunner(charset="ascii").invoke(cli, ["convert", str(folder), str(tmp_path / "o")])
+    assert result.exit_code == 0 and "fr\\xfcher" in result.stdout

@@ -1,0 +1,177 @@
+"""Conversions: where they may go, what they say, and that nothing is touched or half done."""
+
+import dataclasses
+import hashlib
+import os
+
+import numpy as np
+import pytest
+
+from chronoscene.convert import convert, losses, obstacles
+from chronoscene.errors import ConfigError, SceneError
+from chronoscene.formats import read_scene
+from chronoscene.scene import Camera, Period, Points, WorldFrame
+from chronoscene.splits import split_hash
+
+
+def snapshot(folder):
+    return {
+        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in folder.rglob("*")
+        if p.is_file()
+    }
+
+
+def test_there_and_back(make_scene_folder, tmp_path):
+    """Through both other formats: images, periods, split and poses are the same."""
+    folder = make_scene_folder(tests=["a/0002.png", "b/0003.png"])
+    before, scene = snapshot(folder), read_scene(folder)
+    convert(folder, tmp_path / "studio", target="nerfstudio")
+    convert(tmp_path / "studio", tmp_path / "plain", target="colmap-folders")
+    convert(tmp_path / "plain", tmp_path / "back")
+    again = read_scene(tmp_path / "back")
+    assert [f.name for f in again.frames] == [f"{f.period}/{f.name}" for f in scene.frames]
+    assert [(f.period, f.split) for f in again.frames] == [
+        (f.period, f.split) for f in scene.frames
+    ]
+    for a, b in zip(scene.frames, again.frames, strict=True):
+        np.testing.assert_allclose(a.cam_from_world, b.cam_from_world, atol=1e-13)
+        assert again.image_path(b).read_bytes() == scene.image_path(a).read_bytes()
+    np.testing.assert_array_equal(again.points.xyz, scene.points.xyz)
+    assert snapshot(folder) == before
+
+
+def test_labels_dates_and_world_are_kept(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    (folder / "sparse/periods.json").write_text(
+        '[{"id": 0, "label": "vorher", "date": "2016-09"}, {"id": 1, "label": "nachher"}]'
+    )
+    (folder / "sparse/world.json").write_text('{"unit": "metre", "offset": [4e5, 5e6, 0.1]}')
+    convert(folder, tmp_path / "studio", target="nerfstudio")
+    convert(tmp_path / "studio", tmp_path / "back")
+    again = read_scene(tmp_path / "back")
+    assert again.periods == (Period(0, "vorher", "2016-09"), Period(1, "nachher"))
+    assert again.world == WorldFrame("metre", None, (4e5, 5e6, 0.1))
+    assert split_hash(again) == split_hash(read_scene(folder))
+
+
+def test_equal_file_names_stay_apart(make_scene_folder, tmp_path):
+    folder = make_scene_folder({"a/1.png": 0, "b/1.png": 1, "1.png": 1})
+    scene = read_scene(folder)
+    convert(folder, tmp_path / "out", target="colmap-folders")
+    again = read_scene(tmp_path / "out")
+    names = [f.name for f in again.frames]
+    assert sorted(names) == ["0/a/1.png", "1/1.png", "1/b/1.png"]
+    contents = {again.image_path(f).read_bytes() for f in again.frames}
+    assert contents == {scene.image_path(f).read_bytes() for f in scene.frames}
+
+
+@pytest.mark.parametrize("out", ["", "new", "images/new", "../scene/new"])
+def test_never_into_the_source(make_scene_folder, out):
+    folder = make_scene_folder()
+    before = snapshot(folder)
+    with pytest.raises(ConfigError, match="a place outside of the source"):
+        convert(folder, folder / out)
+    assert snapshot(folder) == before
+
+
+def test_never_into_the_source_through_a_link(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    (tmp_path / "link").symlink_to(folder)
+    with pytest.raises(ConfigError, match="a place outside of the source"):
+        convert(folder, tmp_path / "link" / "new")
+
+
+@pytest.mark.parametrize("target", ["chronoscene", "nerfstudio", "colmap-folders"])
+def test_a_folder_in_use_is_left_alone(make_scene_folder, tmp_path, target):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.txt").write_text("all of it")
+    with pytest.raises(SceneError, match="expected a new or empty folder, found one in use"):
+        convert(make_scene_folder(), out, target=target)
+    assert snapshot(out) == {"thesis.txt": hashlib.sha256(b"all of it").hexdigest()}
+
+
+@pytest.mark.parametrize("target", ["chronoscene", "nerfstudio", "colmap-folders"])
+def test_nothing_is_left_of_a_failure(make_scene_folder, tmp_path, target):
+    folder = make_scene_folder()
+    (folder / "images/b/0003.png").unlink()
+    with pytest.raises(SceneError, match=r"0003\.png: expected an image, found nothing"):
+        convert(folder, tmp_path / "target/out", target=target)
+    assert list((tmp_path / "target").iterdir()) == []
+
+
+@pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root may write everywhere")
+def test_a_place_without_permission(make_scene_folder, tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    with pytest.raises(SceneError, match="expected a place that can be written to"):
+        convert(make_scene_folder(), tmp_path / "locked/out")
+
+
+def test_below_a_file(make_scene_folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SceneError, match="expected a place that can be written to, found"):
+        convert(make_scene_folder(), tmp_path / "file/out")
+
+
+@pytest.mark.parametrize("target", ["chronoscene", "nerfstudio", "colmap-folders"])
+def test_links(make_scene_folder, tmp_path, target):
+    folder = make_scene_folder({"0/a.png": 0, "1/a.png": 1})
+    for kind in ("link", "symlink", "copy"):
+        convert(folder, tmp_path / kind, target=target, image_source=kind)
+        image, source = tmp_path / kind / "images/0/a.png", folder / "images/0/a.png"
+        assert image.read_bytes() == source.read_bytes()
+        assert image.is_symlink() == (kind == "symlink")
+        assert os.path.samefile(image, source) == (kind != "copy")
+
+
+def test_progress_counts_images(make_scene_folder, tmp_path):
+    for target in ("chronoscene", "nerfstudio", "colmap-folders"):
+        seen = []
+        convert(
+            make_scene_folder(name=f"s-{target}"),
+            tmp_path / target,
+            target=target,
+            progress=lambda done, total, seen=seen: seen.append((done, total)),
+        )
+        assert seen == [(i, 4) for i in range(1, 5)]
+
+
+def test_unknown_target_and_grouping(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    with pytest.raises(ConfigError, match="chronoscene, colmap-folders, nerfstudio, found 'wat'"):
+        convert(folder, tmp_path / "out", target="wat")
+    with pytest.raises(ConfigError, match="no such option for chronoscene, which says its periods"):
+        convert(folder, tmp_path / "out", period_by="year")
+
+
+def test_losses(make_scene_folder):
+    scene = read_scene(make_scene_folder())
+    assert losses(scene, "chronoscene") == losses(scene, "colmap-folders") == []
+    assert losses(scene, "nerfstudio") == [
+        "nerfstudio has no place for the observations of points, their ids and errors"
+    ]
+    dated = dataclasses.replace(
+        scene,
+        periods=(Period(0, "a", "2016"), Period(1, "2023", "2023")),
+        world=WorldFrame("metre"),
+    )
+    assert losses(dated, "colmap-folders") == [
+        "colmap-folders has no place for the dates of the periods, unit and reference system of "
+        "the world"
+    ]
+
+
+def test_obstacles(make_scene_folder):
+    scene = read_scene(make_scene_folder())
+    assert obstacles(scene) == []
+    odd = Camera(1, "OPENCV", 64, 48, (50, 50, 32, 24, 0.1, 0, 0, 0))
+    frames = [dataclasses.replace(f, camera=odd, split="train") for f in scene.frames]
+    bad = dataclasses.replace(scene.with_frames(frames), points=Points.empty())
+    distortion, points, tests = obstacles(bad)
+    assert "OPENCV" in distortion and "chronoscene undistort" in distortion
+    assert "no points" in points and "chronoscene split" in tests
+    cloud = dataclasses.replace(
+        Points.empty(), ids=np.array([1]), xyz=np.zeros((1, 3)), track_start=np.zeros(2, np.int64)
+    )
+    assert "observed" in obstacles(dataclasses.replace(scene, points=cloud))[0]
