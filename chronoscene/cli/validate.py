@@ -11,12 +11,14 @@ import click
 
 from chronoscene.cli.output import emit
 from chronoscene.validation.report import counts
+from chronoscene.validation.report_html import write_html
 from chronoscene.validation.report_json import write_json
+from chronoscene.validation.report_sarif import write_sarif
 from chronoscene.validation.report_text import write_text
 from chronoscene.validation.rule import choose_rules
 from chronoscene.validation.run import find_folders, validate_scene
 
-WRITERS = {"text": write_text, "json": write_json}
+WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
 
 NOT_VALID = 1
 """Exit status when there are errors."""
@@ -35,6 +37,8 @@ T = TypeVar("T")
     help="What to write.",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead.")
+@click.option("--sarif", type=click.Path(path_type=Path), help="Write a SARIF report here, too.")
+@click.option("--html", type=click.Path(path_type=Path), help="Write an HTML page here, too.")
 @click.option(
     "--select", multiple=True, metavar="CODES", help="Run these rules only: CS201,CS3,split-line."
 )
@@ -52,6 +56,8 @@ def command(
     folder: Path,
     output_format: str,
     out: Path | None,
+    sarif: Path | None,
+    html: Path | None,
     select: tuple[str, ...],
     ignore: tuple[str, ...],
     strict: bool,
@@ -68,6 +74,9 @@ def command(
         for path in find_folders(folder)
     ]
     emit(WRITERS[output_format](reports, strict=strict), out)
+    for file, write in ((sarif, write_sarif), (html, write_html)):
+        if file is not None:
+            emit(write(reports, strict=strict), file)
     total = counts(reports)
     if total["error"] or (strict and total["warning"]):
         context.exit(NOT_VALID)

@@ -54,6 +54,9 @@ MODEL_PLACES = (MODEL, "sparse", "colmap/sparse/0", "dense/sparse", "dense/0/spa
 FEWEST = 10
 """Observations of an image from which the median of its errors means something."""
 
+FEWEST_IMAGES = 3
+"""Images with an error from which the median of a period means something."""
+
 LARGEST_SIDE = 10**6
 """Pixels; a camera that claims more is a damaged record."""
 
@@ -189,6 +192,17 @@ class RawScene:
             if camera.is_pinhole and len(front) >= FEWEST:
                 errors[seen.image] = np.median(front)
         return errors
+
+    @cached_property
+    def period_errors(self) -> dict[int, float]:
+        """Median over the images of a period of `image_errors`, for periods with enough of them."""
+        medians = {}
+        for index, period in enumerate(self.period_ids):
+            errors = self.image_errors[self.image_periods == index]
+            errors = errors[~np.isnan(errors)]
+            if len(errors) >= FEWEST_IMAGES:
+                medians[period] = float(np.median(errors))
+        return medians
 
     # Periods and split.
 

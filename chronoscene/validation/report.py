@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,8 @@ class PeriodSummary:
     train: int | None
     """None if the split is not known."""
     test: int | None
+    reprojection_px: float | None = None
+    """Median over its images of their median reprojection errors, if it was looked at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +68,9 @@ def counts(reports: Iterable[SceneReport]) -> dict[Severity, int]:
 
 def summarise(scene: RawScene) -> Summary:
     """Count what is there."""
+    periods = scene.periods or {}
+    images = Counter(periods.values())
+    tests = Counter(periods[name] for name in scene.tests or () if name in periods)
     observations = None if scene.points is None else len(scene.points.track_image)
     return Summary(
         images=None if scene.images is None else len(scene.images),
@@ -72,13 +78,15 @@ def summarise(scene: RawScene) -> Summary:
         points=None if scene.points is None else len(scene.points),
         observations=observations,
         image_files=len(scene.files),
-        periods=tuple(_period(scene, period) for period in scene.period_ids),
+        periods=tuple(_period(scene, period, images, tests) for period in scene.period_ids),
     )
 
 
-def _period(scene: RawScene, period: int) -> PeriodSummary:
-    names = [name for name, p in (scene.periods or {}).items() if p == period]
-    if scene.tests is None:
-        return PeriodSummary(period, len(names), None, None)
-    test = sum(name in scene.tests for name in names)
-    return PeriodSummary(period, len(names), len(names) - test, test)
+def _period(
+    scene: RawScene, period: int, images: Counter[int], tests: Counter[int]
+) -> PeriodSummary:
+    number = images[period]
+    train, test = (None, None) if scene.tests is None else (number - tests[period], tests[period])
+    looked_at = "reprojections" in vars(scene) and scene.reprojections is not None
+    error = scene.period_errors.get(period) if looked_at else None
+    return PeriodSummary(period, number, train, test, error)

@@ -80,6 +80,19 @@ def test_out(broken, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["report.json", "scene"]
 
 
+def test_reports_for_programs_and_people_beside_the_text(broken, tmp_path):
+    status, text = run(broken, "--sarif", tmp_path / "r.sarif", "--html", tmp_path / "r.html")
+    assert status == 1 and text.startswith("scene: ")
+    assert json.loads((tmp_path / "r.sarif").read_text())["version"] == "2.1.0"
+    assert "images/a0.png" in (tmp_path / "r.html").read_text()
+
+
+@pytest.mark.parametrize(("form", "begin"), [("sarif", "{"), ("html", "<!doctype html>")])
+def test_other_formats(broken, form, begin):
+    status, text = run(broken, "--format", form)
+    assert status == 1 and text.startswith(begin)
+
+
 def test_out_has_no_colours(broken, tmp_path):
     run(broken, "--out", tmp_path / "report.txt")
     assert "\x1b" not in (tmp_path / "report.txt").read_text()

@@ -84,7 +84,13 @@ def test_json_has_every_finding():
         "remedy": "copy it",
         "count": 1,
     }
-    assert scene["summary"]["periods"][0] == {"id": 0, "images": 7, "train": 6, "test": 1}
+    assert scene["summary"]["periods"][0] == {
+        "id": 0,
+        "images": 7,
+        "train": 6,
+        "test": 1,
+        "reprojection_px": None,
+    }
 
 
 @pytest.mark.parametrize(

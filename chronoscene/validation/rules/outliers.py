@@ -17,9 +17,6 @@ WORSE = 3.0
 LEAST_ERROR = 1.0
 """Pixels; below, everything is well whatever its ratio to the rest."""
 
-FEWEST_IMAGES = 3
-"""Images with an error from which the median of a period means something."""
-
 MOST_DUPLICATES = 0.05
 """Share of points on top of another one. COLMAP's models were seen with one percent."""
 
@@ -38,7 +35,7 @@ FAR = 100.0
 )
 def period_error(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
-    medians = period_errors(scene)
+    medians = scene.period_errors
     limit = max(LEAST_ERROR, WORSE * min(medians.values(), default=0.0))
     for period, median in medians.items():
         if median > limit:
@@ -48,20 +45,6 @@ def period_error(scene: RawScene) -> Iterator[Hit]:
             named = shown([scene.images.names[i] for i in worst])
             found = f"{median:.3g} px; worst are {named}"
             yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
-
-
-def period_errors(scene: RawScene) -> dict[int, float]:
-    """Median over the images of a period of their median reprojection errors, in pixels.
-
-    Only of the periods with enough images with points.
-    """
-    medians = {}
-    for index, period in enumerate(scene.period_ids):
-        errors = scene.image_errors[scene.image_periods == index]
-        errors = errors[~np.isnan(errors)]
-        if len(errors) >= FEWEST_IMAGES:
-            medians[period] = float(np.median(errors))
-    return medians
 
 
 @rule(
@@ -75,7 +58,7 @@ def period_errors(scene: RawScene) -> dict[int, float]:
 )
 def image_error(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
-    medians = period_errors(scene)
+    medians = scene.period_errors
     for image in np.flatnonzero(~np.isnan(scene.image_errors)).tolist():
         index, error = int(scene.image_periods[image]), float(scene.image_errors[image])
         period = scene.period_ids[index] if index >= 0 else -1
