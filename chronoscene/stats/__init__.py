@@ -18,16 +18,22 @@ from chronoscene.stats.counts import (
     to_markdown,
     to_text,
 )
+from chronoscene.stats.details import DETAIL_WRITERS
+from chronoscene.stats.measures import Measures, SceneStatistics, measure_scene
 
 __all__ = [
     "COUNT_RULES",
+    "DETAIL_WRITERS",
     "WRITERS",
     "CountRule",
+    "Measures",
     "PeriodCount",
     "SceneCount",
+    "SceneStatistics",
     "assign_points",
     "count_scene",
     "count_table",
+    "measure_scene",
     "observation_counts",
     "to_csv",
     "to_json",

@@ -7,7 +7,7 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -166,10 +166,15 @@ _LATEX_ESCAPES = str.maketrans(
 )
 
 
+def escape_latex(text: str) -> str:
+    """Text as LaTeX prints it."""
+    return text.translate(_LATEX_ESCAPES)
+
+
 def to_latex(counts: Sequence[SceneCount]) -> str:
     """A ``tabular`` for the booktabs package."""
     names = _period_names(counts)
-    rows = [[_text(cell).translate(_LATEX_ESCAPES) for cell in row] for row in count_table(counts)]
+    rows = [[escape_latex(_text(cell)) for cell in row] for row in count_table(counts)]
     lines = [
         r"\begin{tabular}{l" + "rr" * len(names) + "}",
         r"\toprule",
@@ -187,13 +192,15 @@ def to_latex(counts: Sequence[SceneCount]) -> str:
 
 def to_json(counts: Sequence[SceneCount]) -> str:
     """Everything that was counted, with train and test images and the split's fingerprint."""
+    data = {"scenes": [asdict(c) for c in counts], "totals": totals(counts)}
+    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+
+
+def totals(counts: Sequence[SceneCount]) -> dict[str, Any]:
+    """Images and points over all scenes, by period and in all."""
     _, *sums = count_table(counts)[-1]
     pairs = [{"images": sums[i], "points": sums[i + 1]} for i in range(0, len(sums), 2)]
-    data = {
-        "scenes": [asdict(c) for c in counts],
-        "totals": {"periods": pairs[:-1], "all": pairs[-1]},
-    }
-    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+    return {"periods": pairs[:-1], "all": pairs[-1]}
 
 
 def to_text(counts: Sequence[SceneCount]) -> str:

@@ -19,7 +19,7 @@ def run(*args: object):
 
 
 def test_a_scene(make_scene_folder):
-    result = run(make_scene_folder())
+    result = run(make_scene_folder(), "--layout", "paper")
     assert result.exit_code == 0, result.output
     (row,) = [line for line in result.output.splitlines() if line.lstrip().startswith("scene ")]
     images_0, points_0, images_1, points_1, images, points = map(int, row.split()[1:])
@@ -31,19 +31,21 @@ def test_a_folder_of_scenes_and_several_folders(make_scene_folder, tmp_path):
     make_scene_folder(name="set/b")
     make_scene_folder({"1.png": 0, "2.png": 1, "3.png": 2}, name="set/a")
     single = make_scene_folder(name="single")
-    result = run(tmp_path / "set", single, "--format", "csv")
+    result = run(tmp_path / "set", single, "--layout", "paper", "--format", "csv")
     rows = list(csv.DictReader(io.StringIO(result.output)))
     assert [row["scene"] for row in rows] == ["a", "b", "single", "Total"]
     assert [row["period_2_images"] for row in rows] == ["1", "", "", "1"]
     assert [row["total_images"] for row in rows] == ["3", "4", "4", "11"]
 
 
+@pytest.mark.parametrize("layout", ["full", "paper"])
 @pytest.mark.parametrize("output_format", WRITERS)
-def test_out_holds_what_would_be_printed(make_scene_folder, tmp_path, output_format):
+def test_out_holds_what_would_be_printed(make_scene_folder, tmp_path, output_format, layout):
     folder = make_scene_folder()
-    printed = run(folder, "--format", output_format)
+    options = ("--format", output_format, "--layout", layout)
+    printed = run(folder, *options)
     out = tmp_path / "counts"
-    written = run(folder, "--format", output_format, "--out", out)
+    written = run(folder, *options, "--out", out)
     assert (written.exit_code, written.output) == (0, "")
     assert out.read_text(encoding="utf-8") == printed.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["counts", "scene"]
@@ -80,7 +82,7 @@ def test_points_that_no_image_sees_are_mentioned(make_scene_folder):
         file.write("99 1 2 3 4 5 6 0.5\n")
     result = run(folder)
     assert "scene: 1 points are seen by no image" in result.stderr
-    assert "seen by" not in result.stdout
+    assert "no image" not in result.stdout
 
 
 def shell(*args: object) -> subprocess.CompletedProcess[str]:
@@ -121,4 +123,17 @@ def test_torch_is_not_needed(make_scene_folder):
     command = [sys.executable, "-c", code, "stats", str(make_scene_folder())]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert "Total" in done.stdout
+    assert "Observations" in done.stdout
+
+
+def test_several_scenes_are_read_in_several_processes(make_scene_folder, tmp_path):
+    folders = [make_scene_folder(name=f"set/{i}", points=20 + i) for i in range(3)]
+    done = shell(tmp_path / "set", "--format", "json")
+    assert done.returncode == 0, done.stderr
+    scenes = json.loads(done.stdout)["scenes"]
+    assert [(s["name"], s["points"]) for s in scenes] == [("0", 20), ("1", 21), ("2", 22)]
+    (folders[1] / "sparse/split.txt").write_text("a/0001.png\n")
+    done = shell(tmp_path / "set")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"error: {folders[1] / 'sparse/split.txt'}:1: expected")
+    assert len(done.stderr.splitlines()) == 1

@@ -1,0 +1,211 @@
+"""Tracks, reprojection error, overlap, baseline and coverage of the periods of a scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.geometry import camera_centre
+from chronoscene.scene import Camera, Scene
+from chronoscene.stats.counts import CountRule, SceneCount, count_scene, observation_counts
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+CELLS = 50
+"""Cubes along the longest edge of a scene for its coverage."""
+ROBUST = (1.0, 99.0)
+"""Percentiles of the points between which a scene lies; the rest are strays."""
+
+
+@dataclass(frozen=True, slots=True)
+class Measures:
+    """Of one period, or of a whole scene. None where there is nothing to measure."""
+
+    observations: int
+    """Of points by images of the period."""
+    track_mean: float | None
+    """Images of the period that see a point, mean over the points that any of them sees."""
+    track_median: float | None
+    reprojection_error: float | None
+    """Mean over the observations of the distance between observation and projection, in pixels of
+    the camera. Observations behind the camera are left out."""
+    baseline: float | None
+    """Distance from a camera to the nearest other one of the period, as a share of the median depth
+    of the points that it sees; median over the cameras that see any."""
+    coverage: float | None
+    """Share of the scene's space with points in which the period sees a point: of the cubes with
+    points of a grid that has 50 cubes along the scene's longest edge, strays aside."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneStatistics:
+    """Everything that ``chronoscene stats`` knows about a scene."""
+
+    counts: SceneCount
+    periods: tuple[Measures, ...]
+    whole: Measures
+    """Tracks over all periods; cameras compared within their periods."""
+    overlap: tuple[tuple[float | None, ...], ...]
+    """Row a, column b: share of the points that period a sees which period b sees, too. [T, T]"""
+    unit: str
+    """Of the world: ``metre`` or ``unknown``."""
+
+
+def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatistics:
+    """Count and measure a scene; ``count`` is that of `count_scene`."""
+    seen = observation_counts(scene)
+    periods = np.array([f.period for f in scene.frames], np.int64)
+    residual, depths = reproject(scene)
+    baselines = camera_baselines(scene, depths)
+    coverage = period_coverage(scene.points.xyz, seen > 0)
+    observed_in = periods[scene.points.track_frame]
+    by_period = tuple(
+        Measures(
+            observations=int(seen[:, p].sum()),
+            track_mean=_mean(_positive(seen[:, p])),
+            track_median=_median(_positive(seen[:, p])),
+            reprojection_error=_mean(residual[observed_in == p]),
+            baseline=_median(baselines[periods == p]),
+            coverage=coverage[p],
+        )
+        for p in range(scene.num_periods)
+    )
+    length = _positive(seen.sum(axis=1))
+    whole = Measures(
+        observations=int(seen.sum()),
+        track_mean=_mean(length),
+        track_median=_median(length),
+        reprojection_error=_mean(residual),
+        baseline=_median(baselines),
+        coverage=None if not len(length) else 1.0,
+    )
+    overlap = period_overlap(seen > 0)
+    return SceneStatistics(
+        count_scene(scene, count=count), by_period, whole, overlap, scene.world.unit
+    )
+
+
+def reproject(scene: Scene) -> tuple[Array, Array]:
+    """Project every observed point, distortion included.
+
+    Returns:
+        residual: Of each observation in pixels; NaN where the point is not in front of the camera
+            or not finite. [M]
+        depths: Median depth of what each frame sees in front of it, in world units; NaN where it
+            sees nothing. [frames]
+    """
+    points = scene.points
+    of = np.repeat(np.arange(len(points), dtype=np.int32), np.diff(points.track_start))
+    order, ends = _by_frame(points.track_frame, len(scene.frames))
+    residual = np.full(len(order), np.nan)
+    depths = np.full(len(scene.frames), np.nan)
+    with np.errstate(all="ignore"):  # absurd poses and points give NaN, which is left out
+        for i, frame in enumerate(scene.frames):
+            rows = order[ends[i] : ends[i + 1]]
+            local = points.xyz[of[rows]] @ frame.cam_from_world[:3, :3].T
+            local += frame.cam_from_world[:3, 3]
+            shift = _project(frame.camera, local) - points.track_xy[rows]
+            ahead = local[:, 2] > 0
+            residual[rows] = np.where(ahead, np.hypot(shift[:, 0], shift[:, 1]), np.nan)
+            if ahead.any():
+                depths[i] = np.median(local[ahead, 2])
+    return residual, depths
+
+
+def _by_frame(track_frame: NDArray[np.int32], frames: int) -> tuple[Index, Index]:
+    """Observations in the order of their frames [M], and where each frame's begin [frames + 1]."""
+    # Keys of 16 bits are sorted several times faster.
+    keys = track_frame.astype(np.uint16) if frames <= 2**16 else track_frame
+    counts = np.bincount(track_frame, minlength=frames)
+    return np.argsort(keys, kind="stable"), np.concatenate([[0], np.cumsum(counts)])
+
+
+def _project(camera: Camera, local: Array) -> Array:
+    """Points in the frame of a camera to its pixels. [n, 3] -> [n, 2]"""
+    if camera.is_pinhole:
+        K = camera.K
+        return np.asarray(local[:, :2] / local[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2])
+    from chronoscene.colmap import to_pycolmap
+
+    finite = np.isfinite(local).all(axis=1) & (local[:, 2] > 0)
+    at = np.full((len(local), 2), np.nan)
+    at[finite] = to_pycolmap(camera).img_from_cam(local[finite])
+    return at
+
+
+def camera_baselines(scene: Scene, depths: Array) -> Array:
+    """Distance to the nearest camera of the same period over the median depth of what is seen.
+
+    Args:
+        scene: The scene.
+        depths: As `reproject` gives them. [frames]
+
+    Returns:
+        NaN for cameras without points, and for one that is alone in its period. [frames]
+    """
+    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
+    periods = np.array([f.period for f in scene.frames])
+    nearest = np.full(len(centres), np.nan)
+    for p in range(scene.num_periods):
+        mine = np.flatnonzero(periods == p)
+        nearest[mine] = _nearest_distance(centres[mine])
+    return nearest / depths
+
+
+def _nearest_distance(centres: Array, rows: int = 512) -> Array:
+    """Distance of each place to the nearest other one; NaN if there is none. [n, 3] -> [n]"""
+    nearest = np.full(len(centres), np.nan)
+    if len(centres) < 2:
+        return nearest
+    for begin in range(0, len(centres), rows):  # a few rows at a time: n may be thousands
+        block = slice(begin, begin + rows)
+        distance = np.linalg.norm(centres[block, None] - centres, axis=2)
+        within = np.arange(len(distance))
+        distance[within, begin + within] = np.inf
+        nearest[block] = distance.min(axis=1)
+    return nearest
+
+
+def period_overlap(seen: NDArray[np.bool_]) -> tuple[tuple[float | None, ...], ...]:
+    """Share of the points of each period that each other sees, too. [P, T] -> [T, T]"""
+    columns = seen.astype(np.float32)  # exact up to 16 million points
+    both = (columns.T @ columns).astype(np.float64)
+    rows = []
+    for p, own in enumerate(np.diag(both)):
+        rows.append(tuple(float(n / own) if own else None for n in both[p]))
+    return tuple(rows)
+
+
+def period_coverage(xyz: Array, seen: NDArray[np.bool_]) -> list[float | None]:
+    """Coverage of each period; see `Measures.coverage`. [P, 3], [P, T] -> T values"""
+    used = seen.any(axis=1) & np.isfinite(xyz).all(axis=1)
+    if not used.any():
+        return [None] * seen.shape[1]
+    xyz, seen = xyz[used], seen[used]
+    low, high = np.percentile(xyz, ROBUST, axis=0)
+    inside = ((xyz >= low) & (xyz <= high)).all(axis=1)
+    if not inside.any():
+        low, high, inside = xyz.min(axis=0), xyz.max(axis=0), np.ones(len(xyz), bool)
+    edge = float((high - low).max()) / CELLS or 1.0
+    cell = ((xyz[inside] - low) / edge).astype(np.int64)
+    flat = (cell[:, 0] * (CELLS + 1) + cell[:, 1]) * (CELLS + 1) + cell[:, 2]
+    total = int(np.count_nonzero(np.bincount(flat)))
+    covered = [int(np.count_nonzero(np.bincount(flat[column]))) for column in seen[inside].T]
+    return [n / total for n in covered]
+
+
+def _positive(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    return counts[counts > 0]
+
+
+def _mean(values: NDArray[np.float64] | NDArray[np.int64]) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else None
+
+
+def _median(values: NDArray[np.float64] | NDArray[np.int64]) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else None
