@@ -27,14 +27,15 @@ from chronoscene.formats.writing import Progress, place_image, staged_folder
 from chronoscene.images import image_size, load_rgb, resize_camera
 from chronoscene.scene import Camera, Frame, Points, Scene
 from chronoscene.threads import available_threads
+from chronoscene.warp import warp
 
 JPEG_QUALITY = 95
 
 ROWS = 128
 """Rows of a map that are computed at once, to bound the memory."""
 
-LARGEST_SIDE = 32766
-"""Pixels; what the interpolation can address."""
+LARGEST_SIDE = 65535
+"""Pixels; what a JPEG file can hold. A camera that needs more is a mistake."""
 
 WRITABLE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
@@ -249,12 +250,7 @@ def sampling_map(change: CameraChange) -> tuple[NDArray[np.float32], NDArray[np.
 
 def undistort_pixels(rgb: NDArray[np.uint8], change: CameraChange) -> NDArray[np.uint8]:
     """Resample an image to the new camera. [H, W, 3] -> [H', W', 3]"""
-    import cv2
-
-    x, y = sampling_map(change)
-    # Pixel 0 of OpenCV is centred at 0, ours at 0.5.
-    result = cv2.remap(rgb, x - 0.5, y - 0.5, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(result, np.uint8)
+    return warp(rgb, *sampling_map(change))
 
 
 def _write_images(

@@ -1,0 +1,95 @@
+"""chronoscene split: files written, source left alone, errors."""
+
+import json
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from chronoscene.cli import cli, main
+from chronoscene.formats import read_scene
+from chronoscene.splits import split_hash
+
+PERIODS = {f"{'ab'[p]}/{i:02d}.png": p for p in (0, 1) for i in range(16)}
+
+
+@pytest.fixture
+def scene(make_scene_folder):
+    return make_scene_folder(PERIODS)
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, ["split", *map(str, arguments)])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+def snapshot(folder):
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_writes_the_list_and_what_made_it(scene, tmp_path):
+    before = snapshot(scene)
+    out = tmp_path / "lists/test.txt"
+    result = run(scene, out, "--every", 4, "--offset", 1)
+    assert result.exit_code == 0
+    names = out.read_text().splitlines()
+    assert names == [f"{f}/{i:02d}.png" for f in "ab" for i in (1, 5, 9, 13)]
+    record = json.loads((tmp_path / "lists/test.json").read_text())
+    assert (record["strategy"], record["fraction"], record["offset"]) == ("stratified", 0.25, 1)
+    assert f"split hash {record['split_hash']}" in result.stdout
+    assert "  period 0: 12 train, 4 test\n  period 1: 12 train, 4 test\n" in result.stdout
+    assert snapshot(scene) == before
+
+
+def test_the_list_makes_the_split_that_the_hash_names(scene, tmp_path):
+    run(scene, tmp_path / "t.txt", "--strategy", "blocked", "--blocks", 4, "--fraction", 0.25)
+    (scene / "sparse/0/test.txt").write_bytes((tmp_path / "t.txt").read_bytes())
+    record = json.loads((tmp_path / "t.json").read_text())
+    assert split_hash(read_scene(scene)) == record["split_hash"]
+
+
+def test_scene_out(scene, tmp_path):
+    result = run(scene, "--scene-out", tmp_path / "new", "--seed", 1)
+    assert result.exit_code == 0
+    new = read_scene(tmp_path / "new")
+    record = json.loads((tmp_path / "new/sparse/0/test.json").read_text())
+    assert split_hash(new) == record["split_hash"] and new.split_rule == "sparse/0/test.txt"
+    assert (tmp_path / "new/images/a/00.png").samefile(scene / "images/a/00.png")
+
+
+def test_whole_periods_are_remarked_upon(scene, tmp_path):
+    result = run(scene, tmp_path / "t.txt", "--strategy", "periods", "--period", 1)
+    assert "note: period 0 has no test images\n" in result.stdout
+    assert "note: period 1 has no train images\n" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{scene}"], "give a file OUT, or --scene-out"),
+        (["{scene}", "{tmp}/o", "--every", "4", "--fraction", "0.1"], "not both"),
+        (["{scene}", "{tmp}/o", "--every", "1"], "2 or more is needed"),
+        (["{scene}", "{scene}/sparse/0/test.txt"], "a place outside of the source"),
+        (["{scene}", "--scene-out", "{scene}/new"], "a place outside of the source"),
+        (["{scene}", "{tmp}/there.txt"], "expected a new file, found an existing one"),
+        (["{scene}", "{tmp}/other.txt"], "other.json: expected a new file"),
+        (["{scene}", "{tmp}/there.txt/o"], "expected a file that can be written"),
+        (["{scene}", "{tmp}/o", "--strategy", "date"], "expected a date of capture of every image"),
+        (["{scene}", "{tmp}/o", "--fraction", "2"], "--fraction: expected a number between 0 and"),
+        (["{tmp}/nowhere", "{tmp}/o"], "expected a scene folder, found nothing"),
+    ],
+)
+def test_errors(scene, tmp_path, monkeypatch, capsys, arguments, message):
+    (tmp_path / "there.txt").write_text("mine")
+    (tmp_path / "other.json").write_text("mine")
+    before = snapshot(tmp_path)
+    words = [a.format(tmp=tmp_path, scene=scene) for a in arguments]
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "split", *words])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error
+    assert snapshot(tmp_path) == before

@@ -1,0 +1,70 @@
+"""chronoscene undistort: the report, and errors on one line."""
+
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from chronoscene.cli import cli, main
+from chronoscene.formats import read_scene
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, ["undistort", *map(str, arguments)])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture
+def distorted(make_scene_folder):
+    """Its observations do not fit its camera, which matters to none of these tests."""
+    folder = make_scene_folder(form="text")
+    (folder / "sparse/0/cameras.txt").write_text("1 SIMPLE_RADIAL 64 48 50 30 25.5 -0.1\n")
+    return folder
+
+
+def test_reports_sizes(distorted, tmp_path):
+    before = {p: p.read_bytes() for p in distorted.rglob("*") if p.is_file()}
+    result = run(distorted, tmp_path / "out", "--threads", 2)
+    assert result.exit_code == 0
+    camera = read_scene(tmp_path / "out").frames[0].camera
+    assert camera.model == "PINHOLE"
+    line = f"camera 1: SIMPLE_RADIAL 64 x 48 -> PINHOLE {camera.width} x {camera.height}, f 50.00"
+    assert line in result.stdout and "images resampled" in result.stdout
+    assert {p: p.read_bytes() for p in distorted.rglob("*") if p.is_file()} == before
+
+
+def test_center(make_scene_folder, tmp_path):
+    result = run(make_scene_folder(), tmp_path / "out", "--center")
+    assert "PINHOLE 60 x 44, f 50.00 52.00, c 30.00 22.00" in result.stdout
+
+
+def test_says_what_was_dropped(make_scene_folder, tmp_path):
+    folder = make_scene_folder(form="text")
+    (folder / "sparse/0/cameras.txt").write_text("1 PINHOLE 64 48 50 52 10 10\n")
+    result = run(folder, tmp_path / "out", "--center")
+    assert "PINHOLE 20 x 20" in result.stdout
+    assert "observations outside of the new images, and " in result.stdout
+
+
+def test_says_that_nothing_had_to_be_done(make_scene_folder, tmp_path):
+    assert "images copied" in run(make_scene_folder(), tmp_path / "out").stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{tmp}/absent", "{tmp}/out"], "expected a scene folder, found nothing"),
+        (["{scene}", "{scene}/out"], "expected a place outside of the source"),
+        (["{scene}", "{tmp}"], "expected a new or empty folder"),
+    ],
+)
+def test_errors_are_one_line(distorted, tmp_path, monkeypatch, capsys, arguments, message):
+    words = [a.format(tmp=tmp_path, scene=distorted) for a in arguments]
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "undistort", *words])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1

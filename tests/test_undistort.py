@@ -1,0 +1,322 @@
+"""Undistorted scenes: pixels and observations are where the formulas of the models say."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from chronoscene.errors import ImageError, SceneError
+from chronoscene.formats import chronoscene as our_format
+from chronoscene.formats import read_scene
+from chronoscene.scene import Camera, Period, WorldFrame
+from chronoscene.splits import split_hash
+from chronoscene.undistort import pinhole_camera, undistort
+
+SIZE = (256, 192)
+F, CX, CY = 210.0, 120.5, 101.25
+
+CAMERAS = {
+    "SIMPLE_RADIAL": (F, CX, CY, -0.12),
+    "RADIAL": (F, CX, CY, 0.1, -0.05),
+    "OPENCV": (F, F + 4, CX, CY, -0.2, 0.05, 0.003, -0.002),
+    "FULL_OPENCV": (F, F + 4, CX, CY, 0.1, 0.02, 0.002, 0.001, 0.01, 0.15, 0.03, 0.002),
+    "OPENCV_FISHEYE": (F, F + 4, CX, CY, 0.05, -0.02, 0.003, 0.001),
+}
+
+
+def distort(model, params, x, y):
+    """Pixel of a ray x, y, 1 by the published formulas; nothing of it comes from COLMAP."""
+    single = model in ("SIMPLE_RADIAL", "RADIAL")
+    fx, fy, cx, cy = (params[0], *params[:3]) if single else params[:4]
+    k = params[3:] if single else params[4:]
+    r2 = x * x + y * y
+    if model == "OPENCV_FISHEYE":
+        r = np.sqrt(r2)
+        t = np.arctan(r)
+        t = t * (1 + k[0] * t**2 + k[1] * t**4 + k[2] * t**6 + k[3] * t**8)
+        factor = np.where(r > 1e-9, t / np.maximum(r, 1e-9), 1.0)
+        return fx * x * factor + cx, fy * y * factor + cy
+    k1, k2, p1, p2, k3, k4, k5, k6 = {
+        "SIMPLE_RADIAL": (k[0], *[0] * 7),
+        "RADIAL": (*k[:2], *[0] * 6),
+        "OPENCV": (*k[:4], *[0] * 4),
+        "FULL_OPENCV": k,
+    }[model]  # fmt: skip
+    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return fx * u + cx, fy * v + cy
+
+
+@pytest.fixture(params=CAMERAS)
+def camera(request) -> Camera:
+    params = CAMERAS[request.param]
+    return Camera(1, request.param, *SIZE, tuple(float(p) for p in params))
+
+
+@pytest.fixture
+def make_distorted(make_scene_folder, tmp_path):
+    """Factory of scenes in the ChronoScene format with exact observations of a given camera."""
+
+    def make(camera, pixels=None, *, name="distorted", size=SIZE, suffix=".png", **save):
+        names = {f"a/{i}{suffix}": 0 for i in range(3)} | {f"b/{i}{suffix}": 1 for i in range(3)}
+        scene = read_scene(make_scene_folder(names, name=f"{name}-source", tests=["a/1", "b/2"]))
+        points = scene.points
+        xyz = np.repeat(points.xyz, np.diff(points.track_start), axis=0)
+        poses = np.stack([f.cam_from_world for f in scene.frames])[points.track_frame]
+        rays = np.einsum("nij,nj->ni", poses[:, :3, :3], xyz) + poses[:, :3, 3]
+        xy = distort(camera.model, camera.params, *(rays[:, :2] / rays[:, 2:]).T)
+        scene = scene.with_frames([dataclasses.replace(f, camera=camera) for f in scene.frames])
+        scene = dataclasses.replace(
+            scene,
+            points=dataclasses.replace(points, track_xy=np.stack(xy, axis=1)),
+            periods=(Period(0, "old", "2016-09"), Period(1, "new")),
+            world=WorldFrame("metre"),
+        )
+        root = our_format.write(scene, tmp_path / name, image_source="none")
+        for i, frame in enumerate(scene.frames):
+            rng = np.random.default_rng(i)
+            image = rng.integers(0, 256, (*size[::-1], 3), np.uint8) if pixels is None else pixels
+            path = root / "images" / frame.name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(image).save(path, **save)
+        return read_scene(root)
+
+    return make
+
+
+def reprojection_errors(scene):
+    points = scene.points
+    xyz = np.repeat(points.xyz, np.diff(points.track_start), axis=0)
+    poses = np.stack([f.cam_from_world for f in scene.frames])[points.track_frame]
+    Ks = np.stack([f.camera.K for f in scene.frames])[points.track_frame]
+    x = np.einsum("nij,nj->ni", poses[:, :3, :3], xyz) + poses[:, :3, 3]
+    pixels = np.einsum("nij,nj->ni", Ks, x / x[:, 2:])[:, :2]
+    return np.abs(pixels - points.track_xy)
+
+
+def blobs():
+    """White blobs of 1.5 px at known places, on black. Image and places [N, 2]."""
+    x, y = np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5
+    places = np.array([(a, b) for a in range(24, 240, 32) for b in range(24, 180, 32)], float)
+    places += np.random.default_rng(0).uniform(-2, 2, places.shape)
+    image = sum(np.exp(-((x - a) ** 2 + (y[:, None] - b) ** 2) / (2 * 1.5**2)) for a, b in places)
+    return np.repeat(np.round(255 * image).astype(np.uint8)[..., None], 3, axis=2), places
+
+
+def undistorted_place(camera, target, place):
+    """Pixel of the new camera whose ray the old one sees at a place; by Newton's method."""
+    K = target.K
+
+    def old_pixel(uv):
+        ray = (uv - K[:2, 2]) / K[[0, 1], [0, 1]]
+        return np.array(distort(camera.model, camera.params, *ray))
+
+    uv = np.array(place)
+    for _ in range(20):
+        steps = [(old_pixel(uv + d) - old_pixel(uv - d)) / 2e-4 for d in 1e-4 * np.eye(2)]
+        uv = uv - np.linalg.solve(np.stack(steps, axis=1), old_pixel(uv) - place)
+    assert np.abs(old_pixel(uv) - place).max() < 1e-6
+    return uv
+
+
+def centroid(image, place, radius=6):
+    """Centre of mass around a place, in pixels; pixel (0, 0) is centred at (0.5, 0.5)."""
+    a, b = np.floor(place).astype(int)
+    window = image[b - radius : b + radius + 1, a - radius : a + radius + 1, 0].astype(float)
+    ys, xs = np.mgrid[b - radius : b + radius + 1, a - radius : a + radius + 1] + 0.5
+    return np.array([(xs * window).sum(), (ys * window).sum()]) / window.sum()
+
+
+@pytest.mark.parametrize("center", [False, True])
+def test_pixels_are_where_the_formula_says(camera, make_distorted, tmp_path, center):
+    image, places = blobs()
+    scene = make_distorted(camera, image)
+    new = undistort(scene, tmp_path / "out", center=center).scene
+    result = np.array(Image.open(new.image_path(new.frames[0])))
+    target = new.frames[0].camera
+    assert result.shape == (target.height, target.width, 3)
+    found = 0
+    for place in places:
+        u, v = undistorted_place(camera, target, place)
+        if 12 < u < target.width - 12 and 12 < v < target.height - 12:
+            np.testing.assert_allclose(centroid(result, (u, v)), [u, v], atol=0.05)
+            found += 1
+    assert found > 20
+
+
+@pytest.mark.parametrize("center", [False, True])
+def test_observations_reproject(camera, make_distorted, tmp_path, center):
+    scene = make_distorted(camera)
+    done = undistort(scene, tmp_path / "out", center=center)
+    again = read_scene(tmp_path / "out")
+    errors = reprojection_errors(again)
+    assert len(errors) > 60 and errors.max() < 1e-3
+    kept = len(again.points.track_xy)
+    assert kept + done.observations_lost == len(scene.points.track_xy)
+    limits = np.array([[f.camera.width, f.camera.height] for f in again.frames])
+    assert (again.points.track_xy >= 0).all()
+    assert (again.points.track_xy <= limits[again.points.track_frame]).all()
+
+
+def test_all_but_cameras_stays(camera, make_distorted, tmp_path):
+    scene = make_distorted(camera)
+    done = undistort(scene, tmp_path / "out")
+    again = read_scene(tmp_path / "out")
+    assert (again.periods, again.world) == (scene.periods, scene.world)
+    assert split_hash(again) == split_hash(scene)
+    assert {f.camera.model for f in again.frames} == {"PINHOLE"}
+    for a, b in zip(scene.frames, again.frames, strict=True):
+        assert (a.name, a.image_id) == (b.name, b.image_id)
+        np.testing.assert_allclose(a.cam_from_world, b.cam_from_world, atol=1e-13)
+    assert len(again.points) + done.points_lost == len(scene.points)
+
+
+def test_principal_point_in_the_centre(camera, make_distorted, tmp_path):
+    new = undistort(make_distorted(camera), tmp_path / "out", center=True).scene
+    target = new.frames[0].camera
+    assert target.params[2:] == (target.width / 2, target.height / 2)
+    plain = pinhole_camera(camera)
+    assert 0 < plain.width - target.width < 40 and 0 <= plain.height - target.height < 40
+
+
+def pinhole(**changes):
+    return dataclasses.replace(Camera(1, "PINHOLE", *SIZE, (F, F + 4, CX, CY)), **changes)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        pinhole(),
+        pinhole(model="SIMPLE_PINHOLE", params=(F, CX, CY)),
+        pinhole(model="OPENCV", params=(F, F + 4, CX, CY, 0, 0, 0, 0)),
+    ],
+    ids=lambda c: c.model,
+)
+def test_images_without_distortion_are_copied(make_distorted, tmp_path, camera):
+    as_opencv = Camera(1, "OPENCV", *SIZE, (*camera.K[[0, 1], [0, 1]], CX, CY, 0, 0, 0, 0))
+    scene = make_distorted(as_opencv)
+    scene = scene.with_frames([dataclasses.replace(f, camera=camera) for f in scene.frames])
+    done = undistort(scene, tmp_path / "out")
+    assert [change.is_copy for change in done.changes] == [True]
+    for a, b in zip(scene.frames, done.scene.frames, strict=True):
+        assert scene.image_path(a).read_bytes() == done.scene.image_path(b).read_bytes()
+        np.testing.assert_array_equal(a.camera.K, b.camera.K)
+    np.testing.assert_allclose(done.scene.points.track_xy, scene.points.track_xy, atol=1e-12)
+
+
+def test_centring_by_whole_pixels_keeps_pixels(make_distorted, tmp_path):
+    camera = Camera(1, "OPENCV", *SIZE, (F, F, 120.0, 100.0, 0, 0, 0, 0))
+    scene = make_distorted(camera)
+    new = undistort(scene, tmp_path / "out", center=True).scene
+    assert (new.frames[0].camera.width, new.frames[0].camera.height) == (240, 184)
+    for a, b in zip(scene.frames, new.frames, strict=True):
+        old = np.array(Image.open(scene.image_path(a)))
+        np.testing.assert_array_equal(np.array(Image.open(new.image_path(b))), old[8:192, 0:240])
+
+
+def test_files_of_another_size_than_their_camera(make_distorted, tmp_path):
+    """The camera is scaled to the file; observations follow."""
+    camera = Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"])
+    half = make_distorted(camera, size=(SIZE[0] // 2, SIZE[1] // 2))
+    done = undistort(half, tmp_path / "out")
+    (change,) = done.changes
+    assert (change.source.width, change.source.height) == (128, 96)
+    assert change.source.params[0] == F / 2
+    assert abs(change.target.width - 128) < 15
+    assert reprojection_errors(done.scene).max() < 1e-3
+
+
+def test_two_sizes_of_one_camera_become_two_cameras(make_distorted, tmp_path):
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]))
+    Image.new("RGB", (128, 96)).save(scene.image_path(scene.frames[0]))
+    again = undistort(scene, tmp_path / "out").scene
+    ids = [f.camera.camera_id for f in read_scene(tmp_path / "out").frames]
+    assert ids[0] == 1 and set(ids[1:]) == {2}
+    assert reprojection_errors(again).max() < 1e-3
+
+
+def test_points_without_observations_left_are_dropped(make_distorted, tmp_path):
+    """With the principal point near a corner, little is left around it."""
+    camera = Camera(1, "OPENCV", *SIZE, (F, F, 10.0, 10.0, 0, 0, 0, 0))
+    scene = make_distorted(camera)
+    done = undistort(scene, tmp_path / "out", center=True)
+    assert done.points_lost > 0
+    again = read_scene(tmp_path / "out")
+    assert len(again.points) == len(scene.points) - done.points_lost
+    assert (np.diff(again.points.track_start) > 0).all()
+    assert set(again.points.ids) < set(scene.points.ids)
+
+
+def test_observations_at_infinity_are_dropped(make_distorted, tmp_path):
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]))
+    xy = scene.points.track_xy.copy()
+    xy[0] = np.nan
+    scene = dataclasses.replace(scene, points=dataclasses.replace(scene.points, track_xy=xy))
+    done = undistort(scene, tmp_path / "out")
+    assert done.observations_lost >= 1
+    assert np.isfinite(done.scene.points.track_xy).all()
+
+
+def test_exif_and_quality_of_jpegs(make_distorted, tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0x9003] = "2020:01:02 03:04:05"
+    image, _ = blobs()
+    camera = Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"])
+    scene = make_distorted(camera, image, suffix=".jpg", exif=exif, quality=98)
+    new = undistort(scene, tmp_path / "out").scene
+    with Image.open(new.image_path(new.frames[0])) as result:
+        assert result.format == "JPEG"
+        assert result.getexif().get_ifd(0x8769)[0x9003] == "2020:01:02 03:04:05"
+
+
+def test_the_number_of_threads_does_not_matter(make_distorted, tmp_path):
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]))
+    for threads in (1, 3):
+        undistort(scene, tmp_path / str(threads), threads=threads)
+    for frame in scene.frames:
+        one, three = (tmp_path / n / "images" / frame.name for n in ("1", "3"))
+        assert one.read_bytes() == three.read_bytes()
+
+
+def test_progress(make_distorted, tmp_path):
+    seen = []
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]))
+    undistort(scene, tmp_path / "out", progress=lambda *counts: seen.append(counts))
+    assert seen == [(i, 6) for i in range(1, 7)]
+
+
+@pytest.mark.parametrize(
+    ("camera", "center", "message"),
+    [
+        (pinhole(params=(F, F, -3, 10)), True, "a principal point inside the image"),
+        (pinhole(params=(F, F, 0.5, 10)), True, "a principal point inside the image"),
+        (Camera(1, "EQUIRECTANGULAR", 64, 32, (64.0, 32.0)), False, "a perspective camera"),
+        (pinhole(width=70000, height=10), False, "at most 65535 pixels a side"),
+    ],
+)
+def test_cameras_that_are_refused(camera, center, message):
+    with pytest.raises(SceneError, match=f"camera 1: expected {message}"):
+        pinhole_camera(camera, center=center)
+
+
+def test_a_damaged_image_leaves_nothing_behind(make_distorted, tmp_path):
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]))
+    path = scene.image_path(scene.frames[2])
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(ImageError, match=r"2\.png: expected an image that can be decoded"):
+        undistort(scene, tmp_path / "target/out")
+    assert list((tmp_path / "target").iterdir()) == []
+
+
+def test_kinds_of_files_that_cannot_be_written(make_distorted, tmp_path):
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]), suffix=".gif")
+    with pytest.raises(SceneError, match=r"expected an image file that can be written: \.png"):
+        undistort(scene, tmp_path / "out")
+
+
+def test_a_folder_in_use_is_refused_before_the_work(make_distorted, tmp_path):
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]))
+    with pytest.raises(SceneError, match="expected a new or empty folder"):
+        undistort(scene, tmp_path)
