@@ -10,6 +10,8 @@ from typing import TypeVar
 import click
 
 from chronoscene.cli.output import emit
+from chronoscene.validation.finding import counted, printable
+from chronoscene.validation.fix import fix_scene
 from chronoscene.validation.report import counts
 from chronoscene.validation.report_html import write_html
 from chronoscene.validation.report_json import write_json
@@ -50,6 +52,12 @@ T = TypeVar("T")
     show_default=True,
     help="Decode all images: finds damaged pixels and copied images. Takes time.",
 )
+@click.option(
+    "--fix",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    help="Write a corrected copy to this new folder, and report what remains.",
+)
 @click.pass_context
 def command(
     context: click.Context,
@@ -62,16 +70,20 @@ def command(
     ignore: tuple[str, ...],
     strict: bool,
     decode: bool,
+    fix: Path | None,
 ) -> None:
     """Check a scene, or every scene in a folder, and report all problems.
 
     Exit status: 0 valid, 1 there are errors (with --strict: or warnings), 2 there is no scene, or
-    wrong usage. DATASET.md lists the rules. Nothing is written into the scene.
+    wrong usage. DATASET.md lists the rules. Nothing is written into the scene. With --fix, the
+    report and the exit status are of the corrected copy.
     """
     rules = choose_rules(_codes(select), _codes(ignore))
+    folders = find_folders(folder)
+    if fix is not None:
+        folders = _fix(folder, folders, fix)
     reports = [
-        validate_scene(path, rules=rules, decode=decode, track=_progress)
-        for path in find_folders(folder)
+        validate_scene(path, rules=rules, decode=decode, track=_progress) for path in folders
     ]
     emit(WRITERS[output_format](reports, strict=strict), out)
     for file, write in ((sarif, write_sarif), (html, write_html)):
@@ -80,6 +92,19 @@ def command(
     total = counts(reports)
     if total["error"] or (strict and total["warning"]):
         context.exit(NOT_VALID)
+
+
+def _fix(folder: Path, scenes: Sequence[Path], out: Path) -> list[Path]:
+    """Corrected copies of the scenes; what was done goes to standard error."""
+    copies = []
+    for scene in scenes:
+        copy = out if scene == folder else out / scene.name
+        repairs = fix_scene(scene, copy)
+        click.echo(printable(f"{copy}: {counted(len(repairs), 'correction')}"), err=True)
+        for repair in repairs:
+            click.echo(printable(f"  {repair.code or 'also'}: {repair.text}"), err=True)
+        copies.append(copy)
+    return copies
 
 
 def _codes(values: Iterable[str]) -> list[str]:

@@ -93,6 +93,8 @@ def _gather(data: bytes, offsets: NDArray[np.int64], lengths: NDArray[np.int64])
     return RawPoints(
         ids=ids.astype(np.int64),
         xyz=np.ascontiguousarray(heads["xyz"][order]),
+        rgb=np.ascontiguousarray(heads["rgb"][order]),
+        error=np.ascontiguousarray(heads["error"][order]),
         track_start=start,
         track_image=pairs[:, 0].astype(np.int64),
         track_keypoint=pairs[:, 1].astype(np.int64),

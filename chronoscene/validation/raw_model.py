@@ -98,6 +98,10 @@ class RawPoints:
     """[P]"""
     xyz: NDArray[np.float64]
     """World units. [P, 3]"""
+    rgb: NDArray[np.uint8]
+    """[P, 3]"""
+    error: NDArray[np.float64]
+    """As stored, in pixels. [P]"""
     track_start: NDArray[np.int64]
     """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
     track_image: NDArray[np.int64]

@@ -339,14 +339,18 @@ class RawScene:
         return read_pixels(self.root / "images", self.readable, self._track)
 
     def _text(self, place: str) -> TextFile | None:
-        path = self.root / place
-        try:
-            if not path.is_file():  # a pipe would block
-                return None
-            data = path.read_bytes()
-            return TextFile(data, decode_text(data))
-        except (OSError, UnicodeDecodeError):
+        return read_text_file(self.root / place)
+
+
+def read_text_file(path: Path) -> TextFile | None:
+    """A small text file, or None if it is absent, no file, or no text."""
+    try:
+        if not path.is_file():  # a pipe would block
             return None
+        data = path.read_bytes()
+        return TextFile(data, decode_text(data))
+    except (OSError, UnicodeDecodeError):
+        return None
 
 
 def is_safe(name: str) -> bool:

@@ -142,6 +142,8 @@ def read_points(path: Path) -> RawPoints:
     return RawPoints(
         ids=ids,
         xyz=np.ascontiguousarray(heads[order, 1:4]),
+        rgb=rgb[order].astype(np.uint8),
+        error=heads[order, 7].copy(),
         track_start=track_start,
         track_image=_integers(values[at]),
         track_keypoint=_integers(values[at + 1]),

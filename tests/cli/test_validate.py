@@ -146,3 +146,30 @@ def test_names_that_the_output_cannot_encode(good, monkeypatch):
     result = CliRunner(charset="ascii").invoke(cli, ["validate", str(good)])
     assert result.exit_code == 0
     assert "\\u043f" in result.stdout
+
+
+def test_fix_reports_what_it_did_and_what_remains(warned, tmp_path):
+    (warned / "images/a0.png").unlink()
+    arguments = ["validate", str(warned), "--fix", str(tmp_path / "fixed")]
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code == 1
+    assert "fixed: 1 correction\n  CS324: 1 line on images that are not in" in result.stderr
+    assert "CS201" in result.stdout and "CS324" not in result.stdout
+    assert (tmp_path / "fixed/sparse/0/test.txt").read_text() == "a3.png\nb3.png\n"
+
+
+def test_fix_of_several_scenes(make_scene_folder, tmp_path):
+    for name in ("one", "two"):
+        make_scene_folder(PERIODS, name=f"all/{name}", tests=["a3", "b3"])
+    status, text = run(tmp_path / "all", "--fix", tmp_path / "fixed")
+    assert status == 0 and "2 scenes, 0 not valid" in text
+    assert sorted(p.name for p in (tmp_path / "fixed").iterdir()) == ["one", "two"]
+
+
+def test_fix_into_the_scene_is_refused(good, monkeypatch, capsys):
+    arguments = ["chronoscene", "validate", str(good), "--fix", str(good / "fixed")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    assert "one inside the scene; choose another folder" in capsys.readouterr().err

@@ -30,12 +30,12 @@ def image_missing(scene: RawScene) -> Iterator[Hit]:
     present = set(scene.present)
     spellings: dict[str, str] = {}
     for file in scene.files:
-        for key in (_spelling(PurePosixPath(file).name), _spelling(file)):
+        for key in (spelling(PurePosixPath(file).name), spelling(file)):
             spellings[key] = file
     for name in scene.names:
         if name not in present:
-            near = spellings.get(_spelling(name)) or spellings.get(
-                _spelling(PurePosixPath(name).name)
+            near = spellings.get(spelling(name)) or spellings.get(
+                spelling(PurePosixPath(name).name)
             )
             found = "nothing" + (f"; there is {quote(near)}" if near else "")
             yield Hit(_place(name), "an image", found)
@@ -160,7 +160,7 @@ def _expected(camera: Camera) -> str:
     return f"{camera.width} x {camera.height} as in camera {camera.camera_id}"
 
 
-def _spelling(name: str) -> str:
+def spelling(name: str) -> str:
     """A key that ignores case and the two Unicode spellings of accented letters."""
     return unicodedata.normalize("NFC", name).casefold()
 
