@@ -1,0 +1,110 @@
+"""Stacked bars: images and points of all scenes by period."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from textwrap import shorten
+from typing import Any
+
+from chronoscene.figures.canvas import GREY, GRID, new_figure, quiet_axes, save
+from chronoscene.figures.colors import period_colors
+from chronoscene.stats.counts import PeriodCount, SceneCount
+
+BAR = 0.3
+"""Inches per scene."""
+WIDTH = 9.0
+MOST_IN_LEGEND = 12
+"""Periods up to which each has an entry."""
+
+
+def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
+    """Draw the counts of scenes, first scene on top.
+
+    Args:
+        counts: One per scene.
+        path: File to write; the suffix says the format.
+    """
+    periods = max(len(c.periods) for c in counts)
+    colors = period_colors(periods)
+    longest = max(len(_name(c)) for c in counts)
+    left, top, bottom = 0.25 + 0.075 * longest, 0.42, 0.5
+    height = top + bottom + BAR * (len(counts) + 0.4)
+    figure = new_figure(WIDTH, height)
+    gap = 0.35
+    width = (WIDTH - left - gap - 0.2) / 2
+    kinds: tuple[tuple[str, Callable[[PeriodCount], int]], ...] = (
+        ("images", lambda p: p.images),
+        ("points", lambda p: p.points),
+    )
+    for i, (what, of) in enumerate(kinds):
+        box = (left + i * (width + gap), bottom, width, height - top - bottom)
+        axes = figure.add_axes((box[0] / WIDTH, box[1] / height, box[2] / WIDTH, box[3] / height))
+        values = [[of(p) for p in c.periods] for c in counts]
+        _draw_panel(axes, what, values, colors)
+        axes.set_yticks(range(len(counts)), [_name(c) for c in counts] if i == 0 else [])
+        axes.tick_params(axis="y", length=0, labelsize=9)
+    _legend(figure, colors, 1 - 0.1 / height)
+    save(figure, path)
+
+
+def _name(count: SceneCount) -> str:
+    return shorten(count.name, 28, placeholder="...") or count.name[:28]
+
+
+def _draw_panel(
+    axes: Any, what: str, values: Sequence[Sequence[int]], colors: Sequence[str]
+) -> None:
+    """One bar per scene, its periods side by side, and their sum at the end."""
+    quiet_axes(axes)
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+    axes.grid(axis="x", color=GRID, linewidth=0.6)
+    sums = [sum(row) for row in values]
+    for p, color in enumerate(colors):
+        rows = [y for y, row in enumerate(values) if p < len(row)]
+        axes.barh(
+            rows,
+            [values[y][p] for y in rows],
+            left=[sum(values[y][:p]) for y in rows],
+            height=0.72,
+            color=color,
+            edgecolor="white",
+            linewidth=0.5,
+        )
+    largest = max(sums, default=0) or 1
+    for y, total in enumerate(sums):
+        text = axes.text(total + 0.012 * largest, y, f"{total:,}", va="center", fontsize=8)
+        text.set(color=GREY, bbox={"color": "white", "pad": 0.8})
+    axes.set_xlim(0, 1.17 * largest)
+    axes.set_ylim(len(values) - 0.45, -0.55)
+    axes.locator_params(axis="x", nbins=6, integer=True)
+    axes.xaxis.set_major_formatter(_short)
+    axes.set_xlabel(f"{what}, {sum(sums):,} in all", fontsize=9)
+
+
+def _short(value: float, _: int) -> str:
+    if value >= 1e6:
+        return f"{value / 1e6:g}M"
+    return f"{value / 1000:g}k" if value >= 10_000 else f"{value:,.0f}"
+
+
+def _legend(figure: Any, colors: Sequence[str], top: float) -> None:
+    """Names of the periods above the panels; of many only some."""
+    from matplotlib.patches import Patch
+
+    step = -(-len(colors) // MOST_IN_LEGEND)
+    shown = range(0, len(colors), step)
+    figure.legend(
+        [Patch(color=colors[i]) for i in shown],
+        [f"Period {i}" if i == 0 or len(shown) < 7 else str(i) for i in shown],
+        loc="upper center",
+        bbox_to_anchor=(0.5, top),
+        borderaxespad=0,
+        ncol=len(shown),
+        frameon=False,
+        fontsize=9,
+        handlelength=1.0,
+        handleheight=1.0,
+        columnspacing=1.4,
+    )

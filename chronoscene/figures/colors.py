@@ -1,0 +1,37 @@
+"""One colour per period."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FOUR = ("#d62839", "#f2b005", "#2368c4", "#2e9e4f")
+"""Red, yellow, blue, green: the colours of the paper's figures for up to four periods."""
+
+TEN = (
+    *("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9"),
+    *("#d55e00", "#b8a900", "#332288", "#882255", "#777777"),
+)
+"""Told apart with any common form of colour blindness.
+
+Source: Okabe and Ito 2008, with the yellow darkened for a white ground; the last three Tol 2021.
+"""
+
+_RAMP = ("#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#e8d21d")
+"""Dark to light, so the order can be seen without colours. Source: viridis, the end darkened."""
+
+
+def period_colors(periods: int) -> list[str]:
+    """Colours of the periods as ``#rrggbb``: four or ten that are far apart, else a ramp."""
+    for palette in (FOUR, TEN):
+        if periods <= len(palette):
+            return list(palette[:periods])
+    anchors = np.array([rgb_of(color) for color in _RAMP])
+    at = np.linspace(0, len(anchors) - 1, periods)
+    channels = [np.interp(at, np.arange(len(anchors)), anchors[:, c]) for c in range(3)]
+    return ["#{:02x}{:02x}{:02x}".format(*map(round, rgb)) for rgb in zip(*channels, strict=True)]
+
+
+def rgb_of(color: str) -> NDArray[np.float64]:
+    """Red, green and blue, 0..255, of ``#rrggbb``. [3]"""
+    return np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)], np.float64)

@@ -1,0 +1,123 @@
+"""Points as an image of their density, coloured by period: readable with any number of points.
+
+A scatter plot of half a million points shows only what was drawn last. Here the points of each
+period are counted per pixel; a pixel's opacity grows with the logarithm of all its points, and its
+colour is that of one of its periods, drawn by lot with their shares. Where periods overlap their
+colours lie side by side as fine grain, none on top of the other and none mixed to mud.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.figures.colors import rgb_of
+
+Array = NDArray[np.float64]
+
+FAINTEST = 0.5
+"""Opacity of a pixel with one point, where others have many."""
+DARK_QUANTILE = 0.97
+"""Of the pixels with points: the opacity of this many points is 1."""
+DOT_SHARE = 0.35
+"""Dots grow until about this share of the occupied area is covered."""
+LARGEST_DOT = 3
+"""Radius in pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A rectangle of the plane and the pixels that show it."""
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    width: int
+    height: int
+
+
+def count_points(xy: Array, group: NDArray[np.int64], groups: int, window: Window) -> Array:
+    """Points per pixel, the first row at the top.
+
+    Args:
+        xy: Positions; those outside of the window are not counted. [n, 2]
+        group: Of each point; negative ones are not counted. [n]
+        groups: Number of groups, G.
+        window: What is shown.
+
+    Returns:
+        Counts. [G, H, W]
+    """
+    low, high = np.array(window.low), np.array(window.high)
+    size = np.array([window.width, window.height])
+    with np.errstate(invalid="ignore"):
+        at = (xy - low) / (high - low) * size
+        inside = ((at >= 0) & (at < size)).all(axis=1) & (group >= 0)
+    column, row = at[inside].astype(np.int64).T
+    flat = (group[inside] * window.height + window.height - 1 - row) * window.width + column
+    shape = (groups, window.height, window.width)
+    return np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.float64)
+
+
+def dot_radius(points: int, occupied: int) -> int:
+    """Radius in pixels of the dots, so that few points can be seen and many do not clot.
+
+    Args:
+        points: Number of points.
+        occupied: Pixels of the area that they lie in.
+    """
+    radius = 0
+    while radius < LARGEST_DOT and points * _disc(radius + 1).sum() < DOT_SHARE * occupied:
+        radius += 1
+    return radius
+
+
+def grow_dots(counts: Array, radius: int) -> Array:
+    """Give every point a disc of this radius instead of a pixel. [G, H, W]"""
+    if radius == 0:
+        return counts
+    disc = _disc(radius)
+    padded = np.pad(counts, ((0, 0), (radius, radius), (radius, radius)))
+    height, width = counts.shape[1:]
+    grown = np.zeros_like(counts)
+    for dy, dx in np.argwhere(disc):
+        grown += padded[:, dy : dy + height, dx : dx + width]
+    return grown
+
+
+def _disc(radius: int) -> NDArray[np.bool_]:
+    axis = np.arange(-radius, radius + 1)
+    return np.asarray(axis[:, None] ** 2 + axis**2 <= (radius + 0.4) ** 2)
+
+
+def shade(counts: Array, colors: Sequence[str], *, seed: int = 0) -> NDArray[np.uint8]:
+    """Counts to colours; equal counts and seeds give equal bytes.
+
+    Args:
+        counts: Points of each group per pixel. [G, H, W]
+        colors: ``#rrggbb`` of each group.
+        seed: Of the lots.
+
+    Returns:
+        RGBA, transparent where there are no points. [H, W, 4]
+    """
+    total = counts.sum(axis=0)
+    image = np.zeros((*total.shape, 4), np.uint8)
+    rows, columns = np.nonzero(total)
+    if not len(rows):
+        return image
+    here = total[rows, columns]
+    lot = np.random.default_rng(seed).random(len(here)) * here
+    shares = np.cumsum(counts[:, rows, columns], axis=0)
+    chosen = np.minimum((lot >= shares).sum(axis=0), len(colors) - 1)
+    image[rows, columns, :3] = np.array([rgb_of(c) for c in colors])[chosen]
+    image[rows, columns, 3] = np.round(255 * opacity(here))
+    return image
+
+
+def opacity(counts: Array) -> Array:
+    """From `FAINTEST` for one point to 1 for as many as the densest pixels have. [n]"""
+    dark = max(float(np.quantile(counts, DARK_QUANTILE)), 2.0)
+    return np.clip(FAINTEST + (1 - FAINTEST) * np.log(counts) / np.log(dark), FAINTEST, 1.0)
