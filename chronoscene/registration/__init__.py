@@ -1,0 +1,1 @@
+"""Several captures of one place, years apart, in one COLMAP frame, and how well that went."""

@@ -1,0 +1,189 @@
+"""From GPS to metres: a local east-north-up frame, and which positions deserve belief.
+
+The frame is topocentric (EPSG method 9837) around the median position: no map projection, so no
+distortion, and no geoid grid is needed, because heights are taken as the photos state them. Heights
+above the sea instead of the ellipsoid shift the frame upwards as a whole and bend nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.registration.captures import Capture
+
+HeightKind = Literal["as stated", "relative", "none"]
+
+GROSS_FACTOR = 20.0
+"""A position this many times farther from the median than the median distance is wrong, whatever
+the route says; nearer ones are judged when there are poses to compare with."""
+
+GROSS_METRES = 200.0
+"""Nothing nearer to the median than this is called wildly wrong."""
+
+CONSTANT_METRES = 0.5
+"""Positions that all lie within this radius say nothing about the motion of the camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Georeference:
+    """A local frame: x east, y north, z up, in metres, around an origin on WGS 84."""
+
+    latitude: float
+    """Degrees, of the origin."""
+    longitude: float
+    height: float
+    """Metres, of the origin, in the sense of ``height_kind``."""
+    height_kind: HeightKind
+    """``as stated`` (sea level or ellipsoid: cameras do not say), ``relative`` (above take-off, from
+    the barometer) or ``none`` (unknown: all are set to zero)."""
+
+    @property
+    def crs(self) -> str:
+        """The frame in words that PROJ understands: the last step of a pipeline."""
+        return (
+            f"+proj=topocentric +ellps=WGS84 +lat_0={self.latitude!r} +lon_0={self.longitude!r} "
+            f"+h_0={self.height!r}"
+        )
+
+    def to_enu(
+        self,
+        latitude: NDArray[np.float64],
+        longitude: NDArray[np.float64],
+        height: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Metres east, north and up of the origin. [N] each -> [N, 3]"""
+        x, y, z = _pipeline(self.crs).transform(longitude, latitude, height)
+        return np.stack([np.asarray(a, np.float64) for a in (x, y, z)], axis=-1)
+
+    def to_geodetic(self, enu: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Latitude, longitude (degrees) and height (metres): inverse of `to_enu`. [N, 3]"""
+        inverse: Any = "INVERSE"
+        lon, lat, height = _pipeline(self.crs).transform(
+            *np.moveaxis(enu, -1, 0), direction=inverse
+        )
+        return np.stack([lat, lon, height], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Positions:
+    """What the photos say about where they were taken, in a frame if there is one."""
+
+    georeference: Georeference | None
+    """None without at least three photos with positions that differ."""
+    enu: NDArray[np.float64]
+    """NaN where a photo has none. [N, 3]"""
+    sigma: NDArray[np.float64]
+    """Standard deviation, metres, NaN where there is none. [N, 3]"""
+    believed: NDArray[np.bool_]
+    """Not missing, not wildly wrong. [N]"""
+    remarks: tuple[str, ...]
+    """What was found out, for the log."""
+
+
+def locate(captures: Sequence[Capture]) -> Positions:
+    """Put the positions of captures into one local frame.
+
+    Wildly wrong positions (kilometres off among hundreds of metres, or another continent) are
+    found by their distance from the median; subtler errors are left to the comparison with poses.
+    """
+    count = len(captures)
+    nothing = np.full((count, 3), np.nan)
+    none = np.zeros(count, bool)
+    has = np.array([c.gps is not None for c in captures], bool)
+    if has.sum() < 3:
+        remark = f"{int(has.sum())} of {count} photos have a GPS position: too few for a frame"
+        return Positions(None, nothing, nothing, none, (remark,))
+    latitude, longitude = (np.full(count, np.nan) for _ in range(2))
+    for i in np.flatnonzero(has):
+        gps = captures[i].gps
+        assert gps is not None
+        latitude[i], longitude[i] = gps.latitude, gps.longitude
+    height, kind, remarks = _heights(captures, has)
+    frame = Georeference(
+        latitude=round(float(np.nanmedian(latitude)), 7),
+        longitude=round(_median_angle(longitude[has]), 7),
+        height=round(float(np.median(height[has])), 2),
+        height_kind=kind,
+    )
+    enu = nothing.copy()
+    enu[has] = frame.to_enu(latitude[has], longitude[has], height[has])
+    believed, more = _plausible(captures, enu, has)
+    remarks += more
+    sigma = np.stack([_sigma(c, kind) for c in captures])
+    spread = np.linalg.norm(enu[believed] - np.median(enu[believed], axis=0), axis=1)
+    if believed.sum() < 3 or spread.max() < CONSTANT_METRES:
+        remarks.append(
+            f"the GPS positions all lie within {CONSTANT_METRES} m: one fix for all photos, of no use"
+        )
+        return Positions(None, nothing, nothing, none, tuple(remarks))
+    remarks.insert(0, f"{int(has.sum())} of {count} photos have a GPS position; frame {frame.crs}")
+    return Positions(frame, enu, sigma, believed, tuple(remarks))
+
+
+def _heights(
+    captures: Sequence[Capture], has: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], HeightKind, list[str]]:
+    """One kind of height for all photos: mixing kinds would tilt or tear the frame."""
+    count = len(captures)
+    stated, relative = np.full(count, np.nan), np.full(count, np.nan)
+    for i in np.flatnonzero(has):
+        gps = captures[i].gps
+        assert gps is not None
+        stated[i] = np.nan if gps.altitude is None else gps.altitude
+        relative[i] = np.nan if gps.relative_altitude is None else gps.relative_altitude
+    if np.isfinite(stated[has]).all():
+        return stated, "as stated", []
+    if np.isfinite(relative[has]).all():
+        return relative, "relative", ["heights are those above take-off: no others are stated"]
+    known = np.isfinite(stated)
+    if known.sum() >= 0.5 * has.sum():
+        filled = np.where(known, stated, np.nanmedian(stated))
+        missing = int((has & ~known).sum())
+        return filled, "as stated", [f"{missing} photos state no height and get the median"]
+    return np.zeros(count), "none", ["most photos state no height: all are taken as 0"]
+
+
+def _median_angle(degrees: NDArray[np.float64]) -> float:
+    """Median of longitudes, also across 180 degrees."""
+    first = degrees[0]
+    turned = (degrees - first + 180) % 360 - 180
+    return float((np.median(turned) + first + 180) % 360 - 180)
+
+
+def _plausible(
+    captures: Sequence[Capture], enu: NDArray[np.float64], has: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], list[str]]:
+    """Which positions are not wildly wrong, and the names of the others."""
+    distance = np.linalg.norm(enu[:, :2] - np.median(enu[has][:, :2], axis=0), axis=1)
+    limit = max(GROSS_METRES, GROSS_FACTOR * float(np.median(distance[has])))
+    wild = has & ~(np.nan_to_num(distance, nan=0.0) <= limit)
+    remarks = [
+        f"{captures[i].name}: GPS is {distance[i] / 1000:.1f} km from the others: not believed"
+        for i in np.flatnonzero(wild)
+    ]
+    return has & ~wild, remarks
+
+
+def _sigma(capture: Capture, kind: HeightKind) -> NDArray[np.float64]:
+    """Standard deviations east, north, up, in metres."""
+    if capture.gps is None:
+        return np.full(3, np.nan)
+    sigma = np.array(capture.gps.sigma)
+    if kind == "none":
+        sigma[2] = max(sigma[2], 100.0)
+    return sigma
+
+
+def _pipeline(crs: str) -> Any:
+    """Longitude, latitude, height in degrees and metres to the frame."""
+    import pyproj
+
+    return pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+        f"+step +proj=cart +ellps=WGS84 +step {crs}"
+    )

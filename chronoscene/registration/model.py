@@ -1,0 +1,108 @@
+"""What a registration gives: poses of all periods in one frame, points, and what was held out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.registration.georeference import Georeference
+from chronoscene.scene import Camera
+
+Route = Literal["joint", "frozen", "separate"]
+
+ROUTES: tuple[Route, ...] = ("joint", "frozen", "separate")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CrossMatches:
+    """Verified matches between two images of different periods that took no part in estimation.
+
+    Whole tracks are held out: no match of any of these keypoints, within a period or across,
+    reached the mapper.
+    """
+
+    image_a: int
+    """Index into `Registered.names`; its period is the earlier one."""
+    image_b: int
+    xy_a: NDArray[np.float64]
+    """Pixels in ``cameras[image_a]``, with its distortion. [M, 2]"""
+    xy_b: NDArray[np.float64]
+    """[M, 2]"""
+    track: NDArray[np.int64]
+    """Held-out track of each match: index of a track in `HeldOutTracks`. [M]"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOutTracks:
+    """The observations of held-out tracks in registered images, flat and grouped by track.
+
+    A track has at most one observation an image and is seen in at least two periods, so that it
+    can be triangulated in one and projected into another.
+    """
+
+    start: NDArray[np.int64]
+    """Observations of track i are ``start[i]:start[i + 1]``. [K + 1]"""
+    image: NDArray[np.int64]
+    """Index into `Registered.names`. [O]"""
+    xy: NDArray[np.float64]
+    """[O, 2]"""
+
+    @classmethod
+    def empty(cls) -> HeldOutTracks:
+        return cls(np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registered:
+    """What a route produced: one model of all periods, in metres where georeferenced.
+
+    N registered images, P points, O observations.
+    """
+
+    names: tuple[str, ...]
+    """Registered images, sorted, unique: paths below the folder of the prepared photos."""
+    periods: NDArray[np.int64]
+    """Period of each image. [N]"""
+    cam_from_world: NDArray[np.float64]
+    """[N, 4, 4]"""
+    cameras: tuple[Camera, ...]
+    """Camera of each image, with its distortion. [N]"""
+    points: NDArray[np.float64]
+    """[P, 3]"""
+    colors: NDArray[np.uint8]
+    """[P, 3]"""
+    track_start: NDArray[np.int64]
+    """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
+    track_image: NDArray[np.int64]
+    """Index into ``names``. [O]"""
+    track_xy: NDArray[np.float64]
+    """Pixels of the observations. [O, 2]"""
+    unregistered: Mapping[str, str]
+    """Name of each image that has no pose, and why. A photo that was refused is under its path."""
+    unregistered_periods: Mapping[str, int]
+    """Period of each of them."""
+    route: Route
+    gps_enu: NDArray[np.float64]
+    """Position by the photo's own GPS in the frame of the model, whether it was believed or not;
+    NaN where there is none. [N, 3]"""
+    gps_used: NDArray[np.bool_]
+    """Whether the position took part in the estimation. [N]"""
+    georeference: Georeference | None
+    """None where the frame has no known place; its scale is then arbitrary."""
+    num_periods: int
+    labels: tuple[str, ...]
+    dates: tuple[str | None, ...]
+    """ISO dates of the periods."""
+    held_out: tuple[CrossMatches, ...]
+    held_out_tracks: HeldOutTracks
+    images_root: str
+    """Folder in which ``names`` are found: photos as the cameras above describe them."""
+
+    @property
+    def unit(self) -> str:
+        """``metre``, or ``unknown``."""
+        return "unknown" if self.georeference is None else "metre"
