@@ -46,6 +46,8 @@ def reproject(
     Distortion is not applied: errors mean something for pinhole cameras only.
     """
     good = good_poses(images)
+    with np.errstate(all="ignore"):
+        rotations = rotation_from_quaternion(images.quaternions)
     # Columns by themselves: numpy is several times slower along a short last axis.
     xyz = np.ascontiguousarray(points.xyz.T)
     uv = np.ascontiguousarray(images.keypoint_xy.T)
@@ -55,7 +57,7 @@ def reproject(
             continue
         place, (u, v) = xyz[:, seen.point[rows]], uv[:, seen.keypoint[rows]]
         with np.errstate(all="ignore"):  # infinite for absurd poses
-            depth, x, y = project(images, image, camera.K, *place)
+            depth, x, y = project(rotations[image], images.translations[image], camera.K, *place)
             error = np.sqrt((x - u) ** 2 + (y - v) ** 2)
         # What is not finite in points and keypoints has rules of its own.
         known = np.isfinite(place).all(axis=0) & np.isfinite(u) & np.isfinite(v)
@@ -67,10 +69,11 @@ def reproject(
 
 
 def project(
-    images: RawImages, image: int, K: Array, x: Array, y: Array, z: Array
+    rotation: Array, translation: Array, K: Array, x: Array, y: Array, z: Array
 ) -> tuple[Array, Array, Array]:
     """Depth, and pixel position along x and y, of points at ``x, y, z`` in the world. [m] each"""
-    r = rotation_from_quaternion(images.quaternions[image])
-    t = images.translations[image]
-    right, down, depth = (r[i, 0] * x + r[i, 1] * y + r[i, 2] * z + t[i] for i in range(3))
+    right, down, depth = (
+        row[0] * x + row[1] * y + row[2] * z + shift
+        for row, shift in zip(rotation.tolist(), translation.tolist(), strict=True)
+    )
     return depth, right / depth * K[0, 0] + K[0, 2], down / depth * K[1, 1] + K[1, 2]

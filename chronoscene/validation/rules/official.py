@@ -25,6 +25,9 @@ VOXEL, NEAR = 0.001, 0.2
 LOST = 0.1
 """Share of points or observations that is worth a word."""
 
+SAMPLE = 10_000
+"""Points from which the extent of the scene is taken."""
+
 CROWDED = 10
 """Points lie on surfaces: on a square of side a, n points are about a / sqrt(n) apart. Where that
 is so many voxels, no two of them share one."""
@@ -196,7 +199,7 @@ def _is_small(xyz: NDArray[np.float64]) -> bool:
     if len(xyz) < 2:
         return False
     with np.errstate(over="ignore"):
-        low, high = np.percentile(xyz, [5, 95], axis=0)
+        low, high = np.percentile(xyz[:: len(xyz) // SAMPLE + 1], [5, 95], axis=0)
         return bool(np.max(high - low) < VOXEL * len(xyz) ** 0.5 * CROWDED)
 
 
