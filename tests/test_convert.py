@@ -162,6 +162,14 @@ def test_losses(make_scene_folder):
     ]
 
 
+def test_other_files_are_remarked_upon(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    (folder / "gt").mkdir()
+    (folder / "README").write_text("")
+    done = convert(folder, tmp_path / "out")
+    assert done.warnings == ("not part of the format, and not converted: README, gt/",)
+
+
 def test_obstacles(make_scene_folder):
     scene = read_scene(make_scene_folder())
     assert obstacles(scene) == []

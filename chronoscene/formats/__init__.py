@@ -64,18 +64,29 @@ def detect_format(path: Path) -> str:
             found=f"marks of {' and '.join(matching)}",
             todo="name the one that is meant with --format (stats: --dataset-format)",
         )
-    from chronoscene.colmap import model_kind  # pycolmap, loaded by the formats by now
-
     looked_for = "; ".join(f"{name}: {module.MARKS}" for name, module in modules.items())
     content = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
     raise SceneError(
         path,
         expected=f"a scene of a known format ({looked_for})",
         found=", ".join(content[:8]) + (", ..." if len(content) > 8 else "") or "an empty folder",
-        todo="move this COLMAP model to sparse/0 in a folder with images/"
-        if model_kind(path)
-        else "give the folder of one scene; DATASET.md describes its files",
+        todo=_advice(path),
     )
+
+
+def _advice(path: Path) -> str:
+    """What to do about a folder that no format matches."""
+    from chronoscene.colmap import model_kind  # pycolmap, loaded by the formats by now
+    from chronoscene.formats.colmap_layout import find_model
+
+    if model_kind(path):
+        return "move this COLMAP model to sparse/0 in a folder with images/"
+    if find_model(path) and (path / "images").is_dir():
+        return (
+            "say which image is of which period: write sparse/split.txt, or convert it with "
+            "--format colmap-folders --period-by table:FILE"
+        )
+    return "give the folder of one scene; DATASET.md describes its files"
 
 
 def find_scenes(path: Path, *, format: str | None = None) -> list[Path]:

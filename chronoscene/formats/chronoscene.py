@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterable
 from datetime import date
@@ -77,6 +76,13 @@ def read(path: Path) -> Scene:
         format=NAME,
         world=read_world(path),
     )
+
+
+def remarks(path: Path) -> list[str]:
+    """What a folder has that is not part of the format."""
+    others = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
+    others = [name for name in others if name not in ("images/", "sparse/")]
+    return [f"not part of the format, and not converted: {', '.join(others)}"] if others else []
 
 
 def raise_first(path: Path, problems: Iterable[Problem]) -> None:
@@ -159,7 +165,7 @@ def read_periods(path: Path, count: int) -> tuple[Period, ...]:
         )
     if not (path / PERIODS).exists():
         return tuple(Period(i, str(i)) for i in range(count))
-    return parse_periods(path / PERIODS, _read_json(path / PERIODS, list), count)
+    return parse_periods(path / PERIODS, read_json(path / PERIODS, list), count)
 
 
 def parse_periods(place: Path, items: list[Any], count: int) -> tuple[Period, ...]:
@@ -169,7 +175,7 @@ def parse_periods(place: Path, items: list[Any], count: int) -> tuple[Period, ..
         SceneError: If they are damaged or not those with the ids 0 to ``count - 1``.
     """
     if [item.get("id") if isinstance(item, dict) else None for item in items] != [*range(count)]:
-        raise _json_error(place, f"objects with ids 0..{count - 1} in order", "others")
+        raise json_error(place, f"objects with ids 0..{count - 1} in order", "others")
     return tuple(_parse_period(place, item) for item in items)
 
 
@@ -177,9 +183,9 @@ def _parse_period(place: Path, item: dict[str, Any]) -> Period:
     _check_keys(place, item, {"id", "label", "date"})
     label, when = item.get("label", str(item["id"])), item.get("date")
     if not isinstance(label, str) or not label.strip():
-        raise _json_error(place, "a label that is a text", repr(label))
+        raise json_error(place, "a label that is a text", repr(label))
     if when is not None and not (isinstance(when, str) and is_iso_date(when)):
-        raise _json_error(place, "a date YYYY, YYYY-MM or YYYY-MM-DD, or null", repr(when))
+        raise json_error(place, "a date YYYY, YYYY-MM or YYYY-MM-DD, or null", repr(when))
     return Period(item["id"], label, when)
 
 
@@ -199,7 +205,7 @@ def read_world(path: Path) -> WorldFrame:
     place = path / WORLD
     if not place.exists():
         return WorldFrame()
-    return parse_world(place, _read_json(place, dict))
+    return parse_world(place, read_json(place, dict))
 
 
 def parse_world(place: Path, data: dict[str, Any]) -> WorldFrame:
@@ -212,33 +218,43 @@ def parse_world(place: Path, data: dict[str, Any]) -> WorldFrame:
     unit, crs, offset = data.get("unit", "unknown"), data.get("crs"), data.get("offset", [0, 0, 0])
     check_choice(f"{place}: unit", str(unit), ("metre", "unknown"), error=SceneError)
     if crs is not None and not isinstance(crs, str):
-        raise _json_error(place, "a crs such as EPSG:32650, or null", repr(crs))
-    numbers = isinstance(offset, list) and all(
-        type(x) in (int, float) and math.isfinite(x) for x in offset
-    )
-    if not numbers or len(offset) != 3:
-        raise _json_error(place, "an offset of three numbers", repr(offset))
+        raise json_error(place, "a crs such as EPSG:32650, or null", repr(crs))
+    if not (isinstance(offset, list) and len(offset) == 3 and all(map(is_number, offset))):
+        raise json_error(place, "an offset of three numbers", repr(offset))
     return WorldFrame(unit, crs, (float(offset[0]), float(offset[1]), float(offset[2])))
 
 
-def _read_json(place: Path, kind: type) -> Any:
+def is_number(value: object) -> bool:
+    """Whether a JSON value is a finite number, and no integer beyond what a float can hold."""
+    return type(value) in (int, float) and -1e300 < value < 1e300  # type: ignore[operator]
+
+
+def read_json(place: Path, kind: type) -> Any:
+    """Read a JSON file that holds a list or an object.
+
+    Raises:
+        SceneError: If the file is missing, holds something else, or a text that is no Unicode.
+    """
+    text = read_text(place)
     try:
-        data = json.loads(read_text(place))
+        data = json.loads(text)
+        if re.search(r"\\u[dD][89a-fA-F]", text):  # half of a pair of codes, perhaps alone
+            json.dumps(data, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
-        raise _json_error(place, "JSON", str(error)) from error
+        raise json_error(place, "JSON", str(error)) from error
     if not isinstance(data, kind):
-        raise _json_error(
-            place, "a list" if kind is list else "an object", f"{type(data).__name__}"
-        )
+        expected = "a list" if kind is list else "an object"
+        raise json_error(place, expected, type(data).__name__)
     return data
 
 
 def _check_keys(place: Path, item: dict[str, Any], known: set[str]) -> None:
     if unknown := sorted(item.keys() - known):
-        raise _json_error(place, f"only the keys {', '.join(sorted(known))}", ", ".join(unknown))
+        raise json_error(place, f"only the keys {', '.join(sorted(known))}", ", ".join(unknown))
 
 
-def _json_error(place: Path, expected: str, found: str) -> SceneError:
+def json_error(place: object, expected: str, found: str) -> SceneError:
+    """Something wrong in a JSON file."""
     return SceneError(place, expected=expected, found=found, todo="see DATASET.md")
 
 

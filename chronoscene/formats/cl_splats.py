@@ -16,6 +16,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from chronoscene.formats.chronoscene import read_json
 from chronoscene.formats.colmap_layout import find_model, make_scene, read_images, scan
 from chronoscene.formats.grouping import group_labels, natural_key, rule_error
 from chronoscene.formats.ply import read_points
@@ -27,7 +28,6 @@ from chronoscene.formats.transforms import (
     matrix,
     pose_from_opengl,
     read_frames,
-    read_object,
 )
 from chronoscene.formats.transforms import make_scene as scene_from_shots
 from chronoscene.scene import Points, Scene
@@ -127,7 +127,7 @@ def _read_level(path: Path, period_by: str) -> Scene:
 
 def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list[Shot]:
     place = path / folder / file
-    data = read_object(place)
+    data = read_json(place, dict)
     shots = []
     for i, frame in enumerate(read_frames(place, data)):
         where = f"{place}: frames[{i}]"

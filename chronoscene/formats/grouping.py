@@ -31,10 +31,11 @@ _CALENDAR = {"year": 4, "month": 7, "day": 10}
 """Characters of an ISO date that images of one period share."""
 
 
-def natural_key(text: str) -> tuple[tuple[int, int | str], ...]:
-    """Sorts ``t2`` before ``t10``."""
+def natural_key(text: str) -> tuple[tuple[tuple[int, int | str], ...], str]:
+    """Sorts ``t2`` before ``t10``; texts that differ in leading zeros alone by the text."""
     parts = re.findall(r"[0-9]{1,18}|[^0-9]+", text)
-    return tuple((0, int(part)) if part[0] in "0123456789" else (1, part) for part in parts)
+    numbers = tuple((0, int(part)) if part[0] in "0123456789" else (1, part) for part in parts)
+    return numbers, text
 
 
 def group_dates(dates: Mapping[str, date], by: str) -> Grouped:

@@ -24,6 +24,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from chronoscene.errors import SceneError
+from chronoscene.formats.chronoscene import json_error, read_json
 from chronoscene.formats.colmap_layout import scan
 from chronoscene.formats.grouping import Grouped, group_labels, natural_key, rule_error
 from chronoscene.formats.transforms import (
@@ -31,12 +32,10 @@ from chronoscene.formats.transforms import (
     Shot,
     head_has,
     image_name,
-    json_error,
     make_scene,
     matrix,
     pose_from_opengl,
     read_frames,
-    read_object,
 )
 from chronoscene.images import image_size
 from chronoscene.scene import Period, Points, Scene, WorldFrame
@@ -180,7 +179,7 @@ def _pose_files(path: Path) -> list[PoseFile]:
 
 def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[Shot]:
     place = path / file.folder / file.name
-    data = read_object(place)
+    data = read_json(place, dict)
     shots: list[Shot] = []
     for i, frame in enumerate(read_frames(place, data)):
         where = f"{place}: frames[{i}]"

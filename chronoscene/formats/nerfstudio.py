@@ -26,9 +26,11 @@ from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.chronoscene import (
     MOST_PERIODS,
     check_name,
+    json_error,
     parse_periods,
     parse_world,
     period_items,
+    read_json,
     world_item,
 )
 from chronoscene.formats.grouping import (
@@ -47,7 +49,6 @@ from chronoscene.formats.transforms import (
     check_distinct,
     head_has,
     image_name,
-    json_error,
     make_scene,
     matrix,
     nearest_rotation,
@@ -55,7 +56,6 @@ from chronoscene.formats.transforms import (
     opengl_from_pose,
     pose_from_opengl,
     read_frames,
-    read_object,
 )
 from chronoscene.formats.writing import ImageSource, Progress, place_images, staged_folder
 from chronoscene.geometry import Sim3
@@ -93,7 +93,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     """
     path = Path(path)
     place = path / FILE
-    data = read_object(place)
+    data = read_json(place, dict)
     frames = read_frames(place, data)
     shots = _read_shots(path, data, frames)
     extras = {shot.name: frame for shot, frame in zip(shots, frames, strict=True)}
@@ -117,7 +117,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
 
 def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
-    data = read_object(path / FILE)
+    data = read_json(path / FILE, dict)
     frames = read_frames(path / FILE, data)
     found = [
         f"{what} of {count} frames are not read"

@@ -7,7 +7,6 @@ and image paths must stay inside the scene folder.
 
 from __future__ import annotations
 
-import json
 import math
 import posixpath
 from collections.abc import Mapping, Sequence
@@ -18,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.errors import SceneError
+from chronoscene.formats.chronoscene import is_number, json_error
 from chronoscene.images import image_size
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
-from chronoscene.splits import read_text, split_of
+from chronoscene.splits import split_of
 
 LARGEST_SIDE = 1_000_000
 """Pixels; beyond any image."""
@@ -56,32 +55,12 @@ class Shot:
     """0 where the file does not say."""
 
 
-def read_object(place: Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        SceneError: If the file is missing or holds something else.
-    """
-    try:
-        data = json.loads(read_text(place))
-    except (ValueError, RecursionError) as error:
-        raise json_error(place, "JSON", str(error)) from error
-    if not isinstance(data, dict):
-        raise json_error(place, "a JSON object", type(data).__name__)
-    return data
-
-
 def read_frames(place: Path, data: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The list ``frames``, which has at least one object."""
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise json_error(place, "a list of frames", "none")
     return frames
-
-
-def json_error(place: object, expected: str, found: str) -> SceneError:
-    """Something wrong in a file of this family."""
-    return SceneError(place, expected=expected, found=found, todo="see DATASET.md, Other formats")
 
 
 def head_has(path: Path, text: str, *, length: int = 65536) -> bool:
@@ -120,12 +99,8 @@ def number(place: object, data: Mapping[str, Any], key: str) -> float | None:
     value = data.get(key)
     if value is None:
         return None
-    try:
-        valid = type(value) in (int, float) and math.isfinite(value)
-        if valid:
-            return float(value)
-    except OverflowError:
-        pass
+    if is_number(value):
+        return float(value)
     raise json_error(place, f"a finite number as {key}", repr(value)[:40])
 
 
@@ -241,14 +216,13 @@ def _model(place: object, data: Mapping[str, Any]) -> tuple[str, tuple[float, ..
     if named is not None and named not in tuple(MODEL_KEYS):
         raise json_error(place, f"a camera_model {', '.join(MODEL_KEYS)}", repr(named)[:40])
     used = {key for key, value in values.items() if value}
-    fisheye = named == "OPENCV_FISHEYE" or bool(data.get("is_fisheye"))
-    if named is None:
-        named = "OPENCV" if used else "PINHOLE"
-    if fisheye:
+    if data.get("is_fisheye"):
         named = "OPENCV_FISHEYE"
-    if not used <= set(MODEL_KEYS[named]) and not fisheye:
+    elif named is None:
+        named = "OPENCV" if used else "PINHOLE"
+    if named != "OPENCV_FISHEYE" and not used <= set(MODEL_KEYS[named]):
         named = "OPENCV"
-    if named == "OPENCV" and used - {"k3"} <= set(MODEL_KEYS["OPENCV"]) and "k3" in used:
+    if named == "OPENCV" and "k3" in used and "k4" not in used:
         ks = (values[key] for key in ("k1", "k2", "p1", "p2", "k3"))
         return "FULL_OPENCV", (*ks, 0.0, 0.0, 0.0)
     if wrong := sorted(used - set(MODEL_KEYS[named])):

@@ -173,6 +173,7 @@ def test_a_huge_period_id_is_refused_before_anything_is_allocated(make_scene_fol
         ("periods.json", '[{"id": 0}, {"id": 1, "date": "17.4.2023"}]'),
         ("periods.json", '[{"id": 0}, {"id": 1, "date": 2023}]'),
         ("periods.json", "[" * 100_000),
+        ("periods.json", '[{"id": 0, "label": "\\ud800"}, {"id": 1}]'),
         ("world.json", "[]"),
         ("world.json", "{"),
         ("world.json", '{"unit": "yard"}'),
@@ -181,6 +182,7 @@ def test_a_huge_period_id_is_refused_before_anything_is_allocated(make_scene_fol
         ("world.json", '{"offset": [1, 2]}'),
         ("world.json", '{"offset": [1, 2, NaN]}'),
         ("world.json", '{"offset": [1, 2, true]}'),
+        ("world.json", '{"offset": [1, 2, 1' + "0" * 400 + "]}"),
     ],
 )
 def test_labels_and_worlds_that_are_refused(make_scene_folder, file, text):

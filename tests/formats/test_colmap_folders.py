@@ -3,9 +3,12 @@
 import dataclasses
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import colmap_folders, detect_format, read_scene
+from chronoscene.formats.grouping import natural_key
 from chronoscene.scene import Period
 
 DATED = ["2016/a.png", "2016/b.png", "2023-04/a.png", "2023-04/c/d.png"]
@@ -142,6 +145,29 @@ def test_tracks_follow_frames_that_change_places(make_scene_folder, tmp_path):
 def test_folders_are_in_the_order_of_the_periods_and_safe(labels, folders):
     periods = tuple(Period(i, label) for i, label in enumerate(labels))
     assert colmap_folders.period_folders(periods) == folders
+
+
+@given(st.lists(st.text(max_size=8), min_size=1, max_size=12))
+def test_any_labels_become_folders_in_order(labels):
+    periods = tuple(Period(i, label) for i, label in enumerate(labels))
+    folders = colmap_folders.period_folders(periods)
+    assert sorted(set(folders), key=natural_key) == folders
+    for folder in folders:
+        assert folder not in ("", ".", "..") and folder == folder.strip()
+        assert "/" not in folder and "\n" not in folder and "\r" not in folder
+
+
+def test_folders_that_differ_in_zeros_have_one_order(colmap_folder):
+    names = [f"{folder}/a.png" for folder in ("t1", "t01", "t001")]
+    assert [p.label for p in read_scene(colmap_folder(names)).periods] == ["t001", "t01", "t1"]
+
+
+def test_images_without_periods_are_refused_with_the_way_out(colmap_folder):
+    folder = colmap_folder(["a.png", "b.png"])
+    with pytest.raises(
+        SceneError, match=r"sparse/split\.txt, or convert it with --format colmap-f"
+    ):
+        read_scene(folder)
 
 
 def test_written_labels_are_read_again(make_scene_folder, tmp_path):
