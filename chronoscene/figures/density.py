@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from chronoscene.figures.colors import rgb_of
 
 Array = NDArray[np.float64]
+Counts = NDArray[np.float32]
 
 FAINTEST = 0.5
 """Opacity of a pixel with one point, where others have many."""
@@ -38,7 +39,7 @@ class Window:
     height: int
 
 
-def count_points(xy: Array, group: NDArray[np.int64], groups: int, window: Window) -> Array:
+def count_points(xy: Array, group: NDArray[np.int64], groups: int, window: Window) -> Counts:
     """Points per pixel, the first row at the top.
 
     Args:
@@ -58,7 +59,7 @@ def count_points(xy: Array, group: NDArray[np.int64], groups: int, window: Windo
     column, row = at[inside].astype(np.int64).T
     flat = (group[inside] * window.height + window.height - 1 - row) * window.width + column
     shape = (groups, window.height, window.width)
-    return np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.float64)
+    return np.bincount(flat, minlength=int(np.prod(shape))).reshape(shape).astype(np.float32)
 
 
 def dot_radius(points: int, occupied: int) -> int:
@@ -74,7 +75,7 @@ def dot_radius(points: int, occupied: int) -> int:
     return radius
 
 
-def grow_dots(counts: Array, radius: int) -> Array:
+def grow_dots(counts: Counts, radius: int) -> Counts:
     """Give every point a disc of this radius instead of a pixel. [G, H, W]"""
     if radius == 0:
         return counts
@@ -92,7 +93,7 @@ def _disc(radius: int) -> NDArray[np.bool_]:
     return np.asarray(axis[:, None] ** 2 + axis**2 <= (radius + 0.4) ** 2)
 
 
-def shade(counts: Array, colors: Sequence[str], *, seed: int = 0) -> NDArray[np.uint8]:
+def shade(counts: Counts, colors: Sequence[str], *, seed: int = 0) -> NDArray[np.uint8]:
     """Counts to colours; equal counts and seeds give equal bytes.
 
     Args:
@@ -117,7 +118,7 @@ def shade(counts: Array, colors: Sequence[str], *, seed: int = 0) -> NDArray[np.
     return image
 
 
-def opacity(counts: Array) -> Array:
+def opacity(counts: Counts) -> Counts:
     """From `FAINTEST` for one point to 1 for as many as the densest pixels have. [n]"""
     dark = max(float(np.quantile(counts, DARK_QUANTILE)), 2.0)
     return np.clip(FAINTEST + (1 - FAINTEST) * np.log(counts) / np.log(dark), FAINTEST, 1.0)

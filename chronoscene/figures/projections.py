@@ -77,6 +77,8 @@ class Cloud:
     """Of the cameras. [C, 3]"""
     directions: Array
     """Viewing directions. [C, 3]"""
+    tops: Array
+    """Directions that are up in the images. [C, 3]"""
     camera_period: NDArray[np.int64]
     """[C]"""
 
@@ -92,6 +94,7 @@ def cloud_of(scene: Scene) -> Cloud:
         period=assign_points(scene),
         centres=camera_centre(poses),
         directions=poses[:, 2, :3],
+        tops=-poses[:, 1, :3],
         camera_period=np.array([f.period for f in scene.frames], np.int64),
     )
 
