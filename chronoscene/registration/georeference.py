@@ -39,7 +39,7 @@ class Georeference:
     height: float
     """Metres, of the origin, in the sense of ``height_kind``."""
     height_kind: HeightKind
-    """``as stated`` (sea level or ellipsoid: cameras do not say), ``relative`` (above take-off, from
+    """``as stated`` (sea level or ellipsoid: cameras do not say), ``relative`` (above take-off, by
     the barometer) or ``none`` (unknown: all are set to zero)."""
 
     @property
@@ -99,7 +99,7 @@ def locate(captures: Sequence[Capture]) -> Positions:
         remark = f"{int(has.sum())} of {count} photos have a GPS position: too few for a frame"
         return Positions(None, nothing, nothing, none, (remark,))
     latitude, longitude = (np.full(count, np.nan) for _ in range(2))
-    for i in np.flatnonzero(has):
+    for i in np.flatnonzero(has).tolist():
         gps = captures[i].gps
         assert gps is not None
         latitude[i], longitude[i] = gps.latitude, gps.longitude
@@ -118,7 +118,7 @@ def locate(captures: Sequence[Capture]) -> Positions:
     spread = np.linalg.norm(enu[believed] - np.median(enu[believed], axis=0), axis=1)
     if believed.sum() < 3 or spread.max() < CONSTANT_METRES:
         remarks.append(
-            f"the GPS positions all lie within {CONSTANT_METRES} m: one fix for all photos, of no use"
+            f"all GPS positions lie within {CONSTANT_METRES} m: one fix for all photos, of no use"
         )
         return Positions(None, nothing, nothing, none, tuple(remarks))
     remarks.insert(0, f"{int(has.sum())} of {count} photos have a GPS position; frame {frame.crs}")
@@ -131,7 +131,7 @@ def _heights(
     """One kind of height for all photos: mixing kinds would tilt or tear the frame."""
     count = len(captures)
     stated, relative = np.full(count, np.nan), np.full(count, np.nan)
-    for i in np.flatnonzero(has):
+    for i in np.flatnonzero(has).tolist():
         gps = captures[i].gps
         assert gps is not None
         stated[i] = np.nan if gps.altitude is None else gps.altitude
@@ -164,7 +164,7 @@ def _plausible(
     wild = has & ~(np.nan_to_num(distance, nan=0.0) <= limit)
     remarks = [
         f"{captures[i].name}: GPS is {distance[i] / 1000:.1f} km from the others: not believed"
-        for i in np.flatnonzero(wild)
+        for i in np.flatnonzero(wild).tolist()
     ]
     return has & ~wild, remarks
 

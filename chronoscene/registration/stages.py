@@ -1,0 +1,116 @@
+"""Stages that are done once: a killed command goes on where it was.
+
+A stage stores a record when it has ended well: a fingerprint of all that went into it, its result,
+and its remarks. The record is written last, to a temporary name that is renamed. A stage whose
+record has another fingerprint is done again, and so is everything after it, because the fingerprint
+of a stage covers the one before.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from chronoscene.files import write_text_atomic
+from chronoscene.registration.errors import RegistrationError
+
+VERSION = 1
+"""Of what stages store; another version is not read."""
+
+
+def fingerprint(*parts: Any) -> str:
+    """SHA-256 of what JSON can hold."""
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass
+class Stages:
+    """The stages of one run, in the order in which they are done."""
+
+    folder: Path
+    """The work folder."""
+    previous: str = ""
+    """Fingerprint of the last stage."""
+    log: list[dict[str, Any]] = field(default_factory=list)
+    """A record of each stage: name, seconds, remarks, whether it was done in an earlier run."""
+
+    def run(
+        self,
+        name: str,
+        inputs: Any,
+        action: Callable[[], tuple[Any, Sequence[str]]],
+        *,
+        chained: bool = True,
+    ) -> Any:
+        """Do a stage unless it was done with the same inputs; return its result.
+
+        Args:
+            name: Of the stage, and of its record.
+            inputs: All that the result depends on besides the stages before, as JSON holds it.
+            action: Gives the result, as JSON holds it, and remarks for the log.
+            chained: Whether the stages before matter.
+        """
+        key = fingerprint(VERSION, name, self.previous if chained else "", inputs)
+        path = self.folder / f"stage-{name}.json"
+        record = _read(path)
+        if record is None or record.get("key") != key:
+            path.unlink(missing_ok=True)
+            started = time.monotonic()
+            result, remarks = action()
+            record = {
+                "key": key,
+                "stage": name,
+                "seconds": round(time.monotonic() - started, 2),
+                "remarks": list(remarks),
+                "result": result,
+            }
+            write_text_atomic(path, json.dumps(record, indent=1) + "\n")
+            resumed = False
+        else:
+            resumed = True
+        entry = {k: record[k] for k in ("stage", "seconds", "remarks")}
+        self.log.append(entry | {"from_an_earlier_run": resumed})
+        self.previous = key if chained else self.previous
+        return record["result"]
+
+    def remark(self, stage: str, *remarks: str) -> None:
+        """Add a decision that no stage made."""
+        entry = {"stage": stage, "seconds": 0.0, "remarks": list(remarks)}
+        self.log.append(entry | {"from_an_earlier_run": False})
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) else None
+
+
+@contextmanager
+def work_folder(path: Path) -> Iterator[Path]:
+    """Create a work folder and keep others out of it while the block runs.
+
+    Raises:
+        RegistrationError: If another process works in it.
+    """
+    path.mkdir(parents=True, exist_ok=True)
+    with (path / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise RegistrationError(
+                path,
+                expected="a work folder that nobody uses",
+                found="another registration in it",
+                todo="wait for it to end, or choose another folder (--work)",
+            ) from error
+        yield path
