@@ -50,7 +50,7 @@ def rasterize(
     Differentiable in means, quats, scales, opacities, colors and backgrounds. A Gaussian outside
     the depth range or the image, with an opacity below 1/255 (negative ones too), with a
     quaternion of no length, or with any number that is not finite is culled: it changes nothing
-    and gets gradient zero.
+    and gets gradient zero. The limits are in `constants`.
 
     Convention:
         World to camera, +z forward; pixel (0, 0) is centred at (0.5, 0.5).
@@ -71,13 +71,20 @@ def rasterize(
         backgrounds: What the remaining light sees; None is black. [C, D]
         render_depth: Also return the expected z-depth, differentiable.
         backend: auto, reference, cpu or cuda. Auto is cuda for CUDA tensors, else cpu.
-        check_finite: Raise on nan or infinite numbers. Off, such Gaussians are culled.
+        check_finite: Raise on nan or infinite numbers, and on cameras that are none. Off,
+            Gaussians with such numbers are culled.
 
     Raises:
-        ShapeError: If a shape differs from the above, or a number is not finite.
+        ShapeError: If a shape differs from the above, a number is not finite, or an option or a
+            camera is outside the limits of `constants`.
         BackendError: If the backend is unknown or cannot be used on this machine.
     """
-    from chronoscene.rasterizer.validate import check_finite_inputs, check_inputs, check_options
+    from chronoscene.rasterizer.validate import (
+        check_cameras,
+        check_finite_inputs,
+        check_inputs,
+        check_options,
+    )
 
     check_choice("backend", backend, ["auto", *BACKENDS], error=BackendError)
     if backend == "auto":
@@ -95,6 +102,7 @@ def rasterize(
     if check_finite:
         colored = {} if backgrounds is None else {"backgrounds": backgrounds}
         check_finite_inputs({**arrays, **colored})
+        check_cameras(viewmats, Ks, width, height)
     return import_module(BACKENDS[backend]).rasterize(
         *arrays.values(),
         width,

@@ -30,6 +30,10 @@ SIZE_MAX = 65536
 """Largest width and height in pixels: at this distance from the corner of the image float32 still
 places a centre within 0.004 pixels."""
 
+FOCAL_MIN = 1e-3
+"""Smallest focal length in image widths (heights): rays 89.9 degrees off the axis. Beyond, the
+Jacobian of a large Gaussian is a difference of numbers that are equal in float32."""
+
 RADIUS_MAX = 2_000_000_000
 """Larger radii are reported as this: they are int32."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,17 +17,9 @@ from rasterizer_cases.comparison import Comparison, compare, steady_pixels, thre
 from rasterizer_cases.scenes import SmallScene, random_scene, scenes, well_posed
 
 
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parent / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="session")
 def tolerances() -> ModuleType:
-    return _load("tolerances")
+    return importlib.import_module("tolerances")
 
 
 @pytest.fixture(scope="session")

@@ -19,23 +19,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from rasterizer_cases.comparison import everything
 
 from chronoscene.rasterizer import rasterize
 from chronoscene.rasterizer.cpu import layout, pipeline, team, workspace
 from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, SORT_PHASES, sort_phases
 
 MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
-
-
-def everything(scene: Any) -> list[torch.Tensor]:
-    """All outputs and all gradients of one rendering."""
-    result, inputs = scene.render("cpu")
-    generator = torch.Generator().manual_seed(0)
-    loss = (result.image * torch.randn(result.image.shape, generator=generator)).sum()
-    (loss + (result.alphas**2).sum()).backward()
-    assert result.info.means2d.grad is not None
-    outputs = [result.image, result.alphas, result.info.means2d, result.info.means2d.grad]
-    return [*outputs, result.info.radii, *(x.grad for x in inputs.values())]
 
 
 def assert_equal_bits(a: list[torch.Tensor], b: list[torch.Tensor]) -> None:

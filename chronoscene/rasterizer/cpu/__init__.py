@@ -50,6 +50,8 @@ def rasterize(
         )
     if means.dtype == torch.float64:
         means, viewmats = recentred(means, viewmats)
+    if colors.shape[1] != 3 or render_depth:  # the kernel sees three channels, if these are all
+        colors, opacities = _without_bad_colors(colors, opacities)
     gaussians = _prepare(means, quats, scales, opacities, colors)
     count, padded, cameras = means.shape[0], gaussians[0].shape[0], viewmats.shape[0]
     wants_grad = torch.is_grad_enabled() and any(x.requires_grad for x in gaussians)
@@ -97,15 +99,18 @@ def _slot(leaf: Tensor, c: int, padded: int) -> Tensor:
     return pad(part, (0, 0, 0, missing)) if missing else part
 
 
+def _without_bad_colors(colors: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
+    """Gaussians whose colours are not finite or too large, made invisible and harmless."""
+    usable = (colors.abs() < VALUE_MAX).all(dim=1)
+    if bool(usable.all()):
+        return colors, opacities
+    return torch.where(usable[:, None], colors, 0), torch.where(usable, opacities, 0)
+
+
 def _prepare(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor
 ) -> tuple[Tensor, ...]:
     """Contiguous float32, at least `LANES` rows: added rows have opacity 0."""
-    if colors.shape[1] != 3:  # the kernel tests three channels itself
-        usable = (colors.abs() < VALUE_MAX).all(dim=1)
-        if not bool(usable.all()):
-            opacities = torch.where(usable, opacities, 0)
-            colors = torch.where(usable[:, None], colors, 0)
     missing = max(0, LANES - means.shape[0])
     if missing:
         opacities = pad(opacities, (0, missing))

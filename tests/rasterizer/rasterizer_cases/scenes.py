@@ -43,7 +43,11 @@ class SmallScene:
         }
 
     def render(
-        self, backend: str, dtype: torch.dtype = torch.float32, device: str = "cpu"
+        self,
+        backend: str,
+        dtype: torch.dtype = torch.float32,
+        device: str = "cpu",
+        check_finite: bool = False,
     ) -> tuple[Rasterization, dict[str, torch.Tensor]]:
         """The images, and the inputs whose gradients a backward pass fills."""
         inputs = self.tensors(dtype)
@@ -61,7 +65,7 @@ class SmallScene:
             backgrounds=background,
             render_depth=self.render_depth,
             backend=backend,
-            check_finite=False,
+            check_finite=check_finite,
             **dict(self.options),
         )
         return result, inputs
@@ -75,8 +79,8 @@ def well_posed(scene: SmallScene) -> bool:
     centres = np.concatenate([scene.means, np.ones_like(scene.means[:, :1])], axis=1)
     for viewmat in scene.viewmats.astype(np.float64):
         z = np.sort((centres.astype(np.float64) @ viewmat.T)[:, 2])
-        gaps = np.diff(z)
-        if ((gaps < 1e-5) & (gaps > 0)).any() or (np.abs(z - NEAR_PLANE) < 1e-5).any():
+        gaps, least = np.diff(z), 1e-5 * np.maximum(1, np.abs(z))
+        if ((gaps < least[1:]) & (gaps > 0)).any() or (np.abs(z - NEAR_PLANE) < 1e-5).any():
             return False
     return True
 
@@ -139,3 +143,38 @@ def random_scene(count: int, width: int, height: int, seed: int = 0, **changes: 
         height=height,
     )
     return scene.with_(**changes)
+
+
+@st.composite
+def extreme_scenes(draw: st.DrawFn) -> SmallScene:
+    """Scales of 1e-8 to 1e4, quaternions of any length, opacities at their ends, distances from the
+    near plane to 1e6, any focal length, principal points far outside."""
+    n = draw(st.integers(1, 8))
+    width, height = draw(st.integers(1, 33)), draw(st.integers(1, 33))
+
+    def array(shape: tuple[int, ...], low: float, high: float) -> np.ndarray:
+        return draw(hnp.arrays(np.float32, shape, elements=_floats(low, high)))
+
+    K = np.eye(3, dtype=np.float32)
+    K[0, 0], K[1, 1] = np.float32(10) ** array((2,), 0, 5)
+    # Rays up to 87 degrees off the axis.
+    K[0, 2], K[1, 2] = array((2,), -1, 1) * np.minimum(1e3, 20 * K[[0, 1], [0, 1]])
+    z = np.float32(10) ** array((n,), -1.9, 6)
+    pixels = array((n, 2), -0.5, 1.5) * np.array([width, height], np.float32)
+    sideways = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * z[:, None]
+    opacities = st.one_of(
+        _floats(0.005, 1.0), st.sampled_from([0.0, -0.0, 1.0, 1e-40, 0.99, 0.999, 5.0])
+    )
+    return SmallScene(
+        means=np.concatenate([sideways, z[:, None]], axis=1).astype(np.float32),
+        quats=array((n, 4), -1, 1) * np.float32(10) ** array((n, 1), -17, 17),
+        scales=np.float32(10) ** array((n, 3), -8, 4),
+        opacities=draw(hnp.arrays(np.float32, n, elements=opacities)),
+        colors=array((n, 3), 0, 1),
+        viewmats=np.eye(4, dtype=np.float32)[None],
+        Ks=K[None],
+        width=width,
+        height=height,
+        backgrounds=array((1, 3), 0, 1),
+        render_depth=draw(st.booleans()),
+    )

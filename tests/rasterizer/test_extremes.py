@@ -1,0 +1,202 @@
+"""Numerical extremes: each is right, culled or a clear error, forward and backward.
+
+What happens and the measured errors are in the README of the rasterizer.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from rasterizer_cases.comparison import Comparison, compare, everything, rounding
+from rasterizer_cases.exact import exact_pixels
+from rasterizer_cases.extremes import (
+    AGREES,
+    CULLED,
+    EXTREMES,
+    Extreme,
+    in_training_frame,
+    rounded,
+)
+from rasterizer_cases.scenes import SmallScene, extreme_scenes, random_scene, well_posed
+
+import chronoscene.rasterizer
+from chronoscene.errors import ShapeError
+
+BY_NAME = {extreme.name: extreme for extreme in EXTREMES}
+AGREEING = [e for e in EXTREMES if e.outcome == AGREES]
+CULLING = [e for e in EXTREMES if e.outcome == CULLED]
+REFUSED = [e for e in EXTREMES if e.outcome not in (AGREES, CULLED)]
+MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+
+
+def named(extremes: list[Extreme]) -> Any:
+    return pytest.mark.parametrize("extreme", extremes, ids=lambda e: e.name)
+
+
+def assert_close(
+    comparison: Comparison, moved: Comparison, tolerances: ModuleType, mixture: bool = False
+) -> None:
+    """Every output and gradient is as near to the reference as float32 inputs allow."""
+    for name in comparison.expected:
+        if name != "radii":
+            error, unavoidable = comparison.error(name), moved.error(name)
+            limit = tolerances.of_extreme(name, unavoidable, mixture)
+            assert error <= limit, (name, error, unavoidable)
+    got, expected = comparison.got["radii"], comparison.expected["radii"]
+    assert (np.abs(got - expected) <= 1 + 1e-5 * expected).all()
+
+
+def of_both(comparison: Comparison) -> Comparison:
+    """Without what is said of Gaussians that only one side draws: an ellipse may touch the image by
+    less than rounding. Whether they leave a trace in the image is for the image to show."""
+    got, expected = comparison.got, comparison.expected
+    drawn = np.minimum(got["radii"], expected["radii"]).min(-1) > 0
+    for side in (got, expected):
+        for name in ("radii", "means2d", "z"):
+            side[name] = np.where(drawn if name == "z" else np.expand_dims(drawn, -1), side[name], 0)
+    return comparison
+
+
+@named(AGREEING)
+def test_agrees_with_the_reference(extreme: Extreme, tolerances: ModuleType) -> None:
+    comparison = compare(extreme.build(), truth=extreme.truth and extreme.truth())
+    moved = rounding(comparison.scene, fixed=extreme.fixed)
+    assert comparison.expected["alphas"].mean() >= extreme.seen
+    assert comparison.steady.mean() >= 0.99  # next to nothing is left out
+    assert_close(comparison, moved, tolerances)
+
+
+@named(CULLING)
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_culled_without_a_trace(extreme: Extreme, backend: str) -> None:
+    scene = extreme.build()
+    result, inputs = scene.render(backend, torch.float32)
+    assert scene.backgrounds is not None and result.depths is not None
+    background = torch.tensor(scene.backgrounds)[:, None, None].expand_as(result.image)
+    assert torch.equal(result.image, background)
+    assert not result.alphas.any() and not result.depths.any()
+    assert not result.info.radii.any() and not result.info.means2d.any()
+    (result.image.sum() + result.alphas.sum() + result.depths.sum()).backward()
+    inputs.pop("backgrounds")
+    for name, x in inputs.items():
+        assert x.grad is not None and not x.grad.any(), name
+
+
+@named(REFUSED)
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_refused_with_a_clear_error(extreme: Extreme, backend: str) -> None:
+    with pytest.raises(ShapeError, match=re.escape(extreme.outcome)):
+        extreme.build().render(backend, check_finite=True)
+
+
+@named([e for e in EXTREMES if e not in REFUSED and not e.name.startswith("nan")])
+def test_the_check_lets_it_pass(extreme: Extreme) -> None:
+    extreme.build().render("cpu", check_finite=True)
+
+
+@pytest.fixture
+def threads() -> Any:
+    before = numba.get_num_threads()
+    yield numba.set_num_threads
+    numba.set_num_threads(before)
+
+
+@pytest.mark.skipif(MOST_THREADS < 2, reason="needs two threads")
+@named([*AGREEING, *CULLING])
+def test_bits_do_not_depend_on_the_number_of_threads(extreme: Extreme, threads: Any) -> None:
+    scene, results = extreme.build(), []
+    for number in (1, 2):
+        threads(number)
+        results.append(everything(scene))
+    for one, two in zip(*results, strict=True):
+        assert torch.equal(one, two) and torch.isfinite(one).all()
+
+
+@named([e for e in AGREEING if e.name != "1e5 on one pixel"])
+def test_the_reference_itself_is_right(extreme: Extreme) -> None:
+    """Against 60 digits, at pixels all over the image, to the rounding of its largest number."""
+    scene = extreme.build()
+    step = max(6, scene.width // 8)
+    pixels = [(x, y) for y in range(0, scene.height, 5) for x in range(0, scene.width, step)]
+    result = scene.render("reference", torch.float64)[0]
+    values = torch.cat([result.image, result.alphas], dim=-1)[0].detach().numpy()
+    got = np.array([values[y, x] for x, y in pixels])
+    largest = max(np.abs(scene.viewmats).max(), np.abs(scene.Ks).max())
+    assert np.abs(got - exact_pixels(scene, pixels)).max() < 1e-12 + 1e-15 * largest
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
+@given(data=st.data())
+def test_any_mixture_of_extremes(data: st.DataObject, tolerances: ModuleType) -> None:
+    scene = data.draw(extreme_scenes())
+    assume(well_posed(scene))
+    assert_close(of_both(compare(scene)), of_both(rounding(scene)), tolerances, mixture=True)
+
+
+@pytest.mark.parametrize("survey", ["UTM", "ECEF"])
+def test_survey_coordinates_are_harmless_unless_rounded(survey: str) -> None:
+    """With float64 or recentred coordinates the images are equal; rounded ones are another world:
+    that loss happened before rendering."""
+    world = BY_NAME[f"{survey} coordinates, float64"].build()
+    recentred = in_training_frame(world)
+    exact = compare(world).expected["image"]
+    same = compare(rounded(recentred), truth=recentred)
+    np.testing.assert_allclose(same.expected["image"], exact, atol=1e-7)
+    assert same.error("image") < 1e-5 and compare(world).error("image") < 1e-5
+    assert compare(rounded(world), truth=world).error("image") > 0.1
+
+
+def test_equal_depths_keep_the_order_of_the_input() -> None:
+    """Reversing the input changes the image, as it does that of the reference."""
+    scene = BY_NAME["all at equal depth"].build()
+    names = ("means", "quats", "scales", "opacities", "colors")
+    reverse = scene.with_(**{name: getattr(scene, name)[::-1].copy() for name in names})
+    here, there = scene.render("cpu")[0].image, reverse.render("cpu")[0].image
+    assert (here - there).abs().max() > 0.05
+    np.testing.assert_allclose(
+        there.detach(), reverse.render("reference", torch.float64)[0].image.detach(), atol=1e-5
+    )
+
+
+def test_the_far_end_of_the_widest_image_is_right() -> None:
+    """The last pixels of 65536 are those of a small image whose principal point is moved."""
+    wide, narrow = 65536, 32
+    K = np.array([[[80.0, 0, wide - 16], [0, 80, 16], [0, 0, 1]]], np.float32)
+    scene = random_scene(60, wide, narrow, seed=3, Ks=K)
+    moved = K.copy()
+    moved[0, 0, 2] = narrow - 16
+    here = scene.render("cpu")[0].image[:, :, -narrow:]
+    there = scene.with_(width=narrow, Ks=moved).render("cpu")[0].image
+    assert there.max() > 0.3
+    assert (here - there).abs().max() < 0.01  # centres are rounded to 0.004 pixels
+
+
+def test_readme_has_every_extreme_and_no_other() -> None:
+    text = Path(str(chronoscene.rasterizer.__file__)).with_name("README.md").read_text("utf-8")
+    tables = text.split("## Extremes")[1].split("\n## ")[0].split("### ")
+    outcomes, errors = (re.findall(r"^\| (.+?) \| (.+?) \|", t, re.M) for t in tables[1:3])
+    assert outcomes[2:] == [(e.name, e.why) for e in EXTREMES]
+    assert [name for name, _ in errors[2:]] == [e.name for e in EXTREMES if e.compared]
+
+
+def test_scenes_are_small_enough_to_be_compared(tolerances: ModuleType) -> None:
+    """A wrong gradient would be seen: every one that is not zero is far above its tolerance."""
+    scene: SmallScene = BY_NAME["needles 1e4 by 1e-4"].build()
+    comparison = compare(scene)
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        comparison.got["grad " + name] = comparison.got["grad " + name] * 0.99
+    with pytest.raises(AssertionError):
+        assert_close(comparison, rounding(scene), tolerances)
