@@ -27,6 +27,7 @@ from chronoscene.validation.repair_texts import repair_split, repair_test
 from chronoscene.validation.rules import split as split_rules
 from chronoscene.validation.rules import testlist as test_rules
 from chronoscene.validation.rules.images import spelling
+from chronoscene.validation.run import quiet_numbers
 
 
 def fix_scene(root: Path, out: Path) -> list[Repair]:
@@ -48,7 +49,8 @@ def fix_scene(root: Path, out: Path) -> list[Repair]:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
             staged = Path(temporary) / "scene"
             staged.mkdir()
-            repairs = _Fix(RawScene(root), staged).run()
+            with quiet_numbers():
+                repairs = _Fix(RawScene(root), staged).run()
             if out.exists():
                 out.rmdir()
             staged.rename(out)

@@ -66,9 +66,8 @@ class Rays:
         """Median reprojection error in pixels with some axes of world and camera negated."""
         local = np.einsum("nij,nj->ni", self.rotation, self.xyz * world) + self.translation
         local = local * camera
-        with np.errstate(all="ignore"):
-            xy = local[:, :2] / local[:, 2:] * self.K[:, [0, 1], [0, 1]] + self.K[:, :2, 2]
-            distance = np.linalg.norm(xy - self.xy, axis=1)
+        xy = local[:, :2] / local[:, 2:] * self.K[:, [0, 1], [0, 1]] + self.K[:, :2, 2]
+        distance = np.linalg.norm(xy - self.xy, axis=1)
         distance[~(local[:, 2] > 0)] = np.inf
         return float(np.median(distance)) if len(distance) else np.inf
 

@@ -69,8 +69,7 @@ def read_rigs(folder: Path, form: str) -> RawRigs | None:
 def pose_matrix(pose: Pose) -> NDArray[np.float64]:
     """``[R t; 0 1]`` of a pose; not finite where the pose is not."""
     matrix = np.eye(4)
-    with np.errstate(all="ignore"):
-        matrix[:3, :3] = rotation_from_quaternion(pose[:4])
+    matrix[:3, :3] = rotation_from_quaternion(pose[:4])
     matrix[:3, 3] = pose[4:]
     return matrix
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from chronoscene.errors import SceneError
 from chronoscene.validation.finding import SEVERITIES, Finding, Hit, printable
@@ -65,7 +69,19 @@ def validate_scene(
         decode: Whether to decode all images: slower, finds damaged pixels and copied images.
         track: Shows the progress of what takes long.
     """
-    scene = RawScene(Path(path), decode=decode, track=track)
+    with quiet_numbers():
+        return _validate(RawScene(Path(path), decode=decode, track=track), rules)
+
+
+@contextmanager
+def quiet_numbers() -> Iterator[None]:
+    """Without numpy's warnings: absurd numbers are what is looked for, and compare as false."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        yield
+
+
+def _validate(scene: RawScene, rules: Sequence[Rule] | None) -> SceneReport:
     findings: list[Finding] = []
     skipped: list[Skipped] = []
     for rule in sorted(all_rules() if rules is None else rules, key=lambda r: (r.last, r.code)):
@@ -80,7 +96,7 @@ def validate_scene(
     findings.sort(key=lambda f: (SEVERITIES.index(f.severity), f.code))
     return SceneReport(
         name=printable(scene.name),
-        path=Path(path),
+        path=scene.root,
         summary=_summary(scene),
         findings=tuple(findings),
         skipped=tuple(sorted(skipped, key=lambda s: s.code)),

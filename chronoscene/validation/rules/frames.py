@@ -173,17 +173,14 @@ def common_view(scene: RawScene) -> NDArray[np.float64]:
     owner = np.repeat(np.arange(count), list(map(len, owners)))
     known = np.isin(images.camera_ids, list(scene.usable_cameras))
     known &= ~np.isnan(scene.centres).any(axis=1)
-    with np.errstate(all="ignore"):  # of poses that are not used
-        rotations = rotation_from_quaternion(images.quaternions)
+    rotations = rotation_from_quaternion(images.quaternions)
+    poses = list(zip(rotations, images.translations, strict=True))
     for row in sorted(reach.keys() - {-1}):
         viewed = np.zeros(len(xyz), bool)
         for image in _sample(known & (scene.image_periods == row), MOST_IMAGES // count).tolist():
             camera = scene.usable_cameras[int(images.camera_ids[image])]
-            with np.errstate(all="ignore"):
-                depth, x, y = project(
-                    rotations[image], images.translations[image], camera.K, *xyz.T
-                )
-                inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+            depth, x, y = project(*poses[image], camera.K, *xyz.T)
+            inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
             viewed |= inside & (depth > 0) & (depth < REACH * reach[row])
         for column in range(count):
             if len(owners[column]):

@@ -88,6 +88,8 @@ def image_shape(scene: RawScene) -> Iterator[Hit]:
         if not _same_shape(size, camera):
             turned = _same_shape(size[::-1], camera)
             found = f"{size[0]} x {size[1]}" + (", turned by 90 degrees" if turned else "")
+            tag = scene.headers[name].orientation
+            found += f", as its orientation tag {tag} says" if turned and tag >= 5 else ""
             yield Hit(_place(name), _expected(camera), found)
 
 

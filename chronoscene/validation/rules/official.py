@@ -90,6 +90,9 @@ def official_name_collision(scene: RawScene) -> Iterator[Hit]:
     for key, names in groups.items():
         if len(names) > 1:
             found = f"{shown(names)}, all {quote(key)} to it"
+            files = {PurePosixPath(name).name for name in names}
+            if len(files) == 1:
+                found += f", and all read from images/{files.pop()}"
             place = scene.model_file("images")
             yield Hit(place, "file names that differ before the first dot", found)
 
@@ -198,9 +201,8 @@ def _is_small(xyz: NDArray[np.float64]) -> bool:
     """Whether so many points could share voxels at all: saves the sorting of large scenes."""
     if len(xyz) < 2:
         return False
-    with np.errstate(over="ignore"):
-        low, high = np.percentile(xyz[:: len(xyz) // SAMPLE + 1], [5, 95], axis=0)
-        return bool(np.max(high - low) < VOXEL * len(xyz) ** 0.5 * CROWDED)
+    low, high = np.percentile(xyz[:: len(xyz) // SAMPLE + 1], [5, 95], axis=0)
+    return bool(np.max(high - low) < VOXEL * len(xyz) ** 0.5 * CROWDED)
 
 
 def _cut(name: str) -> str:

@@ -122,12 +122,11 @@ def far_points(scene: RawScene) -> Iterator[Hit]:
     usable = np.isfinite(xyz).all(axis=1)
     if not usable.any():
         return
-    with np.errstate(over="ignore", invalid="ignore"):
-        middle = np.median(xyz[usable], axis=0)
-        distance = np.linalg.norm(xyz - middle, axis=1)
-        typical = np.median(distance[usable])
-        if len(cameras):
-            typical = max(typical, np.median(np.linalg.norm(cameras - middle, axis=1)))
+    middle = np.median(xyz[usable], axis=0)
+    distance = np.linalg.norm(xyz - middle, axis=1)
+    typical = np.median(distance[usable])
+    if len(cameras):
+        typical = max(typical, np.median(np.linalg.norm(cameras - middle, axis=1)))
     far = usable & (distance > FAR * typical)
     if number := int(np.count_nonzero(far)):
         ids = ", ".join(map(str, points.ids[far][:3])) + (" ..." if number > 3 else "")

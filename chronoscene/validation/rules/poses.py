@@ -70,10 +70,9 @@ def far_from_origin(scene: RawScene) -> Iterator[Hit]:
     centres = scene.centres[~np.isnan(scene.centres).any(axis=1)]
     if len(centres) < 2:
         return
-    with np.errstate(over="ignore"):
-        middle = np.median(centres, axis=0)
-        extent = float(np.median(np.linalg.norm(centres - middle, axis=1)))
-        distance = float(np.linalg.norm(middle))
+    middle = np.median(centres, axis=0)
+    extent = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    distance = float(np.linalg.norm(middle))
     if extent > 0 and distance > FAR * extent:
         found = f"cameras {distance:.3g} away from it, within {extent:.3g} of their median"
         yield Hit(scene.model_file("images"), "cameras near the origin of the world", found)

@@ -111,6 +111,14 @@ def test_orientation_tag(scene):
     scene.expect("CS207", place="images/a000.png", found="orientation 6")
 
 
+def test_shape_as_the_orientation_tag_says(scene):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(noise(48, 64)).save(scene.path("images/a000.png"), exif=exif)
+    found = "turned by 90 degrees, as its orientation tag 6 says"
+    scene.expect("CS204", place="images/a000.png", found=found, also={"CS207"})
+
+
 def test_pixels_are_decoded_only_on_demand(scene):
     assert RawScene(scene.root).pixels is None
     assert len(RawScene(scene.root, decode=True).pixels) == 14
