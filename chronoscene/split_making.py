@@ -15,21 +15,18 @@ views are to the training views, because near ones make a split easy.
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime
-from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 from scipy.spatial import cKDTree
 
-from chronoscene.errors import ConfigError, SceneError
+from chronoscene.errors import ConfigError
 from chronoscene.geometry import camera_centre
 from chronoscene.scene import Frame, Scene
+from chronoscene.split_blocks import blocked
+from chronoscene.split_dates import latest
 from chronoscene.splits import split_hash, split_of
 
 Strategy = Literal["stratified", "blocked", "date", "periods"]
@@ -37,10 +34,6 @@ Strategy = Literal["stratified", "blocked", "date", "periods"]
 STRATEGIES: tuple[Strategy, ...] = ("stratified", "blocked", "date", "periods")
 
 FRACTION = 1 / 8
-
-_EXIF_IFD = 0x8769
-_CAPTURE_TAGS = (0x9003, 0x9004)
-"""DateTimeOriginal, DateTimeDigitized."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,148 +155,6 @@ def stratified(scene: Scene, settings: SplitSettings) -> set[str]:
     return tests
 
 
-def blocked(scene: Scene, settings: SplitSettings) -> set[str]:
-    """The images of whole blocks of camera positions."""
-    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
-    count = settings.blocks or max(2, round(2 / settings.fraction))
-    if count > len(centres):
-        raise ConfigError(
-            "--blocks",
-            expected=f"at most one block for each of {len(centres)} images",
-            found=str(count),
-            todo="ask for fewer blocks",
-        )
-    block = cut_into_blocks(centres, count)
-    periods = np.array([f.period for f in scene.frames])
-    wanted = max(1, round(settings.fraction * count))
-    chosen = choose_blocks(block, periods, wanted, settings.seed or 0)
-    return {f.name for f, b in zip(scene.frames, block.tolist(), strict=True) if b in chosen}
-
-
-def cut_into_blocks(centres: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Block of each camera; blocks are boxes in space with equally many cameras.
-
-    The cameras are cut across the longest side of their box, again and again; a cut parts them in
-    proportion to the blocks that each side is to have. [N, 3] -> [N]
-    """
-    block = np.zeros(len(centres), np.int64)
-
-    def cut(members: NDArray[np.int64], first: int, number: int) -> None:
-        if number == 1:
-            block[members] = first
-            return
-        places = centres[members]
-        axis = int(np.argmax(np.ptp(places, axis=0)))
-        order = members[np.argsort(places[:, axis], kind="stable")]
-        left = number // 2
-        middle = round(len(members) * left / number)
-        cut(order[:middle], first, left)
-        cut(order[middle:], first + left, number - left)
-
-    cut(np.arange(len(centres)), 0, count)
-    return block
-
-
-def choose_blocks(
-    block: NDArray[np.int64], periods: NDArray[np.int64], wanted: int, seed: int
-) -> set[int]:
-    """Blocks for testing: first those that bring test images to most periods without any.
-
-    Among equals, a random order decides. No block is taken that would leave a period without
-    training images. More than ``wanted`` are taken only while periods have no test image.
-
-    Args:
-        block: Block of each image. [N]
-        periods: Period of each image. [N]
-        wanted: Number of blocks.
-        seed: Of the random order.
-    """
-    order = np.random.default_rng(seed).permutation(int(block.max()) + 1).tolist()
-    has = {b: set(periods[block == b].tolist()) for b in order}
-    missing, chosen = set(periods.tolist()), set[int]()
-    while len(chosen) < wanted or missing:
-        left = [
-            b for b in order if b not in chosen and _leaves_training(block, periods, chosen | {b})
-        ]
-        best = max(left, key=lambda b: len(has[b] & missing), default=None)
-        if best is None or (len(chosen) >= wanted and not has[best] & missing):
-            break
-        chosen.add(best)
-        missing -= has[best]
-    return chosen
-
-
-def _leaves_training(
-    block: NDArray[np.int64], periods: NDArray[np.int64], chosen: set[int]
-) -> bool:
-    return len(set(periods[~np.isin(block, list(chosen))].tolist())) == len(set(periods.tolist()))
-
-
-def latest(scene: Scene, settings: SplitSettings) -> set[str]:
-    """The images of each period that were taken last."""
-    times = capture_times(scene)
-    tests = set()
-    for frames in _by_period(scene):
-        ordered = sorted(frames, key=lambda f: (times[f.name], f.name))
-        days = sorted({times[f.name].date() for f in ordered})
-        if len(days) > 1:
-            tests |= _last_days(
-                [(times[f.name].date(), f.name) for f in ordered], settings.fraction
-            )
-        else:
-            held_out = max(1, round(settings.fraction * len(ordered)))
-            tests |= {f.name for f in ordered[len(ordered) - held_out :]}
-    return tests
-
-
-def _last_days(dated: Sequence[tuple[Any, str]], fraction: float) -> set[str]:
-    """Images of the last days, as many days as come nearest to the fraction; one at least."""
-    days = sorted({day for day, _ in dated})
-    after = [sum(day >= first for day, _ in dated) for first in days[1:]]
-    nearest = min(range(len(after)), key=lambda i: (abs(after[i] - fraction * len(dated)), -i))
-    return {name for day, name in dated if day >= days[1 + nearest]}
-
-
-def capture_times(scene: Scene) -> dict[str, datetime]:
-    """When each image was taken: its EXIF block says, else the beginning of its file name.
-
-    Raises:
-        SceneError: If an image has neither.
-    """
-    times = {f.name: _capture_time(scene.image_path(f)) for f in scene.frames}
-    if lost := [name for name, time in times.items() if time is None]:
-        raise SceneError(
-            scene.root,
-            expected="a date of capture of every image: EXIF DateTimeOriginal, or a file name that "
-            "begins with 2023-04-17 or 20230417",
-            found=f"none for {len(lost)} of {len(times)} images, {lost[0]!r} for example",
-            todo="choose another strategy, or hold out whole periods (--strategy periods)",
-        )
-    return {name: time for name, time in times.items() if time is not None}
-
-
-def _capture_time(path: Path) -> datetime | None:
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif().get_ifd(_EXIF_IFD)
-    except Exception:  # Pillow raises anything for damaged EXIF; the name may still have a date
-        exif = {}
-    for tag in _CAPTURE_TAGS:
-        try:
-            return datetime.strptime(str(exif.get(tag, "")).strip("\0 "), "%Y:%m:%d %H:%M:%S")
-        except ValueError:
-            continue
-    return _time_in_name(PurePosixPath(path.name).name)
-
-
-def _time_in_name(name: str) -> datetime | None:
-    match = re.match("((?:19|20)[0-9]{2})-?([0-9]{2})-?([0-9]{2})(?![0-9])", name)
-    try:
-        return datetime(*map(int, match.groups())) if match else None  # type: ignore[arg-type]
-    except ValueError:
-        return None
-
-
 def whole_periods(scene: Scene, settings: SplitSettings) -> set[str]:
     """All images of the periods that are held out."""
     known = {period.id for period in scene.periods}
@@ -319,8 +170,8 @@ def whole_periods(scene: Scene, settings: SplitSettings) -> set[str]:
 
 _CHOOSE: Mapping[Strategy, Callable[[Scene, SplitSettings], set[str]]] = {
     "stratified": stratified,
-    "blocked": blocked,
-    "date": latest,
+    "blocked": lambda scene, s: blocked(scene, s.fraction, s.blocks, s.seed or 0),
+    "date": lambda scene, s: latest(scene, s.fraction),
     "periods": whole_periods,
 }
 

@@ -11,13 +11,9 @@ from PIL import Image
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
-from chronoscene.split_making import (
-    SplitSettings,
-    choose_blocks,
-    cut_into_blocks,
-    latest,
-    make_split,
-)
+from chronoscene.split_blocks import choose_blocks, cut_into_blocks
+from chronoscene.split_dates import latest
+from chronoscene.split_making import SplitSettings, make_split
 from chronoscene.splits import default_tests, split_hash
 
 CAMERA = Camera(1, "PINHOLE", 64, 48, (50, 50, 32, 24))
@@ -182,8 +178,8 @@ def test_last_days_of_each_period(tmp_path):
     taken |= {f"b{i}.jpg": datetime(2021, 1, 1, 20 - i) for i in range(4)}
     put_images(tmp_path, taken)
     scene = make_scene([0] * 9 + [1] * 4, root=tmp_path, names=list(taken))
-    assert latest(scene, SplitSettings("date", 0.25)) == {"a6.jpg", "a7.jpg", "a8.jpg", "b0.jpg"}
-    many = latest(scene, SplitSettings("date", 0.6))
+    assert latest(scene, 0.25) == {"a6.jpg", "a7.jpg", "a8.jpg", "b0.jpg"}
+    many = latest(scene, 0.6)
     assert {name for name in many if name[0] == "a"} == {f"a{i}.jpg" for i in range(3, 9)}
 
 
@@ -191,7 +187,7 @@ def test_dates_in_file_names(tmp_path):
     names = ["2009-08-31_a.jpg", "20090901_b.jpg", "c.jpg"]
     put_images(tmp_path, dict.fromkeys(names[:2]) | {"c.jpg": datetime(2009, 9, 3)})
     scene = make_scene([0] * 3, root=tmp_path, names=names)
-    assert latest(scene, SplitSettings("date", 0.3)) == {"c.jpg"}
+    assert latest(scene, 0.3) == {"c.jpg"}
 
 
 @pytest.mark.parametrize("name", ["IMG_1.jpg", "2009-13-01.jpg", "202001011.jpg"])

@@ -11,7 +11,8 @@ from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Period, WorldFrame
 from chronoscene.splits import split_hash
-from chronoscene.undistort import pinhole_camera, undistort
+from chronoscene.undistort import undistort
+from chronoscene.undistort_cameras import pinhole_camera
 
 SIZE = (256, 192)
 F, CX, CY = 210.0, 120.5, 101.25

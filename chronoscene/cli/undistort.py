@@ -12,7 +12,8 @@ from chronoscene.cli.progress import image_bar
 from chronoscene.convert import check_outside
 from chronoscene.formats import format_names, read_scene
 from chronoscene.splits import split_hash
-from chronoscene.undistort import CameraChange, Undistortion, undistort
+from chronoscene.undistort import Undistortion, undistort
+from chronoscene.undistort_cameras import CameraChange
 
 
 @click.command("undistort")

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable
-from datetime import date
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
 
 import numpy as np
 
-from chronoscene.checks import check_choice
 from chronoscene.colmap import Model, PosedImage, read_model, write_model
 from chronoscene.errors import SceneError
+from chronoscene.formats.json_values import read_json
+from chronoscene.formats.labels import is_iso_date as is_iso_date  # it was here first
+from chronoscene.formats.labels import (
+    parse_periods,
+    parse_world,
+    period_items,
+    world_item,
+)
 from chronoscene.formats.writing import ImageSource, Progress, place_images, staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame
 from chronoscene.splits import (
@@ -168,94 +172,12 @@ def read_periods(path: Path, count: int) -> tuple[Period, ...]:
     return parse_periods(path / PERIODS, read_json(path / PERIODS, list), count)
 
 
-def parse_periods(place: Path, items: list[Any], count: int) -> tuple[Period, ...]:
-    """Periods from the content of ``periods.json``.
-
-    Raises:
-        SceneError: If they are damaged or not those with the ids 0 to ``count - 1``.
-    """
-    if [item.get("id") if isinstance(item, dict) else None for item in items] != [*range(count)]:
-        raise json_error(place, f"objects with ids 0..{count - 1} in order", "others")
-    return tuple(_parse_period(place, item) for item in items)
-
-
-def _parse_period(place: Path, item: dict[str, Any]) -> Period:
-    _check_keys(place, item, {"id", "label", "date"})
-    label, when = item.get("label", str(item["id"])), item.get("date")
-    if not isinstance(label, str) or not label.strip():
-        raise json_error(place, "a label that is a text", repr(label))
-    if when is not None and not (isinstance(when, str) and is_iso_date(when)):
-        raise json_error(place, "a date YYYY, YYYY-MM or YYYY-MM-DD, or null", repr(when))
-    return Period(item["id"], label, when)
-
-
-def is_iso_date(text: str) -> bool:
-    """Whether a text is a calendar date: year, year-month or year-month-day."""
-    if not re.fullmatch(r"[0-9]{4}(-[0-9]{2}){0,2}", text):
-        return False
-    try:
-        date.fromisoformat(text + "-01" * (2 - text.count("-")))
-    except ValueError:
-        return False
-    return True
-
-
 def read_world(path: Path) -> WorldFrame:
     """Unit and reference system from ``world.json``, or unknown where the file is absent."""
     place = path / WORLD
     if not place.exists():
         return WorldFrame()
     return parse_world(place, read_json(place, dict))
-
-
-def parse_world(place: Path, data: dict[str, Any]) -> WorldFrame:
-    """World frame from the content of ``world.json``.
-
-    Raises:
-        SceneError: If it is damaged.
-    """
-    _check_keys(place, data, {"unit", "crs", "offset"})
-    unit, crs, offset = data.get("unit", "unknown"), data.get("crs"), data.get("offset", [0, 0, 0])
-    check_choice(f"{place}: unit", str(unit), ("metre", "unknown"), error=SceneError)
-    if crs is not None and not isinstance(crs, str):
-        raise json_error(place, "a crs such as EPSG:32650, or null", repr(crs))
-    if not (isinstance(offset, list) and len(offset) == 3 and all(map(is_number, offset))):
-        raise json_error(place, "an offset of three numbers", repr(offset))
-    return WorldFrame(unit, crs, (float(offset[0]), float(offset[1]), float(offset[2])))
-
-
-def is_number(value: object) -> bool:
-    """Whether a JSON value is a finite number, and no integer beyond what a float can hold."""
-    return type(value) in (int, float) and -1e300 < value < 1e300  # type: ignore[operator]
-
-
-def read_json(place: Path, kind: type) -> Any:
-    """Read a JSON file that holds a list or an object.
-
-    Raises:
-        SceneError: If the file is missing, holds something else, or a text that is no Unicode.
-    """
-    text = read_text(place)
-    try:
-        data = json.loads(text)
-        if re.search(r"\\u[dD][89a-fA-F]", text):  # half of a pair of codes, perhaps alone
-            json.dumps(data, ensure_ascii=False).encode()
-    except (ValueError, RecursionError) as error:
-        raise json_error(place, "JSON", str(error)) from error
-    if not isinstance(data, kind):
-        expected = "a list" if kind is list else "an object"
-        raise json_error(place, expected, type(data).__name__)
-    return data
-
-
-def _check_keys(place: Path, item: dict[str, Any], known: set[str]) -> None:
-    if unknown := sorted(item.keys() - known):
-        raise json_error(place, f"only the keys {', '.join(sorted(known))}", ", ".join(unknown))
-
-
-def json_error(place: object, expected: str, found: str) -> SceneError:
-    """Something wrong in a JSON file."""
-    return SceneError(place, expected=expected, found=found, todo="see DATASET.md")
 
 
 def write(
@@ -311,13 +233,3 @@ def write_texts(scene: Scene, root: Path) -> None:
     }
     for name, text in files.items():
         (root / name).write_text(text, encoding="utf-8", newline="\n")
-
-
-def period_items(periods: Iterable[Period]) -> list[dict[str, Any]]:
-    """Periods as they stand in ``periods.json``; `parse_periods` reads them."""
-    return [{"id": p.id, "label": p.label, "date": p.date} for p in periods]
-
-
-def world_item(world: WorldFrame) -> dict[str, Any]:
-    """A world frame as it stands in ``world.json``; `parse_world` reads it."""
-    return {"unit": world.unit, "crs": world.crs, "offset": list(world.offset)}

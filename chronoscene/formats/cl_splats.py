@@ -16,12 +16,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from chronoscene.formats.chronoscene import read_json
 from chronoscene.formats.colmap_layout import find_model, make_scene, read_images, scan
 from chronoscene.formats.grouping import group_labels, natural_key, rule_error
+from chronoscene.formats.intrinsics import CameraTable
+from chronoscene.formats.json_values import read_json
 from chronoscene.formats.ply import read_points
 from chronoscene.formats.transforms import (
-    CameraTable,
     Shot,
     check_distinct,
     image_name,

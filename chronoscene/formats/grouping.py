@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats.chronoscene import is_iso_date
+from chronoscene.formats.labels import is_iso_date
 from chronoscene.scene import Period
 from chronoscene.splits import NameIndex, read_text
 

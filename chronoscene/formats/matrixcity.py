@@ -24,11 +24,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from chronoscene.errors import SceneError
-from chronoscene.formats.chronoscene import json_error, read_json
 from chronoscene.formats.colmap_layout import scan
 from chronoscene.formats.grouping import Grouped, group_labels, natural_key, rule_error
+from chronoscene.formats.intrinsics import CameraTable
+from chronoscene.formats.json_values import json_error, read_json
 from chronoscene.formats.transforms import (
-    CameraTable,
     Shot,
     head_has,
     image_name,

@@ -14,7 +14,6 @@ Source: the data parser of ``nerfstudio-project/nerfstudio``.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -23,16 +22,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats.chronoscene import (
-    MOST_PERIODS,
-    check_name,
-    json_error,
-    parse_periods,
-    parse_world,
-    period_items,
-    read_json,
-    world_item,
-)
+from chronoscene.formats.chronoscene import MOST_PERIODS
 from chronoscene.formats.grouping import (
     OPTION,
     TABLE,
@@ -41,10 +31,13 @@ from chronoscene.formats.grouping import (
     group_times,
     rule_error,
 )
-from chronoscene.formats.ply import read_points, write_points
+from chronoscene.formats.intrinsics import CameraTable
+from chronoscene.formats.json_values import json_error, number, read_json
+from chronoscene.formats.labels import parse_periods, parse_world
+from chronoscene.formats.nerfstudio_writing import FILE
+from chronoscene.formats.nerfstudio_writing import write as write  # part of the format
+from chronoscene.formats.ply import read_points
 from chronoscene.formats.transforms import (
-    MODEL_KEYS,
-    CameraTable,
     Shot,
     check_distinct,
     head_has,
@@ -52,18 +45,14 @@ from chronoscene.formats.transforms import (
     make_scene,
     matrix,
     nearest_rotation,
-    number,
-    opengl_from_pose,
     pose_from_opengl,
     read_frames,
 )
-from chronoscene.formats.writing import ImageSource, Progress, place_images, staged_folder
 from chronoscene.geometry import Sim3
-from chronoscene.scene import Camera, Period, Points, Scene, WorldFrame
+from chronoscene.scene import Period, Points, Scene, WorldFrame
 from chronoscene.splits import DEFAULT_RULE, default_tests
 
 NAME = "nerfstudio"
-FILE = "transforms.json"
 MARKS = FILE
 """What `matches` looks for."""
 
@@ -72,8 +61,6 @@ PERIOD_BY = ("period", "time", "gap:X", "count:N", "table:FILE")
 
 RAW_MATRIXCITY = '"rot_mat"'
 """A key of the raw files of MatrixCity, which have the same name."""
-
-POINTS = "sparse_points.ply"
 
 
 def matches(path: Path) -> bool:
@@ -273,75 +260,3 @@ def _to_original(place: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
     ]
     points = replace(scene.points, xyz=original_from_file.apply(scene.points.xyz))
     return replace(scene.with_frames(frames), points=points)
-
-
-def write(
-    scene: Scene,
-    out: Path,
-    *,
-    image_source: ImageSource = "copy",
-    progress: Progress | None = None,
-) -> Path:
-    """Write a scene in this format; the folder appears complete or not at all.
-
-    Each frame has its ``period``, and ``time`` = period / (T - 1) for loaders of dynamic scenes.
-    Labels, dates and the world frame go to the extra keys ``periods`` and ``world``. Tracks and ids
-    of points have no place in this format.
-
-    Raises:
-        SceneError: If ``out`` is in use, an image is missing, or the format lacks a camera model.
-    """
-    out = Path(out)
-    for frame in scene.frames:
-        check_name(out, frame.name)
-    text = json.dumps(_document(scene), indent=1, ensure_ascii=False) + "\n"
-    with staged_folder(out) as staged:
-        (staged / FILE).write_text(text, encoding="utf-8", newline="\n")
-        if len(scene.points):
-            write_points(staged / POINTS, scene.points)
-        place_images(scene, staged / "images", image_source=image_source, progress=progress)
-    return out
-
-
-def _document(scene: Scene) -> dict[str, Any]:
-    tests = [f"images/{f.name}" for f in scene.frames if f.split == "test"]
-    return {
-        **({"ply_file_path": POINTS} if len(scene.points) else {}),
-        "train_filenames": [f"images/{f.name}" for f in scene.frames if f.split == "train"],
-        "val_filenames": tests,
-        "test_filenames": tests,
-        "periods": period_items(scene.periods),
-        "world": world_item(scene.world),
-        "frames": [
-            {
-                "file_path": f"images/{frame.name}",
-                "transform_matrix": opengl_from_pose(frame.cam_from_world).tolist(),
-                "colmap_im_id": frame.image_id,
-                "period": frame.period,
-                "time": frame.period / max(1, scene.num_periods - 1),
-                **_camera_keys(frame.camera),
-            }
-            for frame in scene.frames
-        ],
-    }
-
-
-def _camera_keys(camera: Camera) -> dict[str, Any]:
-    if camera.model not in MODEL_KEYS:
-        raise SceneError(
-            f"camera {camera.camera_id}",
-            expected=f"a camera model that nerfstudio has: {', '.join(MODEL_KEYS)}",
-            found=camera.model,
-            todo="run chronoscene undistort first",
-        )
-    K = camera.K
-    return {
-        "camera_model": camera.model,
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": K[0, 0].item(),
-        "fl_y": K[1, 1].item(),
-        "cx": K[0, 2].item(),
-        "cy": K[1, 2].item(),
-        **dict(zip(MODEL_KEYS[camera.model], camera.distortion, strict=True)),
-    }

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import nerfstudio, read_scene
-from chronoscene.formats.transforms import CameraTable, opengl_from_pose, pose_from_opengl
+from chronoscene.formats.intrinsics import CameraTable
+from chronoscene.formats.transforms import opengl_from_pose, pose_from_opengl
 from chronoscene.geometry import Sim3, pose_from_rotation_translation, rotation_from_quaternion
 from chronoscene.scene import Camera, Frame, Period, Points, Scene, WorldFrame
 from chronoscene.splits import split_hash

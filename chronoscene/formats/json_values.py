@@ -1,0 +1,51 @@
+"""JSON files and numbers that are not trusted; shared by the formats."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from chronoscene.errors import SceneError
+from chronoscene.splits import read_text
+
+
+def read_json(place: Path, kind: type) -> Any:
+    """Read a JSON file that holds a list or an object.
+
+    Raises:
+        SceneError: If the file is missing, holds something else, or a text that is no Unicode.
+    """
+    text = read_text(place)
+    try:
+        data = json.loads(text)
+        if re.search(r"\\u[dD][89a-fA-F]", text):  # half of a pair of codes, perhaps alone
+            json.dumps(data, ensure_ascii=False).encode()
+    except (ValueError, RecursionError) as error:
+        raise json_error(place, "JSON", str(error)) from error
+    if not isinstance(data, kind):
+        expected = "a list" if kind is list else "an object"
+        raise json_error(place, expected, type(data).__name__)
+    return data
+
+
+def json_error(place: object, expected: str, found: str) -> SceneError:
+    """Something wrong in a JSON file."""
+    return SceneError(place, expected=expected, found=found, todo="see DATASET.md")
+
+
+def is_number(value: object) -> bool:
+    """Whether a JSON value is a finite number, and no integer beyond what a float can hold."""
+    return type(value) in (int, float) and -1e300 < value < 1e300  # type: ignore[operator]
+
+
+def number(place: object, data: Mapping[str, Any], key: str) -> float | None:
+    """A finite number, or None where the key is absent or null."""
+    value = data.get(key)
+    if value is None:
+        return None
+    if is_number(value):
+        return float(value)
+    raise json_error(place, f"a finite number as {key}", repr(value)[:40])

@@ -1,0 +1,92 @@
+"""The writer of `chronoscene.formats.nerfstudio`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from chronoscene.errors import SceneError
+from chronoscene.formats.chronoscene import check_name
+from chronoscene.formats.intrinsics import MODEL_KEYS
+from chronoscene.formats.labels import period_items, world_item
+from chronoscene.formats.ply import write_points
+from chronoscene.formats.transforms import opengl_from_pose
+from chronoscene.formats.writing import ImageSource, Progress, place_images, staged_folder
+from chronoscene.scene import Camera, Scene
+
+FILE = "transforms.json"
+
+POINTS = "sparse_points.ply"
+
+
+def write(
+    scene: Scene,
+    out: Path,
+    *,
+    image_source: ImageSource = "copy",
+    progress: Progress | None = None,
+) -> Path:
+    """Write a scene in this format; the folder appears complete or not at all.
+
+    Each frame has its ``period``, and ``time`` = period / (T - 1) for loaders of dynamic scenes.
+    Labels, dates and the world frame go to the extra keys ``periods`` and ``world``. Tracks and ids
+    of points have no place in this format.
+
+    Raises:
+        SceneError: If ``out`` is in use, an image is missing, or the format lacks a camera model.
+    """
+    out = Path(out)
+    for frame in scene.frames:
+        check_name(out, frame.name)
+    text = json.dumps(_document(scene), indent=1, ensure_ascii=False) + "\n"
+    with staged_folder(out) as staged:
+        (staged / FILE).write_text(text, encoding="utf-8", newline="\n")
+        if len(scene.points):
+            write_points(staged / POINTS, scene.points)
+        place_images(scene, staged / "images", image_source=image_source, progress=progress)
+    return out
+
+
+def _document(scene: Scene) -> dict[str, Any]:
+    tests = [f"images/{f.name}" for f in scene.frames if f.split == "test"]
+    return {
+        **({"ply_file_path": POINTS} if len(scene.points) else {}),
+        "train_filenames": [f"images/{f.name}" for f in scene.frames if f.split == "train"],
+        "val_filenames": tests,
+        "test_filenames": tests,
+        "periods": period_items(scene.periods),
+        "world": world_item(scene.world),
+        "frames": [
+            {
+                "file_path": f"images/{frame.name}",
+                "transform_matrix": opengl_from_pose(frame.cam_from_world).tolist(),
+                "colmap_im_id": frame.image_id,
+                "period": frame.period,
+                "time": frame.period / max(1, scene.num_periods - 1),
+                **_camera_keys(frame.camera),
+            }
+            for frame in scene.frames
+        ],
+    }
+
+
+def _camera_keys(camera: Camera) -> dict[str, Any]:
+    if camera.model not in MODEL_KEYS:
+        raise SceneError(
+            f"camera {camera.camera_id}",
+            expected=f"a camera model that nerfstudio has: {', '.join(MODEL_KEYS)}",
+            found=camera.model,
+            todo="run chronoscene undistort first",
+        )
+    K = camera.K
+    return {
+        "camera_model": camera.model,
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": K[0, 0].item(),
+        "fl_y": K[1, 1].item(),
+        "cx": K[0, 2].item(),
+        "cy": K[1, 2].item(),
+        **dict(zip(MODEL_KEYS[camera.model], camera.distortion, strict=True)),
+    }
