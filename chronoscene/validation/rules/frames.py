@@ -174,12 +174,12 @@ def common_view(scene: RawScene) -> NDArray[np.float64]:
     known = np.isin(images.camera_ids, list(scene.usable_cameras))
     known &= ~np.isnan(scene.centres).any(axis=1)
     rotations = rotation_from_quaternion(images.quaternions)
-    poses = list(zip(rotations, images.translations, strict=True))
     for row in sorted(reach.keys() - {-1}):
         viewed = np.zeros(len(xyz), bool)
         for image in _sample(known & (scene.image_periods == row), MOST_IMAGES // count).tolist():
             camera = scene.usable_cameras[int(images.camera_ids[image])]
-            depth, x, y = project(*poses[image], camera.K, *xyz.T)
+            rotation, translation = rotations[image], images.translations[image]
+            depth, x, y = project(rotation, translation, camera.K, xyz[:, 0], xyz[:, 1], xyz[:, 2])
             inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
             viewed |= inside & (depth > 0) & (depth < REACH * reach[row])
         for column in range(count):
