@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from chronoscene.colmap import from_pycolmap, to_pycolmap
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Period, WorldFrame
 from chronoscene.splits import split_hash
-from chronoscene.undistort import undistort
-from chronoscene.undistort_cameras import pinhole_camera
+from chronoscene.undistort import undistort, undistort_pixels
+from chronoscene.undistort_cameras import CameraChange, pinhole_camera
+
+import pycolmap  # isort: skip
 
 SIZE = (256, 192)
 F, CX, CY = 210.0, 120.5, 101.25
@@ -145,6 +148,21 @@ def test_pixels_are_where_the_formula_says(camera, make_distorted, tmp_path, cen
             np.testing.assert_allclose(centroid(result, (u, v)), [u, v], atol=0.05)
             found += 1
     assert found > 20
+
+
+def test_agrees_with_the_undistorter_of_colmap(camera):
+    """Where an image is smooth, both filters give the same."""
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]]
+    image = np.stack([x * 0.9, y * 1.2, 128 + 60 * np.sin(x / 25) * np.cos(y / 20)], axis=-1)
+    image = np.round(image).astype(np.uint8)
+    options = pycolmap.UndistortCameraOptions()
+    theirs, target = pycolmap.undistort_image(
+        options, pycolmap.Bitmap.from_array(image), to_pycolmap(camera)
+    )
+    change = CameraChange(camera, pinhole_camera(camera))
+    assert from_pycolmap(target).params == change.target.params
+    difference = undistort_pixels(image, change).astype(int) - theirs.to_array()
+    assert np.abs(difference[3:-3, 3:-3]).max() <= 2  # rounded to whole levels twice
 
 
 @pytest.mark.parametrize("center", [False, True])

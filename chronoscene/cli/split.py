@@ -60,7 +60,8 @@ from chronoscene.split_making import (
     "where the disk can.",
 )
 @click.option(
-    "--dataset-format",
+    "--format",
+    "scene_format",
     type=click.Choice(format_names()),
     help="Format of the scene.  [default: found out]",
 )
@@ -75,7 +76,7 @@ def command(
     blocks: int | None,
     periods: tuple[int, ...],
     scene_out: Path | None,
-    dataset_format: str | None,
+    scene_format: str | None,
 ) -> None:
     """Choose new test images of SCENE and write their names to the file OUT.
 
@@ -83,7 +84,7 @@ def command(
     left alone: --scene-out writes a copy that has the split.
     """
     _check_targets(source, out, scene_out)
-    scene = read_scene(source, format=dataset_format)
+    scene = read_scene(source, format=scene_format)
     split = make_split(
         scene,
         SplitSettings(

@@ -28,20 +28,22 @@ from chronoscene.undistort_cameras import CameraChange
     help="Images worked on at the same time.  [default: one per processor]",
 )
 @click.option(
-    "--dataset-format",
+    "--format",
+    "scene_format",
     type=click.Choice(format_names()),
     help="Format of the scene.  [default: found out]",
 )
 def command(
-    source: Path, out: Path, center: bool, threads: int | None, dataset_format: str | None
+    source: Path, out: Path, center: bool, threads: int | None, scene_format: str | None
 ) -> None:
     """Write SCENE into the new folder OUT with undistorted images and PINHOLE cameras.
 
     Observations of points move along; poses, periods and split stay. Images of cameras without
-    distortion are copied. SCENE is left alone. OUT is in the ChronoScene format.
+    distortion are copied, others become RGB of 8 bits, on black where transparent. SCENE is left
+    alone. OUT is in the ChronoScene format.
     """
     check_outside(source, out)
-    scene = read_scene(source, format=dataset_format)
+    scene = read_scene(source, format=scene_format)
     with image_bar("images") as progress:
         done = undistort(scene, out, center=center, threads=threads, progress=progress)
     emit(report(done), None)

@@ -28,15 +28,20 @@ def find_model(path: Path) -> Path | None:
 
 
 def scan(folder: Path) -> tuple[list[str], list[str]]:
-    """Names of the folders and of the images directly in a folder, sorted."""
+    """Names of the folders and of the images directly in a folder, sorted.
+
+    A folder that is not there, or may not be looked into, counts as empty.
+    """
     folders, images = [], []
-    if folder.is_dir():
+    try:
         with os.scandir(folder) as entries:
             for entry in entries:
                 if entry.is_dir():
                     folders.append(entry.name)
                 elif entry.name.lower().endswith(IMAGE_SUFFIXES):
                     images.append(entry.name)
+    except OSError:
+        return [], []
     return sorted(folders), sorted(images)
 
 

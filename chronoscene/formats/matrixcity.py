@@ -138,13 +138,10 @@ def _walk(path: Path) -> Iterator[tuple[list[PoseFile], str | None]]:
     while waiting and visited < MOST_FOLDERS:
         folder, visited = waiting.pop(), visited + 1
         here = path / folder
-        try:
-            folders, images = scan(here)
-        except OSError:
-            continue  # a folder that may not be looked into
         if head_has(here / RAW, RAW_KEY):
             yield [PoseFile(folder, RAW)], None
             continue
+        folders, images = scan(here)
         prepared = [PoseFile(folder, name) for name in PREPARED if (here / name).is_file()]
         numbered = any(re.fullmatch(r"[0-9]{4,}\.png", name) for name in images)
         yield prepared, folder if numbered else None

@@ -1,5 +1,6 @@
 """chronoscene convert: what it prints and how it fails."""
 
+import subprocess
 import sys
 
 import pytest
@@ -76,6 +77,13 @@ def test_errors_are_one_line(make_scene_folder, tmp_path, monkeypatch, capsys, a
     assert stopped.value.code == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+def test_dataset_commands_do_not_need_torch():
+    names = ", ".join(f"chronoscene.cli.{name}" for name in ("convert", "split", "undistort"))
+    code = f"import sys, {names}; assert not {{'torch', 'open3d', 'pandas'}} & set(sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_labels_that_the_output_cannot_encode(make_scene_folder, tmp_path):

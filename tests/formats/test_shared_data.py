@@ -1,9 +1,11 @@
 """Every folder of real data is read, or refused with one clear message."""
 
+import numpy as np
 import pytest
 
+from chronoscene.convert import convert
 from chronoscene.errors import SceneError
-from chronoscene.formats import detect_format, read_scene
+from chronoscene.formats import detect_format, read_scene, writable_formats
 
 READ = {
     "plaza": ("chronoscene", 108, 3),
@@ -34,6 +36,23 @@ def test_scenes_are_read(shared_data, name):
     scene = read_scene(shared_data / name)
     assert (scene.format, len(scene.frames), scene.num_periods) == READ[name]
     assert all(scene.image_path(frame).is_file() for frame in scene.frames)
+
+
+@pytest.mark.parametrize("target", writable_formats())
+@pytest.mark.parametrize("name", READ)
+def test_scenes_are_converted(shared_data, tmp_path, name, target):
+    scene = read_scene(shared_data / name)
+    convert(shared_data / name, tmp_path / "out", target=target, image_source="symlink")
+    again = read_scene(tmp_path / "out")
+    new = {again.image_path(frame).resolve(): frame for frame in again.frames}
+    assert len(new) == len(scene.frames)
+    for old in scene.frames:
+        frame = new[scene.image_path(old).resolve()]
+        assert (frame.period, frame.split, frame.camera) == (old.period, old.split, old.camera)
+        np.testing.assert_allclose(frame.cam_from_world, old.cam_from_world, atol=1e-10)
+    np.testing.assert_array_equal(again.points.xyz, scene.points.xyz)
+    if target != "nerfstudio":
+        assert len(again.points.track_xy) == len(scene.points.track_xy)
 
 
 @pytest.mark.parametrize("name", IMAGES_ONLY)
