@@ -63,7 +63,7 @@ def build_tracks(
     graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(total, total))
     _, labels = connected_components(graph, directed=False)
     used = np.unique(np.concatenate([first, second]))
-    names, compact = np.unique(labels[used], return_inverse=True)
+    compact = np.unique(labels[used], return_inverse=True)[1]
     node_track = np.full(total, -1, np.int64)
     node_track[used] = compact
     image = np.asarray(ids, np.int64)[np.searchsorted(starts, used, side="right") - 1]
@@ -104,10 +104,15 @@ def hold_out(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     chosen = np.sort(rng.choice(candidates, count, replace=False))
     removed = _filtered_copy(Path(arguments["database"]), Path(arguments["out"]), tracks, chosen)
     _write_held_out(Path(arguments["held_out"]), tracks, chosen, removed, points, names)
+    partners: dict[str, int] = dict.fromkeys(names.values(), 0)
+    for pair in matches:
+        for i in pair:
+            partners[names[i]] += 1
     across = {f"{i}-{j}": n for (i, j), n in sorted(_cross_counts(matches, period_of).items())}
     return {
         "tracks_of_several_periods": len(candidates),
-        "held_out": int(count),
+        "held_out": int(removed.sum()),
+        "partners": partners,
         "verified_pairs_across": {k: v[0] for k, v in across.items()},
         "matches_across": {k: v[1] for k, v in across.items()},
     }

@@ -101,7 +101,7 @@ def sequential_pairs(images: Sequence[Mapping[str, Any]], periods: NDArray[np.in
 
 
 def similar_pairs(descriptors: NDArray[np.float32], periods: NDArray[np.int64]) -> set[Pair]:
-    """Each image with the most similar ones of every period. Descriptors [N, D] are unit vectors."""
+    """Each image with the most similar ones of every period, by unit vectors [N, D]."""
     found: list[Pair] = []
     similarity = descriptors @ descriptors.T
     np.fill_diagonal(similarity, -np.inf)

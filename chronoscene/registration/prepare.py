@@ -1,4 +1,4 @@
-"""Photos as the rest of the pipeline wants them: unique names, pixels as stored, no orientation tag.
+"""Photos as the rest wants them: unique names, pixels as stored, no orientation tag.
 
 COLMAP and our format work on the pixels as stored. An orientation tag would make viewers and other
 loaders turn them, so it is set to 1 in a copy, without touching the pixels. Files that COLMAP does

@@ -32,6 +32,7 @@ def _local(database: str | Path, name: str) -> NDArray[np.float32]:
     """Descriptors of the largest features of an image, with unit length. [K, 128]"""
     with pycolmap.Database.open(str(database)) as opened:
         image = opened.read_image_with_name(name)
+        assert image is not None
         keypoints = np.asarray(opened.read_keypoints(image.image_id))
         data = np.asarray(opened.read_descriptors(image.image_id).data, np.float32)
     if not len(data):

@@ -138,7 +138,7 @@ def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
 def verified_matches(
     database: str | Path,
 ) -> tuple[dict[int, str], dict[tuple[int, int], np.ndarray]]:
-    """Names by image id, and the inlier matches of each verified pair as keypoint indices. [M, 2]"""
+    """Names by image id, and the inliers of each verified pair as keypoint indices. [M, 2]"""
     with pycolmap.Database.open(str(database)) as opened:
         names = {int(i.image_id): str(i.name) for i in opened.read_all_images()}
         pair_ids, geometries = opened.read_two_view_geometries()

@@ -1,0 +1,56 @@
+"""Route joint: one reconstruction of the photos of all periods. Worker process only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from chronoscene.registration.errors import RegistrationError
+from chronoscene.registration.georeferencing import finish
+from chronoscene.registration.mapping import adjust, map_images, triangulate
+from chronoscene.registration.sfm import quiet, verified_matches
+from chronoscene.registration.units import Priors, Unit, combine
+from chronoscene.registration.worker import Report
+
+
+def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Map all images together; parts that did not hold together are joined afterwards.
+
+    Arguments: ``database``, ``photos``, ``periods`` (by name), ``priors`` (``enu`` and ``sigma`` by
+    name, or null), ``out`` (model folder), ``scratch``, ``threads``.
+    """
+    quiet()
+    database, photos = arguments["database"], arguments["photos"]
+    scratch, threads = Path(arguments["scratch"]), arguments["threads"]
+    names = sorted(arguments["periods"])
+    models, remarks = map_images(database, photos, names, scratch, threads, report)
+    if not models:
+        raise nothing_mapped(len(names))
+    left: list[list[str]] = []
+    if len(models) == 1:
+        model = models[0]
+        adjust(model, threads=threads)
+    else:
+        units = [Unit(f"part {i}", m) for i, m in enumerate(models)]
+        _, matches = verified_matches(database)
+        combined = combine(units, matches, Priors.of(arguments["priors"]), database)
+        remarks += combined.remarks
+        left = [list(group) for group in combined.left]
+        model = combined.model
+        for _ in range(2):
+            model = triangulate(model, database, photos, scratch / "points", threads)
+            adjust(model, threads=threads)
+    report("adjusting", 0, 1)
+    return finish(model, arguments, remarks) | {"left": left}
+
+
+def nothing_mapped(count: int) -> RegistrationError:
+    """The error of photos that give no model at all."""
+    return RegistrationError(
+        "structure from motion",
+        expected=f"a model of {count} photos",
+        found="no two photos from which one can be begun",
+        todo="give more photos that overlap by more than half, taken from different places; "
+        "features and matches are kept",
+    )

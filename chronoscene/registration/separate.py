@@ -1,0 +1,48 @@
+"""Route separate: a model for each period, then all of them in one frame. Worker process only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from chronoscene.registration.georeferencing import finish
+from chronoscene.registration.joint import nothing_mapped
+from chronoscene.registration.mapping import adjust, map_images, triangulate
+from chronoscene.registration.sfm import quiet, verified_matches
+from chronoscene.registration.units import Priors, Unit, combine
+from chronoscene.registration.worker import Report
+
+ROUNDS = 2
+"""Of triangulation with all matches and adjustment, after merging."""
+
+
+def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Map each period alone, align the models, merge and adjust. Arguments as in `joint.run`."""
+    quiet()
+    database, photos = arguments["database"], arguments["photos"]
+    scratch, threads = Path(arguments["scratch"]), arguments["threads"]
+    periods: Mapping[str, int] = arguments["periods"]
+    units, remarks = [], []
+    for period in sorted(set(periods.values())):
+        names = sorted(n for n, p in periods.items() if p == period)
+        folder = scratch / f"period-{period}"
+        models, told = map_images(database, photos, names, folder, threads, report)
+        remarks += [f"period {period}: {remark}" for remark in told]
+        for i, model in enumerate(models):
+            adjust(model, threads=threads)
+            label = f"period {period}" + (f" part {i}" if len(models) > 1 else "")
+            units.append(Unit(label, model))
+    if not units:
+        raise nothing_mapped(len(periods))
+    report("aligning", 0, 1)
+    _, matches = verified_matches(database)
+    combined = combine(units, matches, Priors.of(arguments["priors"]), database)
+    remarks += combined.remarks
+    model = combined.model
+    for i in range(ROUNDS):
+        report("adjusting", i, ROUNDS)
+        model = triangulate(model, database, photos, scratch / "points", threads)
+        adjust(model, threads=threads)
+    left = [list(group) for group in combined.left]
+    return finish(model, arguments, remarks) | {"left": left}
