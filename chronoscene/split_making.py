@@ -47,7 +47,7 @@ class SplitSettings:
     """``stratified`` without a seed: index of the first test image of each period."""
     seed: int | None = None
     """``stratified``: draw one image of each run, instead of its first. ``blocked``: which blocks
-    are for testing; None is 0."""
+    are for testing; None becomes 0."""
     blocks: int | None = None
     """``blocked``: number of blocks; None for two test blocks, or more if periods need them."""
     periods: tuple[int, ...] = ()
@@ -101,6 +101,8 @@ def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
         SceneError: If dates are needed and an image has none.
     """
     _check(settings)
+    if settings.strategy == "blocked" and settings.seed is None:
+        settings = replace(settings, seed=0)
     tests = _CHOOSE[settings.strategy](scene, settings)
     if len(tests) == len(scene.frames):
         raise ConfigError(
@@ -121,6 +123,19 @@ def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
 
 
 def _check(settings: SplitSettings) -> None:
+    for option, given, strategies in (
+        ("--offset", settings.offset != 0, ("stratified",)),
+        ("--seed", settings.seed is not None, ("stratified", "blocked")),
+        ("--blocks", settings.blocks is not None, ("blocked",)),
+        ("--period", settings.periods != (), ("periods",)),
+    ):
+        if given and settings.strategy not in strategies:
+            raise ConfigError(
+                option,
+                expected=f"no such option, or --strategy {' or '.join(strategies)}",
+                found=settings.strategy,
+                todo="leave the option out, or choose the other strategy",
+            )
     wrong = None
     if not 0 < settings.fraction < 1:
         wrong = ("--fraction", "a number between 0 and 1", settings.fraction)

@@ -71,8 +71,12 @@ def test_stratified_offset_and_seed():
         ({"offset": 8}, "--offset"),
         ({"offset": -1}, "--offset"),
         ({"seed": -1}, "--seed"),
-        ({"blocks": 1}, "--blocks"),
+        ({"strategy": "blocked", "blocks": 1}, "--blocks"),
         ({"strategy": "blocked", "blocks": 100}, "--blocks"),
+        ({"strategy": "stratified", "blocks": 4}, "--blocks"),
+        ({"strategy": "blocked", "offset": 1}, "--offset"),
+        ({"strategy": "date", "seed": 1}, "--seed"),
+        ({"strategy": "stratified", "periods": (1,)}, "--period"),
         ({"strategy": "periods"}, "--period"),
         ({"strategy": "periods", "periods": (0, 2)}, "--period"),
         ({"strategy": "periods", "periods": (0, 1)}, "split"),
@@ -215,6 +219,7 @@ def test_hash_and_record():
     assert record["split_hash"] == split.hash
     assert (record["strategy"], record["seed"], record["fraction"]) == ("stratified", 3, 0.125)
     assert [(c["id"], c["train"], c["test"]) for c in record["counts"]] == [(0, 7, 1), (1, 7, 1)]
+    assert make_split(scene, SplitSettings("blocked")).record()["seed"] == 0
 
 
 def test_frames_keep_all_but_their_split():
