@@ -27,7 +27,6 @@ from typing import Any
 import chronoscene  # noqa: F401
 
 # isort: split
-import numpy as np
 import torch
 
 from chronogs.config import ChronoGSConfig
@@ -45,7 +44,7 @@ from chronoscene.training._decode_function import Decode
 from chronoscene.training.anchor_model import AnchorModel
 from chronoscene.training.anchor_training import AnchorTrainer
 from chronoscene.training.density import DensityStatistics
-from chronoscene.training.optimizer import Adam
+from chronoscene.training.row_adam import DenseTable, RowAdam
 
 PARTS: tuple[tuple[str, Any, str], ...] = (
     ("frustum culling", AnchorModel, "visible"),
@@ -58,7 +57,9 @@ PARTS: tuple[tuple[str, Any, str], ...] = (
     ("rasterize, backward", Render, "backward"),
     ("decode, backward", Decode, "backward"),
     ("density statistics", DensityStatistics, "update"),
-    ("Adam", Adam, "step"),
+    ("fetch anchors", RowAdam, "fetch"),
+    ("Adam, seen anchors", RowAdam, "step"),
+    ("Adam, all scales", DenseTable, "step"),
 )
 """What is timed: name, owner, function."""
 
@@ -113,7 +114,6 @@ def resume(part: Part, preset: str, model: Path, seed: int) -> AnchorTrainer:
     config = ChronoGSConfig(**PRESETS[preset])
     method = ChronoGS(config)
     method.load(model, device="cpu")
-    periods = np.stack([method.weights(period) for period in range(part.train.num_periods)])
     return AnchorTrainer(
         config,
         method.model,
@@ -121,7 +121,6 @@ def resume(part: Part, preset: str, model: Path, seed: int) -> AnchorTrainer:
         voxel_size=0.01,  # of no consequence: nothing grows here
         seed=seed,
         rates=method.rates(part.train.camera_extent),
-        weights=torch.from_numpy(periods),
     )
 
 

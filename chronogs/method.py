@@ -6,8 +6,6 @@ names both. The training machinery is shared with Scaffold-GS.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
@@ -17,7 +15,8 @@ from chronogs.periods import period_weights
 from chronogs.sharing import pack_features, share_periods, unpack_features
 from chronoscene.methods import Prediction, View
 from chronoscene.training.anchor_method import AnchorMethod
-from chronoscene.training.anchor_model import AnchorLayout, AnchorModel
+from chronoscene.training.anchor_model import AnchorLayout
+from chronoscene.training.anchor_training import AfterUpdate
 
 
 class ChronoGS(AnchorMethod):
@@ -47,9 +46,11 @@ class ChronoGS(AnchorMethod):
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
         return super().rates(camera_extent) | {"global_features": self.config.global_lr}
 
-    def after_update(self, model: AnchorModel, rates: Mapping[str, float]) -> None:
-        if self.config.period_sharing and model.layout.num_periods > 1:
-            share_periods(model, rates["features"] * self.config.period_sharing)
+    def after_update(self) -> AfterUpdate | None:
+        weight = self.config.period_sharing
+        if not weight or self.model.layout.num_periods == 1:
+            return None
+        return lambda model, rates: share_periods(model, rates["features"] * weight)
 
     def stored_tensors(self) -> dict[str, Tensor]:
         return pack_features(self.model.tensors(), self.model.layout)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,7 +17,7 @@ from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet,
 from chronoscene.rasterizer.types import Rasterization
 from chronoscene.training.anchor_config import AnchorConfig
 from chronoscene.training.anchor_model import AnchorLayout, AnchorModel, draw_model
-from chronoscene.training.anchor_training import AnchorTrainer, learning_rates
+from chronoscene.training.anchor_training import AfterUpdate, AnchorTrainer, learning_rates
 from chronoscene.training.anchors import (
     finite_points,
     initial_anchors,
@@ -56,8 +56,9 @@ class AnchorMethod:
         """Weights of the periods' features. [T]"""
         raise NotImplementedError
 
-    def after_update(self, model: AnchorModel, rates: Mapping[str, float]) -> None:
+    def after_update(self) -> AfterUpdate | None:
         """What a method does to the features after each optimiser step; here nothing."""
+        return None
 
     def stored_tensors(self) -> dict[str, Tensor]:
         """The model as it goes to disk, by name."""
@@ -71,9 +72,9 @@ class AnchorMethod:
 
     @property
     def model(self) -> AnchorModel:
-        """The tensors; there are none before `setup` or `load`."""
+        """The tensors, up to date; there are none before `setup` or `load`."""
         assert self._model is not None, "setup or load comes first"
-        return self._model
+        return self._model if self._trainer is None else self._trainer.snapshot()
 
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
         """Build anchors, MLPs and optimiser from a training set."""
@@ -90,7 +91,6 @@ class AnchorMethod:
         )
         generator = torch.Generator().manual_seed(seed)
         self._start(train, anchors, generator, device)
-        periods = [self.weights(period) for period in range(train.num_periods)]
         self._trainer = AnchorTrainer(
             config,
             self.model,
@@ -98,8 +98,7 @@ class AnchorMethod:
             voxel_size=size,
             seed=seed,
             rates=self.rates(train.camera_extent),
-            weights=torch.from_numpy(np.stack(periods)),
-            after_update=self.after_update,
+            after_update=self.after_update(),
         )
         self._meta = build_meta(
             self.name,

@@ -7,6 +7,7 @@ same bytes for any number of threads.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -28,6 +29,7 @@ from chronoscene.training.density import (
 )
 from chronoscene.training.losses import photometric_loss
 from chronoscene.training.optimizer import Adam
+from chronoscene.training.row_adam import make_table
 from chronoscene.training.sampler import ViewSampler
 from chronoscene.training.schedule import log_linear
 from chronoscene.training.view import camera_centre_tensor
@@ -84,14 +86,13 @@ class AnchorTrainer:
 
     Args:
         config: Options.
-        model: Trained in place.
+        model: Trained in place; `snapshot` has the present state.
         train: Views, images, background.
         voxel_size: Smallest growth cell in training units.
         seed: All random choices follow from it.
         rates: Learning rates by tensor name.
-        weights: Period weights of each period. [T, T]
         after_update: Called with the model and the learning rates after each step that changed
-            the features.
+            the features; makes every step update the features of all anchors.
     """
 
     def __init__(
@@ -103,7 +104,6 @@ class AnchorTrainer:
         voxel_size: float,
         seed: int,
         rates: Rates,
-        weights: Tensor,
         after_update: AfterUpdate | None = None,
     ) -> None:
         self.config = config
@@ -113,8 +113,19 @@ class AnchorTrainer:
         self.rules = density_rules(config, voxel_size)
         trained = {n: t for n, t in model.tensors().items() if n in rates and t.numel() > 0}
         self.rates = {name: rates[name] for name in trained}
-        self.optimizer = Adam(trained, eps=_ADAM_EPS)
-        self.weights = weights.to(model.device)
+        layout = model.layout
+        blocks = [layout.base_dim, *[layout.period_dim] * layout.num_periods]
+        self.tables = {
+            "offsets": make_table(model.offsets, None, _ADAM_EPS, lazy=True),
+            "features": make_table(model.features, blocks, _ADAM_EPS, lazy=True),
+            # Culling reads the scales of all anchors in every step.
+            "log_scales": make_table(model.log_scales, None, _ADAM_EPS, lazy=False),
+        }
+        self.optimizer = Adam(
+            {n: t for n, t in trained.items() if n not in PER_ANCHOR}, eps=_ADAM_EPS
+        )
+        self._seen_layout = dataclasses.replace(layout, num_periods=1)
+        self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed)
         self._middle = train.points.astype(np.float64).mean(axis=0)
@@ -136,7 +147,7 @@ class AnchorTrainer:
             return StepReport(loss=float("nan"), primitives=len(self.model))
         loss = self._learn(view, photo, visible, done)
         resized = self._densify_if_due(index, done)
-        self._update(done, skip=PER_ANCHOR if resized else ())
+        self._update(done, resized=resized)
         return StepReport(loss=loss, primitives=len(self.model))
 
     def _progress_after(self, index: int, progress: float) -> float:
@@ -146,8 +157,9 @@ class AnchorTrainer:
     def _learn(
         self, view: TrainingView, photo: NDArray[np.uint8], visible: np.ndarray, done: float
     ) -> float:
-        decoded, positions = self.model.decode_living(
-            self.weights[view.period], self._seen_from(view), torch.from_numpy(visible)
+        everything = torch.arange(len(visible), device=self.model.device)
+        decoded, positions = self._seen(visible, view.period).decode_living(
+            self._one_period, self._seen_from(view), everything
         )
         raster = draw(decoded, view, self.background, check_finite=False)
         target = torch.from_numpy(photo).to(self.model.device)
@@ -159,6 +171,25 @@ class AnchorTrainer:
         if self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN:
             self._count(view, visible, positions, decoded.opacities, raster.info)
         return float(loss.detach())
+
+    def _seen(self, visible: np.ndarray, period: int) -> AnchorModel:
+        """The visible anchors with the features of one period: a model of a single period."""
+        tables, model = self.tables, self.model
+        return AnchorModel(
+            self._seen_layout,
+            anchors=model.anchors[torch.from_numpy(visible).to(model.device)],
+            offsets=tables["offsets"].fetch(visible),
+            features=tables["features"].fetch(visible, (0, 1 + period)),
+            log_scales=tables["log_scales"].fetch(visible),
+            global_features=model.global_features[period : period + 1],
+            heads=model.heads,
+        )
+
+    def snapshot(self) -> AnchorModel:
+        """The model up to date: in `model`, anchors that no view saw lately lag behind."""
+        tensors = self.model.tensors()
+        tensors |= {name: table.snapshot() for name, table in self.tables.items()}
+        return AnchorModel.from_tensors(self.model.layout, tensors)
 
     def _seen_from(self, view: TrainingView) -> Tensor:
         """Camera centre for the viewing directions, shifted by chance if so configured. [3]"""
@@ -200,6 +231,8 @@ class AnchorTrainer:
         started = done > config.density_from + sign * _MARGIN
         if not started or (index + 1) % config.density_interval or self.statistics is None:
             return False
+        for table in self.tables.values():
+            table.flush()
         self._grow(self.statistics)
         self._prune(self.statistics)
         return True
@@ -215,7 +248,8 @@ class AnchorTrainer:
             "log_scales": new.log_scales,
         }
         for name, array in rows.items():
-            self._resize(name, extend=torch.from_numpy(array).to(model.device))
+            table = self.tables[name].extend(torch.from_numpy(array).to(model.device))
+            setattr(model, name, table)
         positions = torch.from_numpy(new.positions).to(model.device)
         model.anchors = torch.cat([model.anchors, positions])
         statistics.extend(len(new))
@@ -225,43 +259,35 @@ class AnchorTrainer:
         keep = prune_mask(statistics, self.rules)
         if not keep.all() and keep.any():
             mask = torch.from_numpy(keep).to(self.model.device)
-            for name in PER_ANCHOR:
-                self._resize(name, keep=mask)
+            for name, table in self.tables.items():
+                setattr(self.model, name, table.keep(mask))
             self.model.anchors = self.model.anchors[mask]
             statistics.keep(keep)
         with torch.no_grad():
             self.model.log_scales[:, 3:].clamp_(max=self.config.max_log_scale)
 
-    def _resize(
-        self, name: str, *, extend: Tensor | None = None, keep: Tensor | None = None
-    ) -> None:
-        """Change the rows of a tensor in model and optimiser alike."""
-        if name not in self.optimizer.params:  # of length 0, so nothing trains it
-            old: Tensor = getattr(self.model, name)
-            resized = torch.cat([old, extend]) if extend is not None else old[keep]
-        elif extend is not None:
-            resized = self.optimizer.extend(name, extend)
-        else:
-            assert keep is not None
-            resized = self.optimizer.keep(name, keep)
-        setattr(self.model, name, resized)
-
-    def _update(self, done: float, skip: tuple[str, ...]) -> None:
-        """Adam. After a round the anchors have new tensors without gradients: only MLPs and
-        global features move, as in the official code."""
+    def _update(self, done: float, *, resized: bool) -> None:
+        """Adam. After a round only MLPs and global features move, as in the official code, where
+        the anchors then have new tensors without gradients."""
         rates = {name: log_linear(done, *rate) for name, rate in self.rates.items()}
-        self.optimizer.step(rates, skip=skip)
-        self._decay(rates, skip)
-        if self.after_update is not None and "features" in rates and "features" not in skip:
-            self.after_update(self.model, rates)
+        self.optimizer.step(rates)
         self.optimizer.zero_grad()
+        if not resized:
+            for name, table in self.tables.items():
+                if name in rates:
+                    table.step(rates[name])
+        self._decay(rates, resized)
+        if self.after_update is not None and "features" in rates and not resized:
+            self.tables["features"].flush()
+            self.after_update(self.model, rates)
 
     @torch.no_grad()
-    def _decay(self, rates: Mapping[str, float], skip: tuple[str, ...]) -> None:
+    def _decay(self, rates: Mapping[str, float], resized: bool) -> None:
         """Decoupled weight decay; off unless configured."""
         config = self.config
-        if config.feature_decay and "features" in rates and "features" not in skip:
-            self.model.features.mul_(1.0 - rates["features"] * config.feature_decay)
+        if config.feature_decay and "features" in rates and not resized:
+            factor = 1.0 - rates["features"] * config.feature_decay
+            self.tables["features"].flush().mul_(factor)
         if config.head_decay:
             for name, value in self.optimizer.params.items():
                 if name.endswith(".w1"):

@@ -50,9 +50,10 @@ def test_before_training_equal_directions_give_equal_gaussians(method: Make) -> 
 
 def gradient_blocks(made: ChronoGS, weights: list[float]) -> torch.Tensor:
     """Gradients of the period features as [A, T, Fv]."""
-    decoded = decode_all(made.model, weights)
+    model = made.model.requires_grad()
+    decoded = decode_all(model, weights)
     (decoded.opacities.sum() + decoded.colors.square().sum() + decoded.scales.sum()).backward()
-    grad = made.model.features.grad
+    grad = model.features.grad
     assert grad is not None
     return grad[:, 16:].reshape(len(grad), 3, 16)
 

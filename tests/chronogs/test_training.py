@@ -110,7 +110,7 @@ def test_faint_anchors_go_but_never_all(noise_set: Callable[[int], TrainingSet])
     trainer._prune(statistics)
     torch.testing.assert_close(made.model.anchors, before[::2], rtol=0, atol=0)
     for name in ("offsets", "features", "log_scales"):
-        assert trainer.optimizer.params[name] is getattr(made.model, name)
+        assert trainer.tables[name].value.data_ptr() == getattr(trainer.model, name).data_ptr()
         assert len(getattr(made.model, name)) == len(before[::2]) == len(statistics.visits)
     assert made.model.log_scales[0].tolist() == pytest.approx([3.0] * 3 + [0.05] * 3)
     statistics.visits[:] = 100.0

@@ -1,0 +1,141 @@
+"""RowAdam against Adam, which moves every row in every step."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from chronoscene.training import row_adam
+from chronoscene.training.optimizer import Adam
+from chronoscene.training.row_adam import RowAdam
+
+# Worst of 400 runs: 3e-6 of the rates' sum, by which everything may move.
+TOLERANCE = 1e-5
+
+
+class Both:
+    """The same table under both optimisers, the gradient of what is not read being zero."""
+
+    def __init__(self, rows: int, blocks: list[int], seed: int) -> None:
+        self.blocks, self.rng = blocks, np.random.default_rng(seed)
+        start = torch.from_numpy(self.rng.normal(size=(rows, sum(blocks))).astype(np.float32))
+        self.dense = start.clone().requires_grad_()
+        self.adam = Adam({"x": self.dense})
+        self.lazy = RowAdam(start.clone(), blocks)
+        self.way = 0.0
+
+    def step(self, share: float, blocks: list[int], rate: float, scale: float = 1.0) -> None:
+        rows = np.flatnonzero(self.rng.random(len(self.dense)) < share)
+        starts = np.cumsum(self.blocks) - self.blocks
+        columns = np.concatenate([starts[b] + np.arange(self.blocks[b]) for b in blocks])
+        leaf = self.lazy.fetch(rows, blocks)
+        cells = np.ix_(rows, columns)
+        np.testing.assert_allclose(
+            leaf.detach(), self.dense.detach().numpy()[cells], rtol=0, atol=self.tolerance
+        )
+        grads = scale * self.rng.normal(size=(len(rows), len(columns))).astype(np.float32)
+        leaf.grad = torch.from_numpy(grads)
+        whole = np.zeros(self.dense.shape, np.float32)
+        whole[cells] = grads
+        self.dense.grad = torch.from_numpy(whole)
+        self.lazy.step(rate)
+        self.adam.step({"x": rate})
+        self.way += 4 * rate
+
+    @property
+    def tolerance(self) -> float:
+        return TOLERANCE * self.way + 1e-6
+
+    def compare(self) -> None:
+        np.testing.assert_allclose(
+            self.lazy.flush(), self.dense.detach(), rtol=0, atol=self.tolerance
+        )
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    steps=st.lists(
+        st.tuples(st.floats(0, 1), st.integers(0, 2), st.floats(1e-5, 0.1)), min_size=1, max_size=40
+    ),
+    scale=st.sampled_from([1e-7, 1e-3, 1.0, 1e4]),
+    seed=st.integers(0, 1000),
+)
+def test_waiting_rows_end_where_adam_takes_them(
+    steps: list[tuple[float, int, float]], scale: float, seed: int
+) -> None:
+    both = Both(7, [3, 2, 2, 2], seed)
+    for share, block, rate in steps:
+        both.step(share, [0, 1 + block], rate, scale)
+    both.compare()
+
+
+def test_rows_may_wait_longer_than_the_horizon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some for ever, some until the end."""
+    both = Both(6, [4], seed=3)
+    both.step(1.0, [0], 0.01)
+    monkeypatch.setattr(both, "rng", np.random.default_rng(1))
+    for index in range(row_adam._HORIZON + 60):
+        both.step(0.0, [0], 0.01 * 0.99**index)
+    both.step(1.0, [0], 0.01)
+    both.compare()
+
+
+def test_a_snapshot_changes_nothing() -> None:
+    """Later values are equal bit by bit with and without it."""
+    results = []
+    for look in (False, True):
+        both = Both(6, [3, 2], seed=4)
+        for _ in range(8):
+            both.step(0.4, [0], 0.01)
+            if look:
+                shown = both.lazy.snapshot()
+                np.testing.assert_allclose(shown, both.dense.detach(), rtol=0, atol=both.tolerance)
+        results.append(both.lazy.flush())
+    assert torch.equal(*results)
+
+
+def test_rows_come_and_go() -> None:
+    both = Both(5, [3], seed=1)
+    for _ in range(3):
+        both.step(0.5, [0], 0.01)
+    new = torch.ones(2, 3)
+    mask = torch.tensor([True, False, True, True, False, True, True])
+    both.lazy.extend(new)
+    both.lazy.keep(mask)
+    both.adam.extend("x", new)
+    both.dense = both.adam.keep("x", mask)
+    for _ in range(4):
+        both.step(0.5, [0], 0.01)
+    both.compare()
+
+
+def test_without_a_gradient_nothing_is_lost() -> None:
+    """Rows that were fetched and not used move as those that were not fetched."""
+    both = Both(4, [2], seed=2)
+    both.step(1.0, [0], 0.01)
+    both.lazy.fetch(np.array([1, 3]))
+    both.compare()
+
+
+def test_a_row_keeps_its_shape() -> None:
+    table = RowAdam(torch.zeros(4, 5, 3))
+    assert table.fetch(np.array([2, 0])).shape == (2, 5, 3)
+    assert RowAdam(torch.zeros(0, 5, 3)).fetch(np.empty(0, np.int64)).shape == (0, 5, 3)
+
+
+def test_equal_bits_for_any_number_of_threads() -> None:
+    if numba.config.NUMBA_NUM_THREADS < 2:  # type: ignore[attr-defined]
+        pytest.skip("one processor only")
+    previous, results = numba.get_num_threads(), []
+    for threads in (1, 2):
+        numba.set_num_threads(threads)
+        both = Both(5_000, [7, 4], seed=0)
+        for _ in range(6):
+            both.step(0.4, [0, 1], 0.01)
+        results.append(both.lazy.flush())
+    numba.set_num_threads(previous)
+    assert torch.equal(*results)
