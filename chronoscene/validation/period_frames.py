@@ -45,9 +45,11 @@ class Rays:
             period: Index of the period.
         """
         images, points, seen = scene.images, scene.points, scene.observations
-        assert images is not None and points is not None and seen is not None
+        table = scene.point_periods
+        assert images is not None and points is not None
+        assert seen is not None and table is not None
         of_period = [r for r in scene.reprojections or () if scene.image_periods[r.image] == period]
-        share = scene.point_periods.sum(axis=1) > 1
+        share = table.sum(axis=1) > 1
         rows = np.concatenate([np.zeros(0, np.int64), *(r.rows for r in of_period)])
         rows = rows[share[seen.point[rows]]]
         # Whole tracks, so that points keep several rays.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from chronoscene.errors import SceneError
 from chronoscene.geometry import rotation_from_quaternion
@@ -66,12 +66,13 @@ def read_rigs(folder: Path, form: str) -> RawRigs | None:
         return None  # damaged: the rule on damaged files, or COLMAP itself, says so
 
 
-def pose_matrix(pose: Pose) -> NDArray[np.float64]:
-    """``[R t; 0 1]`` of a pose; not finite where the pose is not."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation_from_quaternion(pose[:4])
-    matrix[:3, 3] = pose[4:]
-    return matrix
+def pose_matrices(poses: ArrayLike) -> NDArray[np.float64]:
+    """``[R t; 0 1]`` of poses, each 7 numbers; not finite where the pose is not. [n, 4, 4]"""
+    values = np.asarray(poses, np.float64).reshape(-1, 7)
+    matrices = np.tile(np.eye(4), (len(values), 1, 1))
+    matrices[:, :3, :3] = rotation_from_quaternion(values[:, :4])
+    matrices[:, :3, 3] = values[:, 4:]
+    return matrices
 
 
 def _walk_rigs(reader: RecordReader) -> dict[int, dict[Sensor, Pose | None]]:

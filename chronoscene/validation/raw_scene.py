@@ -57,6 +57,9 @@ FEWEST = 10
 FEWEST_IMAGES = 3
 """Images with an error from which the median of a period means something."""
 
+MOST_CELLS = 500_000_000
+"""Points times periods, in bytes: a table of more is not made. Real scenes have a few percent."""
+
 LARGEST_SIDE = 10**6
 """Pixels; a camera that claims more is a damaged record."""
 
@@ -72,6 +75,7 @@ _REASONS = {
     "periods": f"{SPLIT} or the images of the model cannot be read",
     "test": "sparse/0/test.txt is absent or cannot be read",
     "tests": f"{SPLIT}, test.txt or the images of the model cannot be read",
+    "point_periods": "points or periods cannot be read, or there are too many periods",
     "pixels": "pixels are decoded with --decode only",
 }
 
@@ -276,12 +280,14 @@ class RawScene:
         return np.array([index[periods[n]] if n in periods else -1 for n in names], np.int64)
 
     @cached_property
-    def point_periods(self) -> NDArray[np.bool_]:
+    def point_periods(self) -> NDArray[np.bool_] | None:
         """Whether an image of a period sees the point; columns as `period_ids`. [P, T]"""
         points, seen = self.points, self.observations
-        table = np.zeros((len(points or ()), len(self.period_ids)), bool)
-        if seen is None:
-            return table
+        if points is None or seen is None or self.periods is None:
+            return None
+        if len(points) * len(self.period_ids) > MOST_CELLS:
+            return None
+        table = np.zeros((len(points), len(self.period_ids)), bool)
         period = np.append(self.image_periods, -1)[seen.image]
         rows = (period >= 0) & seen.valid
         table[seen.point[rows], period[rows]] = True

@@ -182,6 +182,23 @@ def test_what_the_reader_refuses_has_an_error(scene):
     assert scene.validate().count("error")
 
 
+def test_too_many_periods_for_a_table_of_points(scene, monkeypatch):
+    monkeypatch.setattr("chronoscene.validation.raw_scene.MOST_CELLS", 79)
+    report = scene.validate()
+    assert not report.findings
+    skipped = {s.code for s in report.skipped if "too many periods" in s.reason}
+    assert skipped == {"CS506", "CS507", "CS508", "CS519", "CS521"}
+
+
+def test_each_image_a_period_of_its_own(scene):
+    lines = [
+        f"{name} {i}"
+        for i, name in enumerate(sorted(p.name for p in scene.path("images").iterdir()))
+    ]
+    scene.write("sparse/split.txt", lines)
+    assert "CS000" not in {f.code for f in scene.validate().findings}
+
+
 def test_torch_is_not_imported():
     code = (
         "import sys, chronoscene.cli.validate, chronoscene.validation.rule as r; r.all_rules()\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Iterator
 from datetime import date, datetime, timedelta
 from itertools import pairwise
@@ -87,17 +88,16 @@ def exif_period_order(scene: RawScene) -> Iterator[Hit]:
 )
 def exif_other_period(scene: RawScene) -> Iterator[Hit]:
     medians = _median_dates(scene)
+    ordered = sorted((median, period) for period, median in medians.items())
     for name, taken in _dates(scene).items():
-        own = (scene.periods or {})[name]
-        if own not in medians:
+        own = medians.get((scene.periods or {})[name])
+        if own is None:
             continue
-        away = abs(taken - medians[own])
-        for other, median in medians.items():
-            apart = abs(median - medians[own])
-            if other != own and apart >= DAY and abs(taken - median) < MUCH_NEARER * away:
-                found = f"{taken:%Y-%m-%d}, as in period {other}"
-                yield Hit(f"images/{name}", f"a date about {medians[own]:%Y-%m-%d}", found)
-                break
+        at = bisect(ordered, (taken, 0))
+        median, period = min(ordered[max(0, at - 1) : at + 1], key=lambda m: abs(m[0] - taken))
+        if abs(median - own) >= DAY and abs(taken - median) < MUCH_NEARER * abs(taken - own):
+            found = f"{taken:%Y-%m-%d}, as in period {period}"
+            yield Hit(f"images/{name}", f"a date about {own:%Y-%m-%d}", found)
 
 
 @rule(

@@ -36,6 +36,9 @@ APART = 0.05
 OWN = 0.5
 """Share of a period's points that its own cameras must look at."""
 
+MOST_PERIODS = 100
+"""Each is compared with each."""
+
 MOST_POINTS, MOST_IMAGES = 3000, 300
 """Points and images of all periods together that are compared."""
 
@@ -50,7 +53,7 @@ REACH = 3.0
     what="A period is in a frame of its own: mirrored, scaled, turned or moved against the others.",
     remedy="bring its poses into the frame of the others, or register all periods together",
     bad="period 1 was mapped by itself, then scaled to metres; the other periods were not",
-    needs=("images", "periods", "reprojections"),
+    needs=("images", "periods", "reprojections", "point_periods"),
 )
 def period_frame(scene: RawScene) -> Iterator[Hit]:
     limits: dict[int, float | None] = {}
@@ -82,6 +85,7 @@ def _behind(scene: RawScene, images: NDArray[np.int64]) -> NDArray[np.bool_]:
 def _other_depths(scene: RawScene) -> Iterator[Hit]:
     """Periods without shared points whose depths are of another order than those of the rest."""
     seen = scene.point_periods
+    assert seen is not None
     shared = seen[seen.sum(axis=1) > 1].any(axis=0)
     medians = _depths(scene, 50)
     for index, period in enumerate(scene.period_ids):
@@ -143,9 +147,11 @@ def frame_scale(scene: RawScene) -> Iterator[Hit]:
     remedy="leave the period out, or make it a scene of its own; if the places are the same, its "
     "frame is another one: register the periods together",
     bad="the photos of 2016 show the north side, those of 2023 the south side",
-    needs=("images", "periods", "reprojections"),
+    needs=("images", "periods", "reprojections", "point_periods"),
 )
 def period_apart(scene: RawScene) -> Iterator[Hit]:
+    if len(scene.period_ids) > MOST_PERIODS:
+        return
     share = common_view(scene)
     share[~(np.diag(share) >= OWN)] = np.nan  # cameras that miss their own points tell nothing
     for index, period in enumerate(scene.period_ids):
@@ -160,15 +166,13 @@ def common_view(scene: RawScene) -> NDArray[np.float64]:
 
     Points and images are samples. NaN for periods without points or without cameras. [T, T]
     """
-    images, points = scene.images, scene.points
-    assert images is not None and points is not None
+    images, points, seen = scene.images, scene.points, scene.point_periods
+    assert images is not None and points is not None and seen is not None
     count = len(scene.period_ids)
     share = np.full((count, count), np.nan)
     reach = _depths(scene, 95)
     finite = np.isfinite(points.xyz).all(axis=1)
-    owners = [
-        _sample(finite & scene.point_periods[:, i], MOST_POINTS // count) for i in range(count)
-    ]
+    owners = [_sample(finite & seen[:, i], MOST_POINTS // count) for i in range(count)]
     xyz = points.xyz[np.concatenate([np.zeros(0, np.int64), *owners])]
     owner = np.repeat(np.arange(count), list(map(len, owners)))
     known = np.isin(images.camera_ids, list(scene.usable_cameras))

@@ -116,10 +116,11 @@ def track_disagrees(scene: RawScene) -> Iterator[Hit]:
     what="No point is seen by any image of a period.",
     remedy="triangulate points with the images of this period",
     bad="points of period 0 only; the images of period 1 were added later",
-    needs=("observations", "periods"),
+    needs=("observations", "periods", "point_periods"),
 )
 def period_without_points(scene: RawScene) -> Iterator[Hit]:
     seen = scene.point_periods
+    assert seen is not None
     total = len(seen)
     for column, period in enumerate(scene.period_ids):
         if total and not seen[:, column].any():
@@ -133,10 +134,11 @@ def period_without_points(scene: RawScene) -> Iterator[Hit]:
     what="How many points are seen in one period only, and how many in several.",
     remedy=NOTHING,
     bad="(tells numbers)",
-    needs=("observations", "periods"),
+    needs=("observations", "periods", "point_periods"),
 )
 def points_of_one_period(scene: RawScene) -> Iterator[Hit]:
     seen = scene.point_periods
+    assert seen is not None
     if not len(seen) or seen.shape[1] < 2:
         return
     number = seen.sum(axis=1)
@@ -154,10 +156,11 @@ def points_of_one_period(scene: RawScene) -> Iterator[Hit]:
     what="A period shares no point with any other, so nothing shows that they are in one frame.",
     remedy="match images across the periods; if they were aligned otherwise, ignore this rule",
     bad="two models merged by hand",
-    needs=("observations", "periods"),
+    needs=("observations", "periods", "point_periods"),
 )
 def period_unconnected(scene: RawScene) -> Iterator[Hit]:
     seen = scene.point_periods
+    assert seen is not None
     if np.count_nonzero(seen.any(axis=0)) < 2:
         return  # nothing to be connected with
     shared = seen.sum(axis=1) > 1

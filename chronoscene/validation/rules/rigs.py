@@ -6,12 +6,16 @@ from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
+from chronoscene.geometry import camera_centre
 from chronoscene.validation.finding import Hit, counted, shown
-from chronoscene.validation.raw_rigs import CAMERA, RawFrame, RawRigs, pose_matrix, read_rigs
+from chronoscene.validation.raw_rigs import CAMERA, RawFrame, RawRigs, pose_matrices, read_rigs
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.reprojection import good_poses
 from chronoscene.validation.rule import rule
+
+Array = NDArray[np.float64]
 
 ANGLE = 1e-3
 """Radians between two statements of one pose that rounding in a text file cannot explain."""
@@ -112,29 +116,36 @@ def rig_pose_differs(scene: RawScene) -> Iterator[Hit]:
         return
     row = {image_id: i for i, image_id in enumerate(images.ids.tolist())}
     good = good_poses(images)
-    extent = np.nanmax(np.ptp(scene.centres, axis=0)) if good.any() else 0.0
-    different = []
-    for frame in raw.frames:
-        for sensor, image_id in frame.data:
-            pose = raw.rigs.get(frame.rig_id, {}).get(sensor)
-            i = row.get(image_id, -1)
-            if sensor[0] != CAMERA or pose is None or i < 0 or not good[i]:
-                continue
-            stated = pose_matrix((*images.quaternions[i], *images.translations[i]))
-            composed = pose_matrix(pose) @ pose_matrix(frame.rig_from_world)
-            if not _same_pose(stated, composed, extent):
-                different.append(images.names[i])
+    triples = [
+        (row[image_id], pose, frame.rig_from_world)
+        for frame in raw.frames
+        for sensor, image_id in frame.data
+        if sensor[0] == CAMERA
+        and (pose := raw.rigs.get(frame.rig_id, {}).get(sensor)) is not None
+        and good[row.get(image_id, -1)]
+        and image_id in row
+    ]
+    if not triples:
+        return
+    index = np.array([i for i, _, _ in triples])
+    stored = np.concatenate([images.quaternions[index], images.translations[index]], axis=1)
+    composed = pose_matrices([pose for _, pose, _ in triples]) @ pose_matrices(
+        [rig_from_world for _, _, rig_from_world in triples]
+    )
+    extent = float(np.max(np.ptp(scene.centres[good], axis=0)))
+    same = _same_pose(pose_matrices(stored), composed, extent)
+    different = [images.names[i] for i in index[~same].tolist()]
     if different:
         found = f"another one for {counted(len(different), 'image')}: {shown(sorted(different))}"
         place = scene.model_file("images")
         yield Hit(place, "the poses of rigs and frames", found, count=len(different))
 
 
-def _same_pose(a: np.ndarray, b: np.ndarray, extent: float) -> bool:
-    """False, too, where one is not finite."""
-    turned = np.linalg.norm(a[:3, :3] - b[:3, :3])
-    moved = np.linalg.norm(a[:3, :3].T @ a[:3, 3] - b[:3, :3].T @ b[:3, 3])
-    return bool(turned <= 2 * ANGLE and moved <= SHIFT * extent + 1e-9)
+def _same_pose(a: Array, b: Array, extent: float) -> NDArray[np.bool_]:
+    """Of poses [n, 4, 4]; false, too, where one is not finite. [n]"""
+    turned = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2))
+    moved = np.linalg.norm(camera_centre(a) - camera_centre(b), axis=1)
+    return np.asarray((turned <= 2 * ANGLE) & (moved <= SHIFT * extent + 1e-9))
 
 
 def _images(frame: RawFrame) -> list[int]:
