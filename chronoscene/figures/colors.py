@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-FOUR = ("#d62839", "#f2b005", "#2368c4", "#2e9e4f")
-"""Red, yellow, blue, green: the colours of the paper's figures for up to four periods."""
+FOUR = ("#b5121b", "#f5c211", "#1f6fd1", "#4db36a")
+"""Red, yellow, blue, green: the colours of the paper's figures for up to four periods. The red is
+dark and the green light, so that they differ for the colour-blind, too."""
 
-TEN = (
-    *("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9"),
-    *("#d55e00", "#b8a900", "#332288", "#882255", "#777777"),
+EIGHT = (
+    *("#0072b2", "#e69f00", "#009e73", "#cc79a7"),
+    *("#56b4e9", "#d55e00", "#5c5c5c", "#e6dc32"),
 )
 """Told apart with any common form of colour blindness.
 
-Source: Okabe and Ito 2008, with the yellow darkened for a white ground; the last three Tol 2021.
+Source: Okabe and Ito 2008, with grey for black and a darker yellow, for white and dark grounds.
 """
 
 _RAMP = ("#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#e8d21d")
@@ -22,8 +23,8 @@ _RAMP = ("#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0d
 
 
 def period_colors(periods: int) -> list[str]:
-    """Colours of the periods as ``#rrggbb``: four or ten that are far apart, else a ramp."""
-    for palette in (FOUR, TEN):
+    """Colours of the periods as ``#rrggbb``: four or eight that are far apart, else a ramp."""
+    for palette in (FOUR, EIGHT):
         if periods <= len(palette):
             return list(palette[:periods])
     anchors = np.array([rgb_of(color) for color in _RAMP])

@@ -19,7 +19,7 @@ from chronoscene.figures.colors import rgb_of
 Array = NDArray[np.float64]
 Counts = NDArray[np.float32]
 
-FAINTEST = 0.5
+FAINTEST = 0.6
 """Opacity of a pixel with one point, where others have many."""
 DARK_QUANTILE = 0.97
 """Of the pixels with points: the opacity of this many points is 1."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,8 @@ def page_of(cloud: Cloud, rgb: NDArray[np.uint8], *, most_points: int = MOST_POI
     data = json.dumps(_page_data(cloud, rgb, most_points), ensure_ascii=False)
     # No text can end the script: JSON has "<" inside of strings only.
     filled = {"TITLE": html.escape(cloud.name), "DATA": data.replace("<", "\\u003c")}
-    page = TEMPLATE
-    for mark, text in filled.items():
-        page = page.replace(f"@@{mark}@@", text, 1)
-    return page
+    # In one pass: a name may look like a mark.
+    return re.sub("@@(TITLE|DATA)@@", lambda mark: filled[mark[1]], TEMPLATE)
 
 
 def _page_data(cloud: Cloud, rgb: NDArray[np.uint8], most_points: int) -> dict[str, Any]:
