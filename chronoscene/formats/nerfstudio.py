@@ -59,6 +59,9 @@ MARKS = FILE
 PERIOD_BY = ("period", "time", "gap:X", "count:N", "table:FILE")
 """The key ``period`` or ``time``, groups of times, or a CSV file with columns file and period."""
 
+SUFFIX = ".png"
+"""Of images whose names have none, as instant-ngp reads them."""
+
 RAW_MATRIXCITY = '"rot_mat"'
 """A key of the raw files of MatrixCity, which have the same name."""
 
@@ -139,7 +142,7 @@ def _read_shots(path: Path, data: Mapping[str, Any], frames: list[dict[str, Any]
     shared = {key: value for key, value in data.items() if key != "frames"}
     for i, frame in enumerate(frames):
         place = f"{path / FILE}: frames[{i}]"
-        name = image_name(place, "", frame.get("file_path"))
+        name = image_name(place, "", frame.get("file_path"), suffix=SUFFIX)
         world_from_cam = matrix(place, frame.get("transform_matrix"), (3, 4))
         image_id = frame.get("colmap_im_id")
         shots.append(
@@ -178,7 +181,7 @@ def _names(place: Path, data: Mapping[str, Any], key: str) -> set[str] | None:
         return None
     if not isinstance(names, list):
         raise json_error(place, f"a list {key}", type(names).__name__)
-    return {image_name(f"{place}: {key}", "", name) for name in names}
+    return {image_name(f"{place}: {key}", "", name, suffix=SUFFIX) for name in names}
 
 
 def _group(

@@ -185,6 +185,15 @@ def test_hostile_paths_are_refused(nerfstudio_folder, key, path):
         read_scene(folder)
 
 
+def test_names_without_extension_are_png(nerfstudio_folder):
+    folder = nerfstudio_folder(NAMES)
+    edit_frames(folder, lambda i, frame: frame.update(file_path=f"./images/{i}"))
+    edit(folder, test_filenames=["images/2"])
+    scene = read_scene(folder)
+    assert [f.name for f in scene.frames] == NAMES
+    assert [f.name for f in scene.select(split="test")] == ["2.png"]
+
+
 def test_images_beside_the_folder_of_images(nerfstudio_folder):
     folder = nerfstudio_folder(NAMES)
     (folder / "images/3.png").rename(folder / "3.png")
