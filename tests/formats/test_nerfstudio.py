@@ -13,8 +13,7 @@ from chronoscene.formats import nerfstudio, read_scene
 from chronoscene.formats.intrinsics import CameraTable
 from chronoscene.formats.transforms import opengl_from_pose, pose_from_opengl
 from chronoscene.geometry import Sim3, pose_from_rotation_translation, rotation_from_quaternion
-from chronoscene.scene import Camera, Frame, Period, Points, Scene, WorldFrame
-from chronoscene.splits import split_hash
+from chronoscene.scene import Camera, Period
 
 NAMES = [f"{i}.png" for i in range(4)]
 
@@ -269,88 +268,6 @@ def test_poses_survive_the_other_axes(quaternion, position):
     pose = pose_from_rotation_translation(rotation_from_quaternion(quaternion), position)
     again = pose_from_opengl("place", opengl_from_pose(pose))
     np.testing.assert_allclose(again, pose, rtol=0, atol=1e-14 * (1 + np.abs(position).max()))
-
-
-labels = st.text(st.characters(codec="utf-8", exclude_categories=("C", "Z")), min_size=1)
-NO_SLASHES = str.maketrans("", "", "/\\:")
-
-models = {
-    "SIMPLE_PINHOLE": 3,
-    "PINHOLE": 4,
-    "SIMPLE_RADIAL": 4,
-    "RADIAL": 5,
-    "OPENCV": 8,
-    "OPENCV_FISHEYE": 8,
-}
-
-
-@st.composite
-def cameras(draw, camera_id):
-    model = draw(st.sampled_from(sorted(models)))
-    focals = 2 if model in ("PINHOLE", "OPENCV", "OPENCV_FISHEYE") else 1
-    params = [draw(st.floats(1, 1e4)) for _ in range(focals)]
-    params += [draw(st.floats(-1e3, 1e4)) for _ in range(2)]
-    params += [draw(st.floats(-0.5, 0.5)) for _ in range(models[model] - len(params))]
-    size = (draw(st.integers(1, 5000)), draw(st.integers(1, 5000)))
-    return Camera(camera_id, model, *size, tuple(params))
-
-
-@st.composite
-def scenes(draw):
-    count = draw(st.integers(2, 5))
-    texts = draw(st.lists(labels, min_size=count, max_size=count))
-    names = [f"{text.translate(NO_SLASHES)}_{i}.png" for i, text in enumerate(texts)]
-    periods = [0, 1, *(draw(st.integers(0, 1)) for _ in range(count - 2))]
-    frames = tuple(
-        Frame(
-            name=name,
-            image_id=i + 7,
-            camera=draw(cameras(i + 1)),
-            cam_from_world=pose_from_rotation_translation(
-                rotation_from_quaternion(draw(quaternions)), draw(positions)
-            ),
-            period=period,
-            split=draw(st.sampled_from(["train", "test"])) if i else "train",
-        )
-        for i, (name, period) in enumerate(zip(sorted(names), periods, strict=True))
-    )
-    n = draw(st.integers(0, 3))
-    xyz = np.array([draw(positions) for _ in range(n)]).reshape(n, 3)
-    points = dataclasses.replace(
-        Points.empty(),
-        ids=np.arange(1, n + 1),
-        xyz=xyz,
-        rgb=np.full((n, 3), draw(st.integers(0, 255)), np.uint8),
-        error=np.full(n, -1.0),
-        track_start=np.zeros(n + 1, np.int64),
-    )
-    table = (Period(0, draw(labels)), Period(1, draw(labels), "2023-04"))
-    world = WorldFrame("metre", "EPSG:32650", draw(positions))
-    return frames, points, table, world
-
-
-@given(scenes())
-def test_round_trip(tmp_path_factory, parts):
-    """Everything that the format can hold comes back; poses to rounding."""
-    frames, points, table, world = parts
-    root = tmp_path_factory.mktemp("round")
-    (root / "images").mkdir()
-    scene = Scene("s", root, root / "images", frames, points, table, "x", "x", world)
-    for frame in frames:
-        scene.image_path(frame).write_bytes(b"")
-    again = read_scene(nerfstudio.write(scene, root / "out"))
-    assert [(f.name, f.image_id, f.period, f.split) for f in again.frames] == [
-        (f.name, f.image_id, f.period, f.split) for f in frames
-    ]
-    for a, b in zip(frames, again.frames, strict=True):
-        same = ("model", "width", "height", "params")
-        assert all(getattr(a.camera, key) == getattr(b.camera, key) for key in same)
-        tolerance = 1e-14 * (1 + np.abs(a.cam_from_world).max())
-        np.testing.assert_allclose(a.cam_from_world, b.cam_from_world, rtol=0, atol=tolerance)
-    np.testing.assert_array_equal(again.points.xyz, points.xyz)
-    np.testing.assert_array_equal(again.points.rgb, points.rgb)
-    assert (again.periods, again.world) == (table, world)
-    assert split_hash(again) == split_hash(scene)
 
 
 def test_written_time_runs_from_0_to_1(make_scene_folder, tmp_path):
