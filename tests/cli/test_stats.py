@@ -137,3 +137,35 @@ def test_several_scenes_are_read_in_several_processes(make_scene_folder, tmp_pat
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith(f"error: {folders[1] / 'sparse/split.txt'}:1: expected")
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_figures_and_pages_of_every_scene(make_scene_folder, tmp_path):
+    folders = [make_scene_folder(name=name) for name in ("one/place", "two/place", "hill")]
+    out = tmp_path / "out" / "deep"
+    options = ["--figures", out, "--figure-format", "svg", "--cameras", "--pages", out / "pages"]
+    result = run(*folders, *options)
+    assert result.exit_code == 0, result.output
+    assert sorted(str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()) == [
+        "counts.svg",
+        "hill_points.svg",
+        "pages/hill.html",
+        "pages/place.html",
+        "pages/place_2.html",
+        "place_2_points.svg",
+        "place_points.svg",
+    ]
+    assert result.stdout.count("place") == 2
+
+
+@pytest.mark.parametrize("option", ["--figures", "--pages"])
+def test_nothing_is_drawn_into_a_scene(make_scene_folder, option):
+    folder = make_scene_folder()
+    result = run(folder, option, folder / "figures")
+    assert "nothing is written into a dataset" in str(result.exception)
+    assert not (folder / "figures").exists()
+
+
+def test_a_place_for_figures_that_is_a_file(make_scene_folder, tmp_path):
+    (tmp_path / "file").touch()
+    result = run(make_scene_folder(), "--figures", tmp_path / "file")
+    assert "expected a folder that can be made" in str(result.exception)

@@ -167,11 +167,11 @@ try {
   const f = report.zoomed = zoom / zoomed, after = screen(...corner);
   report.under = [0, 1].map(i => mouse[i] * ratio + f * (at[i] - mouse[i] * ratio) - after[i]);
   key("1"); key("ArrowRight"); key("ArrowUp");
-  report.turned = R;
+  report.turned = structuredClone(R);
   const drag = (pointerId, clientX, clientY) => canvas.dispatchEvent(
     new PointerEvent("pointermove", { pointerId, clientX, clientY }));
   fingers.set(7, [100, 100]); drag(7, 160, 90);
-  report.dragged = R; fingers.clear();
+  report.dragged = structuredClone(R); fingers.clear();
   key("0"); const far = zoom;
   fingers.set(1, [100, 100]); fingers.set(2, [200, 100]); drag(2, 300, 100);
   report.pinched = zoom / far; fingers.clear();
