@@ -8,6 +8,7 @@ blanks, and a sensor is ``CAMERA <id>``.
 from __future__ import annotations
 
 import struct
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,9 @@ CAMERA = 0
 
 Sensor = tuple[int, int]
 """Type and id."""
+
+Fields = deque[str]
+"""Of a line of text; they are taken from the left."""
 
 _U32_PAIR, _SENSOR, _POSE = struct.Struct("<II"), struct.Struct("<iI"), struct.Struct("<7d")
 _FLAG, _COUNT, _DATA_ID = struct.Struct("<B"), struct.Struct("<I"), struct.Struct("<Q")
@@ -62,7 +66,7 @@ def read_rigs(folder: Path, form: str) -> RawRigs | None:
         if form == ".bin":
             return RawRigs(read_records(rigs, _walk_rigs), read_records(frames, _walk_frames))
         return RawRigs(dict(map(_rig, _lines(rigs))), tuple(map(_frame, _lines(frames))))
-    except (OSError, SceneError, ValueError, StopIteration):
+    except (OSError, SceneError, ValueError, IndexError, OverflowError):
         return None  # damaged: the rule on damaged files, or COLMAP itself, says so
 
 
@@ -108,36 +112,35 @@ def _sensor(reader: RecordReader) -> Sensor:
     return kind, sensor_id
 
 
-def _lines(path: Path) -> Iterator[Iterator[str]]:
+def _lines(path: Path) -> Iterator[Fields]:
     """Fields of the lines that are no comments."""
     for line in path.read_text(encoding="utf-8").split("\n"):
         if line.strip() and not line.lstrip().startswith("#"):
-            yield iter(line.split())
+            yield deque(line.split())
 
 
-def _rig(fields: Iterator[str]) -> tuple[int, dict[Sensor, Pose | None]]:
-    rig_id, count = int(next(fields)), int(next(fields))
+def _rig(fields: Fields) -> tuple[int, dict[Sensor, Pose | None]]:
+    rig_id, count = int(fields.popleft()), int(fields.popleft())
     sensors: dict[Sensor, Pose | None] = {}
-    for i in range(min(count, 10**6)):
-        sensor = _text_sensor(fields)
-        known = i == 0 or int(next(fields))
-        pose = _text_pose(fields) if i and known else None
-        sensors[sensor] = IDENTITY if i == 0 else pose
+    if count > 0:
+        sensors[_text_sensor(fields)] = IDENTITY
+    for _ in range(count - 1):  # ends with the fields
+        sensor, known = _text_sensor(fields), int(fields.popleft())
+        sensors[sensor] = _text_pose(fields) if known else None
     return rig_id, sensors
 
 
-def _frame(fields: Iterator[str]) -> RawFrame:
-    frame_id, rig_id = int(next(fields)), int(next(fields))
-    pose = _text_pose(fields)
-    count = int(next(fields))
-    data = [(_text_sensor(fields), int(next(fields))) for _ in range(min(count, 10**6))]
+def _frame(fields: Fields) -> RawFrame:
+    frame_id, rig_id = int(fields.popleft()), int(fields.popleft())
+    pose, count = _text_pose(fields), int(fields.popleft())
+    data = [(_text_sensor(fields), int(fields.popleft())) for _ in range(count)]
     return RawFrame(frame_id, rig_id, pose, tuple(data))
 
 
-def _text_pose(fields: Iterator[str]) -> Pose:
-    return tuple(float(next(fields)) for _ in range(7))
+def _text_pose(fields: Fields) -> Pose:
+    return tuple(float(fields.popleft()) for _ in range(7))
 
 
-def _text_sensor(fields: Iterator[str]) -> Sensor:
-    kind = next(fields)
-    return (CAMERA if kind == "CAMERA" else 1), int(next(fields))
+def _text_sensor(fields: Fields) -> Sensor:
+    kind = fields.popleft()
+    return (CAMERA if kind == "CAMERA" else 1), int(fields.popleft())

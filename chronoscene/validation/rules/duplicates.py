@@ -34,6 +34,9 @@ SAME_DIRECTION = 2e-3
 ROUNDING = 1.01
 """So much more is let through to the exact comparison."""
 
+MOST_TRIED = 8
+"""Images that are compared pixel by pixel with one that looks like them all."""
+
 _BLOCK = 8
 _ROWS = 256
 
@@ -138,18 +141,50 @@ def _apart(scene: RawScene, a: str, b: str) -> str:
     needs=("images", "tests"),
 )
 def pose_leak(scene: RawScene) -> Iterator[Hit]:
-    images, tests, periods = scene.images, scene.tests, scene.periods
-    assert images is not None and tests is not None and periods is not None
-    near = SAME_PLACE * typical_depth(scene)
+    images, tests = scene.images, scene.tests
+    assert images is not None and tests is not None
     posed = np.flatnonzero(~np.isnan(scene.centres).any(axis=1))
+    test = np.array([images.names[i] in tests for i in posed.tolist()], bool)
     rotations = rotation_from_quaternion(images.quaternions[posed])
-    role = [(periods.get(images.names[i]), images.names[i] in tests) for i in posed.tolist()]
-    for a, b in close_pairs(scene.centres[posed], near) if near else ():
-        alike = np.linalg.norm(rotations[a] - rotations[b]) <= SAME_DIRECTION
-        if alike and role[a][0] == role[b][0] is not None and role[a][1] != role[b][1]:
-            test, train = (a, b) if role[a][1] else (b, a)
-            found = f"that of {shown([images.names[posed[train]]])}"
-            yield Hit(scene.image_place(images.names[posed[test]]), "a pose of its own", found)
+    pairs = twins(
+        scene.centres[posed],
+        rotations,
+        scene.image_periods[posed],
+        test,
+        near=SAME_PLACE * typical_depth(scene),
+    )
+    for a, b in pairs:
+        found = f"that of {shown([images.names[posed[b]]])}"
+        yield Hit(scene.image_place(images.names[posed[a]]), "a pose of its own", found)
+
+
+def twins(
+    places: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    periods: NDArray[np.int64],
+    test: NDArray[np.bool_],
+    *,
+    near: float,
+) -> Iterator[tuple[int, int]]:
+    """Test images, each with a training image of its period and pose, if there is one.
+
+    Args:
+        places: Camera centres. [N, 3]
+        rotations: [N, 3, 3]
+        periods: Negative for none. [N]
+        test: Which images are for testing. [N]
+        near: Distance of two centres that are one.
+    """
+    order = np.argsort(places[:, 0], kind="stable")
+    x = places[order, 0]
+    for i in np.flatnonzero(test & (periods >= 0)).tolist():
+        begin = np.searchsorted(x, places[i, 0] - near)
+        others = order[begin : np.searchsorted(x, places[i, 0] + near, "right")]
+        others = others[(periods[others] == periods[i]) & ~test[others]]
+        close = np.linalg.norm(places[others] - places[i], axis=1) <= near
+        turned = np.linalg.norm(rotations[others] - rotations[i], axis=(1, 2))
+        if len(alike := others[close & (turned <= SAME_DIRECTION)]):
+            yield i, int(alike[0])
 
 
 def typical_depth(scene: RawScene) -> float:
@@ -159,24 +194,14 @@ def typical_depth(scene: RawScene) -> float:
     return float(np.median(every)) if len(every) else 0.0
 
 
-def close_pairs(places: NDArray[np.float64], near: float) -> Iterator[tuple[int, int]]:
-    """Pairs of positions at most ``near`` apart; only those that lie near along x are compared."""
-    order = np.argsort(places[:, 0], kind="stable")
-    x = places[order, 0]
-    last = np.searchsorted(x, x + near, "right")
-    for i, end in enumerate(last.tolist()):
-        rest = order[i + 1 : end]
-        close = np.linalg.norm(places[rest] - places[order[i]], axis=1) <= near
-        yield from ((int(order[i]), int(j)) for j in rest[close])
-
-
 def near_pairs(
     pixels: Mapping[str, Pixels], role: Mapping[str, object]
 ) -> Iterator[tuple[str, str, float]]:
     """Pairs of images of different roles whose thumbnails differ by less than `NEAR`, not equal.
 
     The difference of means over blocks is never above that of the pixels, so most pairs are
-    settled by a sixty-fourth of the numbers, and none is lost.
+    settled by a sixty-fourth of the numbers. Of an image and all that come after it, one pair is
+    given: thousands of frames of a fixed camera must not give millions of pairs.
     """
     kept = {n: p.thumbnail for n, p in pixels.items() if p.thumbnail is not None}
     names = [n for n, thumbnail in kept.items() if thumbnail.std(axis=(0, 1)).max() >= FEATURELESS]
@@ -194,11 +219,15 @@ def near_pairs(
         squares = norms[rows, None] + norms[first:] - 2 * table[rows] @ table[first:].T
         near = squares < (NEAR**2 * table.shape[1]) * ROUNDING
         near &= group[rows, None] != group[first:]
-        i, j = np.nonzero(np.triu(near, 1))
-        for a, b in zip((first + i).tolist(), (first + j).tolist(), strict=True):
-            distance = _distance(full[a], full[b])
-            if distance < NEAR and pixels[names[a]].digest != pixels[names[b]].digest:
-                yield names[a], names[b], distance
+        near = np.triu(near, 1)
+        for i in np.flatnonzero(near.any(axis=1)).tolist():
+            others = np.flatnonzero(near[i])
+            nearest = others[np.argsort(squares[i, others])[:MOST_TRIED]]
+            for a, b in ((first + i, first + j) for j in nearest.tolist()):
+                distance = _distance(full[a], full[b])
+                if distance < NEAR and pixels[names[a]].digest != pixels[names[b]].digest:
+                    yield names[a], names[b], distance
+                    break
 
 
 def _distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:

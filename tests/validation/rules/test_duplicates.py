@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.validation.pixels import Pixels
-from chronoscene.validation.rules.duplicates import close_pairs, near_pairs
+from chronoscene.validation.rules.duplicates import near_pairs, twins
 
 TEST = "sparse/0/test.txt"
 
@@ -122,10 +122,21 @@ def test_one_pose_in_two_periods_is_a_tripod(scene):
     assert {f.code for f in scene.validate().findings} == {"CS507"}
 
 
-def test_close_pairs_are_all_found():
+def test_twins_are_those_of_the_definition():
     rng = np.random.default_rng(0)
-    places = rng.uniform(size=(200, 3))
-    distance = np.linalg.norm(places[:, None] - places, axis=2)
-    expected = {(i, j) for i, j in zip(*np.nonzero(distance <= 0.1), strict=True) if i < j}
-    found = list(close_pairs(places, 0.1))
-    assert {tuple(sorted(pair)) for pair in found} == expected and len(found) == len(expected) > 10
+    places, periods = rng.uniform(size=(300, 3)), rng.integers(-1, 3, 300)
+    test = rng.random(300) < 0.3
+    rotations = np.where(rng.random((300, 1, 1)) < 0.5, np.eye(3), -np.eye(3))
+    near = np.linalg.norm(places[:, None] - places, axis=2) <= 0.2
+    near &= (rotations[:, None] == rotations).all(axis=(2, 3))
+    near &= (periods[:, None] == periods) & (periods >= 0) & test[:, None] & ~test
+    found = dict(twins(places, rotations, periods, test, near=0.2))
+    assert sorted(found) == np.flatnonzero(near.any(axis=1)).tolist()
+    assert all(near[i, j] for i, j in found.items()) and len(found) > 10
+
+
+def test_a_fixed_camera_gives_one_pair_for_each_image():
+    noise = np.random.default_rng(0).uniform(0, 255, (32, 32, 3)).astype(np.float32)
+    pixels = {f"{i}": Pixels(None, bytes([i]), noise + i / 100) for i in range(200)}
+    pairs = list(near_pairs(pixels, {name: int(name) % 2 for name in pixels}))
+    assert len(pairs) == 199

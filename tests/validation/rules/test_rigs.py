@@ -69,3 +69,15 @@ def test_pose_of_the_frame_differs(rigs):
 def test_pose_of_the_frame_is_not_finite(rigs):
     edit_frame(rigs, 3, lambda v: v.__setitem__(6, float("nan")))
     rigs.expect("CS143", place=IMAGES, found="'a003.png'")
+
+
+@pytest.mark.parametrize("text", ["", "1", "1 2 CAMERA 1", "1 99999999999 CAMERA 1", "x y", "1 -1"])
+def test_damaged_text_is_none_or_empty(tmp_path, text):
+    (tmp_path / "rigs.txt").write_text(f"# comment\n{text}\n")
+    (tmp_path / "frames.txt").write_text("1 1 1 0 0 0 0 0 0 1 CAMERA 1 1\n")
+    found = read_rigs(tmp_path, ".txt")
+    assert found is None or not any(found.rigs.values())
+    (tmp_path / "rigs.txt").write_text("1 1 CAMERA 1\n")
+    (tmp_path / "frames.txt").write_text(f"{text}\n")
+    found = read_rigs(tmp_path, ".txt")
+    assert found is None or not found.frames
