@@ -74,9 +74,8 @@ def _tile(typing: Any, left: Any, right: Any, out: Any, row: Any, column: Any, p
         halves = ir.VectorType(_BFloat(), 32)
         kind = ir.FunctionType(floats, [floats, halves, halves])
         dot = cgutils.get_or_insert_function(b.module, kind, "llvm.x86.avx512bf16.dpbf16ps.512")
-        arrays = [
-            context.make_array(t)(context, b, v) for t, v in zip(signature.args[:3], args[:3])
-        ]
+        kinds = zip(signature.args[:3], args[:3], strict=True)
+        arrays = [context.make_array(kind)(context, b, value) for kind, value in kinds]
         strides = [cgutils.unpack_tuple(b, a.shape, 2)[1] for a in arrays]
         top, first, pairs = args[3:]
         index = top.type
@@ -95,17 +94,17 @@ def _tile(typing: Any, left: Any, right: Any, out: Any, row: Any, column: Any, p
                 value = b.load(pointer, typ=words)
                 value.align = 4
                 vectors.append(b.bitcast(value, halves))
-            for r, row_sums in zip(rows, sums):
+            for r, row_sums in zip(rows, sums, strict=True):
                 pair = b.load(at(0, r, loop.index))
                 single = b.insert_element(ir.Constant(words, ir.Undefined), pair, word(0))
                 spread = b.shuffle_vector(
                     single, ir.Constant(words, ir.Undefined), ir.Constant(words, [0] * 16)
                 )
                 factor = b.bitcast(spread, halves)
-                for total, vector in zip(row_sums, vectors):
+                for total, vector in zip(row_sums, vectors, strict=True):
                     b.store(b.call(dot, [b.load(total), factor, vector]), total)
-        for r, row_sums in zip(rows, sums):
-            for total, c in zip(row_sums, columns):
+        for r, row_sums in zip(rows, sums, strict=True):
+            for total, c in zip(row_sums, columns, strict=True):
                 pointer = b.bitcast(at(2, r, c), floats.as_pointer())
                 b.store(b.load(total), pointer).align = 4
         return context.get_dummy_value()

@@ -1,0 +1,194 @@
+"""Registrations of known truth: errors of poses by period, and whether the verdict can be trusted.
+
+    python benchmarks/registration.py observations [--cases 300] [--seed 0] [--only FAMILY]
+    python benchmarks/registration.py images [--cases 8] [--work FOLDER] [--route joint]
+
+``observations`` generates matches and poses without images (`chronoscene.registration.generated`),
+in families of what can go wrong. ``images`` renders small cities at several dates and runs the
+command ``chronoscene register`` on the photos, with GPS noise of 3 m and 10% gross errors in them.
+
+A registration is right if the median rotation of every period is within 0.1 degrees and its median
+centre within 0.2% of the scene's extent, in the frame of the first period's cameras. The confusion
+table sets that against the verdict. The exit status is 1 if a wrong registration was passed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from chronoscene.bench.identity import processor_name
+from chronoscene.registration.certificate import Certificate, certify, scene_extent
+from chronoscene.registration.generated import CaseSettings, Generated, generate_case, pose_errors
+from chronoscene.registration.verdict import LEVELS, Verdict, judge
+
+ROTATION, CENTRE = 0.1, 0.2
+"""Degrees, and percent of the extent, within which a registration is right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One case: errors of each period but the first, and the verdict."""
+
+    family: str
+    periods: tuple[tuple[float, float, float, float], ...]
+    """Rotation median and largest, degrees; centre median and largest, percent of the extent."""
+    verdict: str
+    reason: str
+    seconds: float
+    """CPU time."""
+
+    @property
+    def right(self) -> bool:
+        return all(r < ROTATION and c < CENTRE for r, _, c, _ in self.periods)
+
+
+def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _common(rng: np.random.Generator) -> dict[str, object]:
+    """What differs between all cases: size, noise, change, GPS or none."""
+    return {
+        "seed": int(rng.integers(2**31)),
+        "views": int(rng.integers(8, 20)),
+        "points": int(rng.integers(1500, 4000)),
+        "noise": float(rng.uniform(0.3, 0.8)),
+        "changed": float(rng.uniform(0.1, 2.0)),
+        "gps_noise": 3.0 if rng.random() < 0.6 else None,
+        "periods": 4 if rng.random() < 0.25 else 2,
+    }
+
+
+FAMILIES: dict[str, Callable[[np.random.Generator], dict[str, object]]] = {
+    "good": lambda rng: {"ties": int(rng.integers(300, 1500))},
+    "few ties": lambda rng: {"ties": int(_log_uniform(rng, 8, 200))},
+    "ties in one spot": lambda rng: {
+        "ties": int(rng.integers(60, 500)), "cluster": rng.uniform(6, 35)
+    },
+    "outliers": lambda rng: {
+        "ties": int(rng.integers(200, 800)), "outliers": rng.uniform(0.2, 0.7)
+    },
+    "repeated structure": lambda rng: {
+        "ties": int(rng.integers(100, 800)), "repeated": rng.uniform(0.5, 1.0),
+        "step": _log_uniform(rng, 0.6, 15), "cluster": None if rng.random() < 0.5 else 25.0,
+    },
+    "a little wrong": lambda rng: {
+        "ties": int(rng.integers(200, 1000)), "rotation": _log_uniform(rng, 0.02, 0.5),
+        "shift": _log_uniform(rng, 0.02, 1.5),
+    },
+    "very wrong": lambda rng: {
+        "ties": int(rng.integers(100, 600)), "rotation": _log_uniform(rng, 0.5, 30),
+        "shift": _log_uniform(rng, 1, 60), "scale": rng.normal(0, 0.1),
+    },
+    "by GPS": lambda rng: {
+        "by_gps": True, "ties": int(_log_uniform(rng, 5, 300)), "gps_noise": 3.0
+    },
+    "chain": lambda rng: {"periods": 4, "chain": True, "ties": int(rng.integers(50, 500))},
+    "bent": lambda rng: {
+        "ties": int(rng.integers(200, 1000)), "bend": _log_uniform(rng, 0.05, 5)
+    },
+    "drift in scale": lambda rng: {
+        "ties": int(rng.integers(200, 1000)), "scale": _log_uniform(rng, 5e-4, 0.05)
+    },
+}  # fmt: skip
+"""What can go wrong, as changes of `CaseSettings`."""
+
+
+def observation_cases(count: int, seed: int, only: str) -> Iterator[tuple[str, CaseSettings]]:
+    """Cases of all families in turn."""
+    names = [n for n in FAMILIES if only in n]
+    for i in range(count):
+        rng = np.random.default_rng([seed, i])
+        family = names[i % len(names)]
+        values = _common(rng) | FAMILIES[family](rng)
+        yield family, CaseSettings(**values)  # type: ignore[arg-type]
+
+
+def outcome(
+    family: str, made: Generated, certificate: Certificate, verdict: Verdict, seconds: float
+) -> Outcome:
+    """Compare a registration with the truth."""
+    model = made.model
+    rotation, centre = pose_errors(model.cam_from_world, made.truth, model.periods == 0)
+    extent = scene_extent(model)
+    rows = []
+    for p in range(1, model.num_periods):
+        r, c = rotation[model.periods == p], 100 * centre[model.periods == p] / extent
+        rows.append((np.median(r), r.max(), np.median(c), c.max()))
+    reason = verdict.findings[0].check if verdict.findings else ""
+    return Outcome(family, tuple(rows), verdict.level, reason, seconds)
+
+
+def run_observations(count: int, seed: int, only: str) -> list[Outcome]:
+    outcomes = []
+    for family, settings in observation_cases(count, seed, only):
+        made = generate_case(settings)
+        start = time.process_time()
+        certificate = certify(made.model)
+        verdict = judge(certificate)
+        seconds = time.process_time() - start
+        outcomes.append(outcome(family, made, certificate, verdict, seconds))
+        if outcomes[-1].verdict == "pass" and not outcomes[-1].right:
+            print(f"PASSED A WRONG ONE: {settings}\n  {outcomes[-1].periods}", flush=True)
+    return outcomes
+
+
+def confusion(outcomes: list[Outcome]) -> str:
+    """Verdict against truth, over all cases and by family."""
+    lines = [f"{'':<22}" + "".join(f"{level:>10}" for level in LEVELS) + "   most frequent reason"]
+    for family in ["all", *dict.fromkeys(o.family for o in outcomes)]:
+        for truth in (True, False):
+            mine = [o for o in outcomes if o.right == truth and family in ("all", o.family)]
+            if not mine:
+                continue
+            counts = "".join(f"{sum(o.verdict == v for o in mine):>10}" for v in LEVELS)
+            reasons = [o.reason for o in mine if o.reason]
+            often = max(set(reasons), key=reasons.count) if reasons else ""
+            lines.append(f"{family + (', right' if truth else ', wrong'):<22}{counts}   {often}")
+    return "\n".join(lines)
+
+
+def errors_table(outcomes: list[Outcome]) -> str:
+    """Median over the cases of each family, worst period of each case."""
+    lines = [f"{'':<22}{'rotation [deg]':>20}{'centre [% extent]':>20}{'CPU [s]':>9}"]
+    lines.append(f"{'':<22}" + f"{'median':>10}{'largest':>10}" * 2)
+    for family in dict.fromkeys(o.family for o in outcomes):
+        mine = [o for o in outcomes if o.family == family]
+        worst = np.array([np.max(o.periods, axis=0) for o in mine])
+        r, rmax, c, cmax = np.median(worst, axis=0)
+        seconds = np.median([o.seconds for o in mine])
+        lines.append(f"{family:<22}{r:10.4f}{rmax:10.4f}{c:10.4f}{cmax:10.4f}{seconds:9.2f}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("tier", choices=("observations", "images"))
+    parser.add_argument("--cases", type=int)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="families or cases whose name has this in it")
+    parser.add_argument("--route", default="auto", help="images: route of the command")
+    parser.add_argument("--work", type=Path, help="images: folder that keeps scenes and models")
+    options = parser.parse_args()
+    print(f"{processor_name()}, {os.cpu_count()} processors, seed {options.seed}")
+    if options.tier == "observations":
+        outcomes = run_observations(options.cases or 330, options.seed, options.only)
+    else:
+        from registration_images import run_images
+
+        outcomes = run_images(options)
+    print(f"{len(outcomes)} cases, {sum(o.right for o in outcomes)} of them right\n")
+    print(errors_table(outcomes) + "\n\n" + confusion(outcomes))
+    sys.exit(any(o.verdict == "pass" and not o.right for o in outcomes))
+
+
+if __name__ == "__main__":
+    main()
