@@ -22,11 +22,12 @@ from chronoscene.validation.finding import counted, shown
 from chronoscene.validation.model_writer import write_raw_model
 from chronoscene.validation.raw_model import FORMS, RawModel
 from chronoscene.validation.raw_scene import RawScene, TextFile, read_text_file
+from chronoscene.validation.repair_images import set_upright
 from chronoscene.validation.repair_model import Repair, repair_model
 from chronoscene.validation.repair_texts import repair_split, repair_test
 from chronoscene.validation.rules import split as split_rules
 from chronoscene.validation.rules import testlist as test_rules
-from chronoscene.validation.rules.images import spelling
+from chronoscene.validation.rules.images import images_of_other_shape, spelling
 from chronoscene.validation.run import quiet_numbers
 
 
@@ -93,6 +94,7 @@ class _Fix:
         self._split(names)
         self._test(names)
         self._misspelt_images()
+        self._orientation_tags()
         self._copy_rest()
         return self._repairs
 
@@ -194,6 +196,25 @@ class _Fix:
         if renamed:
             what = f"{counted(len(renamed), 'image')} renamed as in the model: {shown(renamed)}"
             self._repairs.append(Repair("CS201", what))
+
+    def _orientation_tags(self) -> None:
+        """Images whose tag turns them in viewers while the poses refer to the pixels as stored."""
+        headers = self._scene.headers
+        turned = {n for n, h in headers.items() if h.problem is None and h.orientation > 1}
+        done = []
+        for name in sorted(turned - images_of_other_shape(self._scene)) if turned else ():
+            source = self._scene.image_path(name)
+            upright = set_upright(source.read_bytes()) if self._inside(name) else None
+            if upright is None:
+                continue
+            target = self._out / "images" / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(upright)
+            self._written.add(f"images/{name}")
+            done.append(name)
+        if done:
+            what = f"orientation tag of {counted(len(done), 'image')} set to upright: {shown(done)}"
+            self._repairs.append(Repair("CS207", what))
 
     def _inside(self, name: str) -> bool:
         images = (self._scene.root / "images").resolve()

@@ -1,16 +1,21 @@
 """Each correction alone: the copy has none of the fixed codes, and the scene stays as it was."""
 
 import hashlib
+import io
 import json
 import os
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
 
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.validation.fix import fix_scene
 from chronoscene.validation.raw_model import read_raw_model
+from chronoscene.validation.repair_images import set_upright
 from chronoscene.validation.run import validate_scene
 
 SPLIT, TEST = "sparse/split.txt", "sparse/0/test.txt"
@@ -232,6 +237,46 @@ def test_misspelt_image(scene, fix):
     fixed, after, out = fix()
     assert fixed == {"CS201"} and after == {"CS507"}
     assert not (out / "images/A000.PNG").exists()
+
+
+def tagged(image, orientation, *, order="<"):
+    exif = Image.Exif()
+    exif.endian = order
+    exif[0x010F], exif[0x0112] = "Maker", orientation
+    image.save(file := io.BytesIO(), "JPEG", exif=exif)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_orientation_tag(scene, fix, order):
+    scene.save("a000.png", Image.new("RGB", (64, 48)), as_name="a000.jpg")
+    noise = Image.fromarray(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8))
+    scene.write("images/a000.jpg", tagged(noise, 6, order=order))
+    fixed, after, out = fix()
+    assert fixed == {"CS207"} and after == {"CS507"}
+    with (
+        Image.open(out / "images/a000.jpg") as new,
+        Image.open(scene.path("images/a000.jpg")) as old,
+    ):
+        np.testing.assert_array_equal(np.asarray(new), np.asarray(old))
+        assert new.getexif()[0x010F] == "Maker"
+
+
+def test_orientation_tag_that_the_camera_agrees_with_stays(scene, fix):
+    scene.save("a000.png", Image.new("RGB", (64, 48)), as_name="a000.jpg")
+    scene.write("images/a000.jpg", tagged(Image.new("RGB", (48, 64)), 6))
+    fixed, after, _ = fix()
+    assert fixed == set() and {"CS204", "CS207"} <= after
+
+
+@given(st.binary(max_size=60), st.integers(0, 200))
+def test_upright_changes_two_bytes_or_nothing(garbage, at):
+    good = tagged(Image.new("RGB", (8, 8)), 6)
+    data = good[:at] + garbage + good[at + len(garbage) :]
+    found = set_upright(data)
+    if found is not None:
+        assert len(found) == len(data)
+        assert sum(a != b for a, b in zip(found, data, strict=True)) <= 2
 
 
 def test_model_that_cannot_be_read_is_copied(scene, fix):

@@ -140,6 +140,11 @@ def orientation_tag(scene: RawScene) -> Iterator[Hit]:
             yield Hit(_place(name), "no orientation tag", f"orientation {header.orientation}")
 
 
+def images_of_other_shape(scene: RawScene) -> set[str]:
+    """Names of the images whose shape is not that of their camera."""
+    return {name for name, size, camera in _sizes(scene) if not _same_shape(size, camera)}
+
+
 def _sizes(scene: RawScene) -> Iterator[tuple[str, tuple[int, int], Camera]]:
     """Name, size of the file, and camera of the images that have both."""
     assert scene.images is not None
