@@ -14,7 +14,6 @@ from chronoscene.scene import Scene
 
 _EXIF_IFD = 0x8769
 
-
 _CAPTURE_TAGS = (0x9003, 0x9004)
 """DateTimeOriginal, DateTimeDigitized."""
 

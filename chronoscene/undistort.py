@@ -33,7 +33,6 @@ from chronoscene.warp import warp
 
 JPEG_QUALITY = 95
 
-
 WRITABLE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 _METADATA_FORMATS = (".png", ".jpg", ".jpeg", ".webp")

@@ -18,9 +18,11 @@ from chronoscene.scene import Camera, Frame, Points, Scene
 ROWS = 128
 """Rows of a map that are computed at once, to bound the memory."""
 
-
 LARGEST_SIDE = 65535
 """Pixels; what a JPEG file can hold. A camera that needs more is a mistake."""
+
+LARGEST_DISAGREEMENT = 0.01
+"""Pixels between an observation and the projection of its ray."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,8 +151,21 @@ def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.flo
         K = change.source.K
         rays = (xy - K[:2, 2]) / K[[0, 1], [0, 1]]
     else:
-        rays = unproject_pixels(change.source, xy)
+        rays = _rays(change.source, xy)
     return rays * [fx, fy] + [cx, cy]
+
+
+def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points at depth 1 that a camera sees at pixels. [N, 2] -> [N, 2]
+
+    COLMAP finds them step by step, and returns something even where there is no such ray: beyond
+    the field of view of the model. So they are projected again, and NaN where that disagrees.
+    """
+    rays = unproject_pixels(camera, xy)
+    again = project_points(camera, np.column_stack([rays, np.ones(len(rays))]))
+    wrong = ~(np.abs(again - xy).max(axis=1) < LARGEST_DISAGREEMENT)
+    rays[wrong] = np.nan
+    return rays
 
 
 @lru_cache(maxsize=4)

@@ -13,7 +13,7 @@ from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Period, WorldFrame
 from chronoscene.splits import split_hash
 from chronoscene.undistort import undistort, undistort_pixels
-from chronoscene.undistort_cameras import CameraChange, pinhole_camera
+from chronoscene.undistort_cameras import CameraChange, move_pixels, pinhole_camera
 
 import pycolmap  # isort: skip
 
@@ -276,6 +276,17 @@ def test_observations_at_infinity_are_dropped(make_distorted, tmp_path):
     done = undistort(scene, tmp_path / "out")
     assert done.observations_lost >= 1
     assert np.isfinite(done.scene.points.track_xy).all()
+
+
+def test_pixels_beyond_the_field_of_view_have_no_place():
+    """Rays at 90 degrees and more from the axis of a fisheye are not on the image plane."""
+    params = (284.468, 285.51, 424.355, 393.742, 0.0008, 0.031, -0.03, 0.005)
+    fisheye = Camera(1, "OPENCV_FISHEYE", 848, 800, params)
+    change = CameraChange(fisheye, pinhole_camera(fisheye))
+    inside, corner = move_pixels(change, np.array([[500.0, 300.0], [0.0, 0.0]]))
+    assert np.isnan(corner).all()
+    ray = (inside - change.target.K[:2, 2]) / change.target.K[[0, 1], [0, 1]]
+    np.testing.assert_allclose(distort("OPENCV_FISHEYE", params, *ray), [500, 300], atol=1e-3)
 
 
 def test_exif_and_quality_of_jpegs(make_distorted, tmp_path):

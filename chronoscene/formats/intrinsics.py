@@ -14,7 +14,6 @@ from chronoscene.scene import Camera
 LARGEST_SIDE = 1_000_000
 """Pixels; beyond any image."""
 
-
 MODEL_KEYS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": (),
     "PINHOLE": (),
@@ -24,7 +23,6 @@ MODEL_KEYS: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 """Camera models that such a file can name, with their distortion in COLMAP's order."""
-
 
 _LIST_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of ``distortion_params``."""
