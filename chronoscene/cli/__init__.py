@@ -14,6 +14,7 @@ COMMANDS = {
     "bench": "chronoscene.cli.bench:command",
     "convert": "chronoscene.cli.convert:command",
     "methods": "chronoscene.cli.methods:command",
+    "register": "chronoscene.cli.register:command",
     "score": "chronoscene.cli.score:command",
     "split": "chronoscene.cli.split:command",
     "stats": "chronoscene.cli.stats:command",

@@ -78,7 +78,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
 
 def _posed(arguments: Mapping[str, Any]) -> tuple[pycolmap.Reconstruction, set[int]]:
-    """All images of the database, those of the scene with their poses; and the ids of the latter."""
+    """All images of the database, those of the scene with their poses; ids of the latter."""
     model = known_images(arguments["database"])
     old = set()
     for image_id, image in list(model.images.items()):

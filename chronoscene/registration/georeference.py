@@ -7,6 +7,7 @@ above the sea instead of the ellipsoid shift the frame upwards as a whole and be
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -69,6 +70,17 @@ class Georeference:
         return np.stack([lat, lon, height], axis=-1)
 
 
+def from_crs(crs: str | None) -> Georeference | None:
+    """The frame that `Georeference.crs` describes; None for any other text."""
+    number = r"([-+0-9.e]+)"
+    pattern = rf"\+proj=topocentric \+ellps=WGS84 \+lat_0={number} \+lon_0={number} \+h_0={number}"
+    found = re.fullmatch(pattern, crs or "")
+    if found is None:
+        return None
+    latitude, longitude, height = (float(value) for value in found.groups())
+    return Georeference(latitude, longitude, height, "as stated")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Positions:
     """What the photos say about where they were taken, in a frame if there is one."""
@@ -85,11 +97,15 @@ class Positions:
     """What was found out, for the log."""
 
 
-def locate(captures: Sequence[Capture]) -> Positions:
+def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Positions:
     """Put the positions of captures into one local frame.
 
     Wildly wrong positions (kilometres off among hundreds of metres, or another continent) are
     found by their distance from the median; subtler errors are left to the comparison with poses.
+
+    Args:
+        captures: Photos of all periods.
+        frame: The frame to use; None for one around the median position.
     """
     count = len(captures)
     nothing = np.full((count, 3), np.nan)
@@ -104,7 +120,7 @@ def locate(captures: Sequence[Capture]) -> Positions:
         assert gps is not None
         latitude[i], longitude[i] = gps.latitude, gps.longitude
     height, kind, remarks = _heights(captures, has)
-    frame = Georeference(
+    frame = frame or Georeference(
         latitude=round(float(np.nanmedian(latitude)), 7),
         longitude=round(_median_angle(longitude[has]), 7),
         height=round(float(np.median(height[has])), 2),
@@ -115,7 +131,7 @@ def locate(captures: Sequence[Capture]) -> Positions:
     believed, more = _plausible(captures, enu, has)
     remarks += more
     sigma = np.stack([_sigma(c, kind) for c in captures])
-    spread = np.linalg.norm(enu[believed] - np.median(enu[believed], axis=0), axis=1)
+    spread = np.ptp(enu[believed], axis=0) if believed.any() else np.zeros(3)
     if believed.sum() < 3 or spread.max() < CONSTANT_METRES:
         remarks.append(
             f"all GPS positions lie within {CONSTANT_METRES} m: one fix for all photos, of no use"

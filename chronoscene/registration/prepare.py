@@ -88,7 +88,7 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
             _copy_without_orientation(capture.path, target)
             turned += 1
         else:
-            _link(capture.path, target)
+            link(capture.path, target)
         names.append(target.relative_to(folder).as_posix())
     remarks = []
     if turned:
@@ -135,7 +135,9 @@ def _convert(source: Path, target: Path) -> Path:
     return target
 
 
-def _link(source: Path, target: Path) -> None:
+def link(source: Path, target: Path) -> None:
+    """Make a symbolic link, replacing what is there."""
+    target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     partial.unlink(missing_ok=True)
     partial.symlink_to(source.resolve())

@@ -283,7 +283,7 @@ def merge(
             image = merged.images[ids[str(model.images[old].name)]]
             if image.camera_id not in calibrated:
                 params = model.cameras[model.images[old].camera_id].params
-                merged.cameras[image.camera_id].params = params
+                merged.cameras[image.camera_id].params = params.tolist()
             set_pose(merged, image.image_id, model.images[old].cam_from_world())
         calibrated |= {merged.images[i].camera_id for i in merged.reg_image_ids()}
     return merged

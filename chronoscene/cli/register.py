@@ -1,0 +1,175 @@
+"""``chronoscene register``: several captures, years apart, into one frame."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+
+from chronoscene.cli.output import emit
+from chronoscene.convert import check_outside
+from chronoscene.formats import read_scene
+from chronoscene.registration.captures import read_captures
+from chronoscene.registration.model import ROUTES, Registered, Route
+from chronoscene.registration.pipeline import Options, run, run_into
+from chronoscene.registration.worker import Report
+
+DEFAULTS = Options()
+
+
+@click.command("register")
+@click.argument("captures", type=click.Path(path_type=Path))
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--table",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="CSV with the columns image and period; paths are relative to CAPTURES.",
+)
+@click.option(
+    "--into",
+    "scene",
+    type=click.Path(path_type=Path),
+    help="Add CAPTURES as a new period to this scene, whose poses and cameras stay as they are.",
+)
+@click.option(
+    "--route",
+    type=click.Choice([r for r in ROUTES if r != "frozen"]),
+    help="joint: all photos in one reconstruction; separate: one for each period, then aligned.  "
+    "[default: joint if matches connect all periods]",
+)
+@click.option(
+    "--work",
+    type=click.Path(path_type=Path),
+    help="Folder for features, matches and models, from which a later run goes on.  "
+    "[default: OUT.work]",
+)
+@click.option("--overwrite", is_flag=True, help="Replace an earlier registration at OUT.")
+@click.option(
+    "--max-image-size",
+    type=click.IntRange(200),
+    default=DEFAULTS.max_image_size,
+    show_default=True,
+    help="Pixels; larger photos are scaled down for finding features.",
+)
+@click.option(
+    "--max-features", type=click.IntRange(100), default=DEFAULTS.max_features, show_default=True
+)
+@click.option(
+    "--exhaustive-limit",
+    type=click.IntRange(0),
+    default=DEFAULTS.exhaustive_limit,
+    show_default=True,
+    help="Number of photos up to which all pairs are matched.",
+)
+@click.option(
+    "--held-out",
+    type=click.FloatRange(0, 0.5),
+    default=DEFAULTS.held_out,
+    show_default=True,
+    help="Share of the tracks across periods that only test the result.",
+)
+@click.option(
+    "--camera-model",
+    type=click.Choice(["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]),
+    default=DEFAULTS.camera_model,
+    show_default=True,
+)
+@click.option(
+    "--threads",
+    type=click.IntRange(1),
+    help="With 1, every run gives the same result bit by bit.  [default: one per processor]",
+)
+def command(
+    captures: Path,
+    out: Path,
+    table: Path | None,
+    scene: Path | None,
+    route: Route | None,
+    work: Path | None,
+    overwrite: bool,
+    max_image_size: int,
+    max_features: int,
+    exhaustive_limit: int,
+    held_out: float,
+    camera_model: str,
+    threads: int | None,
+) -> None:
+    """Register photos of several dates into one frame and write the scene OUT.
+
+    CAPTURES is a folder with one folder of photos for each period; or a folder of photos, whose
+    periods are proposed from their dates; or a CSV of image and period. A run that was stopped goes
+    on where it was when the command is given again.
+    """
+    check_outside(captures if captures.is_dir() else captures.parent, out)
+    found = read_captures(captures, table=table)
+    options = Options(
+        route=route,
+        work=work,
+        overwrite=overwrite,
+        max_image_size=max_image_size,
+        max_features=max_features,
+        exhaustive_limit=exhaustive_limit,
+        held_out=held_out,
+        camera_model=camera_model,
+        threads=threads,
+    )
+    with step_bar() as report:
+        if scene is None:
+            registered = run(found, out, options, report=report)
+        else:
+            check_outside(scene, out)
+            registered = run_into(read_scene(scene), found, out, options, report=report)
+    emit(summary(registered, out), None)
+
+
+@contextmanager
+def step_bar() -> Iterator[Report]:
+    """A function that takes what is being done, how much, and of how much; a bar on a terminal."""
+    if not sys.stderr.isatty():
+        yield _print_steps()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda what, done, total: bar.update(
+            task, description=what, completed=done, total=total
+        )
+
+
+def _print_steps() -> Report:
+    """For logs: one line whenever something new begins."""
+    last = ""
+
+    def report(what: str, done: int, total: int) -> None:
+        nonlocal last
+        if what != last:
+            click.echo(f"{what} ({total})", err=True)
+            last = what
+
+    return report
+
+
+def summary(registered: Registered, out: Path) -> str:
+    """What came out, for people."""
+    lines = [f"{out}: route {registered.route}, unit {registered.unit}"]
+    for i, label in enumerate(registered.labels):
+        placed = int((registered.periods == i).sum())
+        lost = sum(period == i for period in registered.unregistered_periods.values())
+        lines.append(f"  period {i} ({label}): {placed} of {placed + lost} photos registered")
+    for name, reason in sorted(registered.unregistered.items())[:10]:
+        lines.append(f"  {name}: {reason}")
+    if len(registered.unregistered) > 10:
+        lines.append(f"  ... and {len(registered.unregistered) - 10} more; see the log")
+    lines.append(f"{len(registered.points)} points; decisions in {out / 'registration_log.json'}")
+    return "\n".join(lines) + "\n"
