@@ -7,8 +7,7 @@ for people to say.
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from chronoscene.splits import NameEntry, NameIndex, SplitEntry
 from chronoscene.validation.finding import counted
@@ -30,36 +29,44 @@ def repair_split(
         The new text; new ids by the old ones; what was done.
     """
     repairs = _line_repairs(data, text)
-    index = NameIndex(names)
-    found = {entry.line: index.find(entry.name) for entry in entries}
-    used = {entry.period for entry in entries if len(found[entry.line]) == 1}
     ids = sorted({entry.period for entry in entries})
     new_ids = {old: new for new, old in enumerate(ids)}
     if ids != list(range(len(ids))):
         listed = ", ".join(f"{old} is now {new}" for old, new in list(new_ids.items())[:10])
         repairs.append(Repair("CS401", f"periods numbered from 0: {listed}"))
-    lines, dropped, done = [], Counter[str](), set()
-    by_line = {entry.line: entry for entry in entries}
+    lines, unknown, twice = _split_lines(text, names, entries, new_ids)
+    if unknown:
+        gone = counted(unknown, "line")
+        repairs.append(Repair("CS309", f"{gone} on images that are not in the model removed"))
+    if twice:
+        repairs.append(Repair("CS308", f"{counted(twice, 'repeated line')} removed"))
+    return "".join(f"{line}\n" for line in lines if line), new_ids, repairs
+
+
+def _split_lines(
+    text: str, names: Sequence[str], entries: Sequence[SplitEntry], new_ids: Mapping[int, int]
+) -> tuple[list[str], int, int]:
+    """New lines, and how many old ones are left out: of unknown images, and repeated ones."""
+    index = NameIndex(names)
+    by_line = {entry.line: (entry, index.find(entry.name)) for entry in entries}
+    used = {entry.period for entry, fits in by_line.values() if len(fits) == 1}
+    lines: list[str] = []
+    unknown = twice = 0
+    done: set[tuple[str, int]] = set()
     for number, line in enumerate(re.split("\r\n|\r|\n", text), start=1):
-        entry = by_line.get(number)
-        if entry is None:
+        if number not in by_line:
             lines.append(" ".join(line.split()))
             continue
-        fits = found[number]
-        name = fits[0] if len(fits) == 1 and _is_line(fits[0]) else entry.name
+        entry, fits = by_line[number]
+        name = _one_name(fits, entry.name)
         if not fits and entry.period in used:
-            dropped["unknown"] += 1
+            unknown += 1
         elif (name, entry.period) in done:
-            dropped["twice"] += 1
+            twice += 1
         else:
             done.add((name, entry.period))
             lines.append(f"{name} {new_ids[entry.period]}")
-    if dropped["unknown"]:
-        gone = counted(dropped["unknown"], "line")
-        repairs.append(Repair("CS309", f"{gone} on images that are not in the model removed"))
-    if dropped["twice"]:
-        repairs.append(Repair("CS308", f"{counted(dropped['twice'], 'repeated line')} removed"))
-    return "".join(f"{line}\n" for line in lines if line), new_ids, repairs
+    return lines, unknown, twice
 
 
 def _line_repairs(data: bytes, text: str) -> list[Repair]:
@@ -86,7 +93,7 @@ def repair_test(
     for entry in entries:
         fits = index.find(entry.name)
         if fits:
-            lines[fits[0] if len(fits) == 1 and _is_line(fits[0]) else entry.name] = None
+            lines[_one_name(fits, entry.name)] = None
         else:
             unknown += 1
     if not lines:
@@ -100,6 +107,8 @@ def repair_test(
     return list(lines), repairs
 
 
-def _is_line(name: str) -> bool:
-    """Whether a name can stand in a line without becoming another one."""
-    return name == name.strip() and "\n" not in name and "\r" not in name
+def _one_name(fits: Sequence[str], name: str) -> str:
+    """The full name, if only one fits and it can stand in a line without becoming another one."""
+    if len(fits) != 1 or fits[0] != fits[0].strip() or "\n" in fits[0] or "\r" in fits[0]:
+        return name
+    return fits[0]
