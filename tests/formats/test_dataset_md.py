@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chronoscene.formats import read_scene
+from chronoscene.formats import FORMATS, read_scene, writable_formats
 from chronoscene.scene import Period, Scene, WorldFrame
 from chronoscene.stats import assign_points
 
@@ -84,3 +84,11 @@ def test_default_split_as_stated(folder, tmp_path):
             target.write_bytes(path.read_bytes())
     tests = [f.name for f in read_scene(tmp_path).frames if f.split == "test"]
     assert tests == ["2016/IMG_0001.jpg", "DJI_0001.1.jpg"]
+
+
+def test_every_format_has_a_row():
+    """The section on other formats lists them all, and says rightly which can be written."""
+    section = PAGE.read_text("utf-8").split("## Other formats")[1].split("\n## ")[0]
+    rows = dict(re.findall(r"^\| `([\w-]+)`.*\| (yes|no) \|$", section, re.M))
+    assert rows.keys() == FORMATS.keys()
+    assert {name for name, written in rows.items() if written == "yes"} == {*writable_formats()}
