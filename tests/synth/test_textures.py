@@ -167,8 +167,8 @@ def test_a_changed_texture_is_compiled_again() -> None:
     from chronoscene.synth import compiled, shade
 
     folder = Path(compiled.__file__).parent
-    listed = set(compiled.SOURCES.split())
+    listed = set(compiled.NAMES.split())
     for path in folder.glob("*.py"):
         if "synth.compiled import" in path.read_text():
-            assert path.stem in listed, f"{path.name} is missing in SOURCES"
+            assert path.stem in listed, f"{path.name} is missing in NAMES"
     assert shade.shade._cache._cache_file._source_stamp == compiled._stamp()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from numba import njit
 
+from chronoscene.compiled import kept_on_disk
 from chronoscene.rasterizer.cpu.simd import FLAGS
 
 _OPTIONS: dict[str, Any] = {
@@ -17,6 +16,8 @@ _OPTIONS: dict[str, Any] = {
     "fastmath": set(FLAGS),
     "error_model": "numpy",
 }
+_FOLDER = Path(__file__).parent
+_SOURCES = (*sorted(_FOLDER.glob("*.py")), _FOLDER.parent / "constants.py")
 
 
 def inlined(function: Callable[..., Any]) -> Any:
@@ -31,20 +32,4 @@ def helper(function: Callable[..., Any]) -> Any:
 
 def kernel(function: Callable[..., Any]) -> Any:
     """What Python calls; kept on disk between processes."""
-    try:
-        dispatcher = njit(cache=True, **_OPTIONS)(function)
-    except RuntimeError:  # no folder that we may write to: compile in every process
-        return njit(**_OPTIONS)(function)
-    # Numba looks at the age of one file only; a kernel is made of several.
-    index: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if hasattr(index, "_source_stamp"):
-        index._source_stamp = _stamp()
-    return dispatcher
-
-
-@cache
-def _stamp() -> str:
-    """Hash of everything that kernels are compiled from."""
-    folder = Path(__file__).parent
-    sources = [*sorted(folder.glob("*.py")), folder.parent / "constants.py"]
-    return sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
+    return kept_on_disk(function, _SOURCES, **_OPTIONS)
