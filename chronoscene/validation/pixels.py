@@ -31,6 +31,8 @@ TAIL = 4096
 """Bytes at the end of a file in which its mark is looked for."""
 
 _HEADER_THREADS = 4
+_FEW = 32
+"""Headers that are read before threads would have begun."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +72,12 @@ class Pixels:
 
 def read_headers(folder: Path, names: Sequence[str]) -> dict[str, Header]:
     """Headers of some images below a folder, in several threads: a disk may be slow."""
-    with _quiet(), ThreadPoolExecutor(_HEADER_THREADS) as pool:
-        paths = [folder / name for name in names]
-        return dict(zip(names, pool.map(read_header, paths, chunksize=64), strict=True))
+    paths = [folder / name for name in names]
+    with _quiet():
+        if len(paths) < _FEW:
+            return dict(zip(names, map(read_header, paths), strict=True))
+        with ThreadPoolExecutor(_HEADER_THREADS) as pool:
+            return dict(zip(names, pool.map(read_header, paths), strict=True))
 
 
 def read_header(path: Path) -> Header:

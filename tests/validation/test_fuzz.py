@@ -7,6 +7,7 @@ first seed; a failure names the seed of its case.
 import os
 import random
 import resource
+import shutil
 import struct
 import sys
 import time
@@ -19,7 +20,12 @@ from PIL import Image
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.validation.fix import fix_scene
+from chronoscene.validation.pixels import read_header, read_pixels_of
+from chronoscene.validation.raw_model import read_raw_model
+from chronoscene.validation.raw_rigs import read_rigs
 from chronoscene.validation.run import validate_scene
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, on damaged files
 
 SECONDS = float(os.environ.get("CHRONOSCENE_FUZZ_SECONDS", "16"))
 SEED = int(os.environ.get("CHRONOSCENE_FUZZ_SEED", "0"))
@@ -104,22 +110,35 @@ def check(root, case, *, decode=False):
     assert not opened, (case, opened)
 
 
-def run_cases(root, files, seconds, *, decode=False):
-    """Damage one or two files at a time until the time is over."""
+def many_cases(seconds, run):
+    """Run cases, each with its own random numbers, until the time is over; name one that fails."""
     end, seed = time.monotonic() + seconds, SEED
     while time.monotonic() < end or seed < SEED + 20:
-        rng = random.Random(seed)
+        try:
+            run(random.Random(seed))
+        except BaseException as error:
+            error.add_note(f"CHRONOSCENE_FUZZ_SEED={seed}")
+            raise
+        seed += 1
+    print(f"{seed - SEED} cases")  # shown by pytest -rP
+
+
+def run_cases(root, files, seconds, *, decode=False):
+    """Damage one or two files at a time until the time is over."""
+
+    def run(rng):
         chosen = rng.sample(files, min(len(files), rng.choice([1, 1, 2])))
         good = {path: path.read_bytes() for path in chosen}
+        damaged = {path: mutate(rng, data) for path, data in good.items()}
         try:
-            for path, data in good.items():
-                path.write_bytes(mutate(rng, data))
-            check(root, (seed, [str(path) for path in chosen]), decode=decode)
+            for path, data in damaged.items():
+                path.write_bytes(data)
+            check(root, damaged, decode=decode)
         finally:
             for path, data in good.items():
                 path.write_bytes(data)
-        seed += 1
-    return seed - SEED
+
+    many_cases(seconds, run)
 
 
 @pytest.fixture
@@ -138,7 +157,42 @@ def test_models(fuzzed, form):
     if form != "text":
         fuzzed.to_binary(classic=form == "binary")
     files = sorted(p for p in fuzzed.path("sparse/0").iterdir() if p.name != "test.txt")
-    run_cases(fuzzed.root, files, SECONDS / 6)
+    run_cases(fuzzed.root, files, SECONDS / 8)
+
+
+@pytest.mark.parametrize("form", [".bin", ".txt"])
+def test_readers_alone(fuzzed, form):
+    """Many more cases than whole scenes allow: only the files of the model are read."""
+    if form == ".bin":
+        fuzzed.to_binary(classic=False)
+    folder = fuzzed.path("sparse/0")
+    good = {path: path.read_bytes() for path in sorted(folder.glob(f"*{form}"))}
+
+    def read(rng):
+        path = rng.choice(list(good))
+        path.write_bytes(mutate(rng, good[path]))
+        model = read_raw_model(folder)
+        read_rigs(folder, form)
+        for part, kind in ((model.images, "images"), (model.points, "points3D")):
+            assert part is not None or kind in "".join(d.file for d in model.damages)
+        path.write_bytes(good[path])
+
+    many_cases(SECONDS / 10, read)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "webp", "gif", "bmp"])
+def test_headers_alone(tmp_path, suffix):
+    path = tmp_path / f"a.{suffix}"
+    Image.effect_noise((40, 30), 50).convert("RGB").save(path)
+    good = path.read_bytes()
+
+    def read(rng):
+        path.write_bytes(mutate(rng, good))
+        header = read_header(path)
+        assert header.problem or min(header.size) > 0
+        read_pixels_of(path)
+
+    many_cases(SECONDS / 60, read)
 
 
 def test_texts(fuzzed):
@@ -190,16 +244,16 @@ def test_corrections_of_damaged_scenes(fuzzed, tmp_path):
     """A corrected copy of anything can be made and checked."""
     fuzzed.to_binary()
     files = sorted(p for p in fuzzed.path("sparse").rglob("*") if p.is_file())
-    end, seed = time.monotonic() + SECONDS / 8, SEED
-    while time.monotonic() < end or seed < SEED + 10:
-        rng = random.Random(seed)
+
+    def run(rng):
         path = rng.choice(files)
         good = path.read_bytes()
         path.write_bytes(mutate(rng, good))
-        out = tmp_path / f"fixed{seed}"
+        shutil.rmtree(out := tmp_path / "fixed", ignore_errors=True)
         repairs = fix_scene(fuzzed.root, out)
         after = {f.code for f in validate_scene(out).findings}
-        assert "CS000" not in after and not {r.code for r in repairs} & after, (seed, repairs)
+        assert "CS000" not in after and not {r.code for r in repairs} & after, repairs
         path.write_bytes(good)
-        seed += 1
+
+    many_cases(SECONDS / 10, run)
     assert not opened
