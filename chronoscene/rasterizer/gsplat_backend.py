@@ -22,6 +22,13 @@ from chronoscene.rasterizer.recentring import recentred
 from chronoscene.rasterizer.types import RasterInfo, Rasterization
 
 
+_TOOLKIT = (
+    "gsplat compiles its kernels when it is first used, and needs for that a C++ compiler and the "
+    f"CUDA toolkit of torch's version, {torch.version.cuda or 'none in this build of torch'}, "
+    "with nvcc on the PATH"
+)
+
+
 def rasterize(
     means: Tensor,
     quats: Tensor,
@@ -54,14 +61,22 @@ def rasterize(
         empty: Callable[..., Rasterization] = reference.rasterize
         return empty(*arrays, *cameras, **options, render_depth=render_depth)
     gaussians, drawable = _without_bad_rows(*arrays)
-    image, alphas, meta = render(
-        *gaussians,
-        *cameras,
-        **options,
-        packed=False,
-        rasterize_mode="classic",
-        render_mode="RGB+ED" if render_depth else "RGB",
-    )
+    try:
+        image, alphas, meta = render(
+            *gaussians,
+            *cameras,
+            **options,
+            packed=False,
+            rasterize_mode="classic",
+            render_mode="RGB+ED" if render_depth else "RGB",
+        )
+    except AttributeError as error:  # gsplat goes on without its kernels, as None
+        raise BackendError(
+            "backend 'cuda'",
+            expected="gsplat's compiled kernels",
+            found=f"gsplat could not build or load them ({error})",
+            todo=f"install the CUDA toolkit: {_TOOLKIT}; or choose backend='cpu'",
+        ) from error
     depths = None
     if render_depth:
         image, depths = image[..., :-1], torch.where(alphas > 0, image[..., -1:], 0)
@@ -77,7 +92,7 @@ def _load(device: torch.device) -> Callable[..., Any]:
             "backend 'cuda'",
             expected="the package gsplat",
             found=f"{type(error).__name__}: {error}",
-            todo="pip install 'chronoscene[cuda]', or choose backend='cpu'",
+            todo=f"pip install 'chronoscene[cuda]' ({_TOOLKIT}), or choose backend='cpu'",
         ) from None
     if not torch.cuda.is_available():
         raise BackendError(

@@ -160,6 +160,20 @@ def test_cuda_backend_speaks_gsplats_language(
     assert result.info.means2d.grad is not None
 
 
+def test_cuda_without_a_toolkit_says_what_to_install(
+    arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without nvcc gsplat imports, and fails when its kernels are called."""
+    from chronoscene.rasterizer import gsplat_backend
+
+    def rasterization(*inputs: Any, **options: Any) -> Any:
+        return None.CameraModelType  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(gsplat_backend, "_load", lambda device: rasterization)
+    with pytest.raises(BackendError, match="install the CUDA toolkit.*nvcc"):
+        rasterize(**arguments, backend="cuda")
+
+
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_shapes_and_types_of_the_result(arguments: dict[str, Any], backend: str) -> None:
     arguments["means"].requires_grad_()
