@@ -183,7 +183,8 @@ def test_gradients_of_the_reference_are_right(name: str) -> None:
         unit = max(1e-18, float(inputs["means"][:, 2].max()))
         return result.image * steady, result.alphas * steady, depths / unit
 
-    assert torch.autograd.gradcheck(outputs, steps, eps=1e-8, atol=1e-4, rtol=1e-3, fast_mode=True)
+    # Failing takes minutes: torch then computes all derivatives one by one for its message.
+    assert torch.autograd.gradcheck(outputs, steps, eps=1e-7, atol=1e-9, rtol=1e-4, fast_mode=True)
 
 
 @settings(
