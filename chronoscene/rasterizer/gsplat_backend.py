@@ -70,7 +70,7 @@ def rasterize(
             rasterize_mode="classic",
             render_mode="RGB+ED" if render_depth else "RGB",
         )
-    except AttributeError as error:  # gsplat goes on without its kernels, as None
+    except (AttributeError, ImportError) as error:  # kernels are None, or could not be built
         raise BackendError(
             "backend 'cuda'",
             expected="gsplat's compiled kernels",

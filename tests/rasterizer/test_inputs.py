@@ -160,14 +160,15 @@ def test_cuda_backend_speaks_gsplats_language(
     assert result.info.means2d.grad is not None
 
 
+@pytest.mark.parametrize("failure", [AttributeError, ImportError])
 def test_cuda_without_a_toolkit_says_what_to_install(
-    arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch, failure: type[Exception]
 ) -> None:
     """Without nvcc gsplat imports, and fails when its kernels are called."""
     from chronoscene.rasterizer import gsplat_backend
 
     def rasterization(*inputs: Any, **options: Any) -> Any:
-        return None.CameraModelType  # type: ignore[attr-defined]
+        raise failure("gsplat_cuda.so")
 
     monkeypatch.setattr(gsplat_backend, "_load", lambda device: rasterization)
     with pytest.raises(BackendError, match="install the CUDA toolkit.*nvcc"):
