@@ -29,10 +29,9 @@ ROBUST = (2.0, 98.0)
 counted."""
 BEYOND = 0.08
 """Of the distance between the two: an even spread of points is shown to its ends."""
-MANY = 60_000
-"""Points from which a cell of the density is a square of several pixels, so colours can be seen."""
 CELL = 2
-"""Pixels along each side of such a square."""
+"""Pixels along each side of a cell of the density where dots are not larger than a cell: the colour
+of a single pixel can hardly be seen."""
 MARGIN = 0.03
 """Of the longest edge, on every side."""
 SMALLEST_EDGE = 0.18
@@ -122,13 +121,14 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
     height = BOTTOM + (dz + dy) * scale + GAP + top
     figure = new_figure(width, height)
     colors = period_colors(len(names))
+    dots = dot_radius(int((cloud.period >= 0).sum()), int(DPI**2 * DRAWING[0] * DRAWING[1] / 3))
     x_right, y_top = LEFT + dx * scale + GAP, BOTTOM + dz * scale + GAP
     places = {(0, 1): (LEFT, y_top), (0, 2): (LEFT, BOTTOM), (2, 1): (x_right, y_top)}
     for plane, (x, y) in places.items():
         size = (box.edges[plane[0]] * scale, box.edges[plane[1]] * scale)
         place = (x / width, y / height, size[0] / width, size[1] / height)
         axes = figure.add_axes(place)
-        _draw_points(axes, cloud, box, plane, size, colors)
+        _draw_points(axes, cloud, box, plane, size, colors, dots)
         if cameras:
             _draw_cameras(axes, cloud, box, plane, colors)
         _label_axes(axes, plane, cloud.unit)
@@ -165,7 +165,7 @@ def legend_names(labels: Sequence[str]) -> list[str]:
     if bare:
         return [f"Period {i}" if len(labels) <= 8 else str(i) for i in range(len(labels))]
     names = [label if label == str(i) else f"{i}: {label}" for i, label in enumerate(labels)]
-    return [shorten(name, 26, placeholder="...") or name[:26] for name in names]
+    return [shorten(name, 28, placeholder="...") or name[:28] for name in names]
 
 
 def _draw_points(
@@ -175,17 +175,16 @@ def _draw_points(
     plane: tuple[int, int],
     size: tuple[float, float],
     colors: Sequence[str],
+    dots: int,
 ) -> None:
-    """The density of the points, in the pixels of the figure."""
+    """The density of the points. ``dots``: their radius in pixels."""
     quiet_axes(axes)
-    dpi = DPI / CELL if len(cloud.xyz) > MANY else DPI
+    dpi = DPI if dots else DPI / CELL
     pixels = [max(1, round(edge * dpi)) for edge in size]
     low, high = box.low[list(plane)], box.high[list(plane)]
     window = Window((low[0], low[1]), (high[0], high[1]), pixels[0], pixels[1])
     counts = count_points(cloud.xyz[:, plane], cloud.period, len(colors), window)
-    # Dots are as large in one panel as in the others: those of the largest panel decide.
-    radius = dot_radius(int(counts.sum()), int(dpi**2 * DRAWING[0] * DRAWING[1] / 3))
-    image = shade(grow_dots(counts, radius), colors)
+    image = shade(grow_dots(counts, dots), colors)
     extent = (low[0], high[0], low[1], high[1])
     axes.imshow(image, extent=extent, interpolation="nearest", aspect="auto", zorder=1)
     axes.grid(color=GRID, linewidth=0.5, zorder=0)

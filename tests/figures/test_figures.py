@@ -230,7 +230,7 @@ def test_names_in_the_legend():
     assert legend_names(["0", "1"]) == ["Period 0", "Period 1"]
     assert legend_names(["2016", "1"]) == ["0: 2016", "1"]
     assert legend_names([str(i) for i in range(50)])[49] == "49"
-    assert len(legend_names(["x" * 80])[0]) <= 26
+    assert len(legend_names(["x" * 80])[0]) <= 28
 
 
 def counted(name: str, rows: list[tuple[int, int]]) -> SceneCount:
