@@ -28,6 +28,10 @@ LEAST_PARALLAX = 1e-4
 """Smallest eigenvalue of the mean of ``I - d d^T`` over the rays of a point: sine squared of about
 half a degree."""
 
+STRAY = 100.0
+"""Distance of a camera from the others, in units of their median distance, beyond which its rays
+would pull all points away."""
+
 FITS = 0.02
 """Median distance after the similarity, as a share of the extent of the points."""
 
@@ -48,7 +52,12 @@ class Rays:
         table = scene.point_periods
         assert images is not None and points is not None
         assert seen is not None and table is not None
-        of_period = [r for r in scene.reprojections or () if scene.image_periods[r.image] == period]
+        pinhole = {i for i, camera in scene.usable_cameras.items() if camera.is_pinhole}
+        of_period = [
+            r
+            for r in scene.reprojections or ()
+            if scene.image_periods[r.image] == period and int(images.camera_ids[r.image]) in pinhole
+        ]
         share = table.sum(axis=1) > 1
         rows = np.concatenate([np.zeros(0, np.int64), *(r.rows for r in of_period)])
         rows = rows[share[seen.point[rows]]]
@@ -82,11 +91,14 @@ class Rays:
         local = np.column_stack([(self.xy - middle) / focal, np.ones(len(self.xy))])
         direction = np.einsum("nji,nj->ni", self.rotation, local)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        away = np.linalg.norm(self.centre - np.median(self.centre, axis=0), axis=1)
+        sound = np.isfinite(direction).all(axis=1) & (away <= STRAY * np.median(away))
+        direction, centre = direction[sound], self.centre[sound]
         across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-        index, slot, count = np.unique(self.point, return_inverse=True, return_counts=True)
+        index, slot, count = np.unique(self.point[sound], return_inverse=True, return_counts=True)
         left, right = np.zeros((len(index), 3, 3)), np.zeros((len(index), 3))
         np.add.at(left, slot, across)
-        np.add.at(right, slot, np.einsum("nij,nj->ni", across, self.centre))
+        np.add.at(right, slot, np.einsum("nij,nj->ni", across, centre))
         good = np.linalg.eigvalsh(left / count[:, None, None])[:, 0] > LEAST_PARALLAX
         placed = np.linalg.solve(left[good], right[good][:, :, None])[:, :, 0]
         return index[good], np.asarray(placed, np.float64)
@@ -107,7 +119,8 @@ def explain(scene: RawScene, period: int, limit: float) -> str | None:
     errors = {(i, j): rays.error(a, b) for i, a in enumerate(signs) for j, b in enumerate(signs)}
     world, camera = min(errors, key=lambda key: errors[key])
     if errors[world, camera] <= limit:
-        return _negated(signs[world], signs[camera])
+        negated = min(*signs[world], *signs[camera]) < 0
+        return _negated(signs[world], signs[camera]) if negated else None
     assert scene.points is not None
     index, own = rays.place_points()
     target = scene.points.xyz[index]

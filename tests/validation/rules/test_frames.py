@@ -78,6 +78,20 @@ def test_opengl_axes_in_one_period(scene):
     scene.expect("CS519", place="period 1", found="y and z of the camera negated")
 
 
+@pytest.mark.parametrize("number", ["1e308", "-1e200", "5e-324"])
+@pytest.mark.parametrize("what", ["keypoint", "translation", "point"])
+def test_absurd_numbers_in_a_period_of_another_frame(scene, what, number):
+    in_frame_of_its_own(scene, Sim3(4.0, np.eye(3), np.zeros(3)))
+    if what == "point":
+        scene.edit_fields(POINTS, 5, {2: number})
+    elif what == "keypoint":
+        scene.edit_fields(IMAGES, 21, {0: number})
+    else:
+        scene.edit_fields(IMAGES, 20, {6: number})
+    codes = {f.code for f in scene.validate().findings}
+    assert "CS519" in codes and "CS000" not in codes
+
+
 def test_scale_of_a_period_without_shared_points(scene):
     separate(scene, scale=30.0)
     found = "times as far from the cameras, and none shared"
