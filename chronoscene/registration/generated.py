@@ -18,7 +18,7 @@ from chronoscene.geometry import Sim3, camera_centre, pose_from_rotation_transla
 from chronoscene.registration.georeference import Georeference
 from chronoscene.registration.misalignment import measure, transfers
 from chronoscene.registration.model import CrossMatches, HeldOutTracks, Registered
-from chronoscene.registration.rays import Rays, model_rays, place, rays_of
+from chronoscene.registration.rays import Rays, place, rays_of
 from chronoscene.scene import Camera
 from chronoscene.validation.alignment import fit_robustly
 
@@ -105,7 +105,7 @@ def generate_case(settings: CaseSettings) -> Generated:
     sightings, of_two = _observe(rng, settings, stable, tied, truth, periods)
     out = of_two & (rng.random(len(of_two)) < settings.held_out)
     gps = _gps(rng, settings, camera_centre(truth), periods)
-    poses = _bent(_jittered(rng, truth), periods, settings.bend)
+    poses = _bent(_jittered(rng, truth), truth, periods, stable, settings.bend)
     model = _empty(settings, poses, periods, gps)
     poses = _align(rng, settings, model, _part(sightings, ~out))
     model = replace(model, cam_from_world=poses)
@@ -260,19 +260,28 @@ def _jittered(rng: np.random.Generator, poses: Array) -> Array:
     return out
 
 
-def _bent(poses: Array, periods: Ints, height: float) -> Array:
-    """Cameras of later periods moved as if the world were a bowl: dz = height (r / (SIDE / 2))^2."""
+def _bent(poses: Array, truth: Array, periods: Ints, points: Array, height: float) -> Array:
+    """Poses of later periods in a world bent like a bowl: dz = height (r / (SIDE / 2))^2.
+
+    Cameras rise with the bowl and turn to where the bent points are: what adjustment makes of a lens
+    that is a little wrong.
+    """
     from scipy.spatial.transform import Rotation
 
-    centre = camera_centre(poses)
-    k = np.where(periods > 0, height / (SIDE / 2) ** 2, 0.0)
-    slope = 2 * k[:, None] * centre[:, :2]
-    turn = Rotation.from_rotvec(np.column_stack([slope[:, 1], -slope[:, 0], 0 * k])).as_matrix()
-    # A normal in z leans towards the middle of the bowl.
+    def bend(x: Array) -> Array:
+        lift = height * (x[:, :2] ** 2).sum(axis=1) / (SIDE / 2) ** 2
+        return np.asarray(x + lift[:, None] * [0.0, 0.0, 1.0])
+
     out = poses.copy()
-    out[:, :3, :3] = np.einsum("nij,nkj->nik", poses[:, :3, :3], turn)
-    lifted = centre + np.column_stack([0 * k, 0 * k, k * (centre[:, :2] ** 2).sum(axis=1)])
-    out[:, :3, 3] = -np.einsum("nij,nj->ni", out[:, :3, :3], lifted)
+    for i in np.flatnonzero(periods > 0) if height else ():
+        local = points[::10] @ truth[i, :3, :3].T + truth[i, :3, 3]
+        seen = local[:, 2] > 1
+        centre = bend(camera_centre(poses[i])[None])[0]
+        there = bend(points[::10])[seen] - centre
+        here = local[seen] / np.linalg.norm(local[seen], axis=1, keepdims=True)
+        there /= np.linalg.norm(there, axis=1, keepdims=True)
+        out[i, :3, :3] = Rotation.align_vectors(here, there)[0].as_matrix()
+        out[i, :3, 3] = -out[i, :3, :3] @ centre
     return out
 
 
@@ -446,8 +455,3 @@ def cross_matches(model: Registered, tracks: HeldOutTracks) -> tuple[CrossMatche
         i, j = np.array(pairs).T
         out.append(CrossMatches(a, b, tracks.xy[i], tracks.xy[j], track[i]))
     return tuple(out)
-
-
-def all_rays(model: Registered) -> Rays:
-    """Rays of all points of a model."""
-    return model_rays(model)
