@@ -4,8 +4,10 @@ import csv
 import hashlib
 import io
 import json
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -169,3 +171,12 @@ def test_a_place_for_figures_that_is_a_file(make_scene_folder, tmp_path):
     (tmp_path / "file").touch()
     result = run(make_scene_folder(), "--figures", tmp_path / "file")
     assert "expected a folder that can be made" in str(result.exception)
+
+
+def test_options_in_the_documentation_exist():
+    text = (Path(__file__).parents[2] / "docs/statistics.md").read_text(encoding="utf-8")
+    lines = re.findall(r"^chronoscene (\w+) (.*?)(?:#.*)?$", text, re.M)
+    assert {command for command, _ in lines} == {"stats", "synth"}
+    for command, arguments in lines:
+        known = CliRunner().invoke(cli, [command, "--help"]).output
+        assert all(option in known for option in re.findall(r"--[a-z-]+", arguments))
