@@ -194,10 +194,9 @@ def align_to_gps(
     use = np.flatnonzero(believed & np.isfinite(enu).all(axis=1))
     if len(use) < 3:
         return None
-    result = fit_robustly(centres[use], enu[use])
-    if result is None:
+    similarity = _first_guess(poses[use], enu[use])
+    if similarity is None:
         return None
-    similarity = as_sim3(result[0])
     residuals = np.full(len(enu), np.nan)
     on_a_line = False
     for _ in range(3):
@@ -218,6 +217,28 @@ def align_to_gps(
     return GpsAlignment(similarity, inliers, residuals, rms, scale_error, on_a_line)
 
 
+def _first_guess(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
+    """Similarity on which most positions agree, whatever it does around a line."""
+    centres = camera_centre(poses)
+    result = fit_robustly(centres, enu)
+    if result is not None:
+        return as_sim3(result[0])
+    best: Sim3 | None = None
+    for i in range(len(enu)):  # all on one line exactly: any two fix scale and direction
+        pair = [i, (i + len(enu) // 2) % len(enu)]
+        guess = _fit_with_horizon(poses[pair], enu[pair])
+        if guess is not None and (
+            best is None
+            or _median_distance(guess, centres, enu) < _median_distance(best, centres, enu)
+        ):
+            best = guess
+    return best
+
+
+def _median_distance(sim: Sim3, centres: NDArray[np.float64], enu: NDArray[np.float64]) -> float:
+    return float(np.median(np.linalg.norm(sim.apply(centres) - enu, axis=1)))
+
+
 def is_line(positions: NDArray[np.float64]) -> bool:
     """Whether positions lie along a line, on the map."""
     flat = positions[:, :2] - positions[:, :2].mean(axis=0)
@@ -226,11 +247,25 @@ def is_line(positions: NDArray[np.float64]) -> bool:
 
 
 def _fit_with_horizon(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
-    """Similarity in which the photos also stand upright.
+    """Similarity in which the photos also stand upright, or else look straight down.
 
     Each camera gets a second point above it, as far up as the cameras are spread along the line.
+    Photos of one heading fit both; what the positions say of the bends in the line decides.
     """
-    up = upright_direction(poses)
+    forward = poses[:, 2, :3].mean(axis=0)
+    down = -forward / max(float(np.linalg.norm(forward)), 1e-12)
+    found = [_fit_upwards(poses, enu, up) for up in (upright_direction(poses), down)]
+    centres = camera_centre(poses)
+    return min(
+        (sim for sim in found if sim is not None),
+        key=lambda sim: float(np.linalg.norm(sim.apply(centres) - enu)),
+        default=None,
+    )
+
+
+def _fit_upwards(
+    poses: NDArray[np.float64], enu: NDArray[np.float64], up: NDArray[np.float64]
+) -> Sim3 | None:
     centres = camera_centre(poses)
     model_spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
     world_spread = float(np.linalg.norm(enu - enu.mean(axis=0), axis=1).mean())
