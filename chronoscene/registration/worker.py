@@ -56,7 +56,7 @@ def run_step(
         RegistrationError: If the process dies.
         ChronoSceneError: What the step raised, as a `RegistrationError` with the same words.
     """
-    command = [sys.executable, "-m", "chronoscene.registration.worker", step]
+    command = [sys.executable, "-m", "chronoscene.registration.worker", STEPS[step]]
     with log.open("ab") as errors:
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True
@@ -103,7 +103,9 @@ def _listen(process: subprocess.Popen[str], report: Report | None) -> dict[str, 
 
 def _ending(status: int, log: Path) -> str:
     """How a process ended, and the end of what it said."""
-    how = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+    how = f"signal {-status}" if status < 0 else f"exit status {status}"
+    if -status in set(signal.Signals):
+        how = f"signal {signal.Signals(-status).name}"
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     said = " / ".join(line.strip()[:160] for line in lines[-LOG_LINES:])
     return f"{how} ({said})" if said else how
@@ -133,7 +135,7 @@ def main() -> None:
         send({"progress": [what, done, total]})
 
     arguments = json.load(sys.stdin)
-    module, _, name = STEPS[sys.argv[1]].partition(":")
+    module, _, name = sys.argv[1].partition(":")
     try:
         step = getattr(importlib.import_module(module), name)
         send({"result": step(arguments, report)})

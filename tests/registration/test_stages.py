@@ -1,0 +1,163 @@
+"""Stages that are done once, and steps in a process of their own."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from chronoscene.registration import worker
+from chronoscene.registration.errors import RegistrationError
+from chronoscene.registration.stages import Stages, work_folder
+
+
+class Counter:
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def stage(self, name: str, result: Any = None) -> Any:
+        def action() -> tuple[Any, list[str]]:
+            self.calls.append(name)
+            return result, [f"did {name}"]
+
+        return action
+
+
+def test_a_stage_is_done_once(tmp_path: Path) -> None:
+    counter = Counter()
+    for _ in range(2):
+        stages = Stages(tmp_path)
+        assert stages.run("a", {"x": 1}, counter.stage("a", [1, 2])) == [1, 2]
+        assert stages.run("b", None, counter.stage("b")) is None
+    assert counter.calls == ["a", "b"]
+    assert [e["from_an_earlier_run"] for e in stages.log] == [True, True]
+    assert stages.log[0]["remarks"] == ["did a"]
+
+
+def test_a_change_repeats_all_that_follows(tmp_path: Path) -> None:
+    counter = Counter()
+    for value in (1, 2):
+        stages = Stages(tmp_path)
+        stages.run("a", value, counter.stage("a"))
+        stages.run("b", None, counter.stage("b"))
+    assert counter.calls == ["a", "b", "a", "b"]
+
+
+def test_a_stage_that_fails_or_is_cut_off_is_repeated(tmp_path: Path) -> None:
+    def fails() -> tuple[Any, list[str]]:
+        raise RuntimeError("killed")
+
+    with pytest.raises(RuntimeError):
+        Stages(tmp_path).run("a", None, fails)
+    counter = Counter()
+    Stages(tmp_path).run("a", None, counter.stage("a"))
+    (tmp_path / "stage-a.json").write_text('{"key": ')
+    Stages(tmp_path).run("a", None, counter.stage("a"))
+    assert counter.calls == ["a", "a"]
+
+
+def test_two_runs_do_not_share_a_work_folder(tmp_path: Path) -> None:
+    with (
+        work_folder(tmp_path / "work"),
+        pytest.raises(RegistrationError, match="another registration in it"),
+        work_folder(tmp_path / "work"),
+    ):
+        pass
+    with work_folder(tmp_path / "work"):
+        pass
+
+
+STEPS = """
+import os, sys, time
+from chronoscene.registration.errors import RegistrationError
+
+def good(arguments, report):
+    report("counting", 1, 2)
+    print("noise on stdout")
+    os.system("echo noise of a library")
+    return {"twice": 2 * arguments["x"]}
+
+def aborts(arguments, report):
+    print("Check failed: bad input", file=sys.stderr, flush=True)
+    os.abort()
+
+def refuses(arguments, report):
+    raise RegistrationError("here", expected="this", found="that", todo="do it")
+
+def breaks(arguments, report):
+    raise ZeroDivisionError("a mistake of ours")
+
+def sleeps(arguments, report):
+    with open(arguments["mark"], "w") as file:
+        file.write(str(os.getpid()))
+    time.sleep(60)
+"""
+
+
+@pytest.fixture(autouse=True)
+def odd_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps that only this test has, in a module that the child process finds."""
+    (tmp_path / "odd_steps.py").write_text(STEPS)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    for name in ("good", "aborts", "refuses", "breaks", "sleeps"):
+        monkeypatch.setitem(worker.STEPS, name, f"odd_steps:{name}")
+
+
+def test_a_step_gives_its_result_and_tells_its_progress(tmp_path: Path) -> None:
+    told: list[tuple[str, int, int]] = []
+    result = worker.run_step(
+        "good", {"x": 21}, log=tmp_path / "log", report=lambda *p: told.append(p)
+    )
+    assert result == {"twice": 42}
+    assert told == [("counting", 1, 2)]
+    assert "noise of a library" in (tmp_path / "log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("step", "found"),
+    [("aborts", r"signal SIGABRT \(.*bad input"), ("breaks", "exit status 1 .*a mistake of ours")],
+)
+def test_the_death_of_a_step_is_a_message(tmp_path: Path, step: str, found: str) -> None:
+    with pytest.raises(RegistrationError, match=found) as caught:
+        worker.run_step(step, {}, log=tmp_path / "log")
+    assert "is kept" in caught.value.todo
+
+
+def test_a_refusal_of_a_step_is_the_same_refusal(tmp_path: Path) -> None:
+    with pytest.raises(RegistrationError, match=r"^here: expected this, found that; do it$"):
+        worker.run_step("refuses", {}, log=tmp_path / "log")
+
+
+def test_a_step_dies_with_the_process_that_asked_for_it(tmp_path: Path) -> None:
+    code = (
+        "from chronoscene.registration import worker\n"
+        "from pathlib import Path\n"
+        "worker.STEPS['sleeps'] = 'odd_steps:sleeps'\n"
+        f"worker.run_step('sleeps', {{'mark': {str(tmp_path / 'mark')!r}}}, log=Path('log'))\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path)
+    mark = tmp_path / "mark"
+    wait_until(lambda: mark.exists() and mark.read_text() != "")
+    child = int(mark.read_text())
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    wait_until(lambda: not is_alive(child))
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def is_alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
