@@ -5,7 +5,8 @@
 Prints milliseconds as the caller sees them, medians and minima, and the processor time of the
 calling thread. The step is that of ChronoGS at the sizes of the paper, with all anchors visible:
 10 offsets, features of 16 + 3 x 16 and 32, hidden layers of 32. "living" are offsets with a
-positive opacity, the only ones that a rasterizer sends gradients to.
+positive opacity, the only ones that a rasterizer sends gradients to. The last lines compare Adam
+on all rows of ten times as many anchors with Adam on those in view; "forward" is the fetch.
 """
 
 from __future__ import annotations
@@ -13,20 +14,24 @@ from __future__ import annotations
 import argparse
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import cycle
 
 # Before torch: it says how idle threads wait.
 import chronoscene  # noqa: F401
 
 # isort: split
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.threads import available_threads, set_threads
 from chronoscene.training.decode import HeadWeights, decode, decode_living, decode_reference
 from chronoscene.training.losses import photometric_loss, photometric_loss_reference
 from chronoscene.training.optimizer import Adam
+from chronoscene.training.row_adam import DenseTable, RowAdam, Table
 
 OFFSETS, BASE, PERIOD, PERIODS, SHARED, HIDDEN = 10, 16, 16, 3, 32, 32
 HEIGHT, WIDTH = 240, 320
@@ -93,7 +98,7 @@ def report(name: str, repeats: int, *parts: Callable[[], object]) -> None:
             wall, processor = time.perf_counter(), time.thread_time()
             part()
             found.append((time.perf_counter() - wall, time.thread_time() - processor))
-    cells = [f"{name:<34}"]
+    cells = [f"{name:<44}"]
     for found in times:
         wall_times, processor_times = (
             sorted(1e3 * t for t in column) for column in zip(*found, strict=True)
@@ -183,6 +188,29 @@ def time_adam(step: Step, repeats: int, reference: bool) -> None:
         report("torch.optim.Adam, fused", repeats, fused.step)
 
 
+def time_tables(anchors: int, repeats: int) -> None:
+    """Features of some anchors and one of three periods: fetched, and moved by Adam."""
+    blocks = [BASE, *[PERIOD] * PERIODS]
+    start = torch.zeros(anchors, sum(blocks))
+    for share in (0.5, 0.1):
+        for name, kind in (("all rows", DenseTable), ("rows in view", RowAdam)):
+            table = kind(start.clone(), blocks)
+            turns = (np.arange(t, anchors, round(1 / share)) for t in cycle(range(10)))
+            leaf = torch.zeros(0)
+
+            def fetch(table: Table = table, turns: Iterator[NDArray[np.int64]] = turns) -> None:
+                nonlocal leaf
+                leaf = table.fetch(next(turns), (0, 1))
+                leaf.grad = torch.full_like(leaf, 1e-3)
+
+            report(
+                f"Adam, {name}, {100 * share:.0f} % of {anchors} in view",
+                repeats,
+                fetch,
+                partial(table.step, 1e-3),
+            )
+
+
 def main() -> None:
     """Time everything with one thread and with all."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -194,12 +222,13 @@ def main() -> None:
     step = Step(args.anchors)
     step.switch_off(1 - args.living)
     print(f"{platform.processor() or platform.machine()}, {args.anchors} anchors x {OFFSETS}")
-    print(f"{'ms: median, minimum, thread':<34} {'forward':^23} | {'backward':^23} |")
+    print(f"{'ms: median, minimum, thread':<44} {'forward':^23} | {'backward':^23} |")
     for threads in sorted({1, available_threads()}):
         print(f"threads: {set_threads(threads)}")
         time_decode(step, args.repeats, args.reference)
         time_loss(args.repeats, args.reference)
         time_adam(step, args.repeats, args.reference)
+        time_tables(10 * args.anchors, args.repeats)
 
 
 if __name__ == "__main__":
