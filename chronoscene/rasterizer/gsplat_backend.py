@@ -21,7 +21,6 @@ from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
 from chronoscene.rasterizer.recentring import recentred
 from chronoscene.rasterizer.types import RasterInfo, Rasterization
 
-
 _TOOLKIT = (
     "gsplat compiles its kernels when it is first used, and needs for that a C++ compiler and the "
     f"CUDA toolkit of torch's version, {torch.version.cuda or 'none in this build of torch'}, "

@@ -171,7 +171,7 @@ def test_cuda_without_a_toolkit_says_what_to_install(
         raise failure("gsplat_cuda.so")
 
     monkeypatch.setattr(gsplat_backend, "_load", lambda device: rasterization)
-    with pytest.raises(BackendError, match="install the CUDA toolkit.*nvcc"):
+    with pytest.raises(BackendError, match=r"install the CUDA toolkit.*nvcc"):
         rasterize(**arguments, backend="cuda")
 
 
