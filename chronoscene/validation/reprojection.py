@@ -48,14 +48,16 @@ def reproject(
     good = good_poses(images)
     with np.errstate(all="ignore"):
         rotations = rotation_from_quaternion(images.quaternions)
-    # Columns by themselves: numpy is several times slower along a short last axis.
+    # Columns by themselves: numpy is several times slower along a short last axis. And `take` is
+    # three times quicker than brackets.
     xyz = np.ascontiguousarray(points.xyz.T)
     uv = np.ascontiguousarray(images.keypoint_xy.T)
     for image, rows in seen.by_image(images):
         camera = cameras.get(int(images.camera_ids[image]))
         if camera is None or not good[image]:
             continue
-        place, (u, v) = xyz[:, seen.point[rows]], uv[:, seen.keypoint[rows]]
+        place = xyz.take(seen.point.take(rows), axis=1)
+        u, v = uv.take(seen.keypoint.take(rows), axis=1)
         with np.errstate(all="ignore"):  # infinite for absurd poses
             depth, x, y = project(rotations[image], images.translations[image], camera.K, *place)
             error = np.sqrt((x - u) ** 2 + (y - v) ** 2)
