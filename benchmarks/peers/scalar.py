@@ -20,8 +20,7 @@ from numba import njit
 from scenes import Scene
 from torch import Tensor
 
-from chronoscene.rasterizer.constants import EPS2D
-from chronoscene.rasterizer.reference import _project
+from peers.projection import project
 
 NAME = "scalar"
 WHAT = "scalar compiled code, one thread, boxes of 3 sigma; without projection and sort"
@@ -50,14 +49,10 @@ def make(scene: Scene) -> Callable[[bool], Tensor]:
 
 def _splats(scene: Scene) -> tuple[Tensor, np.ndarray]:
     """Front to back: x, y, conic (3), half width, half height."""
-    means, quats, scales = (x.detach() for x in scene.gaussians[:3])
-    size = (scene.width, scene.height)
-    flat = _project(means, quats, scales, scene.viewmats[0], scene.Ks[0], *size, EPS2D)
-    a, b, c = (flat.covariances[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    conics = torch.stack([c, -b, a], dim=1) / (a * c - b * b)[:, None]
-    halves = 3 * torch.stack([a, c], dim=1).sqrt()
-    rows = torch.cat([flat.means2d, conics, halves], dim=1)
-    order = torch.argsort(flat.depths, stable=True)
+    with torch.no_grad():
+        centres, variances, conics, depths = project(scene)
+    rows = torch.cat([centres, conics, 3 * variances.sqrt()], dim=1)
+    order = torch.argsort(depths, stable=True)
     return order, np.ascontiguousarray(rows[order].numpy())
 
 

@@ -12,8 +12,8 @@ import torch
 from scenes import Scene
 from torch import Tensor
 
-from chronoscene.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, EPS2D, TRANSMITTANCE_MIN
-from chronoscene.rasterizer.reference import _project
+from chronoscene.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from peers.projection import project
 
 NAME = "torch"
 WHAT = "vectorised torch, float32, 16x16 tiles, autograd"
@@ -36,15 +36,12 @@ def make(scene: Scene) -> Callable[[bool], Tensor]:
 
 def render(scene: Scene) -> Tensor:
     """[H, W, 3]"""
-    means, quats, scales, opacities, colors = scene.gaussians
+    opacities, colors = scene.gaussians[3:]
     width, height = scene.width, scene.height
-    flat = _project(means, quats, scales, scene.viewmats[0], scene.Ks[0], width, height, EPS2D)
-    a, b, c = (flat.covariances[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    conics = torch.stack([c, -b, a], dim=1) / (a * c - b * b)[:, None]
+    centres, variances, conics, depths = project(scene)
     with torch.no_grad():
-        level = 2 * torch.log(opacities / ALPHA_MIN)
-        reach = torch.sqrt(level[:, None] * torch.stack([a, c], dim=1))
-        gaussians, starts = _bin(flat.means2d, reach, flat.depths, width, height)
+        reach = torch.sqrt(2 * torch.log(opacities / ALPHA_MIN)[:, None] * variances)
+        gaussians, starts = _bin(centres, reach, depths, width, height)
     columns = -(-width // TILE)
     rows = []
     for top in range(0, height, TILE):
@@ -53,7 +50,7 @@ def render(scene: Scene) -> Tensor:
             tile = (top // TILE) * columns + left // TILE
             index = gaussians[starts[tile] : starts[tile + 1]]
             box = (left, top, min(TILE, width - left), min(TILE, height - top))
-            tiles.append(_tile(flat.means2d, conics, opacities, colors, index, box))
+            tiles.append(_tile(centres, conics, opacities, colors, index, box))
         rows.append(torch.cat(tiles, dim=1))
     return torch.cat(rows, dim=0)
 
