@@ -33,9 +33,10 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
     figure = new_figure(WIDTH, height)
     gap = 0.35
     width = (WIDTH - left - gap - 0.2) / 2
+    seen = any(c.count == "seen" for c in counts)
     kinds: tuple[tuple[str, Callable[[PeriodCount], int]], ...] = (
         ("images", lambda p: p.images),
-        ("points", lambda p: p.points),
+        ("points, again in each period" if seen else "points", lambda p: p.points),
     )
     for i, (what, of) in enumerate(kinds):
         box = (left + i * (width + gap), bottom, width, height - top - bottom)

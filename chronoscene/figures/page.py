@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.figures.cloud import Cloud, cloud_of, shown_box
 from chronoscene.figures.colors import period_colors
 from chronoscene.figures.page_template import TEMPLATE
-from chronoscene.figures.projections import Cloud, cloud_of, shown_box
 from chronoscene.files import write_text_atomic
 from chronoscene.scene import Scene
 

@@ -205,11 +205,16 @@ def totals(counts: Sequence[SceneCount]) -> dict[str, Any]:
 
 def to_text(counts: Sequence[SceneCount]) -> str:
     """Table for a terminal, without colours."""
+    return plain_text(_rich_table(counts))
+
+
+def plain_text(table: Table) -> str:
+    """A table as text, as wide as it is; markup in its cells is only text."""
     from rich.console import Console
 
     out = io.StringIO()
     console = Console(file=out, width=10_000, color_system=None, markup=False, emoji=False)
-    console.print(_rich_table(counts))
+    console.print(table)
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from chronoscene.stats.counts import escape_latex, totals
+from chronoscene.stats.counts import escape_latex, plain_text, totals
 from chronoscene.stats.measures import Measures, SceneStatistics
 
 MOST_SHOWN = 8
@@ -152,7 +152,6 @@ def _percent(row: Row, other: int) -> str:
 def details_text(statistics: Sequence[SceneStatistics]) -> str:
     """Table for a terminal, without colours."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
     heads, lines = _grid(statistics)
@@ -161,10 +160,7 @@ def details_text(statistics: Sequence[SceneStatistics]) -> str:
         table.add_column("\n".join(head), justify="left" if i < 2 else "right", no_wrap=True)
     for line in lines:
         table.add_row(*line, end_section=line[1] == "all")
-    out = io.StringIO()
-    console = Console(file=out, width=10_000, color_system=None, markup=False, emoji=False)
-    console.print(table)
-    return "\n".join(line.rstrip() for line in out.getvalue().splitlines()).rstrip("\n") + "\n"
+    return plain_text(table)
 
 
 def details_markdown(statistics: Sequence[SceneStatistics]) -> str:

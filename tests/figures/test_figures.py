@@ -11,6 +11,7 @@ from PIL import Image
 
 from chronoscene.figures import projections
 from chronoscene.figures.bars import draw_bars
+from chronoscene.figures.cloud import Cloud, shown_box
 from chronoscene.figures.colors import EIGHT, FOUR, period_colors, rgb_of
 from chronoscene.figures.density import (
     FAINTEST,
@@ -21,7 +22,7 @@ from chronoscene.figures.density import (
     opacity,
     shade,
 )
-from chronoscene.figures.projections import Cloud, draw_cloud, legend_names, shown_box
+from chronoscene.figures.projections import draw_cloud, legend_names
 from chronoscene.stats import PeriodCount, SceneCount
 from chronoscene.stats.published import PAPER_COUNTS
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from chronoscene.figures.cloud import Cloud
 from chronoscene.figures.page import home_view, page_of, write_page
-from chronoscene.figures.projections import Cloud
 from chronoscene.formats import read_scene
 
 NASTY = '</script><script>alert(1)</script> & "it\'s" @@DATA@@ \u2028'
