@@ -114,7 +114,7 @@ class Certificate:
     unit: str
     """``metre``, or ``unknown``: then distances mean something as shares of the extent only."""
     extent: float
-    """Diagonal of the box around all cameras, world units; at least a tenth of that of the points."""
+    """World units: diagonal of the box around all cameras; at least a tenth of the points'."""
     focal: float
     """Median focal length, pixels."""
     labels: tuple[str, ...]
@@ -148,7 +148,7 @@ def certify(model: Registered) -> Certificate:
 
 
 def scene_extent(model: Registered) -> float:
-    """Diagonal of the box around the cameras; for cameras that stand still, a tenth of the points'."""
+    """Diagonal of the box around the cameras; a tenth of that of the points if that is more."""
     size = 0.0
     if len(model.points):
         low, high = np.percentile(model.points, [5, 95], axis=0)
@@ -210,8 +210,9 @@ def _pair(
     centres = camera_centre(model.cam_from_world[np.isin(model.periods, (a, b))])
     moved, placed_a, placed_b = transfers(held_out, model.periods, a, b)
     good = transfer_errors(moved)[1] < BADLY_PLACED if len(moved) else np.zeros(0, bool)
-    figures: HeldOut | str = "no held-out track is placed by one period and seen by the other"
-    misalignment: Misalignment | str = figures
+    nothing = "no held-out track is placed by one period and seen by the other"
+    figures: HeldOut | str = nothing
+    misalignment: Misalignment | str = nothing
     if good.any():
         figures = _held_out(model, moved, good, placed_a, placed_b, (a, b))
         measured = measure(moved, placed_a, placed_b, centres)

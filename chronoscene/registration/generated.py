@@ -263,8 +263,8 @@ def _jittered(rng: np.random.Generator, poses: Array) -> Array:
 def _bent(poses: Array, truth: Array, periods: Ints, points: Array, height: float) -> Array:
     """Poses of later periods in a world bent like a bowl: dz = height (r / (SIDE / 2))^2.
 
-    Cameras rise with the bowl and turn to where the bent points are: what adjustment makes of a lens
-    that is a little wrong.
+    Cameras rise with the bowl and turn to where the bent points are: what adjustment makes of a
+    lens that is a little wrong.
     """
     from scipy.spatial.transform import Rotation
 
@@ -311,7 +311,7 @@ def _empty(settings: CaseSettings, poses: Array, periods: Ints, gps: Array) -> R
         unregistered_periods={},
         route="separate",
         gps_enu=gps,
-        gps_used=np.isfinite(gps).all(axis=1),
+        gps_used=np.asarray(np.isfinite(gps).all(axis=1)),
         georeference=None
         if settings.gps_noise is None
         else Georeference(51.0, 11.0, 200.0, "as stated"),
@@ -332,7 +332,7 @@ def _starts(track: Ints) -> Ints:
 def _align(
     rng: np.random.Generator, settings: CaseSettings, model: Registered, seen: _Sightings
 ) -> Array:
-    """Bring each period from a frame of its own to those before it; then add the error asked for."""
+    """Bring each period from a frame of its own to another; then add the error asked for."""
     poses = model.cam_from_world.copy()
     last = settings.periods - 1
     for b in range(1, settings.periods):

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from chronoscene.geometry import camera_centre, pose_from_rotation_translation
-from chronoscene.registration.misalignment import rotation_angle
-from chronoscene.registration.rays import Array, Placed, Rays
+from chronoscene.registration.misalignment import (
+    NOISE_FLOOR,
+    generators,
+    rotation_angle,
+    transfer_variance,
+)
+from chronoscene.registration.rays import Array, Placed, Rays, project
+from chronoscene.validation.alignment import SIGMA
 
 FEWEST_POINTS = 12
 """Points of the other period that an image must see."""
@@ -33,6 +39,10 @@ class Localisation:
     centre: float
     """Median, world units."""
     largest_centre: float
+    rotation_excess: float
+    """Degrees beyond what the noise of the points makes of it; 0 where it explains all."""
+    centre_excess: float
+    """World units."""
 
 
 def localise(rays: Rays, placed: Placed) -> Localisation | str:
@@ -50,23 +60,66 @@ def localise(rays: Rays, placed: Placed) -> Localisation | str:
         return f"no image sees {FEWEST_POINTS} points that the other period places"
     images = images[:: len(images) // MOST_IMAGES + 1]
     found_poses = [_localise_one(rays.where(rays.image == i), xyz[rays.image == i]) for i in images]
-    pairs = [
-        (rays.pose[np.flatnonzero(rays.image == i)[0]], p)
-        for i, p in zip(images, found_poses, strict=True)
-        if p is not None
-    ]
-    if not pairs:
+    spread = placed.covariance[slot]
+    poses, differences = [], []
+    for i, pose in zip(images, found_poses, strict=True):
+        if pose is not None:
+            mine = rays.image == i
+            poses.append((rays.pose[np.flatnonzero(mine)[0]], pose))
+            differences.append(_expected(rays.where(mine), xyz[mine], spread[mine], pose))
+    if not poses:
         return f"none of {len(images)} images could be localised from the other period"
-    angle = [rotation_angle(new[:3, :3] @ old[:3, :3].T) for old, new in pairs]
-    moved = [float(np.linalg.norm(camera_centre(new) - camera_centre(old))) for old, new in pairs]
+    angle = np.array([rotation_angle(new[:3, :3] @ old[:3, :3].T) for old, new in poses])
+    moved = np.array(
+        [np.linalg.norm(camera_centre(new) - camera_centre(old)) for old, new in poses]
+    )
+    noise = np.array(differences)
     return Localisation(
-        images=len(pairs),
+        images=len(poses),
         tried=len(images),
         rotation=float(np.median(angle)),
-        largest_rotation=max(angle),
+        largest_rotation=float(angle.max()),
         centre=float(np.median(moved)),
-        largest_centre=max(moved),
+        largest_centre=float(moved.max()),
+        rotation_excess=_excess(angle, noise[:, 0]),
+        centre_excess=_excess(moved, noise[:, 1]),
     )
+
+
+def _excess(size: Array, noise: Array) -> float:
+    """What is left of the squares when the expected ones are taken off, and twice their spread.
+
+    Args:
+        size: Differences of the images. [n]
+        noise: Expected variance of each. [n]
+    """
+    beyond = size**2 - noise
+    middle = float(np.median(beyond))
+    spread = SIGMA * float(np.median(np.abs(beyond - middle))) / np.sqrt(len(size))
+    return float(np.sqrt(max(0.0, middle - 2 * spread)))
+
+
+def _expected(rays: Rays, xyz: Array, spread: Array, pose: Array) -> tuple[float, float]:
+    """Variance of the pose that noise causes: rotation in degrees squared, centre in squared units.
+
+    Least squares with equal weights on points of unequal certainty: ``N^-1 M N^-1`` with
+    ``N = J^T J`` and ``M = J^T V J``.
+    """
+    rays = replace(rays, pose=np.broadcast_to(pose, (len(rays), 4, 4)))
+    residual, by_point, _ = project(rays, xyz)
+    variance = transfer_variance(by_point, spread)
+    square = (residual**2).sum(axis=1) / variance
+    good = np.isfinite(square) & (np.linalg.norm(residual, axis=1) < INLIER_PIXELS)
+    local = xyz @ pose[:3, :3].T + pose[:3, 3]
+    motion = generators(local)[:, :, :6]
+    jacobian = np.einsum("nki,ji,njm->nkm", by_point, pose[:3, :3], motion)[good]
+    noise = max(float(np.median(square[good])) / 1.1774**2, NOISE_FLOOR**2)
+    normal = np.einsum("nki,nkj->ij", jacobian, jacobian)
+    middle = np.einsum("nki,n,nkj->ij", jacobian, variance[good] * noise, jacobian)
+    inverse = np.linalg.pinv(normal)
+    covariance = inverse @ middle @ inverse
+    turn = float(np.trace(covariance[3:, 3:])) * np.degrees(1.0) ** 2
+    return turn, float(np.trace(covariance[:3, :3]))
 
 
 def _localise_one(rays: Rays, xyz: Array) -> Array | None:

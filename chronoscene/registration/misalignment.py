@@ -115,10 +115,10 @@ def transfer_errors(moved: Transfers) -> tuple[Array, Array, Array]:
     error = np.linalg.norm(residual, axis=1)
     distance = np.where(depth > 0, error * depth / moved.rays.focal.mean(axis=1), np.inf)
     error = np.where(np.isfinite(error), error, np.inf)
-    return error, np.sqrt(_variance(jacobian, moved.covariance)), distance
+    return error, np.sqrt(transfer_variance(jacobian, moved.covariance)), distance
 
 
-def _variance(jacobian: Array, covariance: Array) -> Array:
+def transfer_variance(jacobian: Array, covariance: Array) -> Array:
     """Mean variance per axis of a transferred point and its observation, for unit noise. [O]"""
     spread = np.einsum("nki,nij,nkj->n", jacobian, covariance, jacobian)
     return np.asarray(1.0 + np.nan_to_num(spread, nan=1e12) / 2)
@@ -152,7 +152,7 @@ def measure(
         weight, _ = _weights(residual, jacobian[1])
         normal, gradient = _sum(residual, jacobian[0], weight)
         try:
-            step = -np.linalg.solve(normal, gradient)
+            step: Array = np.asarray(-np.linalg.solve(normal, gradient), np.float64)
         except np.linalg.LinAlgError:
             return None
         if not np.isfinite(step).all():
@@ -188,14 +188,14 @@ def _residuals(
     residual, by_point, _ = project(moved.rays, xyz)
     # Left perturbation: S <- exp(d) S. The inverse changes as S^-1 exp(-d).
     at = np.where(back[:, None], moved.xyz, xyz) - middle
-    by_motion = _generators(at)
+    by_motion = generators(at)
     linear = -inverse.scale * inverse.rotation
     by_motion = np.where(back[:, None, None], linear @ by_motion, by_motion)
-    variance = _variance(by_point, moved.covariance)
+    variance = transfer_variance(by_point, moved.covariance)
     return residual, (np.einsum("nki,nij->nkj", by_point, by_motion), variance)
 
 
-def _generators(x: Array) -> Array:
+def generators(x: Array) -> Array:
     """Derivative of ``t + w x p + s p`` by (t, w, s) at points. [O, 3] -> [O, 3, 7]"""
     out = np.zeros((len(x), 3, 7))
     out[:, [0, 1, 2], [0, 1, 2]] = 1.0
@@ -242,7 +242,7 @@ def _describe(
 ) -> Misalignment | None:
     residual, (jacobian, variance) = _residuals(moved, similarity, middle)
     weight, noise = _weights(residual, variance)
-    covariance, groups = _sandwich(moved.rays.track, residual, jacobian, weight)
+    covariance = _sandwich(moved.rays.track, residual, jacobian, weight)
     if covariance is None:
         return None
     rng = np.random.default_rng(0)
@@ -259,9 +259,7 @@ def _describe(
     )
 
 
-def _sandwich(
-    track: Ints, residual: Array, jacobian: Array, weight: Array
-) -> tuple[Array | None, int]:
+def _sandwich(track: Ints, residual: Array, jacobian: Array, weight: Array) -> Array | None:
     """Covariance of the seven parameters, grouped by track."""
     residual, jacobian = np.nan_to_num(residual), np.nan_to_num(jacobian)
     normal = np.einsum("nki,n,nkj->ij", jacobian, weight, jacobian)
@@ -270,14 +268,15 @@ def _sandwich(
     score = np.einsum("nki,n,nk->ni", jacobian, weight, residual)
     sums = np.stack([np.bincount(slot, score[:, i], groups) for i in range(7)], axis=1)
     if groups <= 7 or np.linalg.cond(normal) > 1e16:
-        return None, groups
+        return None
     bread = np.linalg.inv(normal)
     # What the noise of the pixels alone would give is the least: few tracks can agree by chance.
     covariance = bread @ (sums.T @ sums) @ bread * groups / (groups - 7)
-    return np.maximum(1.0, _ratio(bread, covariance)) * covariance, groups
+    return np.asarray(_ratio(bread, covariance) * covariance)
 
 
 def _ratio(least: Array, covariance: Array) -> float:
+    """Factor, at least 1, that brings a covariance up to the least that is believed."""
     size = float(np.trace(covariance / np.maximum(np.diag(least), 1e-300)[:, None])) / 7
     return 1.0 / size if 0 < size < 1 else 1.0
 

@@ -50,7 +50,9 @@ class Rays:
 
     def where(self, mask: Mask | Ints) -> Rays:
         """Some of the observations, in their order."""
-        return Rays(*(a[mask] for a in (self.track, self.image, self.pose, self.uv, self.focal)))
+        return Rays(
+            self.track[mask], self.image[mask], self.pose[mask], self.uv[mask], self.focal[mask]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +82,7 @@ def rays_of(model: Registered, start: Ints, image: Ints, xy: Array) -> Rays:
     track = np.repeat(np.arange(len(start) - 1), np.diff(start))
     uv, focal = unproject(model.cameras, image, xy)
     rays = Rays(track, image, model.cam_from_world[image], uv, focal)
-    return rays.where(np.isfinite(uv).all(axis=1))
+    return rays.where(np.flatnonzero(np.isfinite(uv).all(axis=1)))
 
 
 def model_rays(model: Registered, points: Mask | None = None) -> Rays:
@@ -90,7 +92,7 @@ def model_rays(model: Registered, points: Mask | None = None) -> Rays:
     image, track = model.track_image[keep], track[keep]
     uv, focal = unproject(model.cameras, image, model.track_xy[keep])
     rays = Rays(track, image, model.cam_from_world[image], uv, focal)
-    return rays.where(np.isfinite(uv).all(axis=1))
+    return rays.where(np.flatnonzero(np.isfinite(uv).all(axis=1)))
 
 
 def held_out_rays(model: Registered) -> Rays:
@@ -161,7 +163,7 @@ def place(rays: Rays) -> Placed:
     return Placed(
         track=rays.track[first][good],
         xyz=xyz[good],
-        covariance=np.linalg.inv(normal[good]),
+        covariance=np.asarray(np.linalg.inv(normal[good]), np.float64),
         error=np.sqrt(mean_square[good]),
     )
 
@@ -176,7 +178,8 @@ def _nearest_to_rays(rays: Rays, first: Ints, count: Ints) -> tuple[Array, Array
     right = np.add.reduceat(np.einsum("nij,nj->ni", across, camera_centre(rays.pose)), first)
     parallax = np.linalg.eigvalsh(left / count[:, None, None])[:, 0]
     left += 1e-12 * np.eye(3)
-    return np.linalg.solve(left, right[:, :, None])[:, :, 0], parallax
+    nearest = np.linalg.solve(left, right[:, :, None])[:, :, 0]
+    return nearest, np.asarray(parallax, np.float64)
 
 
 def _normal_equations(residual: Array, jacobian: Array, first: Ints) -> tuple[Array, Array]:

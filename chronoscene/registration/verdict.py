@@ -104,9 +104,9 @@ THRESHOLDS: dict[str, Threshold] = {
             _CLICK,
         ),
         Threshold(
-            "localised", "pose of images localised from the other period, median against its limit",
-            "times 0.1 degrees or 0.2%", 5.0, 25.0, False,
-            "one image is placed less well than a period: five times the limit is usual noise",
+            "localised", "pose of images localised from the other period, beyond its noise",
+            "times 0.1 degrees or 0.2%", 1.0, 10.0, False,
+            "the points of either period must put the images of the other where they are",
             "look at the flicker comparisons; if they jump, " + _CLICK,
         ),
         Threshold(
@@ -140,6 +140,9 @@ THRESHOLDS: dict[str, Threshold] = {
 
 FITTED = 1.3
 """Noise of an observation against the residual that is left of it after fitting, at most."""
+
+FEWEST_LINK = 3
+"""Tie points, clicked ones say, without which nothing holds two periods together."""
 
 LACKING = ("held_out", "rotation", "shift", "occupied", "tied")
 """Checks whose doubt is a lack of evidence: a way through other periods can make up for it."""
@@ -185,7 +188,8 @@ def judge(certificate: Certificate) -> Verdict:
     pairs: dict[tuple[int, int], Level | None] = {}
     for pair in certificate.pairs:
         mine = list(_of_pair(certificate, pair))
-        linked = isinstance(pair.by_all, Misalignment) or not isinstance(pair.held_out, str)
+        measured = isinstance(pair.by_all, Misalignment) or not isinstance(pair.held_out, str)
+        linked = measured or pair.ties.points >= FEWEST_LINK
         pairs[pair.a, pair.b] = _worst(f.level for f in mine) if linked else None
         findings += mine if linked else []
     links = list(_links(certificate, pairs, names))
@@ -256,8 +260,8 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Finding]:
     yield from _check("tied", min(pair.ties.tied_a, pair.ties.tied_b), place)
     for found in (pair.localised_b, pair.localised_a):
         if isinstance(found, Localisation) and found.images >= 3:
-            size = 100 * found.centre / certificate.extent
-            worst = max(found.rotation / _limit("rotation"), size / _limit("shift"))
+            size = 100 * found.centre_excess / certificate.extent
+            worst = max(found.rotation_excess / _limit("rotation"), size / _limit("shift"))
             yield from _check("localised", worst, place)
     if isinstance(pair.clouds, CloudDistance):
         yield from _check("clouds", 100 * pair.clouds.shift.low / certificate.extent, place)
