@@ -1,0 +1,171 @@
+"""Databases of two periods with known poses, for routes that need no photos."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import chronoscene  # noqa: F401  (loads zlib before pycolmap)
+from chronoscene.colmap import read_model
+from chronoscene.geometry import camera_centre, pose_from_rotation_translation
+from chronoscene.validation.alignment import fit
+
+import pycolmap  # isort: skip
+
+Array = NDArray[np.float64]
+
+IMAGES = 8
+"""Of each period."""
+
+
+@dataclass
+class Case:
+    """A database, what is true of it, and the arguments of a route."""
+
+    folder: Path
+    truth: dict[str, Array]
+    """``cam_from_world`` by name. [4, 4]"""
+    periods: dict[str, int]
+    priors: dict[str, Any] | None = None
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def database(self) -> Path:
+        return self.folder / "mapping.db"
+
+    def arguments(self) -> dict[str, Any]:
+        return {
+            "database": str(self.database),
+            "photos": str(self.folder / "photos"),
+            "periods": self.periods,
+            "priors": self.priors,
+            "out": str(self.folder / "model"),
+            "scratch": str(self.folder / "scratch"),
+            "threads": 1,
+        } | self.extra
+
+    def estimated(self) -> dict[str, Array]:
+        return {i.name: i.cam_from_world for i in read_model(self.folder / "model").images}
+
+    def errors(self, *, reference: int | None = None) -> dict[int, tuple[float, float]]:
+        """Median rotation (degrees) and centre error (share of the extent) of each period.
+
+        The model is brought to the truth by the cameras of one period, or of all.
+        """
+        found = self.estimated()
+        names = sorted(found)
+        fitted = [n for n in names if reference is None or self.periods[n] == reference]
+        a, b = (camera_centre(np.stack([d[n] for n in fitted])) for d in (found, self.truth))
+        sim = fit(a, b)
+        assert sim is not None
+        every = camera_centre(np.stack(list(self.truth.values())))
+        extent = float(np.linalg.norm(np.ptp(every, axis=0)))
+        rotation = sim.matrix / sim.scale
+        result = {}
+        for period in sorted(set(self.periods.values())):
+            mine = [n for n in names if self.periods[n] == period]
+            angles, distances = [], []
+            for name in mine:
+                turned = found[name][:3, :3] @ rotation.T
+                cosine = (np.trace(turned @ self.truth[name][:3, :3].T) - 1) / 2
+                angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+                place = sim.apply(camera_centre(found[name])[None])[0]
+                distances.append(np.linalg.norm(place - camera_centre(self.truth[name])) / extent)
+            result[period] = (float(np.median(angles)), float(np.median(distances)))
+        return result
+
+
+@pytest.fixture
+def make_case(tmp_path: Path) -> Callable[..., Case]:
+    """Factory of cases."""
+
+    def make(
+        *,
+        points: int = 300,
+        noise: float = 0.5,
+        moved: float = 0.0,
+        cross_matches: float = 1.0,
+        gps: float | None = None,
+    ) -> Case:
+        folder = tmp_path / f"case-{points}-{moved}-{cross_matches}"
+        (folder / "photos").mkdir(parents=True)
+        options = pycolmap.SyntheticDatasetOptions()
+        options.num_rigs = 2
+        options.num_cameras_per_rig = 1
+        options.num_frames_per_rig = IMAGES
+        options.num_points3D = points
+        options.camera_has_prior_focal_length = True
+        disturb = pycolmap.SyntheticNoiseOptions()
+        disturb.point2D_stddev = noise
+        pycolmap.set_random_seed(3)
+        with pycolmap.Database.open(str(folder / "mapping.db")) as database:
+            model = pycolmap.synthesize_dataset(options, database)
+            periods = {str(i.name): int(i.camera_id) - 1 for i in model.images.values()}
+            truth = {str(i.name): pose_of(i) for i in model.images.values()}
+            if moved:
+                move_points(model, database, moved)
+            pycolmap.synthesize_noise(disturb, model, database)
+            if cross_matches < 1:
+                thin_matches(model, database, cross_matches)
+        case = Case(folder, truth, periods)
+        if gps is not None:
+            case.priors = noisy_gps(truth, gps)
+        return case
+
+    return make
+
+
+def pose_of(image: pycolmap.Image) -> Array:
+    matrix = image.cam_from_world().matrix()
+    return pose_from_rotation_translation(matrix[:, :3], matrix[:, 3])
+
+
+def move_points(model: pycolmap.Reconstruction, database: pycolmap.Database, share: float) -> None:
+    """The points at one side, so many of them, are elsewhere when period 1 sees them."""
+    xyz = {i: p.xyz for i, p in model.points3D.items()}
+    limit = np.quantile([p[0] for p in xyz.values()], share)
+    extent = np.ptp([p[0] for p in xyz.values()])
+    for image in model.images.values():
+        if image.camera_id != 2:
+            continue
+        keypoints = np.asarray(database.read_keypoints(image.image_id)).copy()
+        camera = model.cameras[image.camera_id]
+        for k, point2D in enumerate(image.points2D):
+            if point2D.has_point3D() and xyz[point2D.point3D_id][0] < limit:
+                place = xyz[point2D.point3D_id] + 0.04 * extent * np.array([0.3, 0.8, 0.5])
+                seen = camera.img_from_cam(image.cam_from_world() * place)
+                if seen is not None:
+                    keypoints[k, :2] = seen
+        database.update_keypoints(image.image_id, keypoints)
+
+
+def thin_matches(model: pycolmap.Reconstruction, database: pycolmap.Database, share: float) -> None:
+    """Keep a share of the matches between periods; pairs without any are removed."""
+    period = {i: image.camera_id for i, image in model.images.items()}
+    pair_ids, geometries = database.read_two_view_geometries()
+    for pair_id, geometry in zip(pair_ids, geometries, strict=True):
+        a, b = pycolmap.pair_id_to_image_pair(pair_id)
+        if period[a] == period[b]:
+            continue
+        inliers = np.asarray(geometry.inlier_matches)
+        keep = inliers[: round(share * len(inliers))]
+        if not len(keep):
+            database.delete_two_view_geometry(a, b)
+            continue
+        geometry.inlier_matches = keep
+        database.update_two_view_geometry(a, b, geometry)
+
+
+def noisy_gps(truth: dict[str, Array], noise: float) -> dict[str, Any]:
+    """Positions in a frame of 200 m; every tenth is far off."""
+    rng = np.random.default_rng(5)
+    centres = {name: camera_centre(pose) for name, pose in truth.items()}
+    scale = 200.0 / np.linalg.norm(np.ptp(np.stack(list(centres.values())), axis=0))
+    enu = {n: (scale * c + rng.normal(0, noise, 3)).tolist() for n, c in centres.items()}
+    for name in sorted(enu)[::10]:
+        enu[name][0] += 500.0
+    return {"enu": enu, "sigma": {name: [noise] * 3 for name in enu}}
