@@ -64,13 +64,13 @@ THRESHOLDS: dict[str, Threshold] = {
             "add photos of this period",
         ),
         Threshold(
-            "rotation", "rotation between two periods that held-out tracks ask for", "degrees",
+            "rotation", "rotation left between two periods", "degrees",
             0.1, 0.1, False,
             "0.1 degrees are 1.7 pixels at a focal length of 1000: twice what matching leaves",
             _CLICK,
         ),
         Threshold(
-            "shift", "displacement between two periods that held-out tracks ask for", "% of extent",
+            "shift", "displacement left between two periods", "% of extent",
             0.2, 0.2, False,
             "0.2% are 20 cm in 100 m: changes smaller than this cannot be told from misalignment",
             _CLICK,
@@ -182,7 +182,6 @@ class Verdict:
 
 def judge(certificate: Certificate) -> Verdict:
     """Judge a registration by its certificate."""
-    names = certificate.labels
     findings = [f for p in certificate.periods for f in _of_period(p)]
     findings += _between_gps(certificate)
     pairs: dict[tuple[int, int], Level | None] = {}
@@ -192,10 +191,10 @@ def judge(certificate: Certificate) -> Verdict:
         linked = measured or pair.ties.points >= FEWEST_LINK
         pairs[pair.a, pair.b] = _worst(f.level for f in mine) if linked else None
         findings += mine if linked else []
-    links = list(_links(certificate, pairs, names))
-    if not links:
+    good = _bounds(certificate, [k for k, level in pairs.items() if level == "pass"])
+    if all(good[k] <= 1 or level == "pass" for k, level in pairs.items()):
         findings = [f for f in findings if not _made_up_for(f)]
-    findings += links
+    findings += _links(certificate, pairs, good)
     level = _worst(f.level for f in findings)
     findings.sort(key=lambda f: -LEVELS.index(f.level))
     return Verdict(level, _words(certificate, level, findings), tuple(findings), pairs)
@@ -316,32 +315,32 @@ def _excess(certificate: Certificate, pair: PairFigures) -> float:
 
 
 def _links(
-    certificate: Certificate, pairs: dict[tuple[int, int], Level | None], names: tuple[str, ...]
+    certificate: Certificate, pairs: dict[tuple[int, int], Level | None], good: Array
 ) -> Iterator[Finding]:
-    """Periods that no chain of good pairs links, or one along which the errors add up to too much.
+    """Periods without anything in common that are not linked well by a chain of others.
 
-    Where every period is linked, a pair with little in common is no reason for doubt.
+    Args:
+        certificate: What was measured.
+        pairs: Level of each pair; None where nothing links the two directly.
+        good: From `_bounds`, along pairs that passed.
     """
-    good = _bounds(certificate, [k for k, level in pairs.items() if level == "pass"])
+    names = certificate.labels
     some = _bounds(certificate, [k for k, level in pairs.items() if level is not None])
-    for a in range(len(names)):
-        for b in range(a + 1, len(names)):
-            place = f"periods {names[a]} and {names[b]}"
-            if not np.isfinite(some[a, b]):
-                yield Finding(
-                    "fail", "link", place, "nothing measured links the two",
-                    "without matches between them, their alignment is not known at all", _CLICK,
-                )  # fmt: skip
-            elif not good[a, b] <= 1 and pairs.get((a, b)) != "pass":
-                left = (
-                    f"a chain of good pairs links the two, but leaves {good[a, b]:.2g} times the "
-                    "limits open"
-                    if np.isfinite(good[a, b])
-                    else "no chain of good pairs links the two"
-                )
-                yield Finding(
-                    "doubtful", "chain", place, left, "the errors of a chain add up", _CLICK
-                )
+    for (a, b), level in pairs.items():
+        place = f"periods {names[a]} and {names[b]}"
+        if not np.isfinite(some[a, b]):
+            yield Finding(
+                "fail", "link", place, "nothing measured links the two",
+                "without matches between them, their alignment is not known at all", _CLICK,
+            )  # fmt: skip
+        elif level is None and not good[a, b] <= 1:
+            left = (
+                f"a chain of good pairs links the two, but leaves {good[a, b]:.2g} times the "
+                "limits open"
+                if np.isfinite(good[a, b])
+                else "no chain of good pairs links the two"
+            )
+            yield Finding("doubtful", "chain", place, left, "the errors of a chain add up", _CLICK)
 
 
 def _bounds(certificate: Certificate, pairs: list[tuple[int, int]]) -> Array:
