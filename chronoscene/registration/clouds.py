@@ -34,6 +34,12 @@ LARGEST_ROUGHNESS = 0.25
 
 CONFIDENCE = 1.96
 
+TRIALS = 300
+"""Triples of core points that are tried as a common shift."""
+
+NOTABLY = 1.1
+"""Times as many core points as no shift must a shift explain."""
+
 
 @dataclass(frozen=True, slots=True)
 class CloudDistance:
@@ -42,7 +48,7 @@ class CloudDistance:
     cores: int
     """Core points where both periods have a surface."""
     stable: int
-    """Those that did not change: within three robust deviations of the mode."""
+    """Those that one common shift explains: where nothing changed, that is all of them."""
     median: float
     """Of the absolute distance over stable core points."""
     level: float
@@ -117,8 +123,7 @@ def _mean_within(along: Array, inside: Mask) -> tuple[Array, Array, Array]:
 def _summary(
     distance: Array, normal: Array, chance: Array, registration: float
 ) -> CloudDistance | str:
-    width = SIGMA * np.median(np.abs(distance - np.median(distance)))
-    stable = np.abs(distance - np.median(distance)) <= 3 * max(width, float(np.median(chance)))
+    stable = _stable(distance, normal, chance)
     if stable.sum() < FEWEST_CORES:
         return f"{int(stable.sum())} core points on structure that did not change"
     level = CONFIDENCE * chance + registration
@@ -131,6 +136,27 @@ def _summary(
         beyond=float(np.mean(size > level[stable])),
         shift=_shift(distance[stable], normal[stable], chance[stable]),
     )
+
+
+def _stable(distance: Array, normal: Array, chance: Array) -> Mask:
+    """Core points that did not change: the largest set that one translation explains.
+
+    Zero is preferred unless another translation explains notably more: three core points fix a
+    translation, and the best of many triples is taken.
+    """
+    rng = np.random.default_rng(0)
+    reach = 3 * np.maximum(chance, float(np.median(chance)))
+    triples = rng.integers(0, len(distance), (TRIALS, 3))
+    sides = normal[triples]
+    good = np.abs(np.linalg.det(sides)) > 0.1
+    moves = np.linalg.solve(sides[good], distance[triples[good]][:, :, None])[:, :, 0]
+    best = np.abs(distance) <= reach
+    least = NOTABLY * best.sum()
+    for move in moves:
+        agree = np.abs(distance - normal @ move) <= reach
+        if agree.sum() > least:
+            best, least = agree, float(agree.sum())
+    return np.asarray(best)
 
 
 def _shift(distance: Array, normal: Array, chance: Array) -> Interval:

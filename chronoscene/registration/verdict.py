@@ -83,7 +83,7 @@ THRESHOLDS: dict[str, Threshold] = {
         Threshold(
             "agreeing", "share of held-out observations that agree", "", 0.75, 0.15, True,
             "right registrations reach 0.85 and more; with fewer, part of the matches, or part of "
-            "the poses, is wrong",
+            "the poses, is wrong, or matching takes one thing for another",
             "look at the worst pair in the report; remove the photos that it names",
         ),
         Threshold(
@@ -111,8 +111,9 @@ THRESHOLDS: dict[str, Threshold] = {
         ),
         Threshold(
             "clouds", "shift between the surfaces of two periods, beyond its spread", "% of extent",
-            0.2, 1.0, False,
-            "surfaces are compared apart from matches: repeated structure shows here",
+            0.2, None, False,
+            "surfaces are compared apart from matches, so repeated structure shows here; but a "
+            "beach or a quarry may really have moved",
             "look at the flicker comparisons; if they jump, " + _CLICK,
         ),
         Threshold(
