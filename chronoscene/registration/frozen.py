@@ -7,7 +7,6 @@ moves only what is new.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.mapping import (
     adjust,
-    pipeline_options,
+    place_rest,
     summary,
     triangulate,
     write_model,
@@ -69,7 +68,9 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             found=f"{found}",
             todo="check that its poses fit its images: chronoscene validate",
         )
-    model = _add_images(base, arguments, report)
+    total = len(arguments["periods"])
+    database = arguments["database"]
+    model = place_rest(base, database, photos, scratch / "continued", threads, total, report)
     new = [i for i in model.reg_image_ids() if i not in old]
     if not new:
         raise RegistrationError(
@@ -140,39 +141,6 @@ def _posed(arguments: Mapping[str, Any]) -> tuple[pycolmap.Reconstruction, set[i
             set_pose(model, image_id, pycolmap.Rigid3d(np.array(pose, np.float64)))
             old.add(int(image_id))
     return model, old
-
-
-def _add_images(
-    base: pycolmap.Reconstruction, arguments: Mapping[str, Any], report: Report
-) -> pycolmap.Reconstruction:
-    """Continue the mapping with the images that have no pose yet."""
-    folder = Path(arguments["scratch"]) / "continued"
-    shutil.rmtree(folder, ignore_errors=True)
-    for name in ("base", "out"):
-        (folder / name).mkdir(parents=True)
-    base.write_binary(str(folder / "base"))
-    options = pipeline_options(arguments["threads"], arguments["photos"])
-    options.multiple_models = False
-    options.fix_existing_frames = True
-    options.mapper.abs_pose_min_num_inliers = 20
-    options.constant_cameras = {base.images[i].camera_id for i in base.reg_image_ids()}
-    total = len(arguments["periods"]) - int(base.num_reg_images())
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done = min(done + 1, total)
-        report("placing", done, total)
-
-    models = pycolmap.incremental_mapping(
-        arguments["database"],
-        arguments["photos"],
-        str(folder / "out"),
-        options,
-        str(folder / "base"),
-        next_image_callback=count,
-    )
-    return max(models.values(), key=lambda m: m.num_reg_images()) if models else base
 
 
 def _largest_move(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> float:

@@ -24,7 +24,7 @@ from chronoscene.files import replacing
 from chronoscene.registration.sfm import keypoints_of, quiet, verified_matches
 from chronoscene.registration.worker import Report
 
-LEAST_LEFT = 20
+LEAST_LEFT = 16
 """A pair of images keeps this many matches whatever the draw: sparse pairs are not made useless."""
 
 
@@ -49,17 +49,28 @@ class Tracks:
 
 
 def build_tracks(
-    matches: Mapping[tuple[int, int], NDArray[np.int64]], sizes: Mapping[int, int]
+    matches: Mapping[tuple[int, int], NDArray[np.int64]],
+    keypoints: Mapping[int, NDArray[np.float64]],
 ) -> Tracks:
-    """Connected components of matches. ``sizes`` is the number of keypoints of each image."""
-    ids = sorted(sizes)
-    starts = np.concatenate([[0], np.cumsum([sizes[i] for i in ids])])
+    """Connected components of matches.
+
+    SIFT gives a place several keypoints where it has several orientations. They count as one, or a
+    held-out place would be known to the mapper under its other names.
+
+    Args:
+        matches: Keypoint indices by pair of image ids. [M, 2]
+        keypoints: Pixels of the keypoints of each image. [K, 2]
+    """
+    ids = sorted(keypoints)
+    starts = np.concatenate([[0], np.cumsum([len(keypoints[i]) for i in ids])])
     offset = {image: int(start) for image, start in zip(ids, starts, strict=False)}
     total = int(starts[-1])
+    place = [offset[i] + first_at_place(keypoints[i]) for i in ids]
+    alias = np.concatenate([np.zeros(0, np.int64), *place])
     a = [offset[i] + m[:, 0] for (i, _), m in matches.items()]
     b = [offset[j] + m[:, 1] for (_, j), m in matches.items()]
-    first = np.concatenate([np.zeros(0, np.int64), *a])
-    second = np.concatenate([np.zeros(0, np.int64), *b])
+    first = alias[np.concatenate([np.zeros(0, np.int64), *a])]
+    second = alias[np.concatenate([np.zeros(0, np.int64), *b])]
     graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(total, total))
     _, labels = connected_components(graph, directed=False)
     used = np.unique(np.concatenate([first, second]))
@@ -68,7 +79,15 @@ def build_tracks(
     node_track[used] = compact
     image = np.asarray(ids, np.int64)[np.searchsorted(starts, used, side="right") - 1]
     keypoint = used - np.asarray([offset[i] for i in image.tolist()], np.int64)
-    return Tracks(image, keypoint, node_track[used], offset, node_track)
+    return Tracks(image, keypoint, node_track[used], offset, node_track[alias])
+
+
+def first_at_place(xy: NDArray[np.float64]) -> NDArray[np.int64]:
+    """For each keypoint, the first one at the same pixel position. [K, 2] -> [K]"""
+    if not len(xy):
+        return np.zeros(0, np.int64)
+    _, first, inverse = np.unique(xy, axis=0, return_index=True, return_inverse=True)
+    return np.asarray(first[inverse.ravel()], np.int64)
 
 
 def eligible_tracks(tracks: Tracks, period_of: Mapping[int, int]) -> NDArray[np.int64]:
@@ -97,7 +116,7 @@ def hold_out(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     names, matches = verified_matches(arguments["database"])
     points = keypoints_of(arguments["database"])
     period_of = {i: arguments["periods"][name] for i, name in names.items()}
-    tracks = build_tracks(matches, {i: len(xy) for i, xy in points.items()})
+    tracks = build_tracks(matches, points)
     candidates = eligible_tracks(tracks, period_of)
     rng = np.random.default_rng(arguments["seed"])
     count = round(arguments["share"] * len(candidates))

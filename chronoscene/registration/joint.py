@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.georeferencing import finish
-from chronoscene.registration.mapping import adjust, map_images, triangulate
+from chronoscene.registration.mapping import adjust, map_images, nothing_mapped, triangulate
+from chronoscene.registration.separate import complete
 from chronoscene.registration.sfm import quiet, verified_matches
 from chronoscene.registration.units import Priors, Unit, combine
 from chronoscene.registration.worker import Report
@@ -41,16 +41,6 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         for _ in range(2):
             model = triangulate(model, database, photos, scratch / "points", threads)
             adjust(model, threads=threads)
+        model = complete(model, arguments, remarks, report)
     report("adjusting", 0, 1)
     return finish(model, arguments, remarks) | {"left": left}
-
-
-def nothing_mapped(count: int) -> RegistrationError:
-    """The error of photos that give no model at all."""
-    return RegistrationError(
-        "structure from motion",
-        expected=f"a model of {count} photos",
-        found="no two photos from which one can be begun",
-        todo="give more photos that overlap by more than half, taken from different places; "
-        "features and matches are kept",
-    )

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.sfm import SEED
 from chronoscene.registration.units import Priors
 from chronoscene.registration.worker import Report
@@ -22,6 +23,13 @@ SATISFIED = 0.9
 
 LOSS_PIXELS = 1.0
 """Scale of the Cauchy loss: an observation off by much more hardly pulls."""
+
+LEAST_INLIERS = 20
+"""Points with which an image is placed against a model that is there."""
+
+MOST_ITERATIONS = 60
+LEAST_PROGRESS = 1e-6
+"""Of an adjustment: steps, and relative decrease of the cost below which it ends."""
 
 MOST_REPROJECTION_ERROR = 4.0
 LEAST_ANGLE = 1.5
@@ -66,6 +74,17 @@ def map_images(
         if best and best[0].num_reg_images() >= SATISFIED * len(names):
             break
     return best, remarks
+
+
+def nothing_mapped(count: int) -> RegistrationError:
+    """The error of photos that give no model at all."""
+    return RegistrationError(
+        "structure from motion",
+        expected=f"a model of {count} photos",
+        found="no two photos from which one can be begun",
+        todo="give more photos that overlap by more than half, taken from different places; "
+        "features and matches are kept",
+    )
 
 
 def pipeline_options(threads: int, photos: str) -> pycolmap.IncrementalPipelineOptions:
@@ -120,6 +139,49 @@ def _disjoint(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Recons
     return kept
 
 
+def place_rest(
+    model: pycolmap.Reconstruction,
+    database: str,
+    photos: str,
+    scratch: Path,
+    threads: int,
+    total: int,
+    report: Report,
+) -> pycolmap.Reconstruction:
+    """Place images that have no pose yet, one after the other; the others and their cameras stay.
+
+    Args:
+        model: With points from the matches of its images.
+        total: Number of images in all.
+    """
+    shutil.rmtree(scratch, ignore_errors=True)
+    for name in ("from", "to"):
+        (scratch / name).mkdir(parents=True)
+    model.write_binary(str(scratch / "from"))
+    options = pipeline_options(threads, photos)
+    options.multiple_models = False
+    options.fix_existing_frames = True
+    options.mapper.abs_pose_min_num_inliers = LEAST_INLIERS
+    options.constant_cameras = {model.images[i].camera_id for i in model.reg_image_ids()}
+    left = total - int(model.num_reg_images())
+    done = 0
+
+    def count() -> None:
+        nonlocal done
+        done = min(done + 1, left)
+        report("placing", done, left)
+
+    models = pycolmap.incremental_mapping(
+        database,
+        photos,
+        str(scratch / "to"),
+        options,
+        str(scratch / "from"),
+        next_image_callback=count,
+    )
+    return max(models.values(), key=lambda m: m.num_reg_images()) if models else model
+
+
 def triangulate(
     model: pycolmap.Reconstruction, database: str, photos: str, scratch: Path, threads: int
 ) -> pycolmap.Reconstruction:
@@ -155,6 +217,8 @@ def adjust(
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_PIXELS
     options.ceres.solver_options.num_threads = threads
+    options.ceres.solver_options.max_num_iterations = MOST_ITERATIONS
+    options.ceres.solver_options.function_tolerance = LEAST_PROGRESS
     config = pycolmap.BundleAdjustmentConfig()
     ids = sorted(model.reg_image_ids())
     for image_id in ids:

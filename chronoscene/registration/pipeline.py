@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from chronoscene.errors import SceneError
 from chronoscene.geometry import camera_centre
@@ -35,6 +36,9 @@ LEAST_CROSS_MATCHES = 100
 LEAST_SHARE = 0.6
 """Share of the photos of each period that the joint route must place; else periods are also tried
 one by one."""
+
+SAME_PLACE = 0.01
+"""Share of the usual distance between neighbours; nobody stands so exactly where he stood."""
 
 Inspect = Callable[[Registered, Path, Stages], None]
 """Called with the result and the folder of the finished scene before it is published: writes the
@@ -170,9 +174,10 @@ class _Run:
         """All captures as the one period after those of the scene, under names it does not have."""
         assert self.scene is not None
         taken = {f.name for f in self.scene.frames}
+        label = self._new_label
         new = []
         for capture in captures:
-            name = capture.name
+            name = capture.name if "/" in capture.name else f"{label}/{capture.name}"
             while name in taken:
                 name = f"new/{name}"
             taken.add(name)
@@ -334,6 +339,8 @@ class _Run:
                 other = self._separate_or_none(features, held)
                 if other is not None and min(self._shares(other)) > min(shares):
                     registered = other
+        if self.scene is not None:
+            self.stages.remark("route", *same_places(registered, self.scene.num_periods))
         counts = output.registered_counts(registered, self._totals())
         told = [f"period {c['label']}: {c['registered']} of {c['photos']} photos" for c in counts]
         self.stages.remark("result", f"route {registered.route}", *told)
@@ -411,11 +418,14 @@ class _Run:
     @property
     def _new_period(self) -> tuple[str, str | None]:
         """Label and date of the period that is added: those of the captures if all agree."""
-        periods = self.captures.periods
-        label = periods[0].label if len(periods) == 1 else self.captures.root.name
         days = sorted(c.taken.date().isoformat() for c in self.images if c.taken is not None)
         same = days and days[0] == days[-1]
-        return label, days[0] if same else (days[0][:4] if days else None)
+        return self._new_label, days[0] if same else (days[0][:4] if days else None)
+
+    @property
+    def _new_label(self) -> str:
+        periods = self.captures.periods
+        return periods[0].label if len(periods) == 1 else self.captures.root.name
 
     @property
     def _dates(self) -> tuple[str | None, ...]:
@@ -520,6 +530,23 @@ class _Run:
             ],
             "stages": self.stages.log,
         }
+
+
+def same_places(registered: Registered, new_period: int) -> list[str]:
+    """New images with the pose of an old one: probably the same photo, undistorted since."""
+    new = np.flatnonzero(registered.periods == new_period)
+    old = np.flatnonzero(registered.periods != new_period)
+    centres = camera_centre(registered.cam_from_world)
+    if len(old) < 2:
+        return []
+    spacing = float(np.median(cKDTree(centres[old]).query(centres[old], k=2)[0][:, 1]))
+    distance, nearest = cKDTree(centres[old]).query(centres[new])
+    return [
+        f"{registered.names[i]} was taken from the very place of {registered.names[old[j]]}: is it "
+        "the same photo?"
+        for i, j, d in zip(new.tolist(), nearest.tolist(), distance.tolist(), strict=True)
+        if d < SAME_PLACE * spacing
+    ]
 
 
 def connected_periods(held: Mapping[str, Any], count: int) -> bool:

@@ -6,9 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pycolmap
+
 from chronoscene.registration.georeferencing import finish
-from chronoscene.registration.joint import nothing_mapped
-from chronoscene.registration.mapping import adjust, map_images, triangulate
+from chronoscene.registration.mapping import (
+    adjust,
+    map_images,
+    nothing_mapped,
+    place_rest,
+    triangulate,
+)
 from chronoscene.registration.sfm import quiet, verified_matches
 from chronoscene.registration.units import Priors, Unit, combine
 from chronoscene.registration.worker import Report
@@ -44,5 +51,27 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         report("adjusting", i, ROUNDS)
         model = triangulate(model, database, photos, scratch / "points", threads)
         adjust(model, threads=threads)
+    model = complete(model, arguments, remarks, report)
     left = [list(group) for group in combined.left]
     return finish(model, arguments, remarks) | {"left": left}
+
+
+def complete(
+    model: pycolmap.Reconstruction,
+    arguments: Mapping[str, Any],
+    remarks: list[str],
+    report: Report,
+) -> pycolmap.Reconstruction:
+    """Place what its own period could not: the other periods may have the points for it."""
+    database, photos = arguments["database"], arguments["photos"]
+    scratch, threads = Path(arguments["scratch"]) / "rest", arguments["threads"]
+    total, before = len(arguments["periods"]), int(model.num_reg_images())
+    if before == total or not model.num_points3D():
+        return model
+    fuller = place_rest(model, database, photos, scratch, threads, total, report)
+    placed = int(fuller.num_reg_images()) - before
+    if placed <= 0:
+        return model
+    adjust(fuller, threads=threads)
+    remarks.append(f"{placed} more images placed against the merged model")
+    return fuller

@@ -111,11 +111,12 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     listed.unlink(missing_ok=True)
     report("pairs", len(pairs), len(pairs))
     with pycolmap.Database.open(database) as opened:
-        return {
-            "pairs": len(pairs),
-            "verified": int(opened.num_verified_image_pairs()),
-            "inliers": int(opened.num_inlier_matches()),
-        }
+        counts = [int(n) for n in opened.read_two_view_geometry_num_inliers()[1]]
+    return {
+        "pairs": len(pairs),
+        "verified": sum(n > 0 for n in counts),
+        "inliers": sum(counts),
+    }
 
 
 def _unmatched(database: str, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from chronoscene.registration.holdout import build_tracks, eligible_tracks
+from chronoscene.registration.holdout import build_tracks, eligible_tracks, first_at_place
 from chronoscene.registration.pairs import sequential_pairs, similar_pairs, spatial_pairs
 from chronoscene.registration.retrieval import assign, visual_words, vlad
 
@@ -65,6 +65,11 @@ def test_global_descriptors_tell_textures_apart() -> None:
     assert assign(words, words).tolist() == list(range(len(words)))
 
 
+KEYPOINTS = {
+    i: np.random.default_rng(i).uniform(0, 99, (n, 2)) for i, n in ((1, 8), (2, 6), (5, 6))
+}
+
+
 @pytest.fixture
 def matches() -> dict[tuple[int, int], np.ndarray]:
     """Images 1, 2 (period 0) and 5 (period 1); a track over all, one of a period, a wrong one."""
@@ -76,7 +81,7 @@ def matches() -> dict[tuple[int, int], np.ndarray]:
 
 
 def test_matches_become_tracks(matches: dict[tuple[int, int], np.ndarray]) -> None:
-    tracks = build_tracks(matches, {1: 8, 2: 6, 5: 6})
+    tracks = build_tracks(matches, KEYPOINTS)
     assert int(tracks.track.max()) + 1 == 3
     whole = tracks.of(1, np.array([0]))[0]
     mine = tracks.track == whole
@@ -88,13 +93,23 @@ def test_matches_become_tracks(matches: dict[tuple[int, int], np.ndarray]) -> No
 def test_held_out_tracks_are_consistent_and_of_two_periods(
     matches: dict[tuple[int, int], np.ndarray],
 ) -> None:
-    tracks = build_tracks(matches, {1: 8, 2: 6, 5: 6})
+    tracks = build_tracks(matches, KEYPOINTS)
     eligible = eligible_tracks(tracks, {1: 0, 2: 0, 5: 1})
     assert eligible.tolist() == [tracks.of(1, np.array([0]))[0]]
     assert len(eligible_tracks(tracks, {1: 0, 2: 0, 5: 0})) == 0
 
 
 def test_no_matches_make_no_tracks() -> None:
-    tracks = build_tracks({}, {1: 3, 2: 0})
+    tracks = build_tracks({}, {1: np.zeros((3, 2)), 2: np.zeros((0, 2))})
     assert len(tracks.track) == 0
     assert len(eligible_tracks(tracks, {1: 0, 2: 1})) == 0
+
+
+def test_keypoints_at_one_place_are_one(matches: dict[tuple[int, int], np.ndarray]) -> None:
+    xy = np.array([[1.5, 2.0], [3.0, 4.0], [1.5, 2.0], [1.5, 2.5]])
+    assert first_at_place(xy).tolist() == [0, 1, 0, 3]
+    keypoints = {i: p.copy() for i, p in KEYPOINTS.items()}
+    keypoints[1][4] = keypoints[1][0]  # the same place with another orientation
+    tracks = build_tracks(matches | {(1, 2): np.array([[4, 0], [0, 0]])}, keypoints)
+    assert tracks.of(1, np.array([4])) == tracks.of(1, np.array([0]))
+    assert tracks.of(1, np.array([0]))[0] in eligible_tracks(tracks, {1: 0, 2: 0, 5: 1})

@@ -1,0 +1,255 @@
+"""The whole command on small generated photos of two dates."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from chronoscene.cli.register import command
+from chronoscene.errors import SceneError
+from chronoscene.formats import read_scene
+from chronoscene.geometry import camera_centre
+from chronoscene.registration.captures import read_captures
+from chronoscene.registration.errors import RegistrationError
+from chronoscene.registration.model import Registered
+from chronoscene.registration.pipeline import Options, run, run_into
+from chronoscene.scene import Scene
+from chronoscene.synth import SynthSettings, generate
+from chronoscene.validation.alignment import fit
+from chronoscene.validation.run import validate_scene
+
+SETTINGS = SynthSettings(
+    periods=2, width=400, height=300, views=12, points=1000, blocks=2, supersample=1
+)
+
+OPTIONS = Options(threads=1, max_features=3000)
+
+COMMAND = "from chronoscene.cli import main; main()"
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    folder = tmp_path_factory.mktemp("generated") / "scene"
+    generate(folder, SETTINGS)
+    return read_scene(folder)
+
+
+@pytest.fixture(scope="module")
+def captures(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of photos for each period, and some that are of no use."""
+    root = tmp_path_factory.mktemp("captures")
+    for frame in truth.frames:
+        target = root / ("2016", "2023")[frame.period] / frame.name
+        target.parent.mkdir(exist_ok=True)
+        shutil.copyfile(truth.image_path(frame), target)
+    first = sorted((root / "2016").iterdir())[0]
+    shutil.copyfile(first, root / "2023" / "copy of 2016.jpg")
+    (root / "2023" / "cut.jpg").write_bytes(first.read_bytes()[:5000])
+    Image.new("RGB", (400, 300), (128, 128, 128)).save(root / "2023" / "grey.jpg")
+    return root
+
+
+@pytest.fixture(scope="module")
+def joint(captures: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Registered]:
+    out = tmp_path_factory.mktemp("joint") / "scene"
+    return out, run(read_captures(captures), out, OPTIONS)
+
+
+def errors(scene: Scene, truth: Scene, reference: int) -> tuple[float, float]:
+    """Median rotation (degrees) and centre error (share of the extent) of the other period."""
+    known = {f.name: f.cam_from_world for f in truth.frames}
+    poses = {Path(f.name).name: f.cam_from_world for f in scene.frames}
+    poses = {name: pose for name, pose in poses.items() if name in known}
+    fitted = [n for n in poses if n.startswith(f"p{reference}")]
+    sim = fit(
+        camera_centre(np.stack([poses[n] for n in fitted])),
+        camera_centre(np.stack([known[n] for n in fitted])),
+    )
+    assert sim is not None
+    extent = np.linalg.norm(np.ptp(camera_centre(np.stack(list(known.values()))), axis=0))
+    angles, distances = [], []
+    for name in poses.keys() - set(fitted):
+        turned = poses[name][:3, :3] @ (sim.matrix / sim.scale).T @ known[name][:3, :3].T
+        angles.append(np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1))))
+        place = sim.apply(camera_centre(poses[name])[None])[0]
+        distances.append(np.linalg.norm(place - camera_centre(known[name])) / extent)
+    return float(np.median(angles)), float(np.median(distances))
+
+
+def test_a_scene_comes_out(joint: tuple[Path, Registered], truth: Scene) -> None:
+    out, registered = joint
+    scene = read_scene(out)
+    assert [p.label for p in scene.periods] == ["2016", "2023"]
+    assert len(scene.frames) == len(registered.names) >= len(truth.frames) - 2
+    assert all(f.camera.model == "PINHOLE" for f in scene.frames)
+    assert {f.period for f in scene.frames if f.split == "test"} == {0, 1}
+    degrees, share = errors(scene, truth, 0)
+    assert degrees < 0.5  # photos of 400 x 300 pixels, whose focal length is not known
+    assert share < 0.01
+    assert not [f for f in validate_scene(out).findings if f.severity == "error"]
+
+
+def test_every_photo_that_is_missing_has_a_reason(joint: tuple[Path, Registered]) -> None:
+    out, registered = joint
+    reasons = registered.unregistered
+    assert reasons["2023/copy of 2016.jpg"].startswith("the same file as 2016/")
+    assert reasons["2023/cut.jpg"].startswith("cannot be decoded")
+    assert "features only" in reasons["2023/grey.jpg"]
+    assert {registered.unregistered_periods[n] for n in reasons} == {1}
+    log = json.loads((out / "registration_log.json").read_text())
+    assert {u["image"] for u in log["unregistered"]} == set(reasons)
+    stages = [s["stage"] for s in log["stages"]]
+    assert stages.index("features") < stages.index("matches") < stages.index("joint")
+
+
+def test_the_result_hangs_together(joint: tuple[Path, Registered]) -> None:
+    _, registered = joint
+    assert registered.route == "joint"
+    assert registered.unit == "unknown"
+    assert np.isnan(registered.gps_enu).all()
+    assert registered.track_start[-1] == len(registered.track_image) == len(registered.track_xy)
+    assert registered.track_image.max() < len(registered.names)
+    for held in registered.held_out:
+        assert registered.periods[held.image_a] < registered.periods[held.image_b]
+        assert len(held.xy_a) == len(held.xy_b) == len(held.track) > 0
+    tracks = registered.held_out_tracks
+    assert len(tracks.start) > 5
+    assert tracks.start[-1] == len(tracks.image) == len(tracks.xy)
+    assert set(registered.held_out[0].track.tolist()) <= set(range(len(tracks.start) - 1))
+
+
+def test_held_out_tracks_are_not_points_of_the_model(joint: tuple[Path, Registered]) -> None:
+    _, registered = joint
+    tracks = registered.held_out_tracks
+    held = set(zip(tracks.image.tolist(), *tracks.xy.round(3).T.tolist(), strict=True))
+    xy = registered.track_xy.round(3)
+    used = set(zip(registered.track_image.tolist(), *xy.T.tolist(), strict=True))
+    assert len(held) > 10
+    assert not held & used
+
+
+def test_route_separate(
+    joint: tuple[Path, Registered], captures: Path, truth: Scene, tmp_path: Path
+) -> None:
+    work = tmp_path / "work"
+    shutil.copytree(joint[0].with_name("scene.work"), work, symlinks=True)
+    told: list[str] = []
+    registered = run(
+        read_captures(captures),
+        tmp_path / "out",
+        Options(threads=1, max_features=3000, route="separate", work=work),
+        report=lambda what, done, total: told.append(what),
+    )
+    assert "features" not in told  # found in the work folder
+    assert registered.route == "separate"
+    scene = read_scene(tmp_path / "out")
+    degrees, share = errors(scene, truth, 0)
+    assert degrees < 1.0
+    assert share < 0.02
+
+
+def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
+    joint: tuple[Path, Registered], captures: Path, truth: Scene, tmp_path: Path
+) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(captures / "2016", tmp_path / "first" / "2016")
+    run(read_captures(tmp_path / "first"), base, OPTIONS)
+    old = read_scene(base)
+    out = tmp_path / "grown"
+    registered = run_into(old, read_captures(captures / "2023"), out, OPTIONS)
+    assert registered.route == "frozen"
+    new = read_scene(out)
+    assert new.num_periods == 2
+    frames = {f.name: f for f in new.frames}
+    for frame in old.frames:
+        same = frames[frame.name]
+        assert same.cam_from_world.tobytes() == frame.cam_from_world.tobytes()
+        assert same.camera == frame.camera
+        assert (same.image_id, same.period, same.split) == (frame.image_id, 0, frame.split)
+        assert new.image_path(same).read_bytes() == old.image_path(frame).read_bytes()
+    kept = np.isin(new.points.ids, old.points.ids)
+    assert new.points.xyz[kept].tobytes() == old.points.xyz.tobytes()
+    assert len(new.points) > len(old.points)
+    assert (new.point_periods().sum(axis=1) == 2).sum() > 10
+    assert sum(f.period == 1 for f in new.frames) >= 5
+    degrees, share = errors(new, truth, 0)
+    assert degrees < 1.0
+    assert share < 0.02
+    log = json.loads((out / "registration_log.json").read_text())
+    told = [remark for stage in log["stages"] for remark in stage["remarks"]]
+    assert any(r.startswith("2023/copy_of_2016.jpg") and "the same photo" in r for r in told)
+    assert not [f for f in validate_scene(out).findings if f.severity == "error"]
+
+
+def test_a_killed_command_goes_on(
+    joint: tuple[Path, Registered], captures: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    arguments = [str(captures), str(out), "--threads", "1", "--max-features", "3000"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, "register", *arguments],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.startswith("pairs"):
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not out.exists()
+    result = until_free(lambda: CliRunner().invoke(command, arguments))
+    assert "photos registered" in result
+    stages = json.loads((out / "registration_log.json").read_text())["stages"]
+    resumed = {s["stage"] for s in stages if s["from_an_earlier_run"]}
+    assert {"features", "pairs"} <= resumed
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        path = Path("sparse/0") / name
+        assert (out / path).read_bytes() == (joint[0] / path).read_bytes()
+
+
+def until_free(invoke: Callable[[], object]) -> str:
+    """Repeat while the work folder of the killed process is still held by its child."""
+    for _ in range(100):
+        result = invoke()
+        error = getattr(result, "exception", None)
+        if not isinstance(error, RegistrationError) or "nobody uses" not in str(error):
+            assert error is None
+            return str(getattr(result, "output", ""))
+        time.sleep(0.1)
+    raise AssertionError("the work folder was never free")
+
+
+def test_a_place_in_use_is_refused(captures: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(SceneError, match="found one in use"):
+        run(read_captures(captures), tmp_path, OPTIONS)
+
+
+def test_one_photo_is_refused(truth: Scene, tmp_path: Path) -> None:
+    folder = tmp_path / "one"
+    folder.mkdir()
+    shutil.copyfile(truth.image_path(truth.frames[0]), folder / "a.jpg")
+    with pytest.raises(RegistrationError, match="at least two photos, found 1"):
+        run(read_captures(folder), tmp_path / "out", OPTIONS)
+
+
+def test_photos_that_show_nothing_are_refused_and_work_is_kept(tmp_path: Path) -> None:
+    folder = tmp_path / "noise"
+    folder.mkdir()
+    for i in range(3):
+        pixels = np.random.default_rng(i).integers(0, 256, (120, 160, 3), np.uint8)
+        Image.fromarray(pixels).save(folder / f"{i}.png")
+    with pytest.raises(RegistrationError, match="features and matches are kept"):
+        run(read_captures(folder), tmp_path / "out", OPTIONS)
+    assert (tmp_path / "out.work" / "stage-matches.json").is_file()
+    assert not (tmp_path / "out").exists()
