@@ -25,7 +25,8 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene.bench.identity import processor_name
-from chronoscene.registration.certificate import Certificate, certify, scene_extent
+from chronoscene.geometry import camera_centre
+from chronoscene.registration.certificate import Certificate, certify
 from chronoscene.registration.generated import CaseSettings, Generated, generate_case, pose_errors
 from chronoscene.registration.verdict import LEVELS, Verdict, judge
 
@@ -118,13 +119,18 @@ def outcome(
     """Compare a registration with the truth."""
     model = made.model
     rotation, centre = pose_errors(model.cam_from_world, made.truth, model.periods == 0)
-    extent = scene_extent(model)
+    extent = true_extent(made.truth)
     rows = []
     for p in range(1, model.num_periods):
         r, c = rotation[model.periods == p], 100 * centre[model.periods == p] / extent
         rows.append((np.median(r), r.max(), np.median(c), c.max()))
     reason = verdict.findings[0].check if verdict.findings else ""
     return Outcome(family, tuple(rows), verdict.level, reason, seconds)
+
+
+def true_extent(truth: np.ndarray) -> float:
+    """Diagonal of the box around the true cameras."""
+    return float(np.linalg.norm(np.ptp(camera_centre(truth), axis=0)))
 
 
 def run_observations(count: int, seed: int, only: str) -> list[Outcome]:

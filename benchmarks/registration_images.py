@@ -23,8 +23,9 @@ from chronoscene.geometry import camera_centre
 from chronoscene.registration.captures import read_captures
 from chronoscene.registration.certificate import certify
 from chronoscene.registration.certificate_json import to_json
-from chronoscene.registration.generated import Generated
+from chronoscene.registration.generated import Generated, pose_errors
 from chronoscene.registration.georeference import Georeference
+from chronoscene.registration.model import Registered
 from chronoscene.registration.pipeline import Options, run
 from chronoscene.registration.report import write_report
 from chronoscene.registration.verdict import judge
@@ -118,14 +119,31 @@ def _run_case(case: ImageCase, work: Path, route: str) -> object | None:
     )
     poses = np.stack([truth[name] for name in model.names])
     made = Generated(model, poses)
+    _print_errors(model, poses)
     return outcome(case.name, made, certificate, verdict, seconds)
+
+
+def _print_errors(model: Registered, truth: NDArray[np.float64]) -> None:
+    """Errors of every period in the frame of all cameras together."""
+    extent = float(np.linalg.norm(np.ptp(camera_centre(truth), axis=0)))
+    every = np.ones(len(model.names), bool)
+    rotation, centre = pose_errors(model.cam_from_world, truth, every)
+    for p, label in enumerate(model.labels):
+        mine = model.periods == p
+        if mine.any():
+            print(
+                f"  frame of all cameras, {label}: rotation {np.median(rotation[mine]):.4f} "
+                f"(largest {rotation[mine].max():.4f}) degrees, centre "
+                f"{100 * np.median(centre[mine]) / extent:.4f} "
+                f"(largest {100 * centre[mine].max() / extent:.4f}) % of the extent"
+            )
 
 
 def _print(case: ImageCase, found: object) -> None:
     for p, row in enumerate(found.periods, 1):  # type: ignore[attr-defined]
         print(
-            f"  period {p}: rotation {row[0]:.4f} (largest {row[1]:.4f}) degrees, centre "
-            f"{row[2]:.4f} (largest {row[3]:.4f}) % of the extent"
+            f"  frame of the first period, {p}: rotation {row[0]:.4f} (largest {row[1]:.4f}) "
+            f"degrees, centre {row[2]:.4f} (largest {row[3]:.4f}) % of the extent"
         )
     print(f"  verdict {found.verdict} {found.reason}", flush=True)  # type: ignore[attr-defined]
 

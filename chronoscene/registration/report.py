@@ -206,9 +206,9 @@ def _clicks(
     for pair in certificate.pairs:
         if verdict.pairs.get((pair.a, pair.b)) == "pass":
             continue
-        chosen = spots(model, pair, CLICKS, gaps=True)
+        chosen = spots(model, pair, CLICKS, gaps=True, twice=True)
         if len(chosen) < CLICKS:
-            chosen += spots(model, pair, CLICKS - len(chosen), gaps=False)
+            chosen += spots(model, pair, CLICKS - len(chosen), gaps=False, twice=True)
         if chosen:
             names = f"{certificate.labels[pair.a]} and {certificate.labels[pair.b]}"
             found.append((names, [_click(model, certificate, pair, s) for s in chosen]))

@@ -65,7 +65,9 @@ class DrawnPair:
         return float(np.median(self.error))
 
 
-def spots(model: Registered, pair: PairFigures, count: int, *, gaps: bool) -> list[Spot]:
+def spots(
+    model: Registered, pair: PairFigures, count: int, *, gaps: bool, twice: bool = False
+) -> list[Spot]:
     """Places of two periods, spread over the scene.
 
     Args:
@@ -73,6 +75,7 @@ def spots(model: Registered, pair: PairFigures, count: int, *, gaps: bool) -> li
         pair: Figures of the two periods.
         count: Places at most.
         gaps: Whether to take places without tie points; else tie points.
+        twice: Whether two images of either period must show a place.
     """
     seen = seen_by_period(model)
     if gaps:
@@ -85,7 +88,7 @@ def spots(model: Registered, pair: PairFigures, count: int, *, gaps: bool) -> li
     found: list[Spot] = []
     for xyz in places[_spread(places, 3 * count)]:
         spot = _spot(model, pair, xyz, mine, tied=not gaps)
-        if spot is not None:
+        if spot is not None and not (twice and (spot.more_a is None or spot.more_b is None)):
             found.append(spot)
         if len(found) == count:
             break

@@ -197,11 +197,12 @@ def test_a_point_that_moved_is_left_out(tmp_path: Path, apart: Generated) -> Non
     """One corner was clicked on something that stands elsewhere at the second date."""
     ties = read(tmp_path, clicks(apart))
     moved = replace(apart, truth=apart.truth.copy())
-    moved.truth[apart.model.periods == 1, :3, 3] += (
-        moved.truth[apart.model.periods == 1, :3, :3] @ [4.0, 3.0, 0.0]
-    )
+    second = apart.model.periods == 1
+    moved.truth[second, :3, 3] += moved.truth[second, :3, :3] @ [4.0, 3.0, 0.0]
     other = read(tmp_path, clicks(moved), "other.csv")
-    points = tuple(o if p.name == "c1" else p for p, o in zip(ties.points, other.points))
+    points = tuple(
+        o if p.name == "c1" else p for p, o in zip(ties.points, other.points, strict=True)
+    )
     found = align_with_tie_points(apart.model, replace(ties, points=points))
     assert "c1" in found.outliers
     assert any("without c1" in r for r in found.remarks)
