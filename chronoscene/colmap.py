@@ -19,7 +19,9 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from chronoscene.colmap_arrays import RawPoints
 from chronoscene.colmap_records import PointRecords, check_records, read_keypoints, read_points
+from chronoscene.colmap_writer import posed_images, write_raw_model
 from chronoscene.errors import SceneError
 from chronoscene.geometry import pose_from_rotation_translation
 from chronoscene.scene import Camera, Frame, Points
@@ -111,25 +113,25 @@ def write_model(folder: Path, frames: Sequence[Frame], points: Points) -> None:
 
     Image, camera and point ids are kept; keypoints without a point are not part of a scene.
     """
-    reconstruction = pycolmap.Reconstruction()
-    for camera in {f.camera.camera_id: f.camera for f in frames}.values():
-        reconstruction.add_camera_with_trivial_rig(to_pycolmap(camera))
-    order = np.argsort(points.track_frame, kind="stable")
-    ends = np.searchsorted(points.track_frame[order], np.arange(len(frames) + 1))
-    keypoint = np.empty(len(order), np.int64)
-    for i, frame in enumerate(frames):
-        mine = order[ends[i] : ends[i + 1]]
-        keypoint[mine] = np.arange(len(mine))
-        image = pycolmap.Image(
-            name=frame.name,
-            keypoints=points.track_xy[mine].reshape(-1, 2),
-            camera_id=frame.camera.camera_id,
-            image_id=frame.image_id,
-        )
-        pose = pycolmap.Rigid3d(frame.cam_from_world[:3])
-        reconstruction.add_image_with_trivial_frame(image, pose)
-    _add_points(reconstruction, [f.image_id for f in frames], points, keypoint)
-    reconstruction.write_binary(str(folder))
+    cameras = list({f.camera.camera_id: f.camera for f in frames}.values())
+    owner = np.repeat(points.ids, np.diff(points.track_start))
+    images, keypoints = posed_images(
+        np.array([f.image_id for f in frames], np.int64),
+        [f.name for f in frames],
+        np.array([f.cam_from_world for f in frames]).reshape(-1, 4, 4),
+        np.array([f.camera.camera_id for f in frames], np.int64),
+        (points.track_frame.astype(np.int64), owner, points.track_xy),
+    )
+    tracks = RawPoints(
+        ids=points.ids,
+        xyz=points.xyz,
+        rgb=points.rgb,
+        error=points.error,
+        track_start=points.track_start,
+        track_image=images.ids[points.track_frame],
+        track_keypoint=keypoints,
+    )
+    write_raw_model(folder, cameras, images, tracks)
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:
@@ -266,23 +268,3 @@ def _model_error(folder: Path, expected: str, found: str) -> SceneError:
     return SceneError(
         folder, expected=expected, found=found, todo="write the model again with COLMAP"
     )
-
-
-def _add_points(
-    reconstruction: pycolmap.Reconstruction,
-    image_ids: Sequence[int],
-    points: Points,
-    keypoint: NDArray[np.int64],
-) -> None:
-    """Add points with their ids; ``keypoint`` [M] is the index of an observation in its image."""
-    element = pycolmap.TrackElement
-    images = np.asarray(image_ids, np.int64)[points.track_frame].tolist()
-    pairs = list(zip(images, keypoint.tolist(), strict=True))
-    starts = points.track_start.tolist()
-    for i, point_id in enumerate(points.ids.tolist()):
-        point = pycolmap.Point3D()
-        point.xyz = points.xyz[i]
-        point.color = points.rgb[i]
-        point.error = points.error[i]
-        point.track = pycolmap.Track([element(*pair) for pair in pairs[starts[i] : starts[i + 1]]])
-        reconstruction.add_point3D_with_id(point_id, point)

@@ -18,6 +18,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,13 @@ CAMERA_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
 
 _CAMERA_HEAD = struct.Struct("<iiQQ")
 _IMAGE_HEAD = struct.Struct("<i7di")
-_KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
-_POINT_HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8")])
-_POINT_BYTES = _POINT_HEAD.itemsize + COUNT.size
+KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
+"""A keypoint of an image."""
+POINT_HEAD = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+)
+"""What stands before the track of a point."""
+_LENGTH_AT = POINT_HEAD.itemsize - COUNT.size
 _TRACK_BYTES = 8
 _RIG_HEAD = struct.Struct("<II")
 _SENSOR_BYTES = 8
@@ -45,7 +50,7 @@ class PointRecords:
     """The points of a model, sorted by id (P points, M observations)."""
 
     heads: NDArray[np.void]
-    """Fields ``id``, ``xyz``, ``rgb`` and ``error``. [P]"""
+    """See `POINT_HEAD`. [P]"""
     track_start: NDArray[np.int64]
     """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
     tracks: NDArray[np.int32]
@@ -167,8 +172,8 @@ def _walk_images(reader: RecordReader) -> list[ImageRecord]:
         name = reader.text()
         (length,) = reader.unpack(COUNT)
         reader.parts = f"{length} keypoints"
-        begin = reader.skip(length * _KEYPOINT.itemsize)
-        records = np.frombuffer(reader.data, _KEYPOINT, count=length, offset=begin)
+        begin = reader.skip(length * KEYPOINT.itemsize)
+        records = np.frombuffer(reader.data, KEYPOINT, count=length, offset=begin)
         images.append(
             ImageRecord(
                 image_id=image_id,
@@ -193,32 +198,29 @@ def _walk_keypoints(reader: RecordReader) -> dict[int, NDArray[np.float64]]:
 
 
 def _walk_points(reader: RecordReader) -> PointRecords:
-    offsets, lengths = [], []
-    # The loop runs once for each of up to millions of points, so it does without the reader.
+    """One step per record, since each says only how long itself is; all else in whole columns."""
     data, unpack, end = reader.data, COUNT.unpack_from, len(reader.data)
-    at = COUNT.size
-    for _ in reader.records("point", _POINT_BYTES):
-        if at + _POINT_BYTES > end:
+    offsets, at = [COUNT.size], COUNT.size
+    for _ in reader.records("point", POINT_HEAD.itemsize):
+        if at + POINT_HEAD.itemsize > end:
             raise reader.ends()
-        (length,) = unpack(data, at + _POINT_HEAD.itemsize)
-        offsets.append(at)
-        lengths.append(length)
-        at += _POINT_BYTES + _TRACK_BYTES * length
+        (length,) = unpack(data, at + _LENGTH_AT)
+        at += POINT_HEAD.itemsize + _TRACK_BYTES * length
         if at > end:
             reader.parts = f"{length} observations"
             raise reader.ends()
+        offsets.append(at)
         reader.at = at
-    return _gather_points(
-        np.frombuffer(data, np.uint8), np.array(offsets, np.int64), np.array(lengths, np.int64)
-    )
+    begin = np.array(offsets, np.int64)
+    lengths = (np.diff(begin) - POINT_HEAD.itemsize) // _TRACK_BYTES
+    return _gather_points(data, begin[:-1], lengths)
 
 
 def _gather_points(
-    data: NDArray[np.uint8], offsets: NDArray[np.int64], lengths: NDArray[np.int64]
+    data: bytes, offsets: NDArray[np.int64], lengths: NDArray[np.int64]
 ) -> PointRecords:
     """Copy the records at ``offsets`` out of the file, in the order of the point ids."""
-    heads = data[offsets[:, None] + np.arange(_POINT_HEAD.itemsize)]
-    heads = np.ascontiguousarray(heads).view(_POINT_HEAD)[:, 0]
+    heads = _at_every_byte(data, POINT_HEAD)[offsets]
     order = np.argsort(heads["id"], kind="stable")
     ids = heads["id"][order]
     if (ids[1:] == ids[:-1]).any():
@@ -226,12 +228,14 @@ def _gather_points(
     if len(ids) and ids[-1] > np.iinfo(np.int64).max:
         raise RecordError(f"point id {ids[-1]}, more than 63 bits")
     start = np.concatenate([[0], np.cumsum(lengths[order])])
-    # Observation j of point i begins track_start[j] pairs after the first one of the point.
-    first = (offsets + _POINT_BYTES)[order]
-    at = np.repeat(first - _TRACK_BYTES * start[:-1], lengths[order])
-    at += _TRACK_BYTES * np.arange(start[-1])
-    tracks = np.empty((len(at), 2), np.int32)
-    for column in (0, 1):
-        raw = data[(at + 4 * column)[:, None] + np.arange(4)]
-        tracks[:, column] = np.ascontiguousarray(raw).view("<i4")[:, 0]
+    # Observation j of point i begins start[i] pairs after the first one of the point.
+    first = (offsets + POINT_HEAD.itemsize)[order] - _TRACK_BYTES * start[:-1]
+    at = np.repeat(first, lengths[order]) + _TRACK_BYTES * np.arange(start[-1])
+    tracks = _at_every_byte(data, np.dtype("<i8"))[at].view("<i4").reshape(-1, 2)
     return PointRecords(heads[order], start, tracks)
+
+
+def _at_every_byte(data: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """A view of the values that begin at each byte; one index takes records out of it."""
+    count = max(0, len(data) - dtype.itemsize + 1)
+    return np.ndarray((count,), dtype, data, strides=(1,))

@@ -13,6 +13,7 @@ import click
 from chronoscene.cli.output import emit
 from chronoscene.errors import ConfigError
 from chronoscene.formats import find_scenes, format_names, read_scene
+from chronoscene.parallel import map_parallel
 from chronoscene.stats import (
     COUNT_RULES,
     DETAIL_WRITERS,
@@ -23,7 +24,6 @@ from chronoscene.stats import (
     count_scene,
     measure_scene,
 )
-from chronoscene.stats.pool import map_parallel
 
 Layout = Literal["full", "paper"]
 FIGURE_FORMATS = ("png", "pdf", "svg")

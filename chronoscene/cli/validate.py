@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Sized
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 import click
 
 from chronoscene.cli.output import emit
+from chronoscene.parallel import map_parallel
 from chronoscene.validation.finding import counted, printable
 from chronoscene.validation.fix import fix_scene
-from chronoscene.validation.report import counts
+from chronoscene.validation.raw_scene import Track, no_progress
+from chronoscene.validation.report import SceneReport, counts
 from chronoscene.validation.report_html import write_html
 from chronoscene.validation.report_json import write_json
 from chronoscene.validation.report_sarif import write_sarif
@@ -78,13 +81,16 @@ def command(
     wrong usage. DATASET.md lists the rules. Nothing is written into the scene. With --fix, the
     report and the exit status are of the corrected copy.
     """
-    rules = choose_rules(_codes(select), _codes(ignore))
+    check = partial(_check, _codes(select), _codes(ignore), decode)
+    choose_rules(_codes(select), _codes(ignore))  # whatever is wrong with them is said first
     folders = find_folders(folder)
     if fix is not None:
         folders = _fix(folder, folders, fix)
-    reports = [
-        validate_scene(path, rules=rules, decode=decode, track=_progress) for path in folders
-    ]
+    if len(folders) == 1:
+        reports = [check(folders[0], track=_progress)]
+    else:
+        done = map_parallel(check, folders)
+        reports = list(_progress(done, "validate scenes", total=len(folders)))
     emit(WRITERS[output_format](reports, strict=strict), out)
     for file, write in ((sarif, write_sarif), (html, write_html)):
         if file is not None:
@@ -92,6 +98,19 @@ def command(
     total = counts(reports)
     if total["error"] or (strict and total["warning"]):
         context.exit(NOT_VALID)
+
+
+def _check(
+    select: list[str],
+    ignore: list[str],
+    decode: bool,
+    path: Path,
+    *,
+    track: Track = no_progress,
+) -> SceneReport:
+    """One scene, perhaps in a process of its own, which is given names of rules, not rules."""
+    rules = choose_rules(select, ignore)
+    return validate_scene(path, rules=rules, decode=decode, track=track)
 
 
 def _fix(folder: Path, scenes: Sequence[Path], out: Path) -> list[Path]:
@@ -112,13 +131,15 @@ def _codes(values: Iterable[str]) -> list[str]:
     return [code for value in values for code in value.split(",")]
 
 
-def _progress(items: Sequence[T], description: str) -> Iterator[T]:
-    """A bar on stderr, on a terminal only."""
-    if not sys.stderr.isatty() or not items:
+def _progress(items: Iterable[T], description: str, *, total: int | None = None) -> Iterator[T]:
+    """A bar on stderr with rate and remaining time, on a terminal only."""
+    if total is None:
+        total = len(items) if isinstance(items, Sized) else None
+    if not sys.stderr.isatty() or not total:
         yield from items
         return
     from rich.console import Console
     from rich.progress import track
 
     console = Console(stderr=True)
-    yield from track(items, description, console=console, transient=True)
+    yield from track(items, description, total=total, console=console, transient=True)

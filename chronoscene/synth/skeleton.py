@@ -15,6 +15,8 @@ import numpy as np
 from PIL import Image
 from scipy.spatial import cKDTree
 
+from chronoscene.colmap_arrays import RawPoints
+from chronoscene.colmap_writer import posed_images, write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.formats.writing import staged_folder
@@ -23,7 +25,6 @@ from chronoscene.splits import TEST_EVERY, format_split_text
 from chronoscene.stats.published import PAPER_COUNTS
 from chronoscene.synth.seeds import rng_for
 from chronoscene.synth.skeleton_geometry import flying_height, make_camera, make_houses, make_poses
-from chronoscene.synth.skeleton_records import write_cameras, write_images, write_points
 from chronoscene.synth.skeleton_tracks import Flight, add_noise, make_tracks
 
 Progress = Callable[[int, int, str], None]
@@ -160,12 +161,21 @@ def _write_model(
     length = np.bincount(tracks.point, minlength=len(surface.xyz))
     error = np.bincount(tracks.point, residual, len(length)) / np.maximum(length, 1)
     poses = np.concatenate([flight.poses for flight in flights])
-    write_cameras(folder / "cameras.bin", camera)
-    seen = (tracks.point, tracks.image, xy)
-    keypoint = write_images(folder / "images.bin", names, poses, camera.camera_id, seen)
-    rgb = np.round(surface.rgb).astype(np.uint8)
-    slots = (tracks.point, tracks.image, keypoint)
-    write_points(folder / "points3D.bin", surface.xyz, rgb, error, slots)
+    order = np.lexsort((tracks.image, tracks.point))
+    point, image = tracks.point[order], tracks.image[order]
+    ids, camera_ids = 1 + np.arange(len(names)), np.full(len(names), camera.camera_id)
+    seen = (image, 1 + point, xy[order])
+    images, keypoint = posed_images(ids, names, poses, camera_ids, seen)
+    points = RawPoints(
+        ids=1 + np.arange(len(length)),
+        xyz=surface.xyz,
+        rgb=np.round(surface.rgb).astype(np.uint8),
+        error=error,
+        track_start=np.concatenate([[0], np.cumsum(length)]),
+        track_image=1 + image,
+        track_keypoint=keypoint,
+    )
+    write_raw_model(folder, [camera], images, points)
 
 
 def _write_images(folder: Path, names: Sequence[str], size: tuple[int, int], seed: int) -> None:

@@ -14,12 +14,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from chronoscene.colmap import MODEL_FILES
+from chronoscene.colmap_writer import write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.files import write_text_atomic
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST
 from chronoscene.splits import parse_split_text, parse_test_text
 from chronoscene.validation.finding import counted, shown
-from chronoscene.validation.model_writer import write_raw_model
 from chronoscene.validation.raw_model import FORMS, RawModel
 from chronoscene.validation.raw_scene import RawScene, TextFile, read_text_file
 from chronoscene.validation.repair_images import set_upright

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.validation.raw_model import RawImages, RawPoints
+from chronoscene.colmap_arrays import RawImages, RawPoints
 
 DENSE = 1_000_000
 """Ids over a range of about so many numbers are looked up in a table."""

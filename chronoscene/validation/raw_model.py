@@ -13,38 +13,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from chronoscene.colmap import MODEL_FILES
+from chronoscene.colmap_arrays import RawImages, RawPoints
 from chronoscene.colmap_records import check_records
 from chronoscene.errors import SceneError
 from chronoscene.scene import Camera
 
 FORMS = (".bin", ".txt")
 """Suffixes of model files."""
-
-CAMERA_MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "OPENCV_FISHEYE",
-    "FULL_OPENCV",
-    "FOV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "THIN_PRISM_FISHEYE",
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-    "SIMPLE_DIVISION",
-    "DIVISION",
-    "SIMPLE_FISHEYE",
-    "FISHEYE",
-    "EUCM",
-    "EQUIRECTANGULAR",
-)
-"""Names of COLMAP's camera models by their id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,54 +39,6 @@ class DamagedError(Exception):
     def __init__(self, *damages: Damage) -> None:
         super().__init__("; ".join(f"{d.file}: {d.found}" for d in damages))
         self.damages = damages
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RawImages:
-    """Registered images in the order of the file (I images, K keypoints)."""
-
-    ids: NDArray[np.int64]
-    """[I]"""
-    names: tuple[str, ...]
-    """Bytes that are not UTF-8 as lone surrogates, as Python has them in file names."""
-    quaternions: NDArray[np.float64]
-    """wxyz, as stored. [I, 4]"""
-    translations: NDArray[np.float64]
-    """[I, 3]"""
-    camera_ids: NDArray[np.int64]
-    """[I]"""
-    keypoint_start: NDArray[np.int64]
-    """Keypoints of image i are ``keypoint_start[i]:keypoint_start[i + 1]``. [I + 1]"""
-    keypoint_xy: NDArray[np.float64]
-    """Pixels. [K, 2]"""
-    keypoint_point: NDArray[np.int64]
-    """Point id, negative for none. [K]"""
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RawPoints:
-    """Sparse points sorted by id (P points, M observations)."""
-
-    ids: NDArray[np.int64]
-    """[P]"""
-    xyz: NDArray[np.float64]
-    """World units. [P, 3]"""
-    rgb: NDArray[np.uint8]
-    """[P, 3]"""
-    error: NDArray[np.float64]
-    """As stored, in pixels. [P]"""
-    track_start: NDArray[np.int64]
-    """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
-    track_image: NDArray[np.int64]
-    """Image id. [M]"""
-    track_keypoint: NDArray[np.int64]
-    """Index among the keypoints of the image. [M]"""
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap import MODEL_FILES
+from chronoscene.colmap_arrays import RawImages, RawPoints
 from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name
 from chronoscene.geometry import rotation_from_quaternion
@@ -41,7 +42,7 @@ from chronoscene.validation.pixels import (
     read_headers,
     read_pixels,
 )
-from chronoscene.validation.raw_model import FORMS, RawImages, RawModel, RawPoints, read_raw_model
+from chronoscene.validation.raw_model import FORMS, RawModel, read_raw_model
 from chronoscene.validation.reprojection import Reprojection, good_poses, reproject
 
 T = TypeVar("T")

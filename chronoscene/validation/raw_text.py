@@ -15,16 +15,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.colmap_arrays import CAMERA_MODELS, RawImages, RawPoints
 from chronoscene.colmap_records import CAMERA_PARAMETERS
 from chronoscene.scene import Camera
 from chronoscene.validation.finding import quote
-from chronoscene.validation.raw_model import (
-    CAMERA_MODELS,
-    Damage,
-    DamagedError,
-    RawImages,
-    RawPoints,
-)
+from chronoscene.validation.raw_model import Damage, DamagedError
 
 BLOCK = 20_000
 """Lines whose fields are in memory as text at one time."""

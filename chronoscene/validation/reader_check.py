@@ -14,9 +14,10 @@ import struct
 import tempfile
 from pathlib import Path
 
+from chronoscene.colmap_arrays import RawImages
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.validation.raw_model import RawImages, RawModel
+from chronoscene.validation.raw_model import RawModel
 
 TEXTS = (our_format.SPLIT, our_format.TEST, our_format.PERIODS, our_format.WORLD)
 UNCHANGED = ("cameras.bin", "rigs.bin", "frames.bin")

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.colmap_arrays import RawImages, RawPoints
 from chronoscene.validation.finding import counted
 from chronoscene.validation.observations import observe
-from chronoscene.validation.raw_model import RawImages, RawPoints
 from chronoscene.validation.reprojection import good_poses
 from chronoscene.validation.rules.poses import UNIT_TOLERANCE
 

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.colmap_arrays import RawImages, RawPoints
 from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.scene import Camera
 from chronoscene.validation.observations import Observations
-from chronoscene.validation.raw_model import RawImages, RawPoints
 
 Array = NDArray[np.float64]
 

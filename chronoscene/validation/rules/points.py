@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from chronoscene.colmap_arrays import RawPoints
 from chronoscene.validation.finding import NOTHING, Hit, counted, shown
-from chronoscene.validation.raw_model import RawPoints
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
 

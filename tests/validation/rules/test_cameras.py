@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from chronoscene.colmap import pycolmap, to_pycolmap
+from chronoscene.colmap_arrays import CAMERA_MODELS
 from chronoscene.scene import Camera
-from chronoscene.validation.raw_model import CAMERA_MODELS
 from chronoscene.validation.rules.cameras import displacement
 
 CAMERAS = "sparse/0/cameras.txt"

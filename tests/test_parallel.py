@@ -1,0 +1,37 @@
+"""The same work in several processes."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from chronoscene.errors import SceneError
+from chronoscene.parallel import map_parallel
+
+
+def process_of(item: int) -> tuple[int, int]:
+    return item, os.getpid()
+
+
+def fail_on_two(item: int) -> int:
+    if item == 2:
+        raise SceneError("place", expected="one", found="two", todo="count again")
+    return item
+
+
+def test_results_come_in_order_from_other_processes():
+    results = list(map_parallel(process_of, [3, 1, 2], workers=2))
+    assert [item for item, _ in results] == [3, 1, 2]
+    assert os.getpid() not in {pid for _, pid in results}
+
+
+def test_one_item_stays_in_this_process():
+    assert list(map_parallel(process_of, [5], workers=4)) == [(5, os.getpid())]
+    assert list(map_parallel(process_of, [])) == []
+
+
+def test_an_error_keeps_its_kind_and_words_on_its_way():
+    with pytest.raises(SceneError, match="place: expected one, found two; count again") as caught:
+        list(map_parallel(fail_on_two, [1, 2, 3], workers=2))
+    assert (caught.value.place, caught.value.todo) == ("place", "count again")
