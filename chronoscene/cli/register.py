@@ -13,6 +13,7 @@ from chronoscene.cli.output import emit
 from chronoscene.convert import check_outside
 from chronoscene.formats import read_scene
 from chronoscene.registration.captures import read_captures
+from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.model import ROUTES, Registered, Route
 from chronoscene.registration.pipeline import Options, run, run_into
 from chronoscene.registration.worker import Report
@@ -82,6 +83,22 @@ DEFAULTS = Options()
     type=click.IntRange(1),
     help="With 1, every run gives the same result bit by bit.  [default: one per processor]",
 )
+@click.option(
+    "--tie-points",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="CSV of point, image, x, y and optional world coordinates, or ODM's gcp_list.txt: checks "
+    "the alignment, and replaces one that failed.",
+)
+@click.option(
+    "--tie-scale",
+    type=click.FloatRange(0, min_open=True),
+    default=DEFAULTS.tie_scale,
+    show_default=True,
+    help="Size of the photos here over that of those that were clicked in.",
+)
+@click.option(
+    "--report", "page", is_flag=True, help="Write registration.html, for looking at the result."
+)
 def command(
     captures: Path,
     out: Path,
@@ -96,6 +113,9 @@ def command(
     held_out: float,
     camera_model: str,
     threads: int | None,
+    tie_points: Path | None,
+    tie_scale: float,
+    page: bool,
 ) -> None:
     """Register photos of several dates into one frame and write the scene OUT.
 
@@ -115,14 +135,21 @@ def command(
         held_out=held_out,
         camera_model=camera_model,
         threads=threads,
+        tie_points=tie_points,
+        tie_scale=tie_scale,
+        page=page,
     )
+    inspections: list[Inspection] = []
     with step_bar() as report:
         if scene is None:
-            registered = run(found, out, options, report=report)
+            registered = run(found, out, options, report=report, inspected=inspections.append)
         else:
             check_outside(scene, out)
-            registered = run_into(read_scene(scene), found, out, options, report=report)
-    emit(summary(registered, out), None)
+            old = read_scene(scene)
+            registered = run_into(
+                old, found, out, options, report=report, inspected=inspections.append
+            )
+    emit(summary(registered, out) + "".join(i.summary for i in inspections), None)
 
 
 @contextmanager

@@ -18,7 +18,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Map all images together; parts that did not hold together are joined afterwards.
 
     Arguments: ``database``, ``photos``, ``periods`` (by name), ``priors`` (``enu`` and ``sigma`` by
-    name, or null), ``out`` (model folder), ``scratch``, ``threads``.
+    name, or null), ``keep_unplaced`` (see `combine`), ``out`` (model folder), ``scratch``,
+    ``threads``.
     """
     quiet()
     database, photos = arguments["database"], arguments["photos"]
@@ -34,7 +35,13 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     else:
         units = [Unit(f"part {i}", m) for i, m in enumerate(models)]
         _, matches = verified_matches(database)
-        combined = combine(units, matches, Priors.of(arguments["priors"]), database)
+        combined = combine(
+            units,
+            matches,
+            Priors.of(arguments["priors"]),
+            database,
+            keep_unplaced=arguments["keep_unplaced"],
+        )
         remarks += combined.remarks
         left = [list(group) for group in combined.left]
         model = combined.model

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from chronoscene.errors import SceneError
+from chronoscene.errors import ConfigError, SceneError
 from chronoscene.geometry import camera_centre
 from chronoscene.images import image_size
 from chronoscene.registration import assembly, output, prepare
@@ -19,10 +19,14 @@ from chronoscene.registration.cameras import camera_groups
 from chronoscene.registration.captures import Capture, Captures
 from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.georeference import Georeference, Positions, from_crs, locate
+from chronoscene.registration.inspection import Inspection, inspect_registration
 from chronoscene.registration.kept_bits import copy_poses, pose_bytes
 from chronoscene.registration.model import Registered, Route
 from chronoscene.registration.pairs import EXHAUSTIVE_LIMIT
 from chronoscene.registration.stages import Stages, fingerprint, work_folder
+from chronoscene.registration.tie_alignment import TieAlignment
+from chronoscene.registration.tie_points import read_tie_points
+from chronoscene.registration.tying import tie
 from chronoscene.registration.worker import Report, run_step
 from chronoscene.scene import Frame, Scene
 from chronoscene.threads import available_threads
@@ -40,9 +44,8 @@ one by one."""
 SAME_PLACE = 0.01
 """Share of the usual distance between neighbours; nobody stands so exactly where he stood."""
 
-Inspect = Callable[[Registered, Path, Stages], None]
-"""Called with the result and the folder of the finished scene before it is published: writes the
-certificate and whatever else belongs beside it."""
+Inspected = Callable[[Inspection], None]
+"""Called with the certificate and the verdict."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +72,12 @@ class Options:
     """None for one per processor. With 1, results are the same to the last bit in every run."""
     seed: int = 0
     """Of the draw of held-out tracks."""
+    tie_points: Path | None = None
+    """File of tie points or ground control."""
+    tie_scale: float = 1.0
+    """Size of the photos here over that of those which were clicked in."""
+    page: bool = False
+    """Whether to write the page for people beside the scene."""
 
 
 def run(
@@ -77,7 +86,7 @@ def run(
     options: Options | None = None,
     *,
     report: Report | None = None,
-    inspect: Inspect | None = None,
+    inspected: Inspected | None = None,
 ) -> Registered:
     """Register all periods and write a scene.
 
@@ -86,7 +95,7 @@ def run(
         SceneError: If ``out`` is in use.
     """
     options = options or Options()
-    return _Run(captures, None, Path(out), options, report, inspect).run()
+    return _Run(captures, None, Path(out), options, report, inspected).run()
 
 
 def run_into(
@@ -96,7 +105,7 @@ def run_into(
     options: Options | None = None,
     *,
     report: Report | None = None,
-    inspect: Inspect | None = None,
+    inspected: Inspected | None = None,
 ) -> Registered:
     """Add the captures to a scene as one new period, and write a new scene; the old poses stay.
 
@@ -105,7 +114,7 @@ def run_into(
         SceneError: If ``out`` is in use.
     """
     options = options or Options()
-    return _Run(captures, scene, Path(out), options, report, inspect).run()
+    return _Run(captures, scene, Path(out), options, report, inspected).run()
 
 
 @dataclass
@@ -118,7 +127,7 @@ class _Run:
     out: Path
     options: Options
     report: Report | None
-    inspect: Inspect | None
+    inspected: Inspected | None
 
     def run(self) -> Registered:
         output.check_free(self.out, overwrite=self.options.overwrite)
@@ -131,8 +140,48 @@ class _Run:
             self._matches()
             held = self._hold_out()
             registered = self._estimate(features, held)
-            self._write(registered)
+            registered, ties = self._tie(registered)
+            self._write(registered, ties)
         return registered
+
+    def _tie(self, registered: Registered) -> tuple[Registered, TieAlignment | None]:
+        """Heed the tie points, if there are any."""
+        if self.options.tie_points is None:
+            return registered, None
+        if self.scene is not None:
+            raise ConfigError(
+                "--tie-points",
+                expected="a registration of all periods",
+                found="--into, which moves nothing that is there",
+                todo="leave one of the two out",
+            )
+        points = read_tie_points(self.options.tie_points, scale=self.options.tie_scale)
+
+        def refine(arguments: Mapping[str, Any]) -> Registered:
+            return self._refined(registered, arguments)
+
+        result = tie(registered, points, refine)
+        self.stages.remark("tie points", *result.remarks)
+        return result.model, result
+
+    def _refined(self, registered: Registered, arguments: Mapping[str, Any]) -> Registered:
+        """A registration adjusted anew after its periods were moved."""
+
+        def refine() -> tuple[Any, list[str]]:
+            found = self._step("refine", {**self._places("refined"), **arguments})
+            return found, [*found["remarks"], _numbers(found["model"])]
+
+        result = self.stages.run("refined", arguments, refine)
+        parts = self._parts(registered.route, result)
+        again = assembly.assemble(self.work / "model-refined", self.work / "held_out.npz", parts)
+        lost = set(registered.names) - set(again.names)
+        reason = "lost when the model was adjusted by tie points"
+        return replace(
+            again,
+            unregistered=dict(registered.unregistered) | dict.fromkeys(lost, reason),
+            unregistered_periods=dict(registered.unregistered_periods)
+            | {n: self.periods[n] for n in lost},
+        )
 
     def _prepare(self) -> None:
         """Photos, their names and periods, and what they say about where they were."""
@@ -375,24 +424,27 @@ class _Run:
             settings["poses"] = {f.name: f.cam_from_world[:3].tolist() for f in frames}
         else:
             settings["priors"] = self._priors() if self.georeference else None
+            settings["keep_unplaced"] = self.options.tie_points is not None
 
         def estimate() -> tuple[Any, list[str]]:
-            arguments = settings | {
-                "database": str(self.work / "mapping.db"),
-                "photos": str(self.photos),
-                "out": str(self.work / f"model-{route}"),
-                "scratch": str(self.work / f"scratch-{route}"),
-                "threads": self._threads,
-            }
-            found = self._step(route, arguments)
+            found = self._step(route, settings | self._places(route))
             shutil.rmtree(self.work / f"scratch-{route}", ignore_errors=True)
-            numbers = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in found["model"].items())
-            return found, [*found["remarks"], numbers]
+            return found, [*found["remarks"], _numbers(found["model"])]
 
         before = self.stages.previous
         result = dict(self.stages.run(route, settings, estimate))
         self.stages.previous = before  # two routes may start from the same matches
         return result
+
+    def _places(self, name: str) -> dict[str, Any]:
+        """Where a step that estimates finds and leaves things."""
+        return {
+            "database": str(self.work / "mapping.db"),
+            "photos": str(self.photos),
+            "out": str(self.work / f"model-{name}"),
+            "scratch": str(self.work / f"scratch-{name}"),
+            "threads": self._threads,
+        }
 
     def _priors(self) -> dict[str, Any]:
         """Positions that are believed, by name."""
@@ -440,23 +492,7 @@ class _Run:
         features: Mapping[str, Any],
         held: Mapping[str, Any],
     ) -> Registered:
-        georeferenced = result["is_georeferenced"] or self.scene is not None
-        last = len(self._labels) - 1
-        refused = {n: reason for n, _, reason in self.refused}
-        refused_periods = {n: last if self.scene else p for n, p, _ in self.refused}
-        parts = assembly.Assembly(
-            periods=self.periods,
-            labels=self._labels,
-            dates=self._dates,
-            positions=assembly.position_map(self.images, self.positions),
-            positions_used=frozenset(result["positions_used"]),
-            georeference=self.georeference if georeferenced else None,
-            unregistered=refused,
-            unregistered_periods=refused_periods,
-            route=route,
-            images_root=self.photos,
-            frozen={f.name: f for f in self._old_frames()},
-        )
+        parts = self._parts(route, result)
         folder = self.work / f"model-{route}"
         registered = assembly.assemble(folder, self.work / "held_out.npz", parts)
         lost = assembly.reasons(
@@ -468,8 +504,29 @@ class _Run:
         )
         return replace(
             registered,
-            unregistered=lost | refused,
-            unregistered_periods={n: self.periods[n] for n in lost} | refused_periods,
+            unregistered=lost | dict(parts.unregistered),
+            unregistered_periods={n: self.periods[n] for n in lost}
+            | dict(parts.unregistered_periods),
+        )
+
+    def _parts(self, route: Route, result: Mapping[str, Any]) -> assembly.Assembly:
+        """What a `Registered` has besides the model."""
+        georeferenced = result["is_georeferenced"] or self.scene is not None
+        last = len(self._labels) - 1
+        refused = {n: reason for n, _, reason in self.refused}
+        refused_periods = {n: last if self.scene else p for n, p, _ in self.refused}
+        return assembly.Assembly(
+            periods=self.periods,
+            labels=self._labels,
+            dates=self._dates,
+            positions=assembly.position_map(self.images, self.positions),
+            positions_used=frozenset(result["positions_used"]),
+            georeference=self.georeference if georeferenced else None,
+            unregistered=refused,
+            unregistered_periods=refused_periods,
+            route=route,
+            images_root=self.photos,
+            frozen={f.name: f for f in self._old_frames()},
         )
 
     def _totals(self) -> list[int]:
@@ -487,7 +544,7 @@ class _Run:
             if total
         ]
 
-    def _write(self, registered: Registered) -> None:
+    def _write(self, registered: Registered, ties: TieAlignment | None) -> None:
         """The scene, checked and moved to its place in one go."""
         staged = self.work / "scene"
         scene = output.as_scene(registered, self.out.name)
@@ -504,8 +561,21 @@ class _Run:
             self.stages.remark("scene", f"poses of {kept} images copied bit by bit")
         told = ", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())
         self.stages.remark("scene", told)
-        if self.inspect is not None:
-            self.inspect(registered, staged, self.stages)
+        points = None
+        if ties is not None and not ties.replaced:  # else they are points of the model already
+            assert self.options.tie_points is not None
+            points = read_tie_points(self.options.tie_points, scale=self.options.tie_scale)
+        found = inspect_registration(
+            registered,
+            staged,
+            page=self.options.page,
+            ties=ties,
+            tie_points=points,
+            title=f"Registration of {self.out.resolve().name}",
+        )
+        self.stages.remark("verdict", f"{found.verdict.level}: {found.verdict.text}")
+        if self.inspected is not None:
+            self.inspected(found)
         output.write_extras(staged, registered, self._log(registered))
         output.check_free(self.out, overwrite=self.options.overwrite)
         output.publish(staged, self.out)
@@ -530,6 +600,10 @@ class _Run:
             ],
             "stages": self.stages.log,
         }
+
+
+def _numbers(model: Mapping[str, Any]) -> str:
+    return ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in model.items())
 
 
 def same_places(registered: Registered, new_period: int) -> list[str]:

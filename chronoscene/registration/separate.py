@@ -44,7 +44,13 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         raise nothing_mapped(len(periods))
     report("aligning", 0, 1)
     _, matches = verified_matches(database)
-    combined = combine(units, matches, Priors.of(arguments["priors"]), database)
+    combined = combine(
+        units,
+        matches,
+        Priors.of(arguments["priors"]),
+        database,
+        keep_unplaced=arguments["keep_unplaced"],
+    )
     remarks += combined.remarks
     model = combined.model
     for i in range(ROUNDS):
@@ -66,7 +72,7 @@ def complete(
     database, photos = arguments["database"], arguments["photos"]
     scratch, threads = Path(arguments["scratch"]) / "rest", arguments["threads"]
     total, before = len(arguments["periods"]), int(model.num_reg_images())
-    if before == total or not model.num_points3D():
+    if before == total or not model.num_points3D() or arguments["keep_unplaced"]:
         return model
     fuller = place_rest(model, database, photos, scratch, threads, total, report)
     placed = int(fuller.num_reg_images()) - before

@@ -78,6 +78,8 @@ def combine(
     matches: Mapping[tuple[int, int], NDArray[np.int64]],
     priors: Priors,
     database: str | Path,
+    *,
+    keep_unplaced: bool = False,
 ) -> Combined:
     """Lay units into the frame of the largest and merge them.
 
@@ -86,6 +88,8 @@ def combine(
         matches: Verified matches of all pairs of images, by image ids of the database. [M, 2]
         priors: Positions, where known.
         database: Where all images are known.
+        keep_unplaced: Whether units that cannot be placed come into the model nevertheless, each
+            as it lies in its own frame: somebody else will place them.
     """
     remarks: list[str] = []
     links = find_links(units, matches)
@@ -96,6 +100,10 @@ def combine(
     _place_by_gps(units, placed, root, priors, remarks)
     left = [i for i in range(len(units)) if i not in placed]
     remarks += [f"{units[i].label}: {units[i].size} images could not be placed" for i in left]
+    if keep_unplaced:
+        placed |= {i: Sim3.identity() for i in left}
+        remarks += [f"{units[i].label}: kept in a frame of its own, for tie points" for i in left]
+        left = []
     order = sorted(placed)
     model = merge([units[i].model for i in order], [placed[i] for i in order], database)
     names = tuple(

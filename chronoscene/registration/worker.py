@@ -33,6 +33,7 @@ STEPS = {
     "joint": "chronoscene.registration.joint:run",
     "separate": "chronoscene.registration.separate:run",
     "frozen": "chronoscene.registration.frozen:run",
+    "refine": "chronoscene.registration.refine:run",
 }
 """Name of a step to ``module:function``, which takes a dictionary and a `Report` and returns what
 JSON can hold."""

@@ -43,6 +43,7 @@ class Case:
             "photos": str(self.folder / "photos"),
             "periods": self.periods,
             "priors": self.priors,
+            "keep_unplaced": False,
             "out": str(self.folder / "model"),
             "scratch": str(self.folder / "scratch"),
             "threads": 1,
