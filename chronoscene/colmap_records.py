@@ -112,15 +112,6 @@ def read_images(path: Path) -> list[ImageRecord]:
     return read_records(path, _walk_images)
 
 
-def read_keypoints(path: Path) -> dict[int, NDArray[np.float64]]:
-    """Read the pixel positions in ``images.bin``: image id to keypoints [n, 2].
-
-    Raises:
-        SceneError: If the file cannot be read, ends inside a record, or has an id twice.
-    """
-    return read_records(path, _walk_keypoints)
-
-
 def check_records(folder: Path) -> None:
     """Check the small files of a model: ``cameras.bin``, and ``rigs.bin`` and ``frames.bin``.
 
@@ -188,32 +179,49 @@ def _walk_images(reader: RecordReader) -> list[ImageRecord]:
     return images
 
 
-def _walk_keypoints(reader: RecordReader) -> dict[int, NDArray[np.float64]]:
-    keypoints: dict[int, NDArray[np.float64]] = {}
-    for image in _walk_images(reader):
-        if image.image_id in keypoints:
-            raise RecordError(f"image id {image.image_id} twice")
-        keypoints[image.image_id] = image.xy
-    return keypoints
-
-
 def _walk_points(reader: RecordReader) -> PointRecords:
     """One step per record, since each says only how long itself is; all else in whole columns."""
-    data, unpack, end = reader.data, COUNT.unpack_from, len(reader.data)
+    offsets = _quick_offsets(reader.data)
+    if offsets is None:
+        offsets = _checked_offsets(reader)
+    begin = np.array(offsets, np.int64)
+    lengths = (np.diff(begin) - POINT_HEAD.itemsize) // _TRACK_BYTES
+    return _gather_points(reader.data, begin[:-1], lengths)
+
+
+def _quick_offsets(data: bytes) -> list[int] | None:
+    """Where the records begin and the last ends, if the file is as it should be."""
+    if len(data) < COUNT.size:
+        return None
+    (count,) = COUNT.unpack_from(data)
+    if count * POINT_HEAD.itemsize > len(data):
+        return None
+    unpack, head, at = COUNT.unpack_from, POINT_HEAD.itemsize, COUNT.size
+    offsets = [at]
+    try:
+        for _ in range(count):
+            at += head + _TRACK_BYTES * unpack(data, at + _LENGTH_AT)[0]
+            offsets.append(at)
+    except (struct.error, OverflowError):  # a length leads out of the file
+        return None
+    return offsets if at == len(data) else None
+
+
+def _checked_offsets(reader: RecordReader) -> list[int]:
+    """The same, step by step, with a word on the record that is wrong."""
+    data, end = reader.data, len(reader.data)
     offsets, at = [COUNT.size], COUNT.size
     for _ in reader.records("point", POINT_HEAD.itemsize):
         if at + POINT_HEAD.itemsize > end:
             raise reader.ends()
-        (length,) = unpack(data, at + _LENGTH_AT)
+        (length,) = COUNT.unpack_from(data, at + _LENGTH_AT)
         at += POINT_HEAD.itemsize + _TRACK_BYTES * length
         if at > end:
             reader.parts = f"{length} observations"
             raise reader.ends()
         offsets.append(at)
         reader.at = at
-    begin = np.array(offsets, np.int64)
-    lengths = (np.diff(begin) - POINT_HEAD.itemsize) // _TRACK_BYTES
-    return _gather_points(data, begin[:-1], lengths)
+    return offsets
 
 
 def _gather_points(

@@ -18,7 +18,7 @@ from chronoscene.colmap import (
     to_pycolmap,
     write_model,
 )
-from chronoscene.colmap_records import CAMERA_PARAMETERS, read_keypoints, read_points
+from chronoscene.colmap_records import CAMERA_PARAMETERS, read_images, read_points
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Points
@@ -266,7 +266,7 @@ def test_missing_files_are_named(tmp_path):
     with pytest.raises(SceneError, match=r"found cameras\.bin"):
         read_model(tmp_path)
     with pytest.raises(SceneError, match=r"images\.bin: expected complete COLMAP records"):
-        read_keypoints(tmp_path / "images.bin")
+        read_images(tmp_path / "images.bin")
     (tmp_path / "points3D.bin").write_bytes(struct.pack("<Q", 2**60))
     with pytest.raises(SceneError, match="records announced in 8 bytes"):
         read_points(tmp_path / "points3D.bin")

@@ -10,21 +10,15 @@ from __future__ import annotations
 
 import os
 import shutil
-import struct
 import tempfile
 from pathlib import Path
 
-from chronoscene.colmap_arrays import RawImages
+from chronoscene.colmap_writer import write_without_observations
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.validation.raw_model import RawModel
 
 TEXTS = (our_format.SPLIT, our_format.TEST, our_format.PERIODS, our_format.WORLD)
-UNCHANGED = ("cameras.bin", "rigs.bin", "frames.bin")
-
-_HEAD = struct.Struct("<i7di")
-_NOTHING = bytes(8)
-"""No keypoints, or no points."""
 
 
 def reader_complaint(root: Path, model: RawModel) -> ChronoSceneError | None:
@@ -36,22 +30,20 @@ def reader_complaint(root: Path, model: RawModel) -> ChronoSceneError | None:
         skeleton = Path(temporary)
         folder = skeleton / our_format.MODEL
         folder.mkdir(parents=True)
-        for place in TEXTS + tuple(f"{our_format.MODEL}/{file}" for file in UNCHANGED):
+        for place in TEXTS:
             if (root / place).is_file():
                 shutil.copyfile(root / place, skeleton / place)
-        (folder / "images.bin").write_bytes(_without_keypoints(model.images))
-        (folder / "points3D.bin").write_bytes(_NOTHING)
+        images = model.images
+        posed = zip(
+            images.ids.tolist(),
+            images.quaternions.tolist(),
+            images.translations.tolist(),
+            images.camera_ids.tolist(),
+            (name.encode("utf-8", "surrogateescape") for name in images.names),
+            strict=True,
+        )
+        write_without_observations(root / our_format.MODEL, posed, folder)
         return _complaint(skeleton)
-
-
-def _without_keypoints(images: RawImages) -> bytes:
-    records = [struct.pack("<Q", len(images))]
-    poses = zip(images.quaternions.tolist(), images.translations.tolist(), strict=True)
-    for i, (quaternion, translation) in enumerate(poses):
-        camera_id = int(images.camera_ids[i])
-        records.append(_HEAD.pack(int(images.ids[i]), *quaternion, *translation, camera_id))
-        records.append(images.names[i].encode("utf-8", "surrogateescape") + b"\0" + _NOTHING)
-    return b"".join(records)
 
 
 def _complaint(root: Path) -> ChronoSceneError | None:
