@@ -13,7 +13,7 @@ import numpy as np
 
 from chronoscene.geometry import camera_centre
 from chronoscene.registration.clouds import CloudDistance, cloud_distance
-from chronoscene.registration.evidence import TieSpread, seen_by_period, tie_spread
+from chronoscene.registration.evidence import TieSpread, ground_plan, seen_by_period, tie_spread
 from chronoscene.registration.gps_check import GpsFit, fit_gps
 from chronoscene.registration.localisation import Localisation, localise
 from chronoscene.registration.misalignment import (
@@ -38,8 +38,9 @@ from chronoscene.registration.rays import (
     unproject,
 )
 
-MOST_POINTS = 30_000
-"""Points of a period that make up its cloud."""
+MOST_OBSERVATIONS = 200_000
+"""Observations by which the cloud of a period is placed, and those of tie points by which a pair is
+measured: a sample of the points where there are more."""
 
 BADLY_PLACED = 4.0
 """Transfers whose point is less certain than this many pixels tell nothing."""
@@ -131,7 +132,13 @@ def certify(model: Registered) -> Certificate:
     extent = scene_extent(model)
     seen = seen_by_period(model)
     clouds = [_cloud(model, seen, p) for p in range(model.num_periods)]
-    held_out, ties = held_out_rays(model), model_rays(model, seen.sum(axis=1) > 1)
+    cells = ground_plan(model.points)
+    shared = np.flatnonzero(seen.sum(axis=1) > 1)
+    sample = np.zeros(len(seen), bool)
+    lengths = np.diff(model.track_start)
+    most = MOST_OBSERVATIONS * max(1, model.num_periods - 1)
+    sample[shared[:: int(lengths[shared].sum()) // most + 1]] = True
+    held_out, ties = held_out_rays(model), model_rays(model, sample)
     focals = [np.sqrt(c.K[0, 0] * c.K[1, 1]) for c in model.cameras]
     return Certificate(
         route=model.route,
@@ -141,7 +148,7 @@ def certify(model: Registered) -> Certificate:
         labels=tuple(model.labels),
         periods=tuple(_period(model, p) for p in range(model.num_periods)),
         pairs=tuple(
-            _pair(model, seen, clouds, held_out, ties, a, b)
+            _pair(model, (a, b), tie_spread(model, seen, a, b, cells), clouds, held_out, ties)
             for a, b in combinations(range(model.num_periods), 2)
         ),
     )
@@ -163,7 +170,8 @@ def _cloud(model: Registered, seen: Mask, period: int) -> Placed:
     """Points of a period, placed by its images alone: a shared point would fit by construction."""
     points = np.flatnonzero(seen[:, period])
     chosen = np.zeros(len(seen), bool)
-    chosen[points[:: len(points) // MOST_POINTS + 1]] = True
+    observations = int(np.diff(model.track_start)[points].sum())
+    chosen[points[:: observations // MOST_OBSERVATIONS + 1]] = True
     rays = model_rays(model, chosen)
     return place(rays.where(model.periods[rays.image] == period))
 
@@ -200,13 +208,13 @@ def _period(model: Registered, period: int) -> PeriodFigures:
 
 def _pair(
     model: Registered,
-    seen: Mask,
+    periods: tuple[int, int],
+    spread: TieSpread,
     clouds: list[Placed],
     held_out: Rays,
     ties: Rays,
-    a: int,
-    b: int,
 ) -> PairFigures:
+    a, b = periods
     centres = camera_centre(model.cam_from_world[np.isin(model.periods, (a, b))])
     moved, placed_a, placed_b = transfers(held_out, model.periods, a, b)
     good = transfer_errors(moved)[1] < BADLY_PLACED if len(moved) else np.zeros(0, bool)
@@ -227,7 +235,7 @@ def _pair(
     return PairFigures(
         a=a,
         b=b,
-        ties=tie_spread(model, seen, a, b),
+        ties=spread,
         held_out=figures,
         misalignment=misalignment,
         by_all=by_all or "too few tracks are seen by two images of one period, or all in one spot",
@@ -240,8 +248,8 @@ def _pair(
 def _joined(held_out: Rays, ties: Rays, a: int, b: int, model: Registered) -> Rays:
     """Held-out tracks and a sample of the tie points of two periods, under numbers of their own."""
     ties = ties.where(np.isin(model.periods[ties.image], (a, b)))
-    step = len(np.unique(ties.track)) // MOST_POINTS + 1
-    ties = ties.where(ties.track % step == 0)
+    _, number = np.unique(ties.track, return_inverse=True)
+    ties = ties.where(number % (len(ties) // MOST_OBSERVATIONS + 1) == 0)
     parts = held_out, replace(ties, track=ties.track + held_out.track.max(initial=-1) + 1)
     names = ("track", "image", "pose", "uv", "focal")
     return Rays(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))

@@ -48,7 +48,9 @@ def seen_by_period(model: Registered) -> Mask:
     return seen
 
 
-def tie_spread(model: Registered, seen: Mask, a: int, b: int) -> TieSpread:
+def tie_spread(
+    model: Registered, seen: Mask, a: int, b: int, cells: tuple[Array, Ints] | None = None
+) -> TieSpread:
     """Count the tie points of two periods, and find where there are none.
 
     Args:
@@ -56,9 +58,10 @@ def tie_spread(model: Registered, seen: Mask, a: int, b: int) -> TieSpread:
         seen: From `seen_by_period`.
         a: Earlier period.
         b: Later period.
+        cells: From `ground_plan`, where it is at hand.
     """
     tie = seen[:, a] & seen[:, b]
-    plan, cell = _cells(model.points)
+    plan, cell = ground_plan(model.points) if cells is None else cells
     counts = [np.bincount(cell[mask], minlength=cell.max(initial=0) + 1) for mask in seen.T]
     overlap = (counts[a] >= FEWEST_IN_CELL) & (counts[b] >= FEWEST_IN_CELL)
     tied = np.bincount(cell[tie], minlength=len(overlap)) > 0
@@ -82,7 +85,7 @@ def tie_spread(model: Registered, seen: Mask, a: int, b: int) -> TieSpread:
     )
 
 
-def _cells(points: Array) -> tuple[Array, Ints]:
+def ground_plan(points: Array) -> tuple[Array, Ints]:
     """Ground plan of points (their two main axes) and the number of the cell of each."""
     if not len(points):
         return np.zeros((0, 2)), np.zeros(0, np.int64)

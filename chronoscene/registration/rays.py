@@ -104,11 +104,13 @@ def held_out_rays(model: Registered) -> Rays:
 def unproject(cameras: Sequence[Camera], image: Ints, xy: Array) -> tuple[Array, Array]:
     """Depth-1 coordinates and focal lengths of pixels. [O], [O, 2] -> [O, 2], [O, 2]"""
     uv, focal = np.full((len(image), 2), np.nan), np.ones((len(image), 2))
-    of_image: dict[Camera, list[int]] = {}
-    for i, camera in enumerate(cameras):
-        of_image.setdefault(camera, []).append(i)
-    for camera, images in of_image.items():
-        rows = np.flatnonzero(np.isin(image, images))
+    number: dict[Camera, int] = {}
+    of_image = np.array([number.setdefault(c, len(number)) for c in cameras], np.int64)
+    kind = of_image[image]
+    order = np.argsort(kind, kind="stable")
+    ends = np.searchsorted(kind[order], np.arange(len(number) + 1))
+    for camera, k in number.items():
+        rows = order[ends[k] : ends[k + 1]]
         if len(rows):
             uv[rows] = unproject_pixels(camera, xy[rows])
             focal[rows] = camera.K[[0, 1], [0, 1]]

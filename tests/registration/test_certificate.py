@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -299,3 +300,12 @@ def test_extent_of_cameras_that_stand_still(good: Registered) -> None:
     still = replace(good, cam_from_world=poses)
     assert np.ptp(camera_centre(poses), axis=0).max() < 1e-9
     assert 5 < scene_extent(still) < 30
+
+
+def test_the_documented_thresholds_are_those_of_the_code() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "registration.md").read_text(encoding="utf-8")
+    for t in THRESHOLDS.values():
+        sign = "below" if t.larger_is_better else "above"
+        unit = f" {t.unit}" if t.unit else ""
+        fail = f"{sign} {t.fail:g}{unit}" if t.fail is not None else "-"
+        assert f"| {t.what} | {sign} {t.doubtful:g}{unit} | {fail} | {t.why} |" in text
