@@ -147,12 +147,12 @@ def print_size(rows: Sequence[Row]) -> None:
     print(flush=True)
 
 
-def table(sizes: Sequence[tuple[int, int, int]], repeats: int) -> list[Row]:
+def table(sizes: Sequence[tuple[int, int, int]], chosen: Sequence[Candidate]) -> list[Row]:
     """Print all sizes and what could not run."""
     print(f"{'':>10} {'':>10}  {'':<22} {'image, ms':^19}  {'and gradients, ms':^19}")
     titles = "  ".join(f"{'median':>9} {'min':>9}" for _ in range(2))
     print(f"{'Gaussians':>10} {'image':>10}  {'':<22} {titles} {'to ours':>9}")
-    runner, rows = Runner(candidates(repeats)), []
+    runner, rows = Runner(chosen), []
     for size in sizes:
         found = runner.measure(*size)
         print_size(found)
@@ -162,9 +162,8 @@ def table(sizes: Sequence[tuple[int, int, int]], repeats: int) -> list[Row]:
     return rows
 
 
-def growth(repeats: int) -> tuple[list[Row], list[Row]]:
+def growth(chosen: Sequence[Candidate]) -> tuple[list[Row], list[Row]]:
     """Measurements for the two panels of the figure."""
-    chosen = candidates(repeats)
     by_count, by_pixels = Runner(chosen), Runner(chosen)
     first = [row for n in GROWTH for row in by_count.measure(n, 400, 300)]
     second = [row for w in WIDTHS for row in by_pixels.measure(100_000, w, 3 * w // 4)]
@@ -212,10 +211,15 @@ def to_csv(rows: Sequence[Row]) -> str:
     return text.getvalue()
 
 
+def _named(names: Sequence[str], repeats: int) -> list[Candidate]:
+    return [candidate for candidate in candidates(repeats) if candidate.name in names]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--repeats", type=int, default=30, help="counted runs of ours")
     parser.add_argument("--largest", type=int, default=len(SIZES), help="how many of the sizes")
+    parser.add_argument("--only", action="append", help="a candidate; may be repeated")
     parser.add_argument("--figure", type=Path, help="also measure growth, and draw it here")
     parser.add_argument("--csv", type=Path, help="write everything that was measured here")
     options = parser.parse_args()
@@ -226,9 +230,10 @@ def main() -> None:
     for peer in (cpu, scalar, torch_tiles, gsplat_torch, cuda):
         print(f"  {peer.NAME}: {peer.WHAT}")
     print()
-    rows = table(SIZES[: options.largest], options.repeats)
+    names = options.only or [c.name for c in candidates(1)]
+    rows = table(SIZES[: options.largest], _named(names, options.repeats))
     if options.figure:
-        panels = growth(max(3, options.repeats // 3))
+        panels = growth(_named(names, max(3, options.repeats // 3)))
         draw(panels, options.figure)
         rows += [*panels[0], *panels[1]]
     if options.csv:
