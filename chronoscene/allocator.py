@@ -6,13 +6,13 @@ import ctypes
 import sys
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
-_KEPT = 1 << 30
+_KEPT = 256 << 20
 _LARGEST = 32 << 20
 """The largest threshold that glibc accepts."""
 
 
 def keep_freed_memory() -> bool:
-    """Keep freed memory for the next request, up to a gigabyte. Does nothing except with glibc.
+    """Keep freed memory for the next request, up to 256 MB. Does nothing except with glibc.
 
     A training step allocates the same tens of megabytes as the one before it. By default glibc
     returns such blocks to the kernel, which clears every page anew: measured at about 2 ms of a
