@@ -32,8 +32,6 @@ class Assembly:
     """ENU by name."""
     positions_used: frozenset[str]
     georeference: Georeference | None
-    unregistered: Mapping[str, str]
-    unregistered_periods: Mapping[str, int]
     route: Route
     images_root: Path
     frozen: Mapping[str, Frame]
@@ -41,7 +39,7 @@ class Assembly:
 
 
 def assemble(model_folder: Path, held_out: Path, parts: Assembly) -> Registered:
-    """Read a model and what was held out."""
+    """Read a model and what was held out; photos without a pose are left to the caller."""
     model = read_model(model_folder)
     names = tuple(image.name for image in model.images)
     tracks = read_held_out(held_out, names, parts.periods)
@@ -57,8 +55,8 @@ def assemble(model_folder: Path, held_out: Path, parts: Assembly) -> Registered:
         track_start=model.points.track_start,
         track_image=model.points.track_frame.astype(np.int64),
         track_xy=model.points.track_xy,
-        unregistered=parts.unregistered,
-        unregistered_periods=parts.unregistered_periods,
+        unregistered={},
+        unregistered_periods={},
         route=parts.route,
         gps_enu=np.array([parts.positions.get(n, nowhere) for n in names]).reshape(-1, 3),
         gps_used=np.array([n in parts.positions_used for n in names], bool),

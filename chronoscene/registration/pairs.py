@@ -19,9 +19,6 @@ from chronoscene.registration.retrieval import global_descriptors
 from chronoscene.registration.sfm import quiet, write_pairs
 from chronoscene.registration.worker import Report
 
-EXHAUSTIVE_LIMIT = 60
-"""Images; at most 1,770 pairs."""
-
 SPATIAL_NEIGHBOURS = 10
 SEQUENTIAL_NEIGHBOURS = 4
 SIMILAR_NEIGHBOURS = 6

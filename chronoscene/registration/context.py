@@ -1,0 +1,104 @@
+"""What all stages of one run share: options, the work folder, and what was done in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from chronoscene.registration.model import Route
+from chronoscene.registration.stages import Stages
+from chronoscene.registration.worker import Report, run_step
+from chronoscene.threads import available_threads
+
+EXHAUSTIVE_LIMIT = 60
+"""Images; at most 1,770 pairs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to register."""
+
+    route: Route | None = None
+    """None to choose: joint where periods are connected by matches, else separate."""
+    work: Path | None = None
+    """Folder for what is kept between runs; None for ``<out>.work``."""
+    overwrite: bool = False
+    """Whether an earlier registration at the place of the output may be replaced."""
+    max_image_size: int = 1600
+    """Pixels; larger photos are scaled down for finding features."""
+    max_features: int = 4096
+    """Of each photo."""
+    exhaustive_limit: int = EXHAUSTIVE_LIMIT
+    """Number of photos up to which all pairs are matched."""
+    held_out: float = 0.1
+    """Share of the tracks across periods that take no part in estimation."""
+    camera_model: str = "SIMPLE_RADIAL"
+    """COLMAP's camera model for the photos."""
+    threads: int | None = None
+    """None for one per processor. With 1, results are the same to the last bit in every run."""
+    seed: int = 0
+    """Of the draw of held-out tracks."""
+    tie_points: Path | None = None
+    """File of tie points or ground control."""
+    tie_scale: float = 1.0
+    """Size of the photos here over that of those which were clicked in."""
+    page: bool = False
+    """Whether to write the page for people beside the scene."""
+
+    def record(self) -> dict[str, Any]:
+        """What was asked for, for the log."""
+        values = {name: getattr(self, name) for name in self.__slots__}
+        return {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in values.items()
+            if value is not None
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Context:
+    """One run in its work folder."""
+
+    work: Path
+    stages: Stages
+    options: Options
+    report: Report | None
+
+    @property
+    def threads(self) -> int:
+        return self.options.threads or available_threads()
+
+    @property
+    def photos(self) -> Path:
+        """Folder of the prepared photos."""
+        return self.work / "photos"
+
+    @property
+    def database(self) -> Path:
+        """Features and all matches."""
+        return self.work / "features.db"
+
+    @property
+    def mapping_database(self) -> Path:
+        """The same without what is held out."""
+        return self.work / "mapping.db"
+
+    @property
+    def held_out(self) -> Path:
+        return self.work / "held_out.npz"
+
+    def step(self, step: str, arguments: Mapping[str, Any]) -> Any:
+        """Run a step in a process of its own; see `run_step`."""
+        return run_step(step, arguments, log=self.work / "log.txt", report=self.report)
+
+    def places(self, name: str) -> dict[str, Any]:
+        """Where a step that estimates finds and leaves things."""
+        return {
+            "database": str(self.mapping_database),
+            "photos": str(self.photos),
+            "out": str(self.work / f"model-{name}"),
+            "scratch": str(self.work / f"scratch-{name}"),
+            "threads": self.threads,
+        }
