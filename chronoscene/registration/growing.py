@@ -49,17 +49,28 @@ def _same_points(
     b_xy: NDArray[np.float64],
     is_old: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
-    """Old point that each new point has an observation in common with; -1 without. [new points]"""
+    """Old point that each new point shares most of its old observations with; -1 without.
+
+    [new points]
+    """
     a = scene.points
     a_point = np.repeat(np.arange(len(a)), np.diff(a.track_start))
-    target = np.full(int(b_point.max()) + 1 if len(b_point) else 0, -1, np.int64)
+    shared = np.full(len(b_point), -1, np.int64)
     for frame in np.unique(b_frame[is_old[b_frame]]).tolist():
         mine, theirs = np.flatnonzero(b_frame == frame), np.flatnonzero(a_frame == frame)
         if not len(theirs):
             continue
         distance, nearest = cKDTree(a.track_xy[theirs]).query(b_xy[mine])
         near = distance < SAME_PIXELS
-        target[b_point[mine[near]]] = a_point[theirs[nearest[near]]]
+        shared[mine[near]] = a_point[theirs[nearest[near]]]
+    target = np.full(int(b_point.max(initial=-1)) + 1, -1, np.int64)
+    observed = np.bincount(b_point[is_old[b_frame]], minlength=len(target))
+    found = shared >= 0
+    pairs, counts = np.unique(
+        np.column_stack([b_point[found], shared[found]]), axis=0, return_counts=True
+    )
+    most = 2 * counts > observed[pairs[:, 0]]
+    target[pairs[most, 0]] = pairs[most, 1]
     return target
 
 

@@ -50,10 +50,9 @@ def control_frame(points: TiePoints) -> Georeference | None:
     """A frame around the ground control; None without control in a reference system."""
     if points.crs is None or not any(p.world is not None for p in points.points):
         return None
-    # Any frame gives places on the earth; the first control point is as good as another.
-    anchor = Georeference(0.0, 0.0, 0.0, "as stated")
-    around = np.stack(list(points.located(anchor).values()))
-    latitude, longitude, height = anchor.to_geodetic(np.median(around, axis=0)).tolist()
+    anywhere = Georeference(0.0, 0.0, 0.0, "as stated")
+    places = anywhere.to_geodetic(np.stack(list(points.located(anywhere).values())))
+    latitude, longitude, height = np.median(places, axis=0).tolist()
     return Georeference(round(latitude, 7), round(longitude, 7), round(height, 2), "as stated")
 
 

@@ -1,0 +1,32 @@
+"""Tie points in the pipeline."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chronoscene.registration.tie_points import read_tie_points
+from chronoscene.registration.tying import control_frame
+
+
+def test_ground_control_gives_a_frame(tmp_path: Path) -> None:
+    path = tmp_path / "gcp_list.txt"
+    path.write_text(
+        "+proj=utm +zone=11 +datum=WGS84 +units=m +no_defs\n"
+        "500000.0 3811000.0 12.0 10 20 a.jpg one\n"
+        "500100.0 3811000.0 14.0 30 20 a.jpg two\n"
+        "500050.0 3811100.0 13.0 30 40 b.jpg three\n"
+    )
+    points = read_tie_points(path)
+    frame = control_frame(points)
+    assert frame is not None
+    assert frame.longitude == pytest.approx(-117.0 + 50 / 92_500, abs=2e-5)
+    placed = np.stack(list(points.located(frame).values()))
+    assert np.abs(placed).max() < 110.0
+    assert np.linalg.norm(placed[0] - placed[1]) == pytest.approx(100.04, abs=2.1)
+
+
+def test_points_without_a_reference_system_give_none(tmp_path: Path) -> None:
+    path = tmp_path / "ties.csv"
+    path.write_text("point,image,x,y,X,Y,Z\none,a.jpg,1,2,3,4,5\n")
+    assert control_frame(read_tie_points(path)) is None
