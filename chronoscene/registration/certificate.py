@@ -28,6 +28,7 @@ from chronoscene.registration.misalignment import (
 from chronoscene.registration.model import Registered
 from chronoscene.registration.rays import (
     Array,
+    Ints,
     Mask,
     Placed,
     Rays,
@@ -284,18 +285,26 @@ def _held_out(
 
 def _epipolar(model: Registered, periods: tuple[int, int]) -> Array:
     """Epipolar distances of all held-out matches between two periods, pixels."""
-    errors = [np.zeros(0)]
-    for matches in model.held_out:
-        i, j = matches.image_a, matches.image_b
-        if {int(model.periods[i]), int(model.periods[j])} != set(periods):
-            continue
-        rays = _rays_of_image(model, i, matches.xy_a), _rays_of_image(model, j, matches.xy_b)
-        found = sampson_errors(model.cam_from_world[i], model.cam_from_world[j], *rays)
-        errors.append(found[np.isfinite(found)])
-    return np.concatenate(errors)
+    chosen = [
+        m
+        for m in model.held_out
+        if {int(model.periods[m.image_a]), int(model.periods[m.image_b])} == set(periods)
+    ]
+    if not chosen:
+        return np.zeros(0)
+    counts = [len(m.xy_a) for m in chosen]
+    first = _rays(model, np.repeat([m.image_a for m in chosen], counts), [m.xy_a for m in chosen])
+    second = _rays(model, np.repeat([m.image_b for m in chosen], counts), [m.xy_b for m in chosen])
+    ends = np.cumsum(counts)
+    errors = [
+        sampson_errors(first.pose[i], second.pose[i], first.where(rows), second.where(rows))
+        for i, j in zip(ends - counts, ends, strict=True)
+        if len(rows := np.arange(i, j))
+    ]
+    found = np.concatenate([np.zeros(0), *errors])
+    return np.asarray(found[np.isfinite(found)])
 
 
-def _rays_of_image(model: Registered, index: int, xy: Array) -> Rays:
-    image = np.full(len(xy), index, np.int64)
-    uv, focal = unproject(model.cameras, image, xy)
+def _rays(model: Registered, image: Ints, xy: list[Array]) -> Rays:
+    uv, focal = unproject(model.cameras, image, np.concatenate(xy))
     return Rays(image, image, model.cam_from_world[image], uv, focal)

@@ -105,13 +105,13 @@ THRESHOLDS: dict[str, Threshold] = {
         ),
         Threshold(
             "localised", "pose of images localised from the other period, beyond its noise",
-            "times 0.1 degrees or 0.2%", 1.0, 10.0, False,
+            "times 0.1 degrees or 0.2%", 0.5, 10.0, False,
             "the points of either period must put the images of the other where they are",
             "look at the flicker comparisons; if they jump, " + _CLICK,
         ),
         Threshold(
-            "clouds", "shift between the surfaces of two periods, beyond its spread", "% of extent",
-            0.2, None, False,
+            "clouds", "shift between the surfaces of two periods, where its interval excludes 0",
+            "% of extent", 0.15, None, False,
             "surfaces are compared apart from matches, so repeated structure shows here; but a "
             "beach or a quarry may really have moved",
             "look at the flicker comparisons; if they jump, " + _CLICK,
@@ -264,7 +264,9 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Finding]:
             worst = max(found.rotation_excess / _limit("rotation"), size / _limit("shift"))
             yield from _check("localised", worst, place)
     if isinstance(pair.clouds, CloudDistance):
-        yield from _check("clouds", 100 * pair.clouds.shift.low / certificate.extent, place)
+        shift = pair.clouds.shift
+        if shift.low > 0:
+            yield from _check("clouds", 100 * shift.value / certificate.extent, place)
 
 
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Finding]:
