@@ -123,7 +123,8 @@ def command(
     periods are proposed from their dates; or a CSV of image and period. A run that was stopped goes
     on where it was when the command is given again.
     """
-    check_outside(captures if captures.is_dir() else captures.parent, out)
+    for place in (out, work) if work is not None else (out,):
+        check_outside(captures if captures.is_dir() else captures.parent, place)
     found = read_captures(captures, table=table)
     options = Options(
         route=route,

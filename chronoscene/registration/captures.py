@@ -9,7 +9,8 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path, PurePosixPath
 
@@ -19,6 +20,7 @@ from chronoscene.errors import SceneError
 from chronoscene.exif import ExifData, read_exif
 from chronoscene.formats.chronoscene import is_iso_date
 from chronoscene.splits import IMAGE_SUFFIXES, read_text
+from chronoscene.threads import available_threads
 
 GPS_SIGMA = (5.0, 5.0, 10.0)
 """Metres east, north, up, where the photo states none: a consumer receiver under open sky."""
@@ -28,6 +30,9 @@ PERIOD_GAP_DAYS = 14
 
 LEAST_SIDE = 64
 """Pixels; smaller pictures are icons and previews."""
+
+HEAD_BYTES = 200_000
+"""Of a file that are searched for metadata on panoramas."""
 
 LARGEST_ASPECT = 3.0
 """Wider pictures are panoramas, which no perspective camera describes."""
@@ -227,9 +232,10 @@ def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Capt
         raise _nothing(root, "no image files")
     order = _ordered_labels(listed)
     images, refused = [], []
-    for item in listed:
+    with ThreadPoolExecutor(available_threads()) as pool:
+        opened = list(pool.map(lambda item: _open(item, order.index(item.label)), listed))
+    for item, capture in zip(listed, opened, strict=True):
         period = order.index(item.label)
-        capture = _open(item, period)
         if isinstance(capture, str):
             refused.append((item.name, period, capture))
         else:
@@ -268,16 +274,18 @@ def _natural(label: str) -> tuple[list[tuple[int, int, str]], str]:
 
 
 def _open(item: _Listed, period: int) -> Capture | str:
-    """The capture, or why it cannot be used. All pixels are decoded once: half a file is common."""
+    """The capture, or why it cannot be used. Every file is decoded once: half a file is common."""
     try:
         with Image.open(item.path) as image:
             width, height = image.size
+            # A JPEG is then read to its end, but not computed in full.
+            image.draft("RGB", (width // 8, height // 8))
             image.load()
     except Exception as error:  # Pillow raises almost anything for damaged files
         return f"cannot be decoded: {str(error) or type(error).__name__}"
     if min(width, height) < LEAST_SIDE:
         return f"{width} x {height} pixels: too small"
-    if max(width, height) > LARGEST_ASPECT * min(width, height):
+    if is_panorama(item.path) or max(width, height) > LARGEST_ASPECT * min(width, height):
         return f"{width} x {height} pixels: a panorama, which no perspective camera describes"
     exif = read_exif(item.path)
     return Capture(
@@ -290,6 +298,13 @@ def _open(item: _Listed, period: int) -> Capture | str:
         taken=taken_at(item.path, exif),
         gps=_gps(exif),
     )
+
+
+def is_panorama(path: Path) -> bool:
+    """Whether a file says that it is a sphere or cylinder unrolled (Google's GPano metadata)."""
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    return re.search(rb"GPano:ProjectionType\W{1,4}(equirectangular|cylindrical)", head) is not None
 
 
 def _gps(exif: ExifData) -> Gps | None:
@@ -339,11 +354,6 @@ def _check_names(root: Path, images: Sequence[Capture]) -> None:
                 found=repr(capture.name),
                 todo="rename the image",
             )
-
-
-def with_name(capture: Capture, name: str) -> Capture:
-    """The same capture under another name."""
-    return replace(capture, name=name)
 
 
 def _nothing(path: Path, found: str) -> SceneError:

@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +65,9 @@ def run_step(
         )
         try:
             assert process.stdin is not None
-            process.stdin.write(json.dumps(arguments))
-            process.stdin.close()
+            with suppress(BrokenPipeError):  # it died already: the log says why
+                process.stdin.write(json.dumps(arguments))
+                process.stdin.close()
             result = _listen(process, report)
             status = process.wait()
         except BaseException:

@@ -97,6 +97,8 @@ def test_unusable_photos_are_named_with_reasons(tmp_path: Path) -> None:
     (tmp_path / "1" / "text.jpg").write_text("no photo")
     photo(tmp_path / "1" / "icon.png", size=(32, 32))
     photo(tmp_path / "1" / "panorama.jpg", size=(400, 100))
+    xmp = b'<x:xmpmeta GPano:ProjectionType="equirectangular"/>'
+    Image.effect_noise((200, 100), 60).save(tmp_path / "1" / "sphere.jpg", xmp=xmp)
     found = read_captures(tmp_path)
     assert [c.name for c in found.images] == ["0/good.jpg", "1/good.jpg"]
     reasons = {name: reason for name, _, reason in found.refused}
@@ -104,6 +106,7 @@ def test_unusable_photos_are_named_with_reasons(tmp_path: Path) -> None:
     assert reasons["1/text.jpg"].startswith("cannot be decoded")
     assert reasons["1/icon.png"].endswith("too small")
     assert "panorama" in reasons["1/panorama.jpg"]
+    assert "panorama" in reasons["1/sphere.jpg"]
 
 
 def test_nothing_to_register_is_said(tmp_path: Path) -> None:

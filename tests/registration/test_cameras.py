@@ -1,0 +1,36 @@
+"""Which photos share a camera."""
+
+from pathlib import Path
+
+from chronoscene.exif import ExifData
+from chronoscene.registration.cameras import LEAST_OF_ITS_OWN, camera_groups
+from chronoscene.registration.captures import Capture
+
+
+def capture(name: str, period: int, *, model: str = "A", focal: float = 24.0) -> Capture:
+    exif = ExifData(make="maker", model=model, focal_mm=focal)
+    return Capture(name, Path(name), period, 640, 480, exif, None, None)
+
+
+def names(captures: list[Capture]) -> list[list[str]]:
+    return [group["names"] for group in camera_groups(captures, "SIMPLE_RADIAL")]
+
+
+def test_lens_and_zoom_make_the_camera() -> None:
+    mixed = [
+        capture("a", 0),
+        capture("b", 0, model="B"),
+        capture("c", 0, focal=70.0),
+        capture("d", 0),
+    ]
+    assert names(mixed) == [["a", "d"], ["b"], ["c"]]
+
+
+def test_a_period_with_many_photos_has_its_own_calibration() -> None:
+    many = [capture(f"0/{i}", 0) for i in range(LEAST_OF_ITS_OWN)]
+    more = [capture(f"1/{i}", 1) for i in range(LEAST_OF_ITS_OWN)]
+    assert names(many + more) == [[c.name for c in many], [c.name for c in more]]
+
+
+def test_periods_with_few_photos_share_one() -> None:
+    assert names([capture("0/a", 0), capture("1/a", 1)]) == [["0/a", "1/a"]]
