@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap import read_model
-from chronoscene.registration.captures import Capture
 from chronoscene.registration.georeference import Georeference, Positions
 from chronoscene.registration.model import CrossMatches, HeldOutTracks, Registered, Route
+from chronoscene.registration.photo import Capture
 from chronoscene.scene import Camera, Frame
 
 FEW_FEATURES = 100

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from chronoscene.registration.captures import Capture
+from chronoscene.registration.photo import Capture
 
 LEAST_OF_ITS_OWN = 8
 """Photos with which a camera is calibrated for each period alone. Lenses are refocused and dropped

@@ -23,8 +23,8 @@ from chronoscene.registration.mapping import (
     triangulate,
     write_model,
 )
+from chronoscene.registration.reconstruction import image_pose, known_images, set_pose
 from chronoscene.registration.sfm import quiet, verified_matches
-from chronoscene.registration.units import image_pose, known_images, set_pose
 from chronoscene.registration.worker import Report
 
 LEAST_POINTS = 50

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.registration.captures import Capture
+from chronoscene.registration.photo import Capture
 
 HeightKind = Literal["as stated", "relative", "none"]
 

@@ -11,7 +11,8 @@ import numpy as np
 import pycolmap
 
 from chronoscene.registration.mapping import adjust, summary, write_model
-from chronoscene.registration.units import Priors, as_pycolmap, gps_alignment, sorted_ids
+from chronoscene.registration.reconstruction import as_pycolmap, sorted_ids
+from chronoscene.registration.units import Priors, gps_alignment
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from PIL import Image
 
 from chronoscene.files import replacing
 from chronoscene.images import load_rgb
-from chronoscene.registration.captures import Capture
+from chronoscene.registration.photo import Capture
 
 _ORIENTATION = 0x0112
 _PLAIN_MODES = ("RGB", "L")

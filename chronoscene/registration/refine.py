@@ -10,8 +10,8 @@ import numpy as np
 import pycolmap
 
 from chronoscene.registration.mapping import adjust, summary, triangulate, write_model
+from chronoscene.registration.reconstruction import known_images, set_pose
 from chronoscene.registration.sfm import quiet
-from chronoscene.registration.units import known_images, set_pose
 from chronoscene.registration.worker import Report
 
 TIE_COLOR = np.array([255, 255, 255], np.uint8)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from chronoscene.exif import ExifData
 from chronoscene.registration.cameras import LEAST_OF_ITS_OWN, camera_groups
-from chronoscene.registration.captures import Capture
+from chronoscene.registration.photo import Capture
 
 
 def capture(name: str, period: int, *, model: str = "A", focal: float = 24.0) -> Capture:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from chronoscene.exif import ExifData
-from chronoscene.registration.captures import Capture, Gps
 from chronoscene.registration.georeference import Georeference, from_crs, locate
+from chronoscene.registration.photo import Capture, Gps
 
 PLACE = (51.5, 10.25)
 METRES_PER_DEGREE = 111_320.0
