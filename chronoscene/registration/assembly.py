@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from chronoscene.colmap import read_model
 from chronoscene.registration.georeference import Georeference, Positions
 from chronoscene.registration.model import CrossMatches, HeldOutTracks, Registered, Route
 from chronoscene.registration.photo import Capture
-from chronoscene.scene import Camera, Frame
+from chronoscene.scene import Camera, Frame, Points
 
 FEW_FEATURES = 100
 
@@ -41,6 +43,7 @@ class Assembly:
 def assemble(model_folder: Path, held_out: Path, parts: Assembly) -> Registered:
     """Read a model and what was held out; photos without a pose are left to the caller."""
     model = read_model(model_folder)
+    points = without_twins(model.points)
     names = tuple(image.name for image in model.images)
     tracks = read_held_out(held_out, names, parts.periods)
     periods = np.array([parts.periods[name] for name in names], np.int64)
@@ -50,11 +53,11 @@ def assemble(model_folder: Path, held_out: Path, parts: Assembly) -> Registered:
         periods=periods,
         cam_from_world=np.stack([_pose(parts, i.name, i.cam_from_world) for i in model.images]),
         cameras=tuple(_camera(parts, i.name, i.camera) for i in model.images),
-        points=model.points.xyz,
-        colors=model.points.rgb,
-        track_start=model.points.track_start,
-        track_image=model.points.track_frame.astype(np.int64),
-        track_xy=model.points.track_xy,
+        points=points.xyz,
+        colors=points.rgb,
+        track_start=points.track_start,
+        track_image=points.track_frame.astype(np.int64),
+        track_xy=points.track_xy,
         unregistered={},
         unregistered_periods={},
         route=parts.route,
@@ -67,6 +70,36 @@ def assemble(model_folder: Path, held_out: Path, parts: Assembly) -> Registered:
         held_out=cross_matches(tracks, periods),
         held_out_tracks=tracks,
         images_root=str(parts.images_root),
+    )
+
+
+def without_twins(points: Points) -> Points:
+    """Points of which no two are observed at one pixel of one image; the longer track stays.
+
+    SIFT gives a place several keypoints where it has several orientations, and each of them can
+    become a point: the same point twice.
+    """
+    lengths = np.diff(points.track_start)
+    row = np.repeat(np.arange(len(points)), lengths)
+    place = np.column_stack([points.track_frame, points.track_xy])
+    _, pixel = np.unique(place, axis=0, return_inverse=True)
+    count = len(points) + int(pixel.max(initial=-1)) + 1
+    graph = coo_matrix((np.ones(len(row)), (row, len(points) + pixel.ravel())), (count, count))
+    group = connected_components(graph, directed=False)[1][: len(points)]
+    order = np.lexsort((np.arange(len(points)), -lengths, group))
+    first = np.ones(len(points), bool)
+    first[1:] = np.diff(group[order]) != 0
+    keep = np.zeros(len(points), bool)
+    keep[order[first]] = True
+    return replace(
+        points,
+        ids=points.ids[keep],
+        xyz=points.xyz[keep],
+        rgb=points.rgb[keep],
+        error=points.error[keep],
+        track_start=np.concatenate([[0], np.cumsum(lengths[keep])]),
+        track_frame=points.track_frame[keep[row]],
+        track_xy=points.track_xy[keep[row]],
     )
 
 

@@ -118,6 +118,7 @@ def _run_route(route: Route, inputs: Inputs, matched: Matched, context: Context)
         matched.partners,
         result["left"],
     )
+    registered = replace(registered, unplaced=frozenset(result["unplaced"]))
     return _with_lost(registered, lost, inputs)
 
 

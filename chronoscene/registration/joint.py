@@ -50,4 +50,4 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             adjust(model, threads=threads)
         model = complete(model, arguments, remarks, report)
     report("adjusting", 0, 1)
-    return finish(model, arguments, remarks) | {"left": left}
+    return finish(model, arguments, remarks) | {"left": left, "unplaced": []}

@@ -101,6 +101,8 @@ class Registered:
     held_out_tracks: HeldOutTracks
     images_root: str
     """Folder in which ``names`` are found: photos as the cameras above describe them."""
+    unplaced: frozenset[str] = frozenset()
+    """Images of periods that lie in a frame of their own and wait for tie points."""
 
     @property
     def unit(self) -> str:

@@ -46,6 +46,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         "positions_used": [],
         "model": summary(model),
         "left": [],
+        "unplaced": [],
     }
 
 

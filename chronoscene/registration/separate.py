@@ -39,7 +39,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         for i, model in enumerate(models):
             adjust(model, threads=threads)
             label = f"period {period}" + (f" part {i}" if len(models) > 1 else "")
-            units.append(Unit(label, model))
+            units.append(Unit(label, model, period, is_largest=i == 0))
     if not units:
         raise nothing_mapped(len(periods))
     report("aligning", 0, 1)
@@ -59,7 +59,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         adjust(model, threads=threads)
     model = complete(model, arguments, remarks, report)
     left = [list(group) for group in combined.left]
-    return finish(model, arguments, remarks) | {"left": left}
+    unplaced = list(combined.unplaced)
+    return finish(model, arguments, remarks) | {"left": left, "unplaced": unplaced}
 
 
 def complete(

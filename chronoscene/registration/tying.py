@@ -29,7 +29,7 @@ def tie(model: Registered, points: TiePoints, refine: Refine) -> TieAlignment:
     framed = model
     if model.georeference is None and (frame := control_frame(points)) is not None:
         framed = replace(model, georeference=frame, gps_enu=np.full_like(model.gps_enu, np.nan))
-    first = align_with_tie_points(framed, points)
+    first = align_with_tie_points(framed, points, mode="replace" if model.unplaced else "auto")
     if not first.replaced:
         return _unless_placed(first, model)
     adjusted = refine(refine_arguments(first.model, points))

@@ -50,6 +50,10 @@ class Unit:
 
     label: str
     model: pycolmap.Reconstruction
+    period: int | None = None
+    """The period that it is a model of; None where it is of several."""
+    is_largest: bool = True
+    """Whether it is the largest of its period."""
 
     @property
     def size(self) -> int:
@@ -65,6 +69,8 @@ class Combined:
     """Labels of the units in it."""
     left: tuple[tuple[str, ...], ...]
     """Names of the images of each unit that could not be placed."""
+    unplaced: tuple[str, ...]
+    """Names of images that are in the model, but lie in a frame of their own."""
     remarks: tuple[str, ...]
 
 
@@ -83,8 +89,8 @@ def combine(
         matches: Verified matches of all pairs of images, by image ids of the database. [M, 2]
         priors: Positions, where known.
         database: Where all images are known.
-        keep_unplaced: Whether units that cannot be placed come into the model nevertheless, each
-            as it lies in its own frame: somebody else will place them.
+        keep_unplaced: Whether whole periods that cannot be placed come into the model nevertheless,
+            each as it lies in its own frame: tie points will place them.
     """
     remarks: list[str] = []
     links = find_links(units, matches)
@@ -95,17 +101,25 @@ def combine(
     _place_by_gps(units, placed, root, priors, remarks)
     left = [i for i in range(len(units)) if i not in placed]
     remarks += [f"{units[i].label}: {units[i].size} images could not be placed" for i in left]
-    if keep_unplaced:
-        placed |= {i: Sim3.identity() for i in left}
-        remarks += [f"{units[i].label}: kept in a frame of its own, for tie points" for i in left]
-        left = []
+    there = {units[i].period for i in placed}
+    loose = [i for i in left if units[i].is_largest and units[i].period not in there]
+    loose = [i for i in loose if keep_unplaced and units[i].period is not None]
+    placed |= {i: Sim3.identity() for i in loose}
+    remarks += [f"{units[i].label}: kept in a frame of its own, for tie points" for i in loose]
+    left = [i for i in left if i not in loose]
     order = sorted(placed)
     model = merge([units[i].model for i in order], [placed[i] for i in order], database)
-    names = tuple(
-        tuple(sorted(str(units[i].model.images[n].name) for n in units[i].model.reg_image_ids()))
-        for i in left
+    return Combined(
+        model=model,
+        used=tuple(units[i].label for i in order),
+        left=tuple(_names(units[i]) for i in left),
+        unplaced=tuple(name for i in loose for name in _names(units[i])),
+        remarks=tuple(remarks),
     )
-    return Combined(model, tuple(units[i].label for i in order), names, tuple(remarks))
+
+
+def _names(unit: Unit) -> tuple[str, ...]:
+    return tuple(str(unit.model.images[i].name) for i in sorted_ids(unit.model))
 
 
 def _describe(a: Unit, b: Unit, link: Alignment) -> str:

@@ -11,6 +11,9 @@ from chronoscene.geometry import camera_centre
 from chronoscene.registration import frozen, joint, separate
 from chronoscene.registration.errors import RegistrationError
 
+IMAGES = 8
+"""Of each period in the cases."""
+
 MOST_DEGREES = 0.1
 MOST_SHARE = 0.002
 """What is asked of registrations: 0.2% of the extent."""
@@ -120,3 +123,17 @@ def test_nothing_to_map_is_said(make_case: Callable[..., Any]) -> None:
     case = make_case(points=5)
     with pytest.raises(RegistrationError, match="found no two photos"):
         joint.run(case.arguments(), silent)
+
+
+def test_a_period_without_matches_waits_for_tie_points(make_case: Callable[..., Any]) -> None:
+    case = make_case(cross_matches=0.0)
+    case.extra["keep_unplaced"] = True
+    result = separate.run(case.arguments(), silent)
+    assert result["model"]["images"] == len(case.truth)
+    assert result["left"] == []
+    assert {case.periods[name] for name in result["unplaced"]} in ({0}, {1})
+    assert len(result["unplaced"]) == IMAGES
+    for period in (0, 1):
+        degrees, share = case.errors(reference=period)[period]
+        assert degrees < MOST_DEGREES
+        assert share < MOST_SHARE
