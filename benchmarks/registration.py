@@ -122,6 +122,9 @@ def outcome(
     extent = true_extent(made.truth)
     rows = []
     for p in range(1, model.num_periods):
+        if not (model.periods == p).any():
+            rows.append((np.inf,) * 4)
+            continue
         r, c = rotation[model.periods == p], 100 * centre[model.periods == p] / extent
         rows.append((np.median(r), r.max(), np.median(c), c.max()))
     reason = verdict.findings[0].check if verdict.findings else ""

@@ -124,6 +124,13 @@ THRESHOLDS: dict[str, Threshold] = {
             "if the GPS can be believed, " + _CLICK,
         ),
         Threshold(
+            "gps_residual", "residual of a period's cameras to its own GPS, median", "m",
+            12.0, None, False,
+            "receivers are off by 3 to 8 m, so more means that part of the poses is wrong, or that "
+            "the sky was hidden",
+            "look at the map in the report; register the period alone and see which photos bend it",
+        ),
+        Threshold(
             "gps_scale", "scale of a period against its own GPS, beyond its spread", "%",
             2.0, 10.0, False,
             "GPS errs in place, hardly in scale",
@@ -229,6 +236,7 @@ def _of_period(p: PeriodFigures) -> Iterator[Finding]:
     yield from _check("images", p.registered, place)
     if isinstance(p.gps, GpsFit):
         gps = p.gps
+        yield from _check("gps_residual", gps.median, place)
         if gps.scale is not None and gps.scale_error is not None:
             beyond = abs(gps.scale - 1) - 3 * gps.scale_error
             yield from _check("gps_scale", 100 * beyond, place)

@@ -309,3 +309,14 @@ def test_the_documented_thresholds_are_those_of_the_code() -> None:
         unit = f" {t.unit}" if t.unit else ""
         fail = f"{sign} {t.fail:g}{unit}" if t.fail is not None else "-"
         assert f"| {t.what} | {sign} {t.doubtful:g}{unit} | {fail} | {t.why} |" in text
+
+
+def test_a_period_far_from_its_own_gps_is_doubtful(good: Registered) -> None:
+    """Half of a period stands elsewhere: its GPS is the witness."""
+    gps = good.gps_enu.copy()
+    half = np.flatnonzero(good.periods == 1)[::2]
+    gps[half] += np.array([60.0, -50.0, 0.0])
+    gps[half[::2]] += np.array([-150.0, 90.0, 0.0])
+    verdict = judge(certify(replace(good, gps_enu=gps)))
+    assert verdict.level != "pass"
+    assert any(f.check == "gps_residual" and f.place == "period 2017" for f in verdict.findings)
