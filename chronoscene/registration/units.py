@@ -26,6 +26,9 @@ from chronoscene.registration.alignment import (
 )
 from chronoscene.registration.reconstruction import image_pose, merge, sorted_ids
 
+LEAST_POSITIONS = 6
+"""Positions that agree in a unit that is placed by GPS alone: three fit whatever they are."""
+
 LEAST_PAIRS = 12
 """Pairs of points below which no alignment is tried."""
 
@@ -245,12 +248,12 @@ def _place_by_gps(
     if not missing or not priors.enu:
         return
     base = gps_alignment(units[root].model, priors)
-    if base is None or not base.is_useful:
+    if base is None or not _places_alone(base):
         remarks.append(f"{units[root].label}: its GPS does not fix a frame")
         return
     for i in missing:
         found = gps_alignment(units[i].model, priors)
-        if found is None or not found.is_useful:
+        if found is None or not _places_alone(found):
             remarks.append(f"{units[i].label}: its GPS does not fix a frame")
             continue
         placed[i] = chain(base.enu_from_model.inverse(), found.enu_from_model)
@@ -258,6 +261,10 @@ def _place_by_gps(
             f"{units[i].label}: no matches with the others hold; placed by GPS alone, whose rms "
             f"residual is {found.rms:.2f} m"
         )
+
+
+def _places_alone(found: GpsAlignment) -> bool:
+    return found.is_useful and int(found.inliers.sum()) >= LEAST_POSITIONS
 
 
 def gps_alignment(model: pycolmap.Reconstruction, priors: Priors) -> GpsAlignment | None:
