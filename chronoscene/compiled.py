@@ -33,7 +33,7 @@ def kept_on_disk(function: Callable[..., Any], sources: Iterable[Path] = (), **o
     if hasattr(index, "_source_stamp") and hasattr(index, "_load_index"):
         paths = tuple(sources)
         if paths:
-            index._source_stamp = _stamp(paths)
+            index._source_stamp = source_stamp(paths)
         index._load_index = _forgiving(index._load_index)
     return dispatcher
 
@@ -58,6 +58,6 @@ def _forgiving(load: Callable[[], dict[Any, Any]]) -> Callable[[], dict[Any, Any
 
 
 @cache
-def _stamp(sources: tuple[Path, ...]) -> str:
+def source_stamp(sources: tuple[Path, ...]) -> str:
     """Changes with any of the files."""
     return sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()

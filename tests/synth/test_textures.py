@@ -164,6 +164,7 @@ def test_a_changed_texture_is_compiled_again() -> None:
     """The cache of a kernel knows all sources, so that no stale texture is drawn."""
     from pathlib import Path
 
+    from chronoscene.compiled import source_stamp
     from chronoscene.synth import compiled, shade
 
     folder = Path(compiled.__file__).parent
@@ -171,4 +172,5 @@ def test_a_changed_texture_is_compiled_again() -> None:
     for path in folder.glob("*.py"):
         if "synth.compiled import" in path.read_text():
             assert path.stem in listed, f"{path.name} is missing in NAMES"
-    assert shade.shade._cache._cache_file._source_stamp == compiled._stamp()
+    stamp = shade.shade._cache._cache_file._source_stamp
+    assert stamp == source_stamp(tuple(folder / f"{name}.py" for name in compiled.NAMES.split()))
