@@ -21,6 +21,10 @@ from chronoscene.registration.worker import Report
 DEFAULTS = Options()
 
 
+FAILED = 1
+"""Exit status when something contradicts the registration."""
+
+
 @click.command("register")
 @click.argument("captures", type=click.Path(path_type=Path))
 @click.argument("out", type=click.Path(path_type=Path))
@@ -99,7 +103,9 @@ DEFAULTS = Options()
 @click.option(
     "--report", "page", is_flag=True, help="Write registration.html, for looking at the result."
 )
+@click.pass_context
 def command(
+    context: click.Context,
     captures: Path,
     out: Path,
     table: Path | None,
@@ -122,6 +128,9 @@ def command(
     CAPTURES is a folder with one folder of photos for each period; or a folder of photos, whose
     periods are proposed from their dates; or a CSV of image and period. A run that was stopped goes
     on where it was when the command is given again.
+
+    Exit status: 0 unless the verdict is fail, 1 if it is (the scene is written), 2 if the photos
+    cannot be registered, or wrong usage.
     """
     for place in (out, work) if work is not None else (out,):
         check_outside(captures if captures.is_dir() else captures.parent, place)
@@ -151,6 +160,8 @@ def command(
                 old, found, out, options, report=report, inspected=inspections.append
             )
     emit(summary(registered, out) + "".join(i.summary for i in inspections), None)
+    if any(i.verdict.level == "fail" for i in inspections):
+        context.exit(FAILED)
 
 
 @contextmanager

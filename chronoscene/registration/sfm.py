@@ -120,9 +120,17 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
 
 def _unmatched(database: str, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Pairs without a geometry. Matches of such a pair are what a killed run left: COLMAP would
+    verify them and then fail to store them a second time, so they are dropped."""
+    left = []
     with pycolmap.Database.open(database) as opened:
         ids = {str(image.name): image.image_id for image in opened.read_all_images()}
-        return [(a, b) for a, b in pairs if not opened.exists_two_view_geometry(ids[a], ids[b])]
+        for a, b in pairs:
+            if not opened.exists_two_view_geometry(ids[a], ids[b]):
+                if opened.exists_matches(ids[a], ids[b]):
+                    opened.delete_matches(ids[a], ids[b])
+                left.append((a, b))
+    return left
 
 
 def read_pairs(path: Path) -> list[tuple[str, str]]:
