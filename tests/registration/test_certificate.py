@@ -320,3 +320,10 @@ def test_a_period_far_from_its_own_gps_is_doubtful(good: Registered) -> None:
     verdict = judge(certify(replace(good, gps_enu=gps)))
     assert verdict.level != "pass"
     assert any(f.check == "gps_residual" and f.place == "period 2017" for f in verdict.findings)
+
+
+def test_one_period_is_not_praised_for_an_alignment() -> None:
+    made = generate_case(CaseSettings(ties=0, seed=34, periods=1))
+    verdict = judge(certify(made.model))
+    assert verdict.level != "fail"
+    assert "of each other" not in verdict.text
