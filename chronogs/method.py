@@ -48,12 +48,13 @@ class ChronoGS(AnchorMethod):
 
     def after_update(self) -> AfterUpdate | None:
         weight = self.config.period_sharing
-        if not weight or self.model.layout.num_periods == 1:
+        if not weight or self.num_periods == 1:
             return None
         return lambda model, rates: share_periods(model, rates["features"] * weight)
 
     def stored_tensors(self) -> dict[str, Tensor]:
-        return pack_features(self.model.tensors(), self.model.layout)
+        model = self.model
+        return pack_features(model.tensors(), model.layout)
 
     def restored_tensors(
         self, stored: dict[str, Tensor], layout: AnchorLayout
@@ -61,7 +62,7 @@ class ChronoGS(AnchorMethod):
         return unpack_features(stored, layout)
 
     def weights(self, period: float) -> NDArray[np.float32]:
-        return period_weights(period, self.model.layout.num_periods)
+        return period_weights(period, self.num_periods)
 
     def render_split(
         self, view: View, *, geometry_period: float, appearance_period: float

@@ -76,6 +76,12 @@ class AnchorMethod:
         assert self._model is not None, "setup or load comes first"
         return self._model if self._trainer is None else self._trainer.snapshot()
 
+    @property
+    def num_periods(self) -> int:
+        """Of the model; asks for no tensors, which `model` brings up to date at every use."""
+        assert self._model is not None, "setup or load comes first"
+        return self._model.layout.num_periods
+
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
         """Build anchors, MLPs and optimiser from a training set."""
         config = self.config
@@ -145,10 +151,10 @@ class AnchorMethod:
         geometry: NDArray[np.float32],
         appearance: NDArray[np.float32] | None = None,
     ) -> Prediction:
-        device = self.model.device
-        colors = None if appearance is None else torch.from_numpy(appearance).to(device)
-        weights = torch.from_numpy(geometry).to(device)
-        return _prediction(draw_model(self.model, view, self._background, weights, colors))
+        model = self.model
+        colors = None if appearance is None else torch.from_numpy(appearance).to(model.device)
+        weights = torch.from_numpy(geometry).to(model.device)
+        return _prediction(draw_model(model, view, self._background, weights, colors))
 
     def save(self, folder: Path) -> None:
         """Write the model; the optimiser's state is not kept."""
@@ -176,8 +182,8 @@ class AnchorMethod:
 
     def size(self) -> MethodSize:
         """Anchors, and all stored numbers."""
-        tensors = self.stored_tensors().values()
-        return MethodSize(len(self.model), sum(tensor.numel() for tensor in tensors))
+        tensors = self.stored_tensors()
+        return MethodSize(len(tensors["anchors"]), sum(t.numel() for t in tensors.values()))
 
 
 def _prediction(raster: Rasterization) -> Prediction:
