@@ -1,4 +1,4 @@
-"""COLMAP models to and from numpy. The only module that imports pycolmap.
+"""COLMAP models to and from numpy.
 
 pycolmap is the authority on cameras and poses (text and binary, models with and without rigs and
 frames). Points and observations come from the binary records (`chronoscene.colmap_records`) and are
@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.colmap_arrays import RawPoints
 from chronoscene.colmap_records import (
     ImageRecord,

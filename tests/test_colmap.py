@@ -2,6 +2,7 @@
 
 import random
 import shutil
+import signal
 import struct
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.colmap import (
     from_pycolmap,
     model_kind,
@@ -22,8 +24,6 @@ from chronoscene.colmap_records import CAMERA_PARAMETERS, read_images, read_poin
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Points
-
-import pycolmap  # isort: skip
 
 
 @pytest.mark.parametrize("last", ["zlib.compress(b'x' * 1000)", "numpy.savez_compressed(f, a=[1])"])
@@ -39,6 +39,18 @@ def test_the_package_alone_makes_pycolmap_safe():
     code = "import chronoscene, pycolmap, zlib; zlib.compress(b'x' * 1000); print('alive')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "alive\n"), done.stderr
+
+
+@pytest.mark.parametrize("handler", ["lambda *_: sys.exit(7)", "signal.SIG_DFL"])
+def test_pycolmap_leaves_the_termination_signal_alone(handler):
+    """Its own handler would print a stack trace and keep ours from cleaning up."""
+    code = (
+        f"import signal, sys; signal.signal(signal.SIGTERM, {handler})\n"
+        "import chronoscene.colmap; signal.raise_signal(signal.SIGTERM)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == (-signal.SIGTERM if "SIG_DFL" in handler else 7)
+    assert done.stderr == ""
 
 
 def test_camera_models_of_this_pycolmap():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.colmap import from_pycolmap, to_pycolmap
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import chronoscene as our_format
@@ -14,8 +15,6 @@ from chronoscene.scene import Camera, Period, WorldFrame
 from chronoscene.splits import split_hash
 from chronoscene.undistort import undistort, undistort_pixels
 from chronoscene.undistort_cameras import CameraChange, move_pixels, pinhole_camera
-
-import pycolmap  # isort: skip
 
 SIZE = (256, 192)
 F, CX, CY = 210.0, 120.5, 101.25

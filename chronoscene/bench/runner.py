@@ -289,18 +289,13 @@ def stoppable() -> Iterator[None]:
     try:
         yield
     finally:
-        # None stands for a handler that some library installed; it would print a stack trace.
-        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+        signal.signal(signal.SIGTERM, before)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a worker; it has a moment to obey."""
-    process.terminate()
-    try:
-        process.wait(timeout=5)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    """End a worker. It has nothing to clean up; a library's handler might take its time."""
+    process.kill()
+    process.wait()
 
 
 def _write_crash(job: Job, staging: Path, status: int) -> None:

@@ -6,7 +6,6 @@ The process makes a crash harmless to the other runs and its peak memory that of
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import time
 import traceback
@@ -252,7 +251,6 @@ def main(arguments: list[str]) -> int:
     job = read_job(Path(arguments[0]))
     parent = int(arguments[1]) if len(arguments) > 1 else None
     staging = Path(job.staging)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # pycolmap's handler prints a stack trace
     if job.plugin_path is not None:
         sys.path.append(job.plugin_path)
     try:

@@ -65,6 +65,8 @@ class Context:
     stages: Stages
     options: Options
     report: Report | None
+    lock: int
+    """File descriptor that keeps others out of the work folder."""
 
     @property
     def threads(self) -> int:
@@ -91,7 +93,8 @@ class Context:
 
     def step(self, step: str, arguments: Mapping[str, Any]) -> Any:
         """Run a step in a process of its own; see `run_step`."""
-        return run_step(step, arguments, log=self.work / "log.txt", report=self.report)
+        log = self.work / "log.txt"
+        return run_step(step, arguments, log=log, report=self.report, inherited=(self.lock,))
 
     def places(self, name: str) -> dict[str, Any]:
         """Where a step that estimates finds and leaves things."""

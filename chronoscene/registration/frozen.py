@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.mapping import (
     adjust,

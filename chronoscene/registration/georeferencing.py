@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.registration.mapping import adjust, summary, write_model
 from chronoscene.registration.reconstruction import as_pycolmap, sorted_ids
 from chronoscene.registration.units import Priors, gps_alignment

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.files import replacing
 from chronoscene.registration.sfm import keypoints_of, quiet, verified_matches
 from chronoscene.registration.worker import Report

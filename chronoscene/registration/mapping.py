@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.sfm import SEED
 from chronoscene.registration.units import Priors

@@ -98,8 +98,8 @@ def _run(
     points = None
     if options.tie_points is not None:
         points = read_tie_points(options.tie_points, scale=options.tie_scale)
-    with work_folder(work):
-        context = Context(work, Stages(work), options, report)
+    with work_folder(work) as lock:
+        context = Context(work, Stages(work), options, report, lock)
         inputs = gather(captures, scene, context)
         matched = find_matches(inputs, context)
         registered, ties = _tie(estimate(inputs, matched, context), points, inputs, context)

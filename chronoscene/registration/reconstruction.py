@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.geometry import Sim3, pose_from_rotation_translation
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.registration.mapping import adjust, summary, triangulate, write_model
 from chronoscene.registration.reconstruction import known_images, set_pose
 from chronoscene.registration.sfm import quiet

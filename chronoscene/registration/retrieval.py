@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
+
+from chronoscene._pycolmap import pycolmap
 
 WORDS = 64
 TRAINING_DESCRIPTORS = 20_000

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-
+from chronoscene._pycolmap import pycolmap
 from chronoscene.registration.georeferencing import finish
 from chronoscene.registration.mapping import (
     adjust,

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.files import write_text_atomic
 from chronoscene.registration.worker import Report
 

@@ -24,6 +24,9 @@ from chronoscene.registration.errors import RegistrationError
 VERSION = 1
 """Of what stages store; another version is not read."""
 
+PATIENCE = 5.0
+"""Seconds; a step notices within one second that its command was killed."""
+
 
 def fingerprint(*parts: Any) -> str:
     """SHA-256 of what JSON can hold."""
@@ -96,21 +99,38 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 @contextmanager
-def work_folder(path: Path) -> Iterator[Path]:
+def work_folder(path: Path, patience: float = PATIENCE) -> Iterator[int]:
     """Create a work folder and keep others out of it while the block runs.
+
+    Args:
+        path: The folder.
+        patience: Seconds to wait for another process to leave it.
+
+    Yields:
+        A file descriptor. A process that inherits it keeps others out as well: steps do, so that
+        what a killed command was doing ends before the next command begins.
 
     Raises:
         RegistrationError: If another process works in it.
     """
     path.mkdir(parents=True, exist_ok=True)
     with (path / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RegistrationError(
-                path,
-                expected="a work folder that nobody uses",
-                found="another registration in it",
-                todo="wait for it to end, or choose another folder (--work)",
-            ) from error
-        yield path
+        end = time.monotonic() + patience
+        while not _locked(lock.fileno()):
+            if time.monotonic() > end:
+                raise RegistrationError(
+                    path,
+                    expected="a work folder that nobody uses",
+                    found="another registration in it",
+                    todo="wait for it to end, or choose another folder (--work)",
+                )
+            time.sleep(0.1)
+        yield lock.fileno()
+
+
+def _locked(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from chronoscene._pycolmap import pycolmap
 from chronoscene.geometry import Sim3
 from chronoscene.registration.alignment import (
     Alignment,

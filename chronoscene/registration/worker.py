@@ -15,7 +15,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,12 @@ LOG_LINES = 4
 
 
 def run_step(
-    step: str, arguments: Mapping[str, Any], *, log: Path, report: Report | None = None
+    step: str,
+    arguments: Mapping[str, Any],
+    *,
+    log: Path,
+    report: Report | None = None,
+    inherited: Sequence[int] = (),
 ) -> Any:
     """Run a step in a process of its own and return its result.
 
@@ -53,6 +58,7 @@ def run_step(
         arguments: What JSON can hold.
         log: File to which the step's own output is appended.
         report: Called with its progress.
+        inherited: File descriptors that stay open in the process.
 
     Raises:
         RegistrationError: If the process dies.
@@ -61,7 +67,12 @@ def run_step(
     command = [sys.executable, "-m", "chronoscene.registration.worker", STEPS[step]]
     with log.open("ab") as errors:
         process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            pass_fds=inherited,
         )
         try:
             assert process.stdin is not None

@@ -10,11 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 import chronoscene  # noqa: F401  (loads zlib before pycolmap)
+from chronoscene._pycolmap import pycolmap
 from chronoscene.colmap import read_model
 from chronoscene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.validation.alignment import fit
-
-import pycolmap  # isort: skip
 
 Array = NDArray[np.float64]
 

@@ -2,19 +2,14 @@
 
 import json
 import shutil
-import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
-from chronoscene.cli.register import command
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
 from chronoscene.geometry import camera_centre
@@ -32,6 +27,9 @@ SETTINGS = SynthSettings(
 )
 
 OPTIONS = Options(threads=1, max_features=3000)
+
+SAME = ("--threads", "1", "--max-features", "3000")
+"""The same for the command line."""
 
 COMMAND = "from chronoscene.cli import main; main()"
 
@@ -190,43 +188,59 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
     assert not [f for f in validate_scene(out).findings if f.severity == "error"]
 
 
+def started(arguments: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", COMMAND, "register", *arguments, *SAME],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def check_finished(out: Path, uninterrupted: Path) -> set[str]:
+    """The stages that were not done again; the model is that of an uninterrupted run."""
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        path = Path("sparse/0") / name
+        assert (out / path).read_bytes() == (uninterrupted / path).read_bytes()
+    stages = json.loads((out / "registration_log.json").read_text())["stages"]
+    return {s["stage"] for s in stages if s["from_an_earlier_run"]}
+
+
 def test_a_killed_command_goes_on(
     joint: tuple[Path, Registered], captures: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    arguments = [str(captures), str(out), "--threads", "1", "--max-features", "3000"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", COMMAND, "register", *arguments],
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = started([str(captures), str(out)])
     assert process.stderr is not None
-    for line in process.stderr:
-        if line.startswith("pairs"):
-            break
-    process.send_signal(signal.SIGKILL)
+    assert any(line.startswith("pairs") for line in process.stderr)
+    process.kill()
     process.wait()
     assert not out.exists()
-    result = until_free(lambda: CliRunner().invoke(command, arguments))
-    assert "photos registered" in result
-    stages = json.loads((out / "registration_log.json").read_text())["stages"]
-    resumed = {s["stage"] for s in stages if s["from_an_earlier_run"]}
-    assert {"features", "pairs"} <= resumed
-    for name in ("cameras.bin", "images.bin", "points3D.bin"):
-        path = Path("sparse/0") / name
-        assert (out / path).read_bytes() == (joint[0] / path).read_bytes()
+    again = started([str(captures), str(out)])
+    assert again.wait() == 0, again.stderr and again.stderr.read()
+    assert {"features", "pairs"} <= check_finished(out, joint[0])
 
 
-def until_free(invoke: Callable[[], object]) -> str:
-    """Repeat while the work folder of the killed process is still held by its child."""
-    for _ in range(100):
-        result = invoke()
-        error = getattr(result, "exception", None)
-        if not isinstance(error, RegistrationError) or "nobody uses" not in str(error):
-            assert error is None
-            return str(getattr(result, "output", ""))
-        time.sleep(0.1)
-    raise AssertionError("the work folder was never free")
+@pytest.mark.slow
+def test_a_command_killed_again_and_again_ends_as_if_nothing_had_been(
+    joint: tuple[Path, Registered], captures: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    random = np.random.default_rng(0)
+    kills = 0
+    while True:
+        process = started([str(captures), str(out)])
+        try:
+            # The time grows, or a stage that takes longer would never end.
+            _, errors = process.communicate(timeout=random.uniform(0.5, 1.0) * 1.15**kills)
+            break
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+            kills += 1
+    assert process.returncode == 0, errors
+    assert kills >= 10
+    check_finished(out, joint[0])
 
 
 def test_a_place_in_use_is_refused(captures: Path, tmp_path: Path) -> None:

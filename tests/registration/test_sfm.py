@@ -6,9 +6,8 @@ from itertools import combinations
 from pathlib import Path
 
 import chronoscene.colmap  # noqa: F401  # loads pycolmap safely
+from chronoscene._pycolmap import pycolmap
 from chronoscene.registration import sfm
-
-import pycolmap  # isort: skip
 
 
 def test_matches_that_a_killed_run_left_are_dropped(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_two_runs_do_not_share_a_work_folder(tmp_path: Path) -> None:
     with (
         work_folder(tmp_path / "work"),
         pytest.raises(RegistrationError, match="another registration in it"),
-        work_folder(tmp_path / "work"),
+        work_folder(tmp_path / "work", patience=0.2),
     ):
         pass
     with work_folder(tmp_path / "work"):
