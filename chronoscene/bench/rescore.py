@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,8 +34,15 @@ class Rescored:
     """Why the run could not be scored; it is left as it was."""
 
 
-def rescore(runs: Path, scorers: Scorers) -> list[Rescored]:
+def rescore(
+    runs: Path, scorers: Scorers, *, progress: Callable[[int, int], None] | None = None
+) -> list[Rescored]:
     """Score every finished run below a folder again and write what changed.
+
+    Args:
+        runs: Folder that bench wrote.
+        scorers: The metrics.
+        progress: Called with the runs done and their total, before each run.
 
     Raises:
         CheckpointError: If there is no finished run.
@@ -44,7 +52,11 @@ def rescore(runs: Path, scorers: Scorers) -> list[Rescored]:
         raise CheckpointError(
             runs, expected="a folder of runs", found="no finished run in it", todo="run bench first"
         )
-    outcomes = [_rescore_one(runs, folder, scorers) for folder in folders]
+    outcomes: list[Rescored] = []
+    for folder in folders:
+        if progress is not None:
+            progress(len(outcomes), len(folders))
+        outcomes.append(_rescore_one(runs, folder, scorers))
     write_summary(runs)
     return outcomes
 

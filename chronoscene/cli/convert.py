@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
 
 from chronoscene.cli.output import emit
-from chronoscene.cli.progress import image_bar
+from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import convert
 from chronoscene.formats import format_names, load_format, writable_formats
 from chronoscene.formats.writing import ImageSource
@@ -59,7 +60,7 @@ def command(
     SRC is left alone; OUT appears complete or not at all. What gets lost on the way is said.
     DATASET.md describes the formats.
     """
-    with image_bar("images") as progress:
+    with progress_bar() as bar:
         done = convert(
             source,
             out,
@@ -67,7 +68,7 @@ def command(
             target=target,
             period_by=period_by,
             image_source=LINKS[link],
-            progress=progress,
+            progress=partial(bar, "images"),
         )
     scene = done.scene
     lines = [f"{out}: {target} from {scene.format}, {describe(scene)}"]

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
 
 from chronoscene.cli.output import emit
+from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.formats import read_scene
 from chronoscene.registration.captures import read_captures
 from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.model import ROUTES, Registered, Route
 from chronoscene.registration.pipeline import Options, run, run_into
-from chronoscene.registration.worker import Report
 
 DEFAULTS = Options()
 
@@ -150,7 +147,7 @@ def command(
         page=page,
     )
     inspections: list[Inspection] = []
-    with step_bar() as report:
+    with progress_bar(log=True) as report:
         if scene is None:
             registered = run(found, out, options, report=report, inspected=inspections.append)
         else:
@@ -162,41 +159,6 @@ def command(
     emit(summary(registered, out) + "".join(i.summary for i in inspections), None)
     if any(i.verdict.level == "fail" for i in inspections):
         context.exit(FAILED)
-
-
-@contextmanager
-def step_bar() -> Iterator[Report]:
-    """A function that takes what is being done, how much, and of how much; a bar on a terminal."""
-    if not sys.stderr.isatty():
-        yield _print_steps()
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda what, done, total: bar.update(
-            task, description=what, completed=done, total=total
-        )
-
-
-def _print_steps() -> Report:
-    """For logs: one line whenever something new begins."""
-    last = ""
-
-    def report(what: str, done: int, total: int) -> None:
-        nonlocal last
-        if what != last:
-            click.echo(f"{what} ({total})", err=True)
-            last = what
-
-    return report
 
 
 def summary(registered: Registered, out: Path) -> str:

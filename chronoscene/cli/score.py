@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
 
 from chronoscene.bench.rescore import rescore
+from chronoscene.cli.progress import progress_bar
 from chronoscene.metrics.scorers import make_scorers
 
 SOME_FAILED = 1
@@ -26,7 +28,8 @@ def command(runs: Path, lpips_weights: Path | None) -> None:
     Only the images of each run and the frozen ground truth are read; their hashes are checked.
     """
     scorers = make_scorers(lpips_weights=lpips_weights)
-    outcomes = rescore(runs, scorers)
+    with progress_bar() as bar:
+        outcomes = rescore(runs, scorers, progress=partial(bar, "runs"))
     for outcome in outcomes:
         name = outcome.folder.relative_to(runs)
         if outcome.error is not None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import click
 
 from chronoscene.cli.convert import describe_period
 from chronoscene.cli.output import emit
-from chronoscene.cli.progress import image_bar
+from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.errors import ConfigError
 from chronoscene.files import write_text_atomic
@@ -99,8 +100,8 @@ def command(
     for frame in split.scene.frames:
         our_format.check_writable_name(source, frame)
     if scene_out is not None:
-        with image_bar("images") as progress:
-            our_format.write(split.scene, scene_out, image_source="link", progress=progress)
+        with progress_bar() as bar:
+            our_format.write(split.scene, scene_out, image_source="link", progress=partial(bar, "images"))
         _write(split, scene_out / our_format.TEST)
     if out is not None:
         _write(split, out)

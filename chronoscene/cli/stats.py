@@ -11,6 +11,7 @@ from typing import Literal
 import click
 
 from chronoscene.cli.output import emit
+from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
 from chronoscene.formats import find_scenes, format_names, read_scene
 from chronoscene.parallel import map_parallel
@@ -117,7 +118,8 @@ def command(
     paths = [p for f in folders for p in find_scenes(f, format=request.dataset_format)]
     _check_places(request, paths)
     items = list(zip(paths, _file_names(paths), strict=True))
-    results = list(map_parallel(partial(examine, request), items))
+    work = map_parallel(partial(examine, request), items)
+    results = list(tracked(work, "scenes", total=len(items)))
     counts = [r if isinstance(r, SceneCount) else r.counts for r in results]
     full = [r for r in results if isinstance(r, SceneStatistics)]
     text = WRITERS[output_format](counts) if not full else DETAIL_WRITERS[output_format](full)

@@ -8,15 +8,8 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
+from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.synth import PRESETS, SynthSettings, generate, preset
 from chronoscene.synth.settings import KINDS
@@ -38,6 +31,7 @@ SKELETON = "skeleton"
 @click.option("--views", type=int, help="Mean number of images per period.")
 @click.option("--points", type=int, help="Number of sparse points to aim for.")
 @click.option("--noise", type=float, help="Noise of observed point positions in pixels.")
+@click.option("--rebuilt", type=float, help="Share of the blocks that are torn down and rebuilt.")
 @click.option("--off-centre/--centred", "off_centre", default=None,
               help="Principal point away from the image centre, or in it.")  # fmt: skip
 def command(
@@ -61,7 +55,8 @@ def command(
     if scenes:
         raise _not_together(f"--preset {name}", "--scene")
     settings = preset(name, **given)
-    _generate_with_bar(out, settings)
+    with progress_bar() as bar:
+        generate(out, settings, lambda done, total, what: bar(what, done, total))
     console = Console(stderr=True, soft_wrap=True)
     console.print(f"{out}: {settings.periods} periods, seed {settings.seed}", highlight=False)
 
@@ -72,15 +67,13 @@ def _write_skeletons(out: Path, scenes: tuple[str, ...], given: dict[str, Any]) 
     if unused := sorted(given.keys() - {"seed", "width", "height"}):
         raise _not_together(f"--preset {SKELETON}", f"--{unused[0].replace('_', '-')}")
     size = (given.get("width", 64), given.get("height", 48))
-    columns = (TextColumn("{task.description:<13}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("skeleton", total=None)
-
-        def advance(done: int, total: int, what: str) -> None:
-            bar.update(task, completed=done, total=total, description=what)
-
+    with progress_bar() as bar:
         write_dataset(
-            out, scenes=scenes or None, seed=given.get("seed", 0), size=size, progress=advance
+            out,
+            scenes=scenes or None,
+            seed=given.get("seed", 0),
+            size=size,
+            progress=lambda done, total, what: bar(what, done, total),
         )
 
 
@@ -105,23 +98,3 @@ def parse_size(text: str) -> tuple[int, int]:
             todo="give two numbers with an x between them",
         )
     return int(match[1]), int(match[2])
-
-
-def _generate_with_bar(out: Path, settings: SynthSettings) -> None:
-    columns = (
-        TextColumn("{task.description:<13}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("city", total=None, rate="")
-
-        def advance(done: int, total: int, what: str) -> None:
-            speed = bar.tasks[0].speed
-            rate = f"{speed:.1f}/s" if speed else ""
-            bar.update(task, completed=done, total=total, description=what, rate=rate)
-
-        generate(out, settings, advance)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
 
 from chronoscene.cli.convert import describe
 from chronoscene.cli.output import emit
-from chronoscene.cli.progress import image_bar
+from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.formats import format_names, read_scene
 from chronoscene.splits import split_hash
@@ -44,8 +45,8 @@ def command(
     """
     check_outside(source, out)
     scene = read_scene(source, format=scene_format)
-    with image_bar("images") as progress:
-        done = undistort(scene, out, center=center, threads=threads, progress=progress)
+    with progress_bar() as bar:
+        done = undistort(scene, out, center=center, threads=threads, progress=partial(bar, "images"))
     emit(report(done), None)
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Iterator, Sequence, Sized
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import click
 
 from chronoscene.cli.output import emit
+from chronoscene.cli.progress import tracked
 from chronoscene.parallel import map_parallel
 from chronoscene.validation.finding import counted, printable
 from chronoscene.validation.fix import fix_scene
@@ -27,8 +26,6 @@ WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html":
 
 NOT_VALID = 1
 """Exit status when there are errors."""
-
-T = TypeVar("T")
 
 
 @click.command("validate")
@@ -87,10 +84,10 @@ def command(
     if fix is not None:
         folders = _fix(folder, folders, fix)
     if len(folders) == 1:
-        reports = [check(folders[0], track=_progress)]
+        reports = [check(folders[0], track=tracked)]
     else:
         done = map_parallel(check, folders)
-        reports = list(_progress(done, "validate scenes", total=len(folders)))
+        reports = list(tracked(done, "validate scenes", total=len(folders)))
     emit(WRITERS[output_format](reports, strict=strict), out)
     for file, write in ((sarif, write_sarif), (html, write_html)):
         if file is not None:
@@ -129,17 +126,3 @@ def _fix(folder: Path, scenes: Sequence[Path], out: Path) -> list[Path]:
 def _codes(values: Iterable[str]) -> list[str]:
     """Options may be repeated, and each may have several codes with commas."""
     return [code for value in values for code in value.split(",")]
-
-
-def _progress(items: Iterable[T], description: str, *, total: int | None = None) -> Iterator[T]:
-    """A bar on stderr with rate and remaining time, on a terminal only."""
-    if total is None:
-        total = len(items) if isinstance(items, Sized) else None
-    if not sys.stderr.isatty() or not total:
-        yield from items
-        return
-    from rich.console import Console
-    from rich.progress import track
-
-    console = Console(stderr=True)
-    yield from track(items, description, total=total, console=console, transient=True)

@@ -48,6 +48,10 @@ def make_plan(settings: SynthSettings) -> Plan:
     return Plan(*edges)
 
 
+REBUILT = ("houses", "slabs", "tower", "park")
+"""What may stand on a block after all of it was torn down."""
+
+
 def make_world(settings: SynthSettings) -> World:
     """Build all objects of all periods."""
     plan = make_plan(settings)
@@ -59,13 +63,28 @@ def make_world(settings: SynthSettings) -> World:
     for (column, row), role in _roles(settings).items():
         name = f"block_{column}{row}"
         rect = plan.rect(column, row)
-        fill.FILLERS[role](world, name, rect)
+        _fill(world, settings, name, rect, role)
         if role != "suburb":
             x, y = rect.center
             world.focus.append(np.array([x, y, 3.0]))
             curb_side(world, name, rect, ROAD)
     surroundings(world, plan.x, plan.y)
     return world
+
+
+def _fill(world: World, settings: SynthSettings, name: str, rect: Rect, role: str) -> None:
+    """Build on a block; at one date it may be torn down, and something else be built."""
+    build = fill.FILLERS[role]
+    rng = rng_for(settings.seed, name, "rebuilt")
+    if world.periods == 1 or rng.random() >= settings.rebuilt:
+        build(world, name, rect)
+        return
+    date = int(rng.integers(1, world.periods))
+    with world.during(range(date)):
+        build(world, name, rect)
+    other = role if role == "suburb" else str(rng.choice(sorted({*REBUILT} - {role})))
+    with world.during(range(date, world.periods)):
+        fill.FILLERS[other](world, f"{name}_rebuilt", rect)
 
 
 def _roles(settings: SynthSettings) -> dict[tuple[int, int], str]:

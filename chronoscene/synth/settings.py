@@ -39,6 +39,9 @@ class SynthSettings:
     """Mean edge of a block."""
     supersample: int = 2
     """Rays per pixel and axis."""
+    rebuilt: float = 0.0
+    """Share of the blocks that are torn down and rebuilt as something else at one date, beside the
+    changes that every scene has. With 1 little more than the streets stays."""
     probe_spacing: float = 3.0
     """Grid step of the samples of indirect light."""
     noise: float = 0.0
@@ -69,6 +72,7 @@ _RANGES: tuple[tuple[str, float, float], ...] = (
     ("supersample", 1, 8),
     ("probe_spacing", 0.5, 50.0),
     ("noise", 0.0, 100.0),
+    ("rebuilt", 0.0, 1.0),
 )
 
 PRESETS: dict[str, SynthSettings] = {

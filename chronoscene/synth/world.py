@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -68,6 +69,8 @@ class World:
     """Places that cameras look at. [3] each"""
     elements: list[Element] = field(default_factory=list)
     edits: list[Edit] = field(default_factory=list)
+    lifetime: frozenset[int] | None = None
+    """Periods in which what is being added exists; None for all. See `during`."""
 
     @property
     def periods(self) -> int:
@@ -77,6 +80,15 @@ class World:
     def names(self) -> list[str]:
         """Names of the objects in the order of their identity numbers."""
         return list(dict.fromkeys(e.name for e in self.elements))
+
+    @contextmanager
+    def during(self, periods: Sequence[int]) -> Iterator[None]:
+        """Whatever is added in this block exists in these periods only."""
+        self.lifetime = frozenset(periods)
+        try:
+            yield
+        finally:
+            self.lifetime = None
 
     def add(
         self,
@@ -94,6 +106,8 @@ class World:
             make: Builds the geometry of a state.
         """
         assert len(states) == self.periods
+        if self.lifetime is not None:
+            states = [s if p in self.lifetime else None for p, s in enumerate(states)]
         parts: dict[Hashable, Part] = {}
         for state in states:
             if state is not None and state not in parts:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError
 from chronoscene.synth import preset, stages
+from chronoscene.synth.city import make_world
 from chronoscene.synth.light import make_lights
 from chronoscene.synth.mesh import Part, PartBuilder
 from chronoscene.synth.pipeline import make_periods
@@ -115,3 +116,23 @@ def test_street_views_walk_between_the_houses() -> None:
     # No facade may be closer than the walk allows, in any period.
     for renderer in renderers:
         assert (renderer.clearance(eyes) > 0.7).all()
+
+
+def test_rebuilt_blocks_leave_the_streets() -> None:
+    plain = make_world(preset("tiny"))
+    city = make_world(preset("tiny", rebuilt=1.0))
+    first = {e.name for e in plain.elements if 0 in e.periods}
+    assert {e.name for e in city.elements if 0 in e.periods} == first
+    kept = [e for e in city.elements if e.periods == (0, 1)]
+    assert any(e.kind == "ground" for e in kept)
+    assert not any(e.kind == "building" and e.name.startswith("block") for e in kept)
+    new = {e.name for e in city.elements if e.periods == (1,)}
+    assert {name.split("/")[0] for name in new if "rebuilt" in name} == {
+        f"block_{i}{j}_rebuilt" for i in range(4) for j in range(4)
+    }
+
+
+def test_part_of_the_blocks_is_rebuilt() -> None:
+    city = make_world(preset("tiny", rebuilt=0.4, seed=3))
+    rebuilt = {e.name.split("/")[0] for e in city.elements if "rebuilt" in e.name}
+    assert 2 <= len(rebuilt) <= 12

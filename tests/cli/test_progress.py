@@ -1,0 +1,169 @@
+"""The bar of all long commands: what it shows on a terminal, and the lines in a log."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import rich.console
+from click.testing import CliRunner
+
+from chronoscene.cli import cli, progress
+from chronoscene.cli.progress import format_rate, progress_bar, tracked
+
+
+class Terminal(io.StringIO):
+    """Takes what is drawn; `frames` are the lines of it without colours and cursor movements."""
+
+    def isatty(self) -> bool:
+        return True
+
+    def frames(self) -> list[str]:
+        plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", self.getvalue())
+        return [line.strip() for line in re.split(r"[\r\n]+", plain) if line.strip()]
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(rich.console, "monotonic", clock)
+    return clock
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    for name in ("NO_COLOR", "FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    return sys.stderr  # type: ignore[return-value]
+
+
+def test_counts_rate_time_passed_and_time_left(terminal: Terminal, clock: Clock) -> None:
+    with progress_bar() as bar:
+        for done in range(7):
+            bar("photos", done, 20)
+            clock.now += 2
+    assert re.fullmatch(r"photos \S+ +6/20 0\.5/s 0:00:14 < 0:00:28", terminal.frames()[-1])
+
+
+def test_the_bar_goes_when_the_block_ends(terminal: Terminal) -> None:
+    with progress_bar() as bar:
+        bar("photos", 1, 2)
+    assert terminal.getvalue().endswith("\x1b[1A\x1b[2K")  # a line up, and that line erased
+
+
+def test_a_new_step_has_its_own_clock(terminal: Terminal, clock: Clock) -> None:
+    with progress_bar() as bar:
+        for done in range(4):
+            bar("features", done, 3)
+            clock.now += 60
+        bar("pairs", 0, 3)
+        clock.now += 1
+    assert re.fullmatch(r"pairs \S+ 0/3 +0:00:01 < -:--:--", terminal.frames()[-1])
+
+
+def test_a_count_that_goes_on_under_another_name_keeps_its_clock(
+    terminal: Terminal, clock: Clock
+) -> None:
+    with progress_bar() as bar:
+        for done, scene in enumerate(["Bund [1]", "Mall", "Plaza"]):
+            bar(scene, done, 3)
+            clock.now += 10
+    assert re.fullmatch(r"Plaza \S+ 2/3 0\.1/s 0:00:30 < 0:00:10", terminal.frames()[-1])
+    assert any(line.startswith("Bund [1] ") for line in terminal.frames())
+
+
+def test_what_an_earlier_run_did_makes_nothing_faster(terminal: Terminal, clock: Clock) -> None:
+    with progress_bar() as bar:
+        for done in (900, 910, 920):
+            bar("features", done, 1000)
+            clock.now += 10
+        bar("features", 930, 1000)
+    assert " 930/1000 1/s 0:00:30 < 0:01:10" in terminal.frames()[-1]
+
+
+def test_in_a_log_each_step_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bar(log=True) as bar:
+        for what, total in (("features", 3), ("pairs", 123)):
+            for done in range(3):
+                bar(what, done, total)
+    assert capsys.readouterr() == ("", "features (3)\npairs (123)\n")
+
+
+def test_other_commands_leave_logs_alone(capfd: pytest.CaptureFixture[str]) -> None:
+    with progress_bar() as bar:
+        partial(bar, "images")(1, 2)
+    assert list(tracked([1, 2], "scenes")) == [1, 2]
+    assert capfd.readouterr() == ("", "")
+
+
+def test_tracked_items_are_counted_when_they_are_done_with(
+    terminal: Terminal, clock: Clock
+) -> None:
+    passed = []
+    for item in tracked(iter("abcd"), "scenes", total=4):
+        passed.append(item)
+        clock.now += 5
+    assert passed == list("abcd")
+    assert re.fullmatch(r"scenes \S+ 4/4 0\.2/s 0:00:20 < 0:00:00", terminal.frames()[-1])
+
+
+def test_nothing_to_track(terminal: Terminal) -> None:
+    assert list(tracked([], "scenes")) == []
+
+
+@pytest.mark.parametrize(
+    ("speed", "text"),
+    [(None, ""), (0, ""), (0.0234, "0.023/s"), (2.5, "2.5/s"), (9.96, "10/s"), (1234.5, "1,234/s")],
+)
+def test_rate(speed: float | None, text: str) -> None:
+    assert format_rate(speed) == text
+
+
+@pytest.mark.parametrize(
+    ("words", "last"),
+    [
+        ("convert {scene} {out}", ("images", 4, 4)),
+        ("undistort {scene} {out}", ("images", 4, 4)),
+        ("split {scene} --scene-out {out}", ("images", 4, 4)),
+        ("validate {scene} --decode", ("decode images", 4, 4)),
+        ("stats {scene}", ("scenes", 1, 1)),
+        ("synth {out} --preset skeleton --scene lotuspond --size 16x16", ("lotuspond", 0, 1)),
+    ],
+)
+def test_commands_tell_their_progress(
+    make_scene_folder: Callable[[], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: str,
+    last: tuple[str, int, int],
+) -> None:
+    told: list[tuple[str, int, int]] = []
+
+    @contextmanager
+    def bar() -> Iterator[progress.Report]:
+        yield lambda *news: told.append(news)
+
+    terminal = SimpleNamespace(stderr=SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(progress, "sys", terminal)
+    monkeypatch.setattr(progress, "_bar", bar)
+    arguments = words.format(scene=make_scene_folder(), out=tmp_path / "out").split()
+    done = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert done.exit_code in (0, 1) and told[-1] == last
