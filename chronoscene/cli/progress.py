@@ -90,8 +90,8 @@ def _bar() -> Iterator[Report]:
             counts_on = task.total == total and done > task.completed  # under another name
             if what != task.description and not counts_on:
                 progress.reset(bar, total=total, completed=done, description=what, rate="")
-            rate = format_rate(task.speed)
-            progress.update(bar, description=what, completed=done, total=total, rate=rate)
+            progress.update(bar, description=what, completed=done, total=total)
+            task.fields["rate"] = format_rate(task.speed)
 
         yield report
 

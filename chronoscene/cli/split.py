@@ -101,7 +101,9 @@ def command(
         our_format.check_writable_name(source, frame)
     if scene_out is not None:
         with progress_bar() as bar:
-            our_format.write(split.scene, scene_out, image_source="link", progress=partial(bar, "images"))
+            our_format.write(
+                split.scene, scene_out, image_source="link", progress=partial(bar, "images")
+            )
         _write(split, scene_out / our_format.TEST)
     if out is not None:
         _write(split, out)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
-from chronoscene.synth import PRESETS, SynthSettings, generate, preset
+from chronoscene.synth import PRESETS, generate, preset
 from chronoscene.synth.settings import KINDS
 
 SKELETON = "skeleton"

@@ -46,7 +46,9 @@ def command(
     check_outside(source, out)
     scene = read_scene(source, format=scene_format)
     with progress_bar() as bar:
-        done = undistort(scene, out, center=center, threads=threads, progress=partial(bar, "images"))
+        done = undistort(
+            scene, out, center=center, threads=threads, progress=partial(bar, "images")
+        )
     emit(report(done), None)
 
 

@@ -22,8 +22,9 @@ def scorers():
 def test_scoring_again_changes_nothing(runs, scorers):
     before = {p: p.read_bytes() for p in runs.rglob("rows.csv")}
     records = [read_run(p) for p in run_folders(runs)]
-    outcomes = rescore(runs, scorers)
-    assert len(outcomes) == 4
+    told = []
+    outcomes = rescore(runs, scorers, progress=lambda done, total: told.append((done, total)))
+    assert len(outcomes) == 4 and told == [(done, 4) for done in range(4)]
     assert all(not o.changes and o.error is None for o in outcomes)
     assert {p: p.read_bytes() for p in runs.rglob("rows.csv")} == before
     for old, folder in zip(records, run_folders(runs), strict=True):

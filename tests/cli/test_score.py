@@ -20,7 +20,7 @@ def score(monkeypatch, tmp_path):
         monkeypatch.setattr(
             score_module, "make_scorers", lambda lpips_weights: Scorers({}, skipped or {})
         )
-        monkeypatch.setattr(score_module, "rescore", lambda runs, scorers: list(outcomes))
+        monkeypatch.setattr(score_module, "rescore", lambda runs, scorers, progress: list(outcomes))
         return CliRunner().invoke(cli, ["score", str(tmp_path)], catch_exceptions=False)
 
     return run
