@@ -11,7 +11,7 @@ from chronoscene.bench.protocol import STRATEGIES
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.stopping import parse_duration
 from chronoscene.checks import check_choice
-from chronoscene.cli.output import emit
+from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.table import split_list
 from chronoscene.errors import ConfigError
 from chronoscene.images import MAX_WIDTH
@@ -84,6 +84,7 @@ def command(
     predictions and its scores. Finished runs are kept, so the same command goes on after an
     interruption.
     """
+    check_place("--out", out)
     names = split_list("--method", methods)
     if any(":" in name for name in names) and str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))  # a plug-in under development, named module:SPEC

@@ -1,9 +1,12 @@
-"""What commands with ``--out`` print or write."""
+"""What commands print or write, and errors that name the option a place was given with."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 
 import click
 
@@ -11,10 +14,15 @@ from chronoscene.errors import ConfigError
 from chronoscene.files import write_text_atomic
 
 
-def emit(text: str, out: Path | None) -> None:
-    """Print a text, or write it to the file that ``--out`` names, without colours.
+def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
+    """Print a text, or write it to a file, without colours.
 
     What the terminal's encoding lacks is printed as an escape sequence.
+
+    Args:
+        text: With the end of its last line.
+        out: The file; None to print.
+        option: What the user named the file with.
 
     Raises:
         ConfigError: If the file cannot be written.
@@ -23,12 +31,37 @@ def emit(text: str, out: Path | None) -> None:
         encoding = sys.stdout.encoding or "utf-8"
         click.echo(text.encode(encoding, "backslashreplace").decode(encoding), nl=False)
         return
-    try:
+    with writing_to(option, out, expected="a file that can be written"):
         write_text_atomic(out, click.unstyle(text))
+
+
+@contextmanager
+def writing_to(
+    option: str, place: Path, *, expected: str = "a place that can be written to"
+) -> Iterator[None]:
+    """Tell what the disk refuses in the block under the option that names the place.
+
+    Raises:
+        ConfigError: Instead of an OSError.
+    """
+    try:
+        yield
     except OSError as error:
         raise ConfigError(
-            f"--out {out}",
-            expected="a file that can be written",
+            f"{option} {place}",
+            expected=expected,
             found=error.strerror or "an error",
             todo="choose another place",
         ) from error
+
+
+def check_place(option: str, folder: Path) -> None:
+    """See that a folder can be made and written to, before long work; makes nothing.
+
+    Raises:
+        ConfigError: If it cannot.
+    """
+    with writing_to(option, folder):
+        nearest = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+        with TemporaryFile(dir=nearest):
+            pass

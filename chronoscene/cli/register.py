@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.output import emit
+from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.formats import read_scene
@@ -129,8 +129,10 @@ def command(
     Exit status: 0 unless the verdict is fail, 1 if it is (the scene is written), 2 if the photos
     cannot be registered, or wrong usage.
     """
-    for place in (out, work) if work is not None else (out,):
-        check_outside(captures if captures.is_dir() else captures.parent, place)
+    for option, place in (("OUT", out), ("--work", work)):
+        if place is not None:
+            check_outside(captures if captures.is_dir() else captures.parent, place)
+            check_place(option, place)
     found = read_captures(captures, table=table)
     options = Options(
         route=route,

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.convert import describe_period
-from chronoscene.cli.output import emit
+from chronoscene.cli.output import check_place, emit, writing_to
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.errors import ConfigError
@@ -104,9 +104,9 @@ def command(
             our_format.write(
                 split.scene, scene_out, image_source="link", progress=partial(bar, "images")
             )
-        _write(split, scene_out / our_format.TEST)
+        _write(split, scene_out / our_format.TEST, "--scene-out")
     if out is not None:
-        _write(split, out)
+        _write(split, out, "OUT")
     emit(report(split), None)
 
 
@@ -125,6 +125,8 @@ def _check_targets(source: Path, out: Path | None, scene_out: Path | None) -> No
     for target in (out, scene_out):
         if target is not None:
             check_outside(source, target)
+    if scene_out is not None:
+        check_place("--scene-out", scene_out)
     for file in (out, out and _json_beside(out)):
         if file is not None and file.exists():
             raise ConfigError(
@@ -136,20 +138,13 @@ def _json_beside(out: Path) -> Path:
     return out.with_name(f"{out.stem}.json")
 
 
-def _write(split: NewSplit, out: Path) -> None:
+def _write(split: NewSplit, out: Path, option: str) -> None:
     names = "".join(f"{f.name}\n" for f in split.scene.select(split="test"))
     record = json.dumps(split.record(), indent=1, ensure_ascii=False) + "\n"
-    try:
+    with writing_to(option, out, expected="a file that can be written"):
         out.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(out, names)
         write_text_atomic(_json_beside(out), record)
-    except OSError as error:
-        raise ConfigError(
-            out,
-            expected="a file that can be written",
-            found=error.strerror or "an error",
-            todo="choose another place",
-        ) from error
 
 
 def report(split: NewSplit) -> str:

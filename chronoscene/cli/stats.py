@@ -10,7 +10,7 @@ from typing import Literal
 
 import click
 
-from chronoscene.cli.output import emit
+from chronoscene.cli.output import emit, writing_to
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
 from chronoscene.formats import find_scenes, format_names, read_scene
@@ -127,7 +127,9 @@ def command(
     if request.figures is not None:
         from chronoscene.figures.bars import draw_bars
 
-        draw_bars(counts, request.figures / f"counts.{request.figure_format}")
+        bars = request.figures / f"counts.{request.figure_format}"
+        with writing_to("--figures", bars):
+            draw_bars(counts, bars)
     _remark_on_unseen(counts)
 
 
@@ -144,11 +146,14 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
         from chronoscene.figures.projections import draw_projections
 
         target = request.figures / f"{name}_points.{request.figure_format}"
-        draw_projections(scene, target, cameras=request.cameras)
+        with writing_to("--figures", target):
+            draw_projections(scene, target, cameras=request.cameras)
     if request.pages is not None:
         from chronoscene.figures.page import write_page
 
-        write_page(scene, request.pages / f"{name}.html")
+        page = request.pages / f"{name}.html"
+        with writing_to("--pages", page):
+            write_page(scene, page)
     if request.layout == "paper":
         return count_scene(scene, count=request.count)
     return measure_scene(scene, count=request.count)
@@ -178,15 +183,8 @@ def _check_places(request: Request, paths: Iterable[Path]) -> None:
                 found="one inside",
                 todo="choose another place: nothing is written into a dataset",
             )
-        try:
+        with writing_to(option, place, expected="a folder that can be made"):
             place.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(
-                f"{option} {place}",
-                expected="a folder that can be made",
-                found=error.strerror or "an error",
-                todo="choose another place",
-            ) from error
 
 
 def _remark_on_unseen(counts: list[SceneCount]) -> None:

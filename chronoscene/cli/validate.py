@@ -89,9 +89,9 @@ def command(
         done = map_parallel(check, folders)
         reports = list(tracked(done, "validate scenes", total=len(folders)))
     emit(WRITERS[output_format](reports, strict=strict), out)
-    for file, write in ((sarif, write_sarif), (html, write_html)):
+    for option, file, write in (("--sarif", sarif, write_sarif), ("--html", html, write_html)):
         if file is not None:
-            emit(write(reports, strict=strict), file)
+            emit(write(reports, strict=strict), file, option=option)
     total = counts(reports)
     if total["error"] or (strict and total["warning"]):
         context.exit(NOT_VALID)

@@ -1,0 +1,83 @@
+"""Where commands write: an error names the option that the place came with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from chronoscene.cli import cli, table
+from chronoscene.cli.output import check_place, emit, writing_to
+from chronoscene.errors import ConfigError
+
+
+@pytest.fixture
+def places(make_scene_folder: Callable[[], Path], tmp_path: Path) -> Path:
+    """A scene, photos, a file where a folder should be, and folders where files should be."""
+    make_scene_folder()
+    (tmp_path / "file").touch()
+    for folder in ("folder", "figures/counts.png", "drawn/scene_points.svg", "pages/scene.html"):
+        (tmp_path / folder).mkdir(parents=True)
+    for period in "ab":
+        (tmp_path / "photos" / period).mkdir(parents=True)
+        Image.fromarray(np.zeros((480, 640, 3), np.uint8)).save(tmp_path / f"photos/{period}/0.jpg")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "place"),
+    [
+        ("validate scene --out folder", "--out folder"),
+        ("validate scene --sarif folder", "--sarif folder"),
+        ("validate scene --html absent/page.html", "--html absent/page.html"),
+        ("validate scene --fix file/new", "--fix file/new"),
+        ("stats scene --out folder", "--out folder"),
+        ("stats scene --figures file/new", "--figures file/new"),
+        ("stats scene --figures figures", "--figures figures/counts.png"),
+        ("stats scene --figures drawn --figure-format svg", "--figures drawn/scene_points.svg"),
+        ("stats scene --pages file", "--pages file"),
+        ("stats scene --pages pages", "--pages pages/scene.html"),
+        ("split scene file/new", "OUT file/new"),
+        ("split scene --scene-out file/new", "--scene-out file/new"),
+        ("register photos file/new", "OUT file/new"),
+        ("register photos new --work file/new", "--work file/new"),
+        ("register photos new --work file", "--work file"),
+        ("bench scene --method chronogs --out file/new", "--out file/new"),
+    ],
+)
+def test_the_option_is_named(
+    places: Path, monkeypatch: pytest.MonkeyPatch, words: str, place: str
+) -> None:
+    monkeypatch.chdir(places)
+    result = CliRunner().invoke(cli, words.split())
+    assert isinstance(result.exception, ConfigError), result.exception
+    assert result.exception.place == place
+    assert not (places / "new").exists()
+
+
+def test_a_table(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table, "read_runs", lambda folders: ([], []))
+    monkeypatch.setattr(table, "format_runs", lambda *_: "no runs\n")
+    with pytest.raises(ConfigError, match=r"^--out .*file/t\.csv: expected a file that can be"):
+        arguments = ["table", str(places), "--out", str(places / "file/t.csv")]
+        CliRunner().invoke(cli, arguments, catch_exceptions=False)
+
+
+def test_what_is_no_error_of_the_disk_passes() -> None:
+    with pytest.raises(ZeroDivisionError), writing_to("--out", Path("x")):
+        _ = 1 / 0
+
+
+def test_places_are_looked_at_and_left_alone(tmp_path: Path) -> None:
+    check_place("--out", tmp_path)
+    check_place("--out", tmp_path / "a/b/c")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_written_text_has_no_colours(tmp_path: Path) -> None:
+    emit("\x1b[31mred\x1b[0m\n", tmp_path / "text")
+    assert (tmp_path / "text").read_text() == "red\n"
