@@ -100,6 +100,24 @@ class Points:
             track_xy=np.zeros((0, 2)),
         )
 
+    def select(self, keep: NDArray[np.bool_]) -> Points:
+        """Some of the points, in the same order, each with all of its observations.
+
+        Args:
+            keep: Which points. [P]
+        """
+        lengths = np.diff(self.track_start)
+        observed = np.repeat(keep, lengths)
+        return Points(
+            ids=self.ids[keep],
+            xyz=self.xyz[keep],
+            rgb=self.rgb[keep],
+            error=self.error[keep],
+            track_start=np.concatenate([[0], np.cumsum(lengths[keep])]),
+            track_frame=self.track_frame[observed],
+            track_xy=self.track_xy[observed],
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Period:

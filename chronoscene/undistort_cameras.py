@@ -13,7 +13,7 @@ from chronoscene.colmap import project_points, undistorted_camera, unproject_pix
 from chronoscene.errors import SceneError
 from chronoscene.formats.colmap_layout import filter_observations
 from chronoscene.images import image_size, resize_camera
-from chronoscene.scene import Camera, Frame, Points, Scene
+from chronoscene.scene import Camera, Frame, Scene
 
 ROWS = 128
 """Rows of a map that are computed at once, to bound the memory."""
@@ -125,21 +125,8 @@ def move_observations(scene: Scene, changes: list[CameraChange]) -> tuple[Scene,
         replace(points, track_xy=xy), inside, np.arange(len(frames), dtype=np.int32)
     )
     lost = (np.diff(points.track_start) > 0) & (np.diff(moved.track_start) == 0)
-    new = replace(scene.with_frames(frames), points=_drop_unobserved(moved, lost))
+    new = replace(scene.with_frames(frames), points=moved.select(~lost))
     return new, int((~inside).sum()), int(lost.sum())
-
-
-def _drop_unobserved(points: Points, drop: NDArray[np.bool_]) -> Points:
-    """Points without some that have no observations."""
-    keep = ~drop
-    return replace(
-        points,
-        ids=points.ids[keep],
-        xyz=points.xyz[keep],
-        rgb=points.rgb[keep],
-        error=points.error[keep],
-        track_start=np.append(points.track_start[:-1][keep], points.track_start[-1]),
-    )
 
 
 def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.float64]:

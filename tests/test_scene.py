@@ -97,6 +97,35 @@ def test_periods_of_points():
     assert empty.point_periods().shape == (0, 2)
 
 
+@pytest.mark.parametrize(
+    ("keep", "starts", "frames"),
+    [
+        ([1, 1, 1], [0, 3, 4, 4], [0, 1, 2, 3]),
+        ([0, 1, 1], [0, 1, 1], [3]),
+        ([1, 0, 1], [0, 3, 3], [0, 1, 2]),
+        ([0, 0, 1], [0, 0], []),
+        ([0, 0, 0], [0], []),
+    ],
+)
+def test_some_of_the_points(keep, starts, frames):
+    points = replace(
+        tiny_scene().points,
+        xyz=np.arange(9.0).reshape(3, 3),
+        rgb=np.arange(9, dtype=np.uint8).reshape(3, 3),
+        error=np.arange(3.0),
+        track_xy=np.arange(8.0).reshape(4, 2),
+    )
+    mask = np.array(keep, bool)
+    some = points.select(mask)
+    assert len(some) == mask.sum()
+    assert some.track_start.tolist() == starts and some.track_frame.tolist() == frames
+    assert some.track_xy.tolist() == points.track_xy[frames].tolist()  # frame i is seen in row i
+    for name in ("ids", "xyz", "rgb", "error"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(points, name)[mask])
+    for name in Points.__dataclass_fields__:
+        assert getattr(some, name).dtype == getattr(points, name).dtype
+
+
 def test_select():
     scene = tiny_scene()
     assert [f.name for f in scene.select()] == ["0.png", "1.png", "2.png", "3.png"]

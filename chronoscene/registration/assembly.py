@@ -91,16 +91,7 @@ def without_twins(points: Points) -> Points:
     first[1:] = np.diff(group[order]) != 0
     keep = np.zeros(len(points), bool)
     keep[order[first]] = True
-    return replace(
-        points,
-        ids=points.ids[keep],
-        xyz=points.xyz[keep],
-        rgb=points.rgb[keep],
-        error=points.error[keep],
-        track_start=np.concatenate([[0], np.cumsum(lengths[keep])]),
-        track_frame=points.track_frame[keep[row]],
-        track_xy=points.track_xy[keep[row]],
-    )
+    return points.select(keep)
 
 
 def _pose(parts: Assembly, name: str, pose: NDArray[np.float64]) -> NDArray[np.float64]:
