@@ -160,7 +160,10 @@ class RowAdam:
         self._stamps = np.zeros((len(value), len(self._widths)), np.int64)
         self._speeds: list[float] = []
         """rate / root of each step."""
-        self._ways, self._settled = self._new_ways(), np.empty(0, np.float32)
+        self._ways = self._new_ways()
+        self._settled = np.empty(_HORIZON, np.float32)
+        """The whole way of what was last read at each step, known up to `_HORIZON` steps ago; then
+        room for more."""
         self._fetched: tuple[_Rows, Tensor] | None = None
 
     def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
@@ -191,7 +194,7 @@ class RowAdam:
         self._speeds.append(corrected / root)
         self._ways = self._new_ways()
         if self.steps >= _HORIZON:
-            self._settled = np.append(self._settled, self._ways[_HORIZON, 0])
+            self._settle(self._ways[_HORIZON, 0])
 
     def flush(self) -> Tensor:
         """See `Table.flush`."""
@@ -229,6 +232,13 @@ class RowAdam:
         self.value, self._mean, self._square = (table[mask] for table in tables)
         self._mark_all()
         return self.value
+
+    def _settle(self, way: np.float32) -> None:
+        """Keep the way of what has waited `_HORIZON` steps now; twice the room where it is full."""
+        stamp = self.steps - _HORIZON
+        if stamp == len(self._settled):
+            self._settled = np.concatenate([self._settled, np.empty_like(self._settled)])
+        self._settled[stamp] = way
 
     def _mark_all(self) -> None:
         self._stamps = np.full((len(self.value), len(self._widths)), self.steps, np.int64)

@@ -84,6 +84,15 @@ def test_rows_may_wait_longer_than_the_horizon(monkeypatch: pytest.MonkeyPatch) 
     both.compare()
 
 
+def test_waits_over_the_horizon_begin_at_any_step() -> None:
+    """Rows are read every 150 steps or so, up to where the table of whole ways has grown twice."""
+    both = Both(40, [4], seed=5)
+    both.step(1.0, [0], 0.01)
+    for index in range(5 * row_adam._HORIZON):
+        both.step(1 / 150, [0], 0.001 * (1 + index % 7))
+    both.compare()
+
+
 def test_a_snapshot_changes_nothing() -> None:
     """Later values are equal bit by bit with and without it."""
     results = []
