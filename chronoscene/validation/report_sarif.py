@@ -6,6 +6,7 @@ Source: OASIS, Static Analysis Results Interchange Format version 2.1.0, section
 from __future__ import annotations
 
 import json
+import posixpath
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 from urllib.parse import quote
 
 from chronoscene import __version__
+from chronoscene.formats.chronoscene import SPLIT
 from chronoscene.validation.finding import Finding, Severity
 from chronoscene.validation.report import SceneReport
 from chronoscene.validation.rule import GROUPS, Rule, all_rules
@@ -87,10 +89,11 @@ def _result(finding: Finding, index: dict[str, int], strict: bool) -> dict[str, 
 
 
 def _location(place: str) -> dict[str, Any]:
-    """File and line where the place names them; else the place as it is, in words."""
+    """File, and line and record where the place names them.
+
+    Always with a file: GitHub refuses a report with a location that has none.
+    """
     file, line, what = split_place(place)
-    if file is None:
-        return {"logicalLocations": [{"fullyQualifiedName": place}]}
     physical: dict[str, Any] = {"artifactLocation": {"uri": quote(file), "uriBaseId": "SCENE"}}
     if line is not None:
         physical["region"] = {"startLine": line}
@@ -100,16 +103,21 @@ def _location(place: str) -> dict[str, Any]:
     return location
 
 
-def split_place(place: str) -> tuple[str | None, int | None, str | None]:
-    """File, line and record of ``file``, ``file:line`` or ``file (record)``; None for the rest."""
-    match = re.fullmatch(
-        r"(?P<file>.*?)(?::(?P<line>[1-9][0-9]{0,8}))?(?: \((?P<what>.*)\))?", place
-    )
-    if match is None or not re.match(r"(images|sparse)(/|$)", match["file"]):
-        return None, None, None
-    if match["file"].startswith("images/"):
+def split_place(place: str) -> tuple[str, int | None, str | None]:
+    """File, line and record of ``file``, ``file:line`` or ``file (record)``.
+
+    A period is in the file that says which images it has.
+    """
+    if place.startswith("images/"):
         return place, None, None  # names of photos may hold anything
-    return match["file"], int(match["line"]) if match["line"] else None, match["what"]
+    if re.fullmatch(r"period -?[0-9]+", place):
+        return SPLIT, None, place
+    parts = re.fullmatch(
+        r"(?P<file>.*?)(?::(?P<line>[1-9][0-9]{0,8}))?(?: \((?P<what>.*)\))?", place, re.DOTALL
+    )
+    assert parts is not None  # the first group takes any text
+    line = int(parts["line"]) if parts["line"] else None
+    return posixpath.normpath(parts["file"]), line, parts["what"]
 
 
 def _folder_uri(path: Path) -> str:

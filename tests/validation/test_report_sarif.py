@@ -1,13 +1,18 @@
 """SARIF: what the schema requires, and where findings point to."""
 
 import json
-from urllib.parse import unquote
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from urllib.parse import unquote, urljoin, urlsplit
 
 import pytest
 from PIL import Image
 
 from chronoscene.validation.report_sarif import split_place, write_sarif
 from chronoscene.validation.rule import all_rules
+from chronoscene.validation.run import RULE_FAILED, validate_scene
 
 LEVELS = {"none", "note", "warning", "error"}
 
@@ -50,12 +55,13 @@ def test_results(document):
         assert run["tool"]["driver"]["rules"][result["ruleIndex"]]["id"] == result["ruleId"]
         assert result["level"] in LEVELS
         check_message(result["message"])
-        for location in result["locations"]:
-            assert set(location) <= {"physicalLocation", "logicalLocations"} and location
-            if physical := location.get("physicalLocation"):
-                uri = physical["artifactLocation"]["uri"]
-                assert not uri.startswith("/") and ".." not in unquote(uri).split("/")
-                assert physical.get("region", {"startLine": 1})["startLine"] >= 1
+        (location,) = result["locations"]
+        assert set(location) <= {"physicalLocation", "logicalLocations"}
+        physical = location["physicalLocation"]  # code hosts refuse reports without it
+        uri = physical["artifactLocation"]["uri"]
+        assert not uri.startswith("/") and ".." not in unquote(uri).split("/")
+        assert physical["artifactLocation"]["uriBaseId"] in run["originalUriBaseIds"]
+        assert physical.get("region", {"startLine": 1})["startLine"] >= 1
 
 
 def test_line_of_a_finding(document):
@@ -82,21 +88,74 @@ def test_strict_makes_errors_of_warnings(scene):
         ("sparse/0/images.bin (a (1).jpg)", ("sparse/0/images.bin", None, "a (1).jpg")),
         ("images/a (1):2.jpg", ("images/a (1):2.jpg", None, None)),
         ("images", ("images", None, None)),
-        ("period 1", (None, None, None)),
-        ("rule CS201", (None, None, None)),
+        ("period 12", ("sparse/split.txt", None, "period 12")),
+        ("colmap/sparse/0/images.txt (b.jpg)", ("colmap/sparse/0/images.txt", None, "b.jpg")),
+        ("./frames.bin", ("frames.bin", None, None)),
+        (".", (".", None, None)),
     ],
 )
 def test_places(place, expected):
     assert split_place(place) == expected
 
 
+def pointed_at(run):
+    """Files that the results of a run are in."""
+    base = run["originalUriBaseIds"]["SCENE"]["uri"]
+    for result in run["results"]:
+        uri = result["locations"][0]["physicalLocation"]["artifactLocation"]["uri"]
+        assert re.fullmatch(r"([A-Za-z0-9._~/-]|%[0-9A-F]{2})+", uri)
+        yield Path(unquote(urlsplit(urljoin(base, uri)).path))
+
+
 def test_names_are_escaped(scene):
-    scene.save("a000.png", Image.new("RGB", (64, 40)), as_name="ä#?.png")
-    text = write_sarif([scene.validate()])
-    uris = {
-        location["physicalLocation"]["artifactLocation"]["uri"]
-        for result in json.loads(text)["runs"][0]["results"]
-        for location in result["locations"]
-        if "physicalLocation" in location
-    }
-    assert "images/%C3%A4%23%3F.png" in uris
+    names = ["a b.png", "Größe.png", "城.png", "50%41.png", "#?&+;.png", "a:2 (3).png", "x/y z.png"]
+    scene.path("images/x").mkdir()
+    for name in names:
+        Image.new("RGB", (64, 40)).save(scene.path(f"images/{name}"))
+    (run,) = json.loads(write_sarif([scene.validate()]))["runs"]
+    assert set(pointed_at(run)) >= {scene.path(f"images/{name}") for name in names}
+
+
+def test_a_known_name_as_the_standard_writes_it(scene):
+    scene.save("a000.png", Image.new("RGB", (64, 40)), as_name="ä b#?.png")
+    assert '"uri": "images/%C3%A4%20b%23%3F.png"' in write_sarif([scene.validate()])
+
+
+def test_the_scene_may_be_anywhere(scene, tmp_path):
+    scene.path("images/a000.png").unlink()
+    place = tmp_path / "100% Straße #1" / "my scene"
+    place.parent.mkdir()
+    shutil.copytree(scene.root, place)
+    (run,) = json.loads(write_sarif([validate_scene(place)]))["runs"]
+    assert "/100%25%20Stra%C3%9Fe%20%231/my%20scene/" in run["originalUriBaseIds"]["SCENE"]["uri"]
+    assert place / "images/a000.png" in pointed_at(run)
+
+
+def test_a_model_in_another_place(scene):
+    shutil.copytree(scene.path("sparse/0"), scene.path("colmap/sparse/0"))
+    shutil.rmtree(scene.path("sparse/0"))
+    (run,) = json.loads(write_sarif([scene.validate()]))["runs"]
+    assert scene.path("colmap/sparse/0/points3D.txt") in pointed_at(run)
+
+
+def test_a_rule_that_failed_is_told_apart(scene):
+    report = scene.validate()
+    failure = replace(report.findings[0], code=RULE_FAILED, place="rule CS201")
+    report = replace(report, findings=(*report.findings, failure))
+    (run,) = json.loads(write_sarif([report]))["runs"]
+    (invocation,) = run["invocations"]
+    assert invocation["executionSuccessful"] is False
+    (notification,) = invocation["toolExecutionNotifications"]
+    assert notification["level"] == "error" and "rule CS201" in notification["message"]["text"]
+    assert len(run["results"]) == len(report.findings) - 1
+
+
+def test_each_scene_is_a_run_with_a_name_of_its_own(scene):
+    report = scene.validate()
+    empty = replace(report, name="other", findings=())
+    runs = json.loads(write_sarif([report, empty]))["runs"]
+    assert [run["automationDetails"]["id"] for run in runs] == [
+        "chronoscene/scene/",
+        "chronoscene/other/",
+    ]
+    assert runs[1]["results"] == [] and runs[1]["invocations"][0]["executionSuccessful"] is True
