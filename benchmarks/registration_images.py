@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
+import os
 import shutil
 import sys
 import tempfile
@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,18 +22,19 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.geometry import camera_centre
 from chronoscene.registration.captures import read_captures
-from chronoscene.registration.certificate import certify
-from chronoscene.registration.certificate_json import to_json
-from chronoscene.registration.generated import Generated, pose_errors
 from chronoscene.registration.georeference import Georeference
+from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.model import Registered
-from chronoscene.registration.pipeline import Options, run
-from chronoscene.registration.report import write_report
-from chronoscene.registration.verdict import judge
+from chronoscene.registration.pipeline import Options, run, run_into
 from chronoscene.scene import Scene
 from chronoscene.synth import SynthSettings, generate
 
+if TYPE_CHECKING:
+    from registration import Outcome
+
 ORIGIN = Georeference(48.1, 11.5, 520.0, "as stated")
+
+WIDTH, HEIGHT = 800, 600
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +42,12 @@ class ImageCase:
     """One rendered scene and how its photos are treated."""
 
     name: str
+    seed: int
     periods: int = 2
     kind: str = "aerial"
-    views: int = 14
-    seed: int = 0
+    views: int = 16
+    rebuilt: float = 0.0
+    """Share of the blocks that are torn down and rebuilt at one date."""
     gamma: float = 1.0
     """Of the periods after the first: another exposure."""
     colour: float = 1.0
@@ -57,26 +61,34 @@ class ImageCase:
 
 
 CASES = (
-    ImageCase("two periods", seed=11),
-    ImageCase("two periods, no GPS", seed=12, gps=False),
-    ImageCase("two periods, dark", seed=13, gamma=1.8, colour=0.4, quality=60),
-    ImageCase("four periods", periods=4, seed=14),
-    ImageCase("four periods, dark", periods=4, seed=15, gamma=1.6, colour=0.5, quality=70),
-    ImageCase("other place", seed=16, other_place=True),
-    ImageCase("two periods, very dark", seed=17, gamma=3.0, colour=0.0, quality=25),
-    ImageCase("street, two periods", kind="street", seed=18),
+    ImageCase("two periods", 31),
+    ImageCase("two periods, no GPS", 32, gps=False),
+    ImageCase("two periods, dark", 33, gamma=1.8, colour=0.4, quality=60),
+    ImageCase("two periods, half rebuilt", 34, rebuilt=0.5),
+    ImageCase("two periods, all rebuilt", 35, rebuilt=1.0),
+    ImageCase("two periods, all rebuilt, dark, no GPS", 36, rebuilt=1.0, gamma=1.8, gps=False),
+    ImageCase("two periods, very dark", 37, gamma=3.0, colour=0.0, quality=25),
+    ImageCase("four periods", 38, periods=4),
+    ImageCase("four periods, half rebuilt, dark", 39, periods=4, rebuilt=0.5, gamma=1.6),
+    ImageCase("four periods, all rebuilt", 40, periods=4, rebuilt=1.0),
+    ImageCase("street, two periods", 41, kind="street"),
+    ImageCase("street, half rebuilt, dark", 42, kind="street", rebuilt=0.5, gamma=1.6),
+    ImageCase("other place", 43, other_place=True),
+    ImageCase("other place, no GPS", 44, other_place=True, gps=False),
 )
 
+ROUTES = ("joint", "separate", "frozen")
 
-def run_images(options: argparse.Namespace) -> list[object]:
+
+def run_images(options: argparse.Namespace) -> list[Outcome]:
     """Render, register and judge the cases, with the options of `benchmarks/registration.py`."""
     outcomes = []
+    routes = ROUTES if options.route == "all" else (options.route,)
     with work_folder(options.work) as work:
         for case in [c for c in CASES if options.only in c.name][: options.cases]:
-            found = _run_case(case, work, options.route)
-            if found is not None:
-                outcomes.append(found)
-                _print(case, found)
+            folder = work / case.name.replace(", ", "-").replace(" ", "_")
+            truth = _photos(case, folder)
+            outcomes += [_run_case(case, folder, truth, route) for route in routes]
     return outcomes
 
 
@@ -90,65 +102,72 @@ def work_folder(kept: Path | None) -> Iterator[Path]:
         yield Path(folder)
 
 
-def _run_case(case: ImageCase, work: Path, route: str) -> object | None:
-    from registration import outcome
+def _run_case(
+    case: ImageCase, folder: Path, truth: dict[str, NDArray[np.float64]], route: str
+) -> Outcome:
+    from registration import judged, refused
 
-    folder = work / case.name.replace(", ", "-").replace(" ", "_")
-    photos, truth = _photos(case, folder)
-    out = folder / f"registered-{route}"
-    chosen = Options(route=None if route == "auto" else route, overwrite=True, work=folder / "work")  # type: ignore[arg-type]
-    start, cpu = time.perf_counter(), time.process_time()
+    found: list[Inspection] = []
+    start, cpu = time.perf_counter(), _cpu()
     try:
-        model = run(read_captures(photos), out, chosen)
+        if route == "frozen":
+            model = _frozen(folder, found)
+        else:
+            out = folder / f"registered-{route}"
+            options = _options(folder / "work", None if route == "auto" else route)
+            model = run(read_captures(folder / "photos"), out, options, inspected=found.append)
     except ChronoSceneError as error:
-        print(f"{case.name}: refused: {error}", flush=True)
-        return None
-    certificate = certify(model)
-    verdict = judge(certificate)
-    seconds = time.process_time() - cpu
-    (folder / f"registration-{route}.json").write_text(
-        json.dumps(to_json(certificate, verdict), indent=1)
-    )
-    write_report(folder / f"report-{route}.html", model, certificate, verdict, title=case.name)
+        print(f"{case.name}, {route}: refused: {error}", flush=True)
+        return refused(case.name, route, case.periods, _cpu() - cpu)
+    poses = np.stack([truth[Path(name).name] for name in model.names])
+    outcome = judged(case.name, route, model, poses, found[-1].verdict, _cpu() - cpu)
     print(
-        f"{case.name}: route {model.route}, {len(model.names)} of "
+        f"{case.name}, {route}: route {model.route}, {len(model.names)} of "
         f"{len(model.names) + len(model.unregistered)} photos, "
         f"{time.perf_counter() - start:.0f} s",
         flush=True,
     )
-    poses = np.stack([truth[name] for name in model.names])
-    made = Generated(model, poses)
-    _print_errors(model, poses)
-    return outcome(case.name, made, certificate, verdict, seconds)
+    _print(outcome, found[-1])
+    return outcome
 
 
-def _print_errors(model: Registered, truth: NDArray[np.float64]) -> None:
-    """Errors of every period in the frame of all cameras together."""
-    extent = float(np.linalg.norm(np.ptp(camera_centre(truth), axis=0)))
-    every = np.ones(len(model.names), bool)
-    rotation, centre = pose_errors(model.cam_from_world, truth, every)
-    for p, label in enumerate(model.labels):
-        mine = model.periods == p
-        if mine.any():
-            print(
-                f"  frame of all cameras, {label}: rotation {np.median(rotation[mine]):.4f} "
-                f"(largest {rotation[mine].max():.4f}) degrees, centre "
-                f"{100 * np.median(centre[mine]) / extent:.4f} "
-                f"(largest {100 * centre[mine].max() / extent:.4f}) % of the extent"
-            )
+def _cpu() -> float:
+    """Seconds of this process and of those it started and waited for."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
-def _print(case: ImageCase, found: object) -> None:
-    for p, row in enumerate(found.periods, 1):  # type: ignore[attr-defined]
+def _options(work: Path, route: str | None) -> Options:
+    return Options(route=route, overwrite=True, work=work, page=True)  # type: ignore[arg-type]
+
+
+def _frozen(folder: Path, found: list[Inspection]) -> Registered:
+    """All periods but the last are registered; the last is added to them."""
+    periods = sorted(p.name for p in (folder / "photos").iterdir())
+    old = folder / "old"
+    shutil.rmtree(old, ignore_errors=True)
+    for label in periods[:-1]:
+        shutil.copytree(folder / "photos" / label, old / label)
+    base = folder / "registered-old"
+    run(read_captures(old), base, _options(folder / "work-old", None))
+    captures = read_captures(folder / "photos" / periods[-1])
+    options = _options(folder / "work-frozen", None)
+    out = folder / "registered-frozen"
+    return run_into(read_scene(base), captures, out, options, inspected=found.append)
+
+
+def _print(outcome: Outcome, inspection: Inspection) -> None:
+    for p, row in enumerate(outcome.periods, 1):
         print(
-            f"  frame of the first period, {p}: rotation {row[0]:.4f} (largest {row[1]:.4f}) "
-            f"degrees, centre {row[2]:.4f} (largest {row[3]:.4f}) % of the extent"
+            f"  period {p}: rotation {row[0]:.4f} (largest {row[1]:.4f}) degrees, centre "
+            f"{row[2]:.4f} (largest {row[3]:.4f}) % of the extent"
         )
-    print(f"  verdict {found.verdict} {found.reason}", flush=True)  # type: ignore[attr-defined]
+    told = "; ".join(f"{f.check} {f.place}: {f.found}" for f in inspection.verdict.findings[:2])
+    print(f"  verdict {outcome.verdict} {told}", flush=True)
 
 
-def _photos(case: ImageCase, folder: Path) -> tuple[Path, dict[str, NDArray[np.float64]]]:
-    """Photos by period with noisy GPS in EXIF, and the true pose of each."""
+def _photos(case: ImageCase, folder: Path) -> dict[str, NDArray[np.float64]]:
+    """Write photos by period with noisy GPS in EXIF; the true pose of each, by its file's name."""
     scenes = [_render(case, folder / "scene", case.seed)]
     if case.other_place:
         scenes.append(_render(case, folder / "other", case.seed + 1000))
@@ -162,22 +181,21 @@ def _photos(case: ImageCase, folder: Path) -> tuple[Path, dict[str, NDArray[np.f
         centres = np.array([camera_centre(f.cam_from_world) for f in frames])
         gps = _noisy(rng, centres)
         for frame, place in zip(frames, gps, strict=True):
-            name = f"{2016 + 2 * period}/{Path(frame.name).name}"
-            target = photos / name
+            target = photos / f"{2016 + 2 * period}" / Path(frame.name).name
             target.parent.mkdir(parents=True, exist_ok=True)
             known = place if case.gps else None
             _write(
                 case, scene.image_path(frame), target, period, known, mirror=scene is not scenes[0]
             )
-            truth[name] = frame.cam_from_world
-    return photos, truth
+            truth[target.name] = frame.cam_from_world
+    return truth
 
 
 def _render(case: ImageCase, folder: Path, seed: int) -> Scene:
     if not (folder / "sparse").is_dir():
         settings = SynthSettings(
-            kind=case.kind, periods=case.periods, width=480, height=360, views=case.views,
-            points=2000, blocks=2, seed=seed, supersample=2,
+            kind=case.kind, periods=case.periods, width=WIDTH, height=HEIGHT, views=case.views,
+            points=2000, blocks=2, seed=seed, rebuilt=case.rebuilt,
         )  # fmt: skip
         generate(folder, settings)
     return read_scene(folder)

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chronoscene._pycolmap import pycolmap
+from chronoscene.registration.consistency import agreement, pair_agreements
 from chronoscene.registration.errors import RegistrationError
+from chronoscene.registration.joining import take_out_misplaced
 from chronoscene.registration.mapping import (
     adjust,
     place_rest,
@@ -23,17 +24,15 @@ from chronoscene.registration.mapping import (
     triangulate,
     write_model,
 )
-from chronoscene.registration.reconstruction import image_pose, known_images, set_pose
+from chronoscene.registration.reconstruction import known_images, set_pose
 from chronoscene.registration.sfm import quiet, verified_matches
 from chronoscene.registration.worker import Report
 
 LEAST_POINTS = 50
 """Fewer points from the photos of the scene do not carry new photos."""
 
-AGREEING_PIXELS = 4.0
 LEAST_AGREEING = 0.5
-"""Share of the matches among the photos of the scene that must lie this near to the epipolar lines
-of its poses."""
+"""Share of the matches among the photos of the scene that must agree with its poses."""
 
 
 def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -46,7 +45,8 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     photos, threads = arguments["photos"], arguments["threads"]
     scratch = Path(arguments["scratch"])
     base, old = _posed(arguments)
-    agreeing = agreement(base, verified_matches(arguments["database"])[1], old)
+    _, matches = verified_matches(arguments["database"])
+    agreeing = agreement(pair_agreements(base, matches), old)
     if agreeing < LEAST_AGREEING:
         raise RegistrationError(
             "the scene",
@@ -81,6 +81,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             "features and matches are kept",
         )
     remarks.append(f"{len(new)} new images placed")
+    take_out_misplaced(model, matches, remarks, sorted(old))
     report("adjusting", 0, 1)
     ended = adjust(model, constant=old, threads=threads)
     moved = _largest_move(model, arguments["poses"])
@@ -94,42 +95,6 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         "left": [],
         "unplaced": [],
     }
-
-
-def agreement(
-    model: pycolmap.Reconstruction,
-    matches: Mapping[tuple[int, int], NDArray[np.int64]],
-    images: set[int],
-) -> float:
-    """Share of the matches among posed images that lie near the epipolar lines of the poses."""
-    agreeing = total = 0
-    for (a, b), pairs in matches.items():
-        if a not in images or b not in images:
-            continue
-        first, second = model.images[a], model.images[b]
-        rays, focals = [], []
-        for image, column in ((first, 0), (second, 1)):
-            camera = model.cameras[image.camera_id]
-            xy = np.array([p.xy for p in image.points2D])[pairs[:, column]]
-            rays.append(np.column_stack([camera.cam_from_img(xy), np.ones(len(xy))]))
-            focals.append(camera.mean_focal_length())
-        pose = image_pose(second) @ np.linalg.inv(image_pose(first))
-        errors = epipolar_distance(pose, rays[0], rays[1]) * float(np.mean(focals))
-        agreeing += int((errors < AGREEING_PIXELS).sum())
-        total += len(pairs)
-    return agreeing / max(total, 1)
-
-
-def epipolar_distance(
-    b_from_a: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Sampson distances at depth 1 of rays x, y, 1 in two cameras. [N]"""
-    x, y, z = b_from_a[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    essential = cross @ b_from_a[:3, :3]
-    lines_b, lines_a = a @ essential.T, b @ essential
-    norm = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
-    return np.asarray(np.abs((b * lines_b).sum(axis=1)) / np.sqrt(np.maximum(norm, 1e-30)))
 
 
 def _posed(arguments: Mapping[str, Any]) -> tuple[pycolmap.Reconstruction, set[int]]:

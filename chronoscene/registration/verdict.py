@@ -117,6 +117,14 @@ THRESHOLDS: dict[str, Threshold] = {
             "look at the flicker comparisons; if they jump, " + _CLICK,
         ),
         Threshold(
+            "surfaces", "share of the surfaces that lie beyond their level of detection", "",
+            0.3, None, False,
+            "right registrations stay below 0.25 even where two thirds of what is seen is new; "
+            "with more, surfaces contradict the matches, as where these took one thing for its "
+            "like",
+            "look at the flicker comparisons; if they jump, " + _CLICK,
+        ),
+        Threshold(
             "gps_offset", "horizontal offset between the GPS of two periods, beyond its spread",
             "m", 5.0, 15.0, False,
             "receivers are off by up to some 3.5 m as a whole from day to day; heights by more, "
@@ -275,6 +283,7 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Finding]:
         shift = pair.clouds.shift
         if shift.low > 0:
             yield from _check("clouds", 100 * shift.value / certificate.extent, place)
+        yield from _check("surfaces", pair.clouds.beyond, place)
 
 
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Finding]:
