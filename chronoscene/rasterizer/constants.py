@@ -5,8 +5,10 @@ from __future__ import annotations
 ALPHA_MIN = 1.0 / 255.0
 """A Gaussian is skipped at a pixel where its alpha is below this."""
 
-ALPHA_MAX = 0.999
-"""Alpha is capped here, so that light always passes and 1 - alpha can be divided by."""
+ALPHA_MAX = 0.9990000128746033
+"""Alpha is capped here, so that light always passes and 1 - alpha can be divided by. It is 0.999 in
+float32: with more digits, what passes, 1 - alpha, would depend on the float type from its fifth
+digit on."""
 
 TRANSMITTANCE_MIN = 1e-4
 """A pixel is finished before the Gaussian that would bring its transmittance to this or below."""

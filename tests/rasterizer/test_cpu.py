@@ -261,7 +261,8 @@ def _touched(records: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     y, x = np.mgrid[:70, :100] + 0.5
     dx, dy = x - records[:, 0, None, None], y - records[:, 1, None, None]
     u = records[:, 2, None, None] * dx + records[:, 3, None, None] * dy
-    v = records[:, 4, None, None] * dy
+    v = records[:, 4, None, None]
+    v = v * np.where(v > 0, dy, dx)
     power = records[:, 5, None, None] - u**2 - v**2
     return (power >= layout.LEVEL_MIN) & drawn[:, None, None]
 

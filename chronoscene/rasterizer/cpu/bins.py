@@ -54,10 +54,10 @@ def _columns(mx: Any, my: Any, tile_y: int, record: Any, at: int, width: int) ->
         record[at + lay.HALF_WIDTH],
         record[at + lay.RIGHTMOST],
     )
-    axis_yy, reach = record[at + lay.AXIS_YY], record[at + lay.LEVEL] - _LEVEL_MIN
+    inverse_y, reach = record[at + lay.INVERSE_Y], record[at + lay.LEVEL] - _LEVEL_MIN
     yr = minimum(maximum(top, rightmost), bottom)
     yl = minimum(maximum(top, -rightmost), bottom)
-    vr, vl = yr * axis_yy, yl * axis_yy
+    vr, vl = yr * inverse_y, yl * inverse_y
     qr, ql = reach - vr * vr, reach - vl * vl
     right = mx - np.float32(0.5) + (yr * shear + sqrt(maximum(qr, 0.0)) * half)
     left = mx - np.float32(0.5) + (yl * shear - sqrt(maximum(ql, 0.0)) * half)

@@ -16,6 +16,7 @@ from chronoscene.rasterizer.cpu.simd import (
     any_lane,
     load,
     minimum,
+    multiply_add,
     prefetch,
     select,
     splat,
@@ -88,7 +89,7 @@ def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records
                 return entry
             continue
         record = lay.RECORD * gaussians[entry]
-        level, u0, v0 = whitened(records, record, left, top, state, _STEPS)
+        level, u0, v0, shift = whitened(records, record, left, top, state, _STEPS)
         red, green = splat(records[record + lay.COLOR]), splat(records[record + lay.COLOR + 1])
         blue = splat(records[record + lay.COLOR + 2])
         while bits != 0:
@@ -96,13 +97,16 @@ def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records
             bits &= bits - np.uint64(1)
             for part in range(PARTS):
                 at = _STATE * block + LANES * part
-                u, v = offset(u0, v0, block, part, state, _STEPS)
+                u, v = offset(u0, v0, block, part, state, _STEPS, shift)
                 rest = level - v * v
                 power = rest - u * u
                 alpha = minimum(exp2(power, power + ROUND), ALPHA_MAX)
+                counts = power >= _LEVEL_MIN
                 light = load(state, at)
-                weight = select(power >= _LEVEL_MIN, alpha * light, 0.0)
-                after = light - weight
+                weight = select(counts, alpha * light, 0.0)
+                # Not light - weight: its rounding is that of the light before, which may be 1000
+                # times what is left.
+                after = select(counts, multiply_add(0.0 - alpha, light, light), light)
                 dying = (light > 0.0) & (after <= TRANSMITTANCE_MIN)
                 if any_lane(dying):
                     weight = select(dying, 0.0, weight)

@@ -96,7 +96,7 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
         if bits == 0:
             continue
         record = lay.RECORD * gaussians[entry]
-        level, u0, v0 = whitened(records, record, left, top, state, _STEPS)
+        level, u0, v0, shift = whitened(records, record, left, top, state, _STEPS)
         red, green = splat(records[record + lay.COLOR]), splat(records[record + lay.COLOR + 1])
         blue = splat(records[record + lay.COLOR + 2])
         s = su = sv = suu = suv = svv = sr = sg = sb = splat(np.float32(0.0))
@@ -106,7 +106,7 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
             bits &= bits - np.uint64(1)
             for part in range(PARTS):
                 at = _STATE * block + LANES * part
-                u, v = offset(u0, v0, block, part, state, _STEPS)
+                u, v = offset(u0, v0, block, part, state, _STEPS, shift)
                 rest = level - v * v
                 power = rest - u * u
                 raw = exp2(power, power + ROUND)
@@ -138,6 +138,7 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
         place = places[entry]
         touched[place] = 1
         store_sums(rows, lay.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
+        rows[lay.RECORD * place + lay.SUM_SIGN] = records[record + lay.V]
 
 
 @kernel

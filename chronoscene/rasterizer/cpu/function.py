@@ -76,15 +76,17 @@ class Render(torch.autograd.Function):
         grads = job.backward(lease, image_grad, alpha_grad, weighted_grad)
         background_grad = None
         if background is not None and ctx.needs_input_grad[6]:
-            background_grad = _background_gradient(image_grad, alphas)
+            assert lease.binned is not None
+            light = pipeline.transmittance(lease.binned, job.view)
+            background_grad = _background_gradient(image_grad, light)
         *gaussian_grads, means2d_grad = grads
         return (*gaussian_grads, means2d_grad.reshape(ctx.slot), background_grad, None)
 
 
-def _background_gradient(image_grad: Tensor, alphas: Tensor) -> Tensor:
+def _background_gradient(image_grad: Tensor, light: pipeline.Array) -> Tensor:
     """Summed by numpy, whose order does not depend on the number of threads. [D]"""
-    light = (image_grad * (1 - alphas)).numpy()
-    return torch.from_numpy(light.sum(axis=(0, 1), dtype=np.float64).astype(np.float32))
+    passed = image_grad.numpy() * light[..., None]
+    return torch.from_numpy(passed.sum(axis=(0, 1), dtype=np.float64).astype(np.float32))
 
 
 class _Job:

@@ -95,7 +95,10 @@ def make_view(
         CLAMP_MARGIN * 0.5 * height / fy,
     )
     camera = np.zeros(lay.CAMERA, np.float32)
-    camera[lay.ROTATION : lay.ROTATION + 9] = viewmat[:3, :3].reshape(-1)
+    rows = np.asarray(viewmat[:3, :3])
+    camera[lay.ROTATION : lay.ROTATION + 9] = rows.reshape(-1)
+    cofactors = np.cross(np.roll(rows, -1, axis=0), np.roll(rows, -2, axis=0))
+    camera[lay.COFACTORS : lay.COFACTORS + 9] = cofactors.reshape(-1)
     centre = _centre(viewmat)
     camera[lay.CENTRE : lay.CENTRE + 3] = centre
     camera[lay.CENTRE_REST : lay.CENTRE_REST + 3] = centre - camera[lay.CENTRE : lay.CENTRE + 3]
@@ -257,6 +260,15 @@ def render_backward(
         rows,
     )
     return touched, rows
+
+
+def transmittance(binned: Binned, view: View) -> Array:
+    """What light is left at each pixel, with more digits than 1 - opacity has. [H, W]"""
+    tiles_y = view.tiles // view.tiles_x
+    # By tile, block, row and column.
+    plane = binned.planes[0].reshape(tiles_y, view.tiles_x, lay.BLOCKS, lay.BLOCKS, 4, 4)
+    rows = plane.transpose(0, 2, 4, 1, 3, 5).reshape(tiles_y * lay.TILE, view.tiles_x * lay.TILE)
+    return rows[: view.height, : view.width]
 
 
 def sum_rows(binned: Binned, touched: Array, rows: Array, sums: Array) -> None:

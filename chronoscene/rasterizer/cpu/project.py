@@ -17,7 +17,15 @@ from chronoscene.rasterizer.constants import (
     VALUE_MAX,
 )
 from chronoscene.rasterizer.cpu import layout as lay
-from chronoscene.rasterizer.cpu.geometry import project_axes, unit
+from chronoscene.rasterizer.cpu.geometry import (
+    by,
+    dot,
+    ellipse,
+    project_axes,
+    rotation,
+    scaled,
+    times,
+)
 from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
 from chronoscene.rasterizer.cpu.simd import (
     LANES,
@@ -61,11 +69,18 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     width, height = size
     means2d, radii, depths = out
     w, x, y, z = load4(quats, 4 * at)
-    w, x, y, z, _, longest = unit(w, x, y, z)
-    pz, (tx, ty), _, _, _, _, (shear, xx_given_y, yy, _) = project_axes(
-        camera, load3(means, 3 * at), (w, x, y, z), load3(scales, 3 * at)
+    (w, x, y, z), length2, _, longest = scaled(w, x, y, z)
+    (pz, rz, (tx, ty), _), _, rows, normal = project_axes(
+        camera, load3(means, 3 * at), rotation(w, x, y, z)
     )
-    xx = xx_given_y + shear * shear * yy
+    sizes = by(rz, load3(scales, 3 * at))
+    s = by(1.0 / length2, sizes)
+    a, b = times(rows[0], s), times(rows[1], s)
+    xx, yy = dot(a, a) + camera[lay.BLUR], dot(b, b) + camera[lay.BLUR]
+    sideways = xx > yy
+    _, _, shear, given, (second, inverse), _ = ellipse(
+        rows, normal, s, sizes, camera[lay.BLUR], sideways
+    )
     mx, my = camera[lay.FX] * tx + camera[lay.CX], camera[lay.FY] * ty + camera[lay.CY]
 
     opacity = load(opacities, at)
@@ -78,7 +93,7 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     visible = visible & (opacity > ALPHA_MIN) & (opacity < VALUE_MAX) & (reach > 0.0)
     visible = visible & (ex > 0.0) & (ex < EXTENT_MAX) & (ey > 0.0) & (ey < EXTENT_MAX)
     visible = visible & (mx + ex > 0.0) & (mx - ex < width)
-    visible = visible & (my + ey > 0.0) & (my - ey < height) & (xx_given_y > 0.0)
+    visible = visible & (my + ey > 0.0) & (my - ey < height) & (given > 0.0)
     visible = visible & (longest >= QUATERNION_MIN)
     visible = visible & (absolute(cr) < VALUE_MAX) & (absolute(cg) < VALUE_MAX)
     visible = visible & (absolute(cb) < VALUE_MAX)
@@ -88,28 +103,32 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     ty0, nty = _tile_range(my - ey * 1.001 - 0.01, my + ey * 1.001 + 0.01, height)
     drawn = visible & (ntx > 0) & (nty > 0)
     ntx, nty = select(drawn, ntx, 0), select(drawn, nty, 0)
-    axis_xx, axis_yy = lay.WHITEN / sqrt(xx_given_y), lay.WHITEN / sqrt(yy)
     zero = splat(0.0)
+    inverse_given, inverse_y, xy = 1.0 / sqrt(given), 1.0 / sqrt(yy), shear * second
+    u, v = lay.WHITEN * inverse_given, lay.WHITEN * inverse
+    u_sheared = zero - u * shear
+    # The standard deviation of x given y: the root of the determinant over that of y.
+    half = (given * inverse_given) * (second * inverse) * inverse_y
     store_records(
         records,
         lay.RECORD * at,
         (
             mx,
             my,
-            axis_xx,
-            zero - axis_xx * shear,
-            axis_yy,
+            select(sideways, u_sheared, u),
+            select(sideways, u, u_sheared),
+            select(sideways, zero - v, v),
             level,
             cr,
             cg,
             cb,
-            shear,
-            1.0 / axis_xx,
-            shear * yy / xx * ex,
+            xy * inverse_y * inverse_y,
+            half * (1.0 / lay.WHITEN),
+            xy / xx * ex,
             as_float(tx0 + (ntx << 16)),
             as_float(ty0 + (nty << 16)),
             zero,
-            zero,
+            lay.WHITEN * inverse_y,
         ),
     )
     store(keys, at, select(drawn, as_int(pz), -1))

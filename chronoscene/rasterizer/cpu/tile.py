@@ -31,28 +31,32 @@ _block_steps = make_constant([4.0 * i for i in range(8)])
 
 @inlined
 def whitened(records: Any, at: int, left: Any, top: Any, state: Any, steps: int) -> Any:
-    """Level of a Gaussian, and (u, v) of the pixels of a tile's first block.
+    """Level of a Gaussian, (u, v) of the pixels of a tile's first block, and `offset`'s shift.
 
-    How u and v change from block to block goes into 24 numbers of ``state``: u by column, u by
-    row, v by row. Adding them costs less than multiplying anew: additions have units of their own.
+    How u and v change from block to block goes into numbers of ``state``: 8 of u by column, 8 of u
+    by row, 8 of v by row or by column, 1 of v by row. Adding them costs less than multiplying anew:
+    additions have units of their own.
     """
-    axis_xx, axis_xy = records[at + lay.AXIS_XX], records[at + lay.AXIS_XY]
-    axis_yy = records[at + lay.AXIS_YY]
-    store(state, steps, _block_steps() * axis_xx)
-    store(state, steps + 8, _block_steps() * axis_xy)
-    store(state, steps + 16, _block_steps() * axis_yy)
+    u_x, u_y, v = records[at + lay.U_X], records[at + lay.U_Y], records[at + lay.V]
+    zero = np.float32(0.0)
+    v_x, v_y, shift = (zero, v, 3) if v > zero else (v, zero, 0)
+    store(state, steps, _block_steps() * u_x)
+    store(state, steps + 8, _block_steps() * u_y)
+    store(state, steps + 16, _block_steps() * v)
+    state[steps + 24] = np.float32(4.0) * v_y
     dx = _lane_x() + (left - records[at + lay.MEAN_X])
     dy = _lane_y() + (top - records[at + lay.MEAN_Y])
-    return splat(records[at + lay.LEVEL]), dx * axis_xx + dy * axis_xy, dy * axis_yy
+    return splat(records[at + lay.LEVEL]), dx * u_x + dy * u_y, dx * v_x + dy * v_y, shift
 
 
 @inlined
-def offset(u0: Any, v0: Any, block: Any, part: int, state: Any, steps: int) -> Any:
-    """(u, v) of the pixels of part of a block."""
+def offset(u0: Any, v0: Any, block: Any, part: int, state: Any, steps: int, shift: Any) -> Any:
+    """(u, v) of the pixels of part of a block. Shifted, its number begins with its row if v goes
+    by rows; else it is left as it is and begins with its column."""
     row = block >> 3
     u = u0 + state[steps + (block & 7)] + state[steps + 8 + row]
-    v = v0 + state[steps + 16 + row]
+    v = v0 + state[steps + 16 + ((block >> shift) & 7)]
     if PARTS > 1:  # the second half is two pixels below
         u = u + state[steps + 9] * np.float32(0.5 * part)
-        v = v + state[steps + 17] * np.float32(0.5 * part)
+        v = v + state[steps + 24] * np.float32(0.5 * part)
     return u, v

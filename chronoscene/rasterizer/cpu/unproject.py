@@ -10,7 +10,17 @@ from typing import Any
 import numpy as np
 
 from chronoscene.rasterizer.cpu import layout as lay
-from chronoscene.rasterizer.cpu.geometry import dot, project_axes, unit
+from chronoscene.rasterizer.cpu.geometry import (
+    by,
+    dot,
+    either,
+    ellipse,
+    plus,
+    project_axes,
+    rotation,
+    scaled,
+    times,
+)
 from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
 from chronoscene.rasterizer.cpu.phases import draw
 from chronoscene.rasterizer.cpu.project import chunk_range
@@ -75,7 +85,8 @@ def add_rows(worker, control, numbering, touched, rows, sums):
 
 @inlined
 def _quaternion_gradient(w: Any, x: Any, y: Any, z: Any, d: Any) -> Any:
-    """Gradient of a unit quaternion from that of its rotation matrix, given by rows."""
+    """Gradient of a unit quaternion from that of its rotation matrix, given by rows; of one of
+    another length, times that."""
     return (
         2.0 * (x * (d[7] - d[5]) + (y * (d[2] - d[6]) + z * (d[3] - d[1]))),
         2.0 * (w * (d[7] - d[5]) + y * (d[1] + d[3]) + z * (d[2] + d[6]))
@@ -99,11 +110,6 @@ def _turned_back(camera: Any, i: int, d0: Any, d1: Any, d2: Any) -> Any:
 
 
 @inlined
-def _times(a: Any, b: Any) -> Any:
-    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
-
-
-@inlined
 def _keep(mask: Any, values: Any) -> Any:
     """Three vectors, zero where the mask is not set, whatever was there."""
     return (
@@ -120,56 +126,60 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_means2d = grads
     f = load_records(sums, sums_at)
     w, qx, qy, qz = load4(quats, 4 * at)
-    w, qx, qy, qz, inverse, _ = unit(w, qx, qy, qz)
-    s = load3(scales, 3 * at)
-    pz, (tx, ty), (jx, jy), r, m2, (_, b), (shear, xx_given_y, yy, d) = project_axes(
-        camera, load3(means, 3 * at), (w, qx, qy, qz), s
+    (w, qx, qy, qz), length2, power, _ = scaled(w, qx, qy, qz)
+    r = rotation(w, qx, qy, qz)
+    (_, rz, (tx, ty), (jx, jy)), m2, rows, normal = project_axes(camera, load3(means, 3 * at), r)
+    inverse2 = 1.0 / length2
+    sizes = by(rz, load3(scales, 3 * at))
+    s = by(inverse2, sizes)
+    sideways = f[lay.SUM_SIGN] < 0.0
+    b, second, shear, given, (_, k), rest = ellipse(
+        rows, normal, s, sizes, camera[lay.BLUR], sideways
     )
-    rz = 1.0 / pz
-    fx, fy = camera[lay.FX] * rz, camera[lay.FY] * rz
 
-    # Whitening A = [[i, -shear i], [0, k]]: Sigma^-1 = A^T A. The sums are over u, v, which are
-    # WHITEN times the whitened offset A d; d loss / d Sigma = A^T (sum g (A d)(A d)^T) A / 2 and
-    # d loss / d mean = A^T sum g A d.
-    i, k = 1.0 / sqrt(xx_given_y), 1.0 / sqrt(yy)
+    # Whitening W = [[i, -shear i], [0, k]] for offsets (first, second): Sigma^-1 = W^T W. The sums
+    # are over u, v, which are WHITEN times the whitened offset W d; d loss / d Sigma =
+    # W^T (sum g (W d)(W d)^T) W / 2 and d loss / d mean = W^T sum g W d.
+    i = 1.0 / sqrt(given)
+    k = select(sideways, 0.0 - k, k)
     su, sv = f[lay.SUM_U] * (1.0 / lay.WHITEN), f[lay.SUM_V] * (1.0 / lay.WHITEN)
     scale = 1.0 / (lay.WHITEN * lay.WHITEN)
     suu, suv, svv = f[lay.SUM_UU] * scale, f[lay.SUM_UV] * scale, f[lay.SUM_VV] * scale
-    gmx = i * su
-    gmy = k * sv - shear * gmx
-    # A (a, b) = (i d, k b) with d = a - shear b: the gradients of a and b from those of the
-    # whitened rows, in terms of d lest they cancel for needles.
+    gm_first = i * su
+    gm_second = k * sv - shear * gm_first
+    gmx, gmy = select(sideways, gm_second, gm_first), select(sideways, gm_first, gm_second)
+    # W (a, b) = (i d, k b) with d = a - shear b: the gradients of d and b from those of the
+    # whitened rows. Those of a and b are of parts that cancel in needles; not these.
     huu, huv, hvv = i * i * suu, i * k * suv, k * k * svv
-    da = (huu * d[0] + huv * b[0], huu * d[1] + huv * b[1], huu * d[2] + huv * b[2])
-    db = (
-        huv * d[0] + hvv * b[0] - shear * da[0],
-        huv * d[1] + hvv * b[1] - shear * da[1],
-        huv * d[2] + hvv * b[2] - shear * da[2],
-    )
-    turning = huu * dot(d, d) + 2.0 * huv * dot(d, b) + hvv * dot(b, b)  # da . a + db . b
+    d = times(rest, s)
+    gd = plus(by(huu, d), by(huv, b))
+    gb = plus(by(huv, d), by(hvv, b))
+    gs = plus(times(gd, rest), times(gb, second))
+    turning = dot(gs, s)
+    gb = plus(gb, by(0.0 - shear, gd))
+    row_x, row_y = either(sideways, gb, gd), either(sideways, gd, gb)
 
-    d0 = (fx * da[0], fx * da[1], fx * da[2])
-    d1 = (fy * db[0], fy * db[1], fy * db[2])
+    d0 = times(by(camera[lay.FX], row_x), sizes)
+    d1 = times(by(camera[lay.FY], row_y), sizes)
     zero = splat(0.0)
-    d2 = (
-        zero - (jx * d0[0] + jy * d1[0]),
-        zero - (jx * d0[1] + jy * d1[1]),
-        zero - (jx * d0[2] + jy * d1[2]),
-    )
-    gjx = select((tx > camera[lay.X_MIN]) & (tx < camera[lay.X_MAX]), dot(d0, m2), 0.0)
-    gjy = select((ty > camera[lay.Y_MIN]) & (ty < camera[lay.Y_MAX]), dot(d1, m2), 0.0)
-    gpx, gpy = fx * gmx - rz * gjx, fy * gmy - rz * gjy
+    d2 = plus(by(zero - jx, d0), by(zero - jy, d1))
+    gjx = select((tx > camera[lay.X_MIN]) & (tx < camera[lay.X_MAX]), inverse2 * dot(d0, m2), 0.0)
+    gjy = select((ty > camera[lay.Y_MIN]) & (ty < camera[lay.Y_MAX]), inverse2 * dot(d1, m2), 0.0)
+    gpx = rz * (camera[lay.FX] * gmx - gjx)
+    gpy = rz * (camera[lay.FY] * gmy - gjy)
     gpz = zero - tx * gpx - ty * gpy - rz * turning
     if depth_gradients.size > 0:
         gpz = gpz + load(depth_gradients, at)
 
-    # N = R_gaussian diag(s); d loss / d N = rotation^T (d0, d1, d2).
-    n0 = _turned_back(camera, 0, d0, d1, d2)
-    n1 = _turned_back(camera, 1, d0, d1, d2)
-    n2 = _turned_back(camera, 2, d0, d1, d2)
-    dr = (*_times(n0, s), *_times(n1, s), *_times(n2, s))
+    # d loss / d R = rotation^T (d0, d1, d2).
+    dr = (
+        *_turned_back(camera, 0, d0, d1, d2),
+        *_turned_back(camera, 1, d0, d1, d2),
+        *_turned_back(camera, 2, d0, d1, d2),
+    )
     gw, gx, gy, gz = _quaternion_gradient(w, qx, qy, qz, dr)
-    along = w * gw + (qx * gx + (qy * gy + qz * gz))
+    along = inverse2 * (w * gw + (qx * gx + (qy * gy + qz * gz)))
+    inverse = inverse2 * power
 
     # Culled lanes hold nan: select, do not multiply by zero.
     drawn = load(keys, at) >= 0
@@ -185,12 +195,7 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     )
     gw = select(drawn, (gw - along * w) * inverse, 0.0)
     store_columns(grad_quats, 4 * at, (gw, gq[0], gq[1], gq[2]))
-    gs = (
-        n0[0] * r[0] + (n1[0] * r[3] + n2[0] * r[6]),
-        n0[1] * r[1] + (n1[1] * r[4] + n2[1] * r[7]),
-        n0[2] * r[2] + (n1[2] * r[5] + n2[2] * r[8]),
-    )
-    store_columns(grad_scales, 3 * at, _keep(drawn, gs))
+    store_columns(grad_scales, 3 * at, _keep(drawn, by(inverse2 * rz, gs)))
     store(grad_opacities, at, select(drawn, f[lay.SUM] / load(opacities, at), 0.0))
     gc = (f[lay.SUM_COLOR], f[lay.SUM_COLOR + 1], f[lay.SUM_COLOR + 2])
     store_columns(grad_colors, 3 * at, _keep(drawn, gc))
