@@ -8,10 +8,11 @@ from typing import Any
 
 from numba import njit
 
+from chronoscene import simd
 from chronoscene.compiled import kept_on_disk
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-_SOURCES = tuple(sorted(Path(__file__).parent.glob("_*.py")))
+_SOURCES = (*sorted(Path(__file__).parent.glob("_*.py")), Path(simd.__file__))
 
 
 def inner(function: Callable[..., Any]) -> Any:

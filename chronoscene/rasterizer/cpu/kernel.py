@@ -8,16 +8,20 @@ from typing import Any
 
 from numba import njit
 
+from chronoscene import simd
 from chronoscene.compiled import kept_on_disk
-from chronoscene.rasterizer.cpu.simd import FLAGS
 
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
-    "fastmath": set(FLAGS),
+    "fastmath": set(simd.FLAGS),
     "error_model": "numpy",
 }
 _FOLDER = Path(__file__).parent
-_SOURCES = (*sorted(_FOLDER.glob("*.py")), _FOLDER.parent / "constants.py")
+_SOURCES = (
+    *sorted(_FOLDER.glob("*.py")),
+    _FOLDER.parent / "constants.py",
+    Path(simd.__file__),
+)
 
 
 def inlined(function: Callable[..., Any]) -> Any:

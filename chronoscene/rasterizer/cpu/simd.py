@@ -1,92 +1,33 @@
-"""Vectors of 8 or 16 numbers inside Numba kernels, written as LLVM vector instructions.
+"""What the kernels do with vectors of 8 or 16 numbers: memory, functions, and lanes that move.
 
-Numba has no vector type, and leaving loops to the auto-vectoriser costs a factor of four to ten in
-the compositing kernels. Here a vector is a Numba type of its own; ``+ - * /``, comparisons and the
-functions below emit one or a few instructions of LLVM's portable vector IR, which LLVM turns into
-AVX-512, AVX2, SSE or NEON as the machine has it. Nothing in this file names a processor's
-instruction, so the same kernels run everywhere; only `LANES`, the width they are written for, is
-chosen from the processor.
+The vectors themselves and their operators are in `chronoscene.simd`.
 
 All arrays must be one-dimensional and contiguous; offsets count elements and are not checked.
 """
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from llvmlite import binding, ir
-from numba import config, types
-from numba.extending import (
-    intrinsic as _numba_intrinsic,
+from llvmlite import ir
+from numba import types
+
+from chronoscene.simd import (
+    ELEMENTS,
+    FLAGS,
+    I32,
+    REGISTER_LANES,
+    Vector,
+    comparison,
+    emit_lanes,
+    emit_promoted,
+    intrinsic,
+    make_splat,
 )
-from numba.extending import (
-    lower_builtin,
-    models,
-    register_model,
-    type_callable,
-)
 
-intrinsic: Any = _numba_intrinsic
-"""Untyped, since what it makes takes other arguments than the function under it."""
-
-FLAGS = ("contract", "nsz", "arcp", "afn")
-"""Rounding may differ from IEEE in the last place (fused multiply-add, reciprocals); infinities
-and nan are kept, since comparisons with them decide what is culled."""
-
-
-def _native_lanes() -> int:
-    """16 with AVX-512, else 8. Honours NUMBA_CPU_FEATURES, as the compiled code does."""
-    features = config.CPU_FEATURES  # type: ignore[attr-defined]
-    if features is not None:
-        return 16 if "+avx512f" in features else 8
-    return 16 if binding.get_host_cpu_features().get("avx512f") else 8
-
-
-LANES = _native_lanes()
+LANES = max(REGISTER_LANES, 8)
 """Numbers in the vectors of the kernels."""
-
-_ELEMENTS = {"f32": ir.FloatType(), "i32": ir.IntType(32), "i1": ir.IntType(1)}
-_I32 = ir.IntType(32)
-
-
-class Vector(types.Type):
-    """A Numba value of several f32, i32 or i1 (a mask)."""
-
-    def __init__(self, kind: str, lanes: int) -> None:
-        self.kind, self.lanes = kind, lanes
-        super().__init__(name=f"{kind}x{lanes}")
-
-    @property
-    def llvm(self) -> ir.VectorType:
-        return ir.VectorType(_ELEMENTS[self.kind], self.lanes)
-
-    def with_kind(self, kind: str) -> Vector:
-        return Vector(kind, self.lanes)
-
-
-@register_model(Vector)
-class _VectorModel(models.PrimitiveModel):
-    def __init__(self, dmm: Any, fe_type: Vector) -> None:
-        super().__init__(dmm, fe_type, fe_type.llvm)
-
-
-_SCALARS = {"f32": types.float32, "i32": types.int32}
-
-
-def _constant(values: list[int] | list[float], element: ir.Type) -> ir.Constant:
-    return ir.Constant(
-        ir.VectorType(element, len(values)), [ir.Constant(element, v) for v in values]
-    )
-
-
-def _splat(builder: Any, value: Any, lanes: int) -> Any:
-    vector = ir.VectorType(value.type, lanes)
-    first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(
-        first, ir.Constant(vector, ir.Undefined), _constant([0] * lanes, _I32)
-    )
 
 
 def _shuffle(builder: Any, a: Any, b: Any, lanes: Sequence[int | None]) -> Any:
@@ -95,7 +36,7 @@ def _shuffle(builder: Any, a: Any, b: Any, lanes: Sequence[int | None]) -> Any:
     return builder.shuffle_vector(
         a,
         b,
-        _constant([min(k, free) if i is None else i for k, i in enumerate(lanes)], _I32),
+        emit_lanes([min(k, free) if i is None else i for k, i in enumerate(lanes)], I32),
     )
 
 
@@ -120,89 +61,6 @@ def _pick(builder: Any, sources: list[Any], lanes: list[tuple[int, int]]) -> Any
             result = _shuffle(builder, result, piece, merged)
         placed |= here
     return result
-
-
-def _promote(context: Any, builder: Any, value: Any, kind: Any, like: Vector) -> Any:
-    if isinstance(kind, Vector):
-        return value
-    scalar = context.cast(builder, value, kind, _SCALARS[like.kind])
-    return _splat(builder, scalar, like.lanes)
-
-
-def _define_operator(op: Callable, emit: Callable[[Any, str, Any, Any], Any], mask: bool) -> None:
-    """Let ``op`` take two vectors, or a vector and a number."""
-
-    def result(a: Any, b: Any) -> Vector | None:
-        vectors = [x for x in (a, b) if isinstance(x, Vector)]
-        others = [x for x in (a, b) if not isinstance(x, Vector)]
-        if not vectors or len({v.name for v in vectors}) > 1:
-            return None
-        if any(not isinstance(x, types.Number) for x in others):
-            return None
-        return vectors[0].with_kind("i1") if mask else vectors[0]
-
-    @type_callable(op)
-    def _type(context: Any) -> Callable:
-        def typer(a: Any, b: Any) -> Vector | None:
-            return result(a, b)
-
-        return typer
-
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        like = next(x for x in sig.args if isinstance(x, Vector))
-        a, b = (_promote(context, builder, x, t, like) for x, t in zip(args, sig.args, strict=True))
-        return emit(builder, like.kind, a, b)
-
-    for pair in ((Vector, Vector), (Vector, types.Number), (types.Number, Vector)):
-        lower_builtin(op, *pair)(lower)
-
-
-def _arithmetic(name: str) -> Callable[[Any, str, Any, Any], Any]:
-    def emit(builder: Any, kind: str, a: Any, b: Any) -> Any:
-        if kind == "f32":
-            return getattr(builder, "f" + name)(a, b, flags=FLAGS)
-        return getattr(builder, name)(a, b)
-
-    return emit
-
-
-def _bitwise(name: str) -> Callable[[Any, str, Any, Any], Any]:
-    def emit(builder: Any, kind: str, a: Any, b: Any) -> Any:
-        return getattr(builder, name)(a, b)
-
-    return emit
-
-
-def _comparison(symbol: str) -> Callable[[Any, str, Any, Any], Any]:
-    def emit(builder: Any, kind: str, a: Any, b: Any) -> Any:
-        if kind == "f32":
-            return builder.fcmp_ordered(symbol, a, b)
-        return builder.icmp_signed(symbol, a, b)
-
-    return emit
-
-
-for _op, _name in (
-    (operator.add, "add"),
-    (operator.sub, "sub"),
-    (operator.mul, "mul"),
-    (operator.truediv, "div"),
-):
-    _define_operator(_op, _arithmetic(_name), mask=False)
-for _op, _symbol in (
-    (operator.lt, "<"),
-    (operator.le, "<="),
-    (operator.gt, ">"),
-    (operator.ge, ">="),
-):
-    _define_operator(_op, _comparison(_symbol), mask=True)
-for _op, _name in (
-    (operator.and_, "and_"),
-    (operator.or_, "or_"),
-    (operator.lshift, "shl"),
-    (operator.rshift, "ashr"),
-):
-    _define_operator(_op, _bitwise(_name), mask=False)
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, offset: Any) -> Any:
@@ -276,23 +134,10 @@ def store_where(typingctx: Any, array: Any, offset: Any, mask: Any, value: Any) 
     return types.void(array, types.intp, mask, value), codegen
 
 
-def _make_splat(kind: str, lanes: int) -> Callable:
-    @intrinsic
-    def splat(typingctx: Any, value: Any) -> Any:
-        """Vector with one number in every lane."""
-
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return _splat(builder, args[0], lanes)
-
-        return Vector(kind, lanes)(_SCALARS[kind]), codegen
-
-    return splat
-
-
-splat = _make_splat("f32", LANES)
-splat_int = _make_splat("i32", LANES)
-splat16 = _make_splat("f32", 16)
-splat16_int = _make_splat("i32", 16)
+splat = make_splat("f32", LANES)
+splat_int = make_splat("i32", LANES)
+splat16 = make_splat("f32", 16)
+splat16_int = make_splat("i32", 16)
 
 
 def make_constant(values: list[int] | list[float]) -> Callable:
@@ -302,7 +147,7 @@ def make_constant(values: list[int] | list[float]) -> Callable:
     @intrinsic
     def constant(typingctx: Any) -> Any:
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return _constant(values, _ELEMENTS[kind])
+            return emit_lanes(values, ELEMENTS[kind])
 
         return Vector(kind, len(values))(), codegen
 
@@ -351,23 +196,13 @@ def absolute(typingctx: Any, a: Any) -> Any:
 
 
 @intrinsic
-def multiply_add(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
-    """a * b + c, rounded once where the processor can."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return _intrinsic_call(builder, "fmuladd", list(args))
-
-    return a(a, b, c), codegen
-
-
-@intrinsic
 def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
     """Lanes of ``a`` where the mask is set, of ``b`` elsewhere. Either may be a number."""
     like = a if isinstance(a, Vector) else b
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        yes = _promote(context, builder, args[1], sig.args[1], like)
-        no = _promote(context, builder, args[2], sig.args[2], like)
+        yes = emit_promoted(context, builder, args[1], sig.args[1], like)
+        no = emit_promoted(context, builder, args[2], sig.args[2], like)
         return builder.select(args[0], yes, no)
 
     return like(mask, a, b), codegen
@@ -380,9 +215,9 @@ def _make_extremum(symbol: str) -> Callable:
         like = a if isinstance(a, Vector) else b
 
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            x = _promote(context, builder, args[0], sig.args[0], like)
-            y = _promote(context, builder, args[1], sig.args[1], like)
-            return builder.select(_comparison(symbol)(builder, like.kind, x, y), x, y)
+            x = emit_promoted(context, builder, args[0], sig.args[0], like)
+            y = emit_promoted(context, builder, args[1], sig.args[1], like)
+            return builder.select(comparison(symbol)(builder, like.kind, x, y), x, y)
 
         return like(a, b), codegen
 
@@ -476,12 +311,12 @@ def _make_prefetch(write: int) -> Callable:
             name = "llvm.prefetch.p0"
             function = builder.module.globals.get(name)
             if function is None:
-                kinds = [address.type, _I32, _I32, _I32]
+                kinds = [address.type, I32, I32, I32]
                 function = ir.Function(
                     builder.module, ir.FunctionType(ir.VoidType(), kinds), name=name
                 )
             # Write or read, keep in all caches, data.
-            builder.call(function, [address, *(ir.Constant(_I32, v) for v in (write, 3, 1))])
+            builder.call(function, [address, *(ir.Constant(I32, v) for v in (write, 3, 1))])
             return context.get_dummy_value()
 
         return types.void(array, types.intp), codegen
