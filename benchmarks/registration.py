@@ -2,11 +2,13 @@
 
     python benchmarks/registration.py observations [--cases 300] [--seed 0] [--only FAMILY]
     python benchmarks/registration.py images [--only NAME] [--work FOLDER] [--route joint]
+    python benchmarks/registration.py photos FOLDER [FOLDER ...] [--work FOLDER] [--route joint]
 
 ``observations`` generates matches and poses without images (`chronoscene.registration.generated`),
 in families of what can go wrong. ``images`` renders small cities at several dates and runs the
 command ``chronoscene register`` on the photos, with GPS noise of 3 m and 10% gross errors in them,
-by each of its routes.
+by each of its routes. ``photos`` takes real photos, deals them into periods, and compares with the
+one reconstruction of all of them.
 
 A registration is right if the median rotation of every period is within 0.1 degrees and its median
 centre within 0.2% of the scene's extent, in the frame of the first period's cameras. The confusion
@@ -126,16 +128,19 @@ def judged(
     truth: np.ndarray,
     verdict: Verdict,
     seconds: float,
+    where: np.ndarray | None = None,
 ) -> Outcome:
-    """Compare a registration with the truth. [N, 4, 4]"""
-    rotation, centre = pose_errors(model.cam_from_world, truth, model.periods == 0)
-    extent = true_extent(truth)
+    """Compare a registration with the truth [N, 4, 4], where that is known. [N]"""
+    where = np.ones(len(truth), bool) if where is None else where
+    rotation, centre = pose_errors(model.cam_from_world, truth, where & (model.periods == 0))
+    extent = true_extent(truth[where])
     rows = []
     for p in range(1, model.num_periods):
-        if not (model.periods == p).any():
+        mine = where & (model.periods == p)
+        if not mine.any():
             rows.append((np.inf,) * 4)
             continue
-        r, c = rotation[model.periods == p], 100 * centre[model.periods == p] / extent
+        r, c = rotation[mine], 100 * centre[mine] / extent
         rows.append((np.median(r), r.max(), np.median(c), c.max()))
     reason = verdict.findings[0].check if verdict.findings else ""
     return Outcome(family, route, tuple(rows), verdict.level, reason, seconds)
@@ -199,16 +204,21 @@ def errors_table(outcomes: list[Outcome]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("tier", choices=("observations", "images"))
+    parser.add_argument("tier", choices=("observations", "images", "photos"))
+    parser.add_argument("folders", nargs="*", type=Path, help="photos: folders with images/")
     parser.add_argument("--cases", type=int)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="families or cases whose name has this in it")
-    parser.add_argument("--route", default="all", help="images: one of the routes, or all")
-    parser.add_argument("--work", type=Path, help="images: folder that keeps scenes and models")
+    parser.add_argument("--route", default="all", help="one of the routes, or all")
+    parser.add_argument("--work", type=Path, help="folder that keeps scenes and models")
     options = parser.parse_args()
     print(f"{processor_name()}, {os.cpu_count()} processors, seed {options.seed}")
     if options.tier == "observations":
         outcomes = run_observations(options.cases or 330, options.seed, options.only)
+    elif options.tier == "photos":
+        from registration_photos import run_photos
+
+        outcomes = run_photos(options)
     else:
         from registration_images import run_images
 

@@ -114,7 +114,7 @@ def _run_case(
             model = _frozen(folder, found)
         else:
             out = folder / f"registered-{route}"
-            options = _options(folder / "work", None if route == "auto" else route)
+            options = options_for(folder / "work", None if route == "auto" else route)
             model = run(read_captures(folder / "photos"), out, options, inspected=found.append)
     except ChronoSceneError as error:
         print(f"{case.name}, {route}: refused: {error}", flush=True)
@@ -127,7 +127,7 @@ def _run_case(
         f"{time.perf_counter() - start:.0f} s",
         flush=True,
     )
-    _print(outcome, found[-1])
+    print_outcome(outcome, found[-1])
     return outcome
 
 
@@ -137,7 +137,8 @@ def _cpu() -> float:
     return times.user + times.system + times.children_user + times.children_system
 
 
-def _options(work: Path, route: str | None) -> Options:
+def options_for(work: Path, route: str | None) -> Options:
+    """As the command has them, with the page; None lets it choose the route."""
     return Options(route=route, overwrite=True, work=work, page=True)  # type: ignore[arg-type]
 
 
@@ -149,14 +150,15 @@ def _frozen(folder: Path, found: list[Inspection]) -> Registered:
     for label in periods[:-1]:
         shutil.copytree(folder / "photos" / label, old / label)
     base = folder / "registered-old"
-    run(read_captures(old), base, _options(folder / "work-old", None))
+    run(read_captures(old), base, options_for(folder / "work-old", None))
     captures = read_captures(folder / "photos" / periods[-1])
-    options = _options(folder / "work-frozen", None)
+    options = options_for(folder / "work-frozen", None)
     out = folder / "registered-frozen"
     return run_into(read_scene(base), captures, out, options, inspected=found.append)
 
 
-def _print(outcome: Outcome, inspection: Inspection) -> None:
+def print_outcome(outcome: Outcome, inspection: Inspection) -> None:
+    """Errors by period, the verdict, and what it rests on."""
     for p, row in enumerate(outcome.periods, 1):
         print(
             f"  period {p}: rotation {row[0]:.4f} (largest {row[1]:.4f}) degrees, centre "

@@ -244,11 +244,15 @@ def _align_periods(
 
 
 def _too_few(model: Registered, tie_points: TiePoints, period: int, count: int) -> SceneError:
+    images = match_images(tie_points, model.names)
+    missing = sorted(name for name, i in images.items() if i is None)
+    also = f", and clicks in {len(missing)} photos without a pose: " if missing else ""
+    also += ", ".join(missing[:5]) + (" ..." if len(missing) > 5 else "")
     return SceneError(
         tie_points.path,
         expected=f"three points or more, not on one line, each clicked in two images of period "
         f"{model.labels[period]} and in two of another period",
-        found=f"{count} such points",
+        found=f"{count} such points{also}",
         todo="click more points, spread over the scene; a point needs two images of each period",
     )
 

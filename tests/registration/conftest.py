@@ -1,4 +1,4 @@
-"""Databases of two periods with known poses, for routes that need no photos."""
+"""A small city at two dates, and databases of known poses for routes that need no photos."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,10 +12,17 @@ from numpy.typing import NDArray
 import chronoscene  # noqa: F401  (loads zlib before pycolmap)
 from chronoscene._pycolmap import pycolmap
 from chronoscene.colmap import read_model
+from chronoscene.formats import read_scene
 from chronoscene.geometry import camera_centre, pose_from_rotation_translation
+from chronoscene.scene import Scene
+from chronoscene.synth import SynthSettings, generate
 from chronoscene.validation.alignment import fit
 
 Array = NDArray[np.float64]
+
+SETTINGS = SynthSettings(
+    periods=2, width=400, height=300, views=12, points=1000, blocks=2, supersample=1
+)
 
 IMAGES = 8
 """Of each period."""
@@ -77,6 +84,14 @@ class Case:
                 distances.append(np.linalg.norm(place - camera_centre(self.truth[name])) / extent)
             result[period] = (float(np.median(angles)), float(np.median(distances)))
         return result
+
+
+@pytest.fixture(scope="session")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """A small city at two dates."""
+    folder = tmp_path_factory.mktemp("generated") / "scene"
+    generate(folder, SETTINGS)
+    return read_scene(folder)
 
 
 @pytest.fixture

@@ -18,13 +18,8 @@ from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.model import Registered
 from chronoscene.registration.pipeline import Options, run, run_into
 from chronoscene.scene import Scene
-from chronoscene.synth import SynthSettings, generate
 from chronoscene.validation.alignment import fit
 from chronoscene.validation.run import validate_scene
-
-SETTINGS = SynthSettings(
-    periods=2, width=400, height=300, views=12, points=1000, blocks=2, supersample=1
-)
 
 OPTIONS = Options(threads=1, max_features=3000)
 
@@ -32,13 +27,6 @@ SAME = ("--threads", "1", "--max-features", "3000")
 """The same for the command line."""
 
 COMMAND = "from chronoscene.cli import main; main()"
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    folder = tmp_path_factory.mktemp("generated") / "scene"
-    generate(folder, SETTINGS)
-    return read_scene(folder)
 
 
 @pytest.fixture(scope="module")
