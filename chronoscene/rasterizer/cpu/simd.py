@@ -196,6 +196,16 @@ def absolute(typingctx: Any, a: Any) -> Any:
 
 
 @intrinsic
+def multiply_add(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
+    """a * b + c, rounded once where the processor can."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return _intrinsic_call(builder, "fmuladd", list(args))
+
+    return a(a, b, c), codegen
+
+
+@intrinsic
 def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
     """Lanes of ``a`` where the mask is set, of ``b`` elsewhere. Either may be a number."""
     like = a if isinstance(a, Vector) else b
