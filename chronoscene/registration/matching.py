@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from chronoscene.registration.cameras import camera_groups
 from chronoscene.registration.context import Context
 from chronoscene.registration.inputs import Inputs
-from chronoscene.registration.stages import fingerprint
 from chronoscene.scene import Frame, Scene
 
 
@@ -42,7 +40,7 @@ def find_matches(inputs: Inputs, context: Context) -> Matched:
 
 def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
     options = context.options
-    groups = camera_groups(inputs.images, options.camera_model)
+    groups = camera_groups(inputs.images, options.camera_model, options.calibration)
     if inputs.scene is not None:
         groups = scene_groups(inputs.scene) + groups
     settings = {
@@ -50,7 +48,6 @@ def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
         "max_image_size": options.max_image_size,
         "max_features": options.max_features,
     }
-    _renew(context, settings)
 
     def extract() -> tuple[Any, list[str]]:
         places = {
@@ -58,6 +55,8 @@ def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
             "photos": str(context.photos),
             "threads": context.threads,
         }
+        # The database can become another one: pairs that an earlier one had may be missing in it.
+        (context.work / "stage-matches.json").unlink(missing_ok=True)
         found = context.step("features", settings | places)
         total = sum(found["keypoints"].values())
         known = sum(found["focal_known"].values())
@@ -65,19 +64,13 @@ def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
             f"{total} features in {len(found['keypoints'])} photos, {len(groups)} cameras, "
             f"{known} with a focal length from EXIF or the scene"
         )
-        return found, [remark]
+        return found, [remark, *_told(found["carried"], len(found["keypoints"]), "photos")]
 
     return dict(context.stages.run("features", settings, extract))
 
 
-def _renew(context: Context, settings: Any) -> None:
-    """Remove a database that was made from other photos or with other settings."""
-    mark = context.work / "features.key"
-    key = fingerprint(context.stages.previous, settings)
-    if not mark.exists() or mark.read_text() != key:
-        for suffix in ("", "-wal", "-shm"):
-            Path(f"{context.database}{suffix}").unlink(missing_ok=True)
-        mark.write_text(key)
+def _told(carried: int, total: int, what: str) -> list[str]:
+    return [f"{carried} of {total} {what} carried over from the run before"] if carried else []
 
 
 def _matches(inputs: Inputs, context: Context) -> None:
@@ -111,7 +104,8 @@ def _matches(inputs: Inputs, context: Context) -> None:
         }
         found = context.step("matches", arguments)
         pairs, verified, inliers = (found[k] for k in ("pairs", "verified", "inliers"))
-        return found, [f"{verified} of {pairs} pairs verified, {inliers} matches"]
+        told = f"{verified} of {pairs} pairs verified, {inliers} matches"
+        return found, [told, *_told(found["carried"], pairs, "pairs")]
 
     context.stages.run("pairs", settings, choose)
     context.stages.run("matches", None, match)

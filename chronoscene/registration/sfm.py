@@ -1,7 +1,8 @@
 """Features and matches in a COLMAP database. Runs in the worker process only.
 
 Images enter the database in the order of the photos, so ids are the same in every run. Both steps
-go in small batches: what a batch has stored is not done again.
+go in small batches: what a batch has stored is not done again. What an earlier database has of the
+same photos is copied from there; see `chronoscene.registration.carrying`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 
 from chronoscene._pycolmap import pycolmap
 from chronoscene.files import write_text_atomic
+from chronoscene.registration import carrying
 from chronoscene.registration.worker import Report
 
 FEATURE_BATCH = 8
@@ -37,11 +39,13 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     Returns:
         ``keypoints``: number by name; ``focal_known``: whether the focal length of a group is known
-        beforehand.
+        beforehand; ``carried``: number of photos whose features an earlier database had.
     """
     quiet()
     database, photos = arguments["database"], arguments["photos"]
+    carrying.renew(Path(database), carrying.record_of(arguments))
     _import(database, photos, arguments["groups"])
+    carried = carrying.carry_features(Path(database))
     names = sorted(name for group in arguments["groups"] for name in group["names"])
     left = [name for name, count in keypoint_counts(database).items() if count == 0]
     left = sorted(set(left) & set(names))
@@ -58,7 +62,11 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     with pycolmap.Database.open(database) as opened:
         known = {c.camera_id: bool(c.has_prior_focal_length) for c in opened.read_all_cameras()}
     counts = keypoint_counts(database)
-    return {"keypoints": {name: counts[name] for name in names}, "focal_known": known}
+    return {
+        "keypoints": {name: counts[name] for name in names},
+        "focal_known": known,
+        "carried": carried,
+    }
 
 
 def keypoint_counts(database: str | Path) -> dict[str, int]:
@@ -92,10 +100,16 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     Arguments: ``database``, ``pairs`` (text file with two names a line), ``threads``,
     ``scratch`` (folder).
+
+    Returns:
+        Number of ``pairs``, of those ``verified``, of their ``inliers``, and of the pairs
+        ``carried`` over from an earlier database.
     """
     quiet()
     database = arguments["database"]
     pairs = read_pairs(Path(arguments["pairs"]))
+    _drop_others(database, pairs)
+    carried = carrying.carry_matches(Path(database), pairs)
     left = _unmatched(database, pairs)
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -112,11 +126,24 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     report("pairs", len(pairs), len(pairs))
     with pycolmap.Database.open(database) as opened:
         counts = [int(n) for n in opened.read_two_view_geometry_num_inliers()[1]]
+    carrying.forget(Path(database))
     return {
         "pairs": len(pairs),
         "verified": sum(n > 0 for n in counts),
         "inliers": sum(counts),
+        "carried": carried,
     }
+
+
+def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:
+    """Drop pairs that are not listed: an earlier list can have had others."""
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): image.image_id for image in opened.read_all_images()}
+        listed = {pycolmap.image_pair_to_pair_id(ids[a], ids[b]) for a, b in pairs}
+        for pair_id in set(opened.read_num_matches()[0]) - listed:
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            opened.delete_matches(a, b)
+            opened.delete_two_view_geometry(a, b)
 
 
 def _unmatched(database: str, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
