@@ -10,6 +10,7 @@ from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.formats import read_scene
+from chronoscene.registration.cameras import CALIBRATIONS, LEAST_OF_ITS_OWN, Calibration
 from chronoscene.registration.captures import read_captures
 from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.model import ROUTES, Registered, Route
@@ -80,6 +81,14 @@ FAILED = 1
     show_default=True,
 )
 @click.option(
+    "--calibration",
+    type=click.Choice(CALIBRATIONS),
+    default=DEFAULTS.calibration,
+    show_default=True,
+    help="Whether a camera that took photos at several dates is calibrated for each date; auto: "
+    f"where a date has {LEAST_OF_ITS_OWN['auto']} of them or more.",
+)
+@click.option(
     "--threads",
     type=click.IntRange(1),
     help="With 1, every run gives the same result bit by bit.  [default: one per processor]",
@@ -115,6 +124,7 @@ def command(
     exhaustive_limit: int,
     held_out: float,
     camera_model: str,
+    calibration: Calibration,
     threads: int | None,
     tie_points: Path | None,
     tie_scale: float,
@@ -143,6 +153,7 @@ def command(
         exhaustive_limit=exhaustive_limit,
         held_out=held_out,
         camera_model=camera_model,
+        calibration=calibration,
         threads=threads,
         tie_points=tie_points,
         tie_scale=tie_scale,

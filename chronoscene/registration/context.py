@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from chronoscene.registration.cameras import Calibration
 from chronoscene.registration.model import Route
 from chronoscene.registration.stages import Stages
 from chronoscene.registration.worker import Report, run_step
@@ -36,6 +37,8 @@ class Options:
     """Share of the tracks across periods that take no part in estimation."""
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP's camera model for the photos."""
+    calibration: Calibration = "auto"
+    """Whether periods that were taken with the same camera share its calibration."""
     threads: int | None = None
     """None for one per processor. With 1, results are the same to the last bit in every run."""
     seed: int = 0

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from chronoscene.exif import ExifData
-from chronoscene.registration.cameras import LEAST_OF_ITS_OWN, camera_groups
+from chronoscene.registration.cameras import LEAST_OF_ITS_OWN, Calibration, camera_groups
 from chronoscene.registration.photo import Capture
 
 
@@ -12,8 +12,8 @@ def capture(name: str, period: int, *, model: str = "A", focal: float = 24.0) ->
     return Capture(name, Path(name), period, 640, 480, exif, None, None)
 
 
-def names(captures: list[Capture]) -> list[list[str]]:
-    return [group["names"] for group in camera_groups(captures, "SIMPLE_RADIAL")]
+def names(captures: list[Capture], calibration: Calibration = "auto") -> list[list[str]]:
+    return [group["names"] for group in camera_groups(captures, "SIMPLE_RADIAL", calibration)]
 
 
 def test_lens_and_zoom_make_the_camera() -> None:
@@ -27,10 +27,18 @@ def test_lens_and_zoom_make_the_camera() -> None:
 
 
 def test_a_period_with_many_photos_has_its_own_calibration() -> None:
-    many = [capture(f"0/{i}", 0) for i in range(LEAST_OF_ITS_OWN)]
-    more = [capture(f"1/{i}", 1) for i in range(LEAST_OF_ITS_OWN)]
-    assert names(many + more) == [[c.name for c in many], [c.name for c in more]]
+    many = [capture(f"0/{i}", 0) for i in range(LEAST_OF_ITS_OWN["auto"])]
+    more = [capture(f"1/{i}", 1) for i in range(LEAST_OF_ITS_OWN["auto"])]
+    assert names(many + more) == [sorted(c.name for c in many), sorted(c.name for c in more)]
 
 
 def test_periods_with_few_photos_share_one() -> None:
-    assert names([capture("0/a", 0), capture("1/a", 1)]) == [["0/a", "1/a"]]
+    few = [capture("0/a", 0), capture("1/a", 1)]
+    assert names(few) == [["0/a", "1/a"]]
+    assert names(few, "per-period") == [["0/a"], ["1/a"]]
+
+
+def test_periods_share_one_where_that_is_asked_for() -> None:
+    many = [capture(f"{p}/{i}", p) for p in (0, 1) for i in range(LEAST_OF_ITS_OWN["auto"])]
+    assert names(many, "shared") == [sorted(c.name for c in many)]
+    assert len(names([*many, capture("1/b", 1, model="B")], "shared")) == 2
