@@ -26,6 +26,6 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     names = sorted(arguments["periods"])
     models, remarks = map_images(database, photos, names, scratch, threads, report)
     if not models:
-        raise nothing_mapped(len(names))
+        raise nothing_mapped(len(names), tied=arguments["keep_unplaced"])
     units = [Unit(f"part {i}", model) for i, model in enumerate(models)]
     return join(units, arguments, remarks, report)

@@ -76,14 +76,15 @@ def map_images(
     return best, remarks
 
 
-def nothing_mapped(count: int) -> RegistrationError:
-    """The error of photos that give no model at all."""
+def nothing_mapped(count: int, *, tied: bool) -> RegistrationError:
+    """The error of photos that give no model at all, with tie points or without."""
+    also = "tie points bring models together, they do not make them; " if tied else ""
     return RegistrationError(
         "structure from motion",
         expected=f"a model of {count} photos",
         found="no two photos from which one can be begun",
         todo="give more photos that overlap by more than half, taken from different places; "
-        "features and matches are kept",
+        f"{also}features and matches are kept",
     )
 
 

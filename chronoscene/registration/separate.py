@@ -30,5 +30,5 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             label = f"period {period}" + (f" part {i}" if len(models) > 1 else "")
             units.append(Unit(label, model, period, is_largest=i == 0))
     if not units:
-        raise nothing_mapped(len(periods))
+        raise nothing_mapped(len(periods), tied=arguments["keep_unplaced"])
     return join(units, arguments, remarks, report)

@@ -123,6 +123,9 @@ def test_nothing_to_map_is_said(make_case: Callable[..., Any]) -> None:
     case = make_case(points=5)
     with pytest.raises(RegistrationError, match="found no two photos"):
         joint.run(case.arguments(), silent)
+    case.extra["keep_unplaced"] = True
+    with pytest.raises(RegistrationError, match="tie points bring models together"):
+        separate.run(case.arguments(), silent)
 
 
 def test_a_period_without_matches_waits_for_tie_points(make_case: Callable[..., Any]) -> None:
