@@ -54,5 +54,12 @@ def main() -> None:
     try:
         cli.main(prog_name="chronoscene")
     except ChronoSceneError as error:
-        click.secho(f"error: {error}", fg="red", err=True)
-        sys.exit(USAGE_ERROR)
+        _end(str(error))
+    except OSError as error:  # a full disk, a place that went away
+        place = f"{error.filename}: " if error.filename else ""
+        _end(f"{place}{error.strerror or error}; what was finished before is kept")
+
+
+def _end(message: str) -> None:
+    click.secho(f"error: {message}", fg="red", err=True)
+    sys.exit(USAGE_ERROR)

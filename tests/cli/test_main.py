@@ -1,5 +1,7 @@
 """The command starts quickly, lists its commands, and turns our errors into one line."""
 
+import errno
+import os
 import subprocess
 import sys
 
@@ -36,6 +38,21 @@ def test_our_errors_become_one_line_and_status_2(monkeypatch, capsys):
         main()
     assert stopped.value.code == 2
     assert capsys.readouterr().err == "error: scene: expected a model, found nothing; add one\n"
+
+
+def test_a_full_disk_is_one_line_too(monkeypatch, capsys):
+    @click.command("boom")
+    def boom() -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "runs/results.json")
+
+    monkeypatch.setattr(cli_package.cli, "get_command", lambda ctx, name: boom)
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "boom"])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: runs/results.json: No space left on device")
+    assert told.count("\n") == 1
 
 
 def test_help_imports_nothing_heavy():
