@@ -91,10 +91,10 @@ def carry_features(database: Path) -> int:
             if was is None or not old.database.num_keypoints_for_image(was):
                 continue
             carried += 1
-            if not new.database.num_keypoints_for_image(now):
-                with pycolmap.DatabaseTransaction(new.database):
-                    new.database.write_keypoints(now, old.database.read_keypoints(was))
-                    new.database.write_descriptors(now, old.database.read_descriptors(was))
+            if not new.database.exists_descriptors(now):
+                new.database.write_descriptors(now, old.database.read_descriptors(was))
+            if not new.database.exists_keypoints(now):  # by which a photo counts as done
+                new.database.write_keypoints(now, old.database.read_keypoints(was))
     return carried
 
 
@@ -179,18 +179,17 @@ def _sources(was: Record | None, now: Record | None) -> dict[str, str]:
 
 
 def _copy_pair(old: _Opened, was: tuple[int, int], new: _Opened, now: tuple[int, int]) -> None:
-    """Copy one pair at once, unless it is there."""
+    """Copy one pair, unless it is there; the geometry last, by which a pair counts as done."""
     if new.database.exists_two_view_geometry(*now):
         return
+    if new.database.exists_matches(*now):
+        new.database.delete_matches(*now)
+    new.database.write_matches(*now, old.database.read_matches(*was))
     geometry = old.database.read_two_view_geometry(*was)
     for camera, image in zip((geometry.camera1, geometry.camera2), now, strict=True):
         if camera is not None:  # with the focal length that the pair suggests
             camera.camera_id = new.camera_ids[image]
-    with pycolmap.DatabaseTransaction(new.database):
-        if new.database.exists_matches(*now):  # not verified, see `sfm.match`
-            new.database.delete_matches(*now)
-        new.database.write_matches(*now, old.database.read_matches(*was))
-        new.database.write_two_view_geometry(*now, geometry)
+    new.database.write_two_view_geometry(*now, geometry)
 
 
 def _worth(database: Path, wanted: Record) -> tuple[int, int]:
