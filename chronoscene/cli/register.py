@@ -85,8 +85,8 @@ FAILED = 1
     type=click.Choice(CALIBRATIONS),
     default=DEFAULTS.calibration,
     show_default=True,
-    help="Whether a camera that took photos at several dates is calibrated for each date; auto: "
-    f"where a date has {LEAST_OF_ITS_OWN['auto']} of them or more.",
+    help="Whether a camera that took photos of several periods is calibrated for each; auto: where "
+    f"they are more than a day apart and have {LEAST_OF_ITS_OWN} of them or more.",
 )
 @click.option(
     "--threads",
