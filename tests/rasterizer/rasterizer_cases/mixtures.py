@@ -1,8 +1,8 @@
 """Mixtures of extremes that drawing at random has found, cut down to the Gaussians that count.
 
 In most of them the CPU backend once lost digits that the inputs have: along an ellipse that the
-image cuts short, in the rounding of a unit quaternion, in what light is left. The last two are
-nothing but rounding: there the inputs themselves have no digits for one of the gradients.
+image cuts short, in the rounding of a unit quaternion, in what light is left. The last three are
+mostly rounding: there the inputs themselves have few digits for a radius or a gradient.
 """
 
 from __future__ import annotations
@@ -191,6 +191,18 @@ FOUND: dict[str, SmallScene] = {
             (1e-5, 1e-5, 1e-5),
         ),
         render_depth=True,
+    ),
+    "an axis whose angle to a row is mostly rounding": _mixture(
+        (1, 3),
+        (53884.98, 11037.035, 622.2686, 983.1049),
+        (0.6, 0.1, 0.3),
+        (
+            (-0.019391224, -0.14950514, 1.6808931),
+            (0.1964447, -1.1888857, 0.26600957, -1.1888857),
+            (3557.064, 3.316394e-6, 4.312318e-8),
+            0.999,
+            (0.2, 0.4, 0.8),
+        ),
     ),
     "the middle of the only pixel": _mixture(
         (1, 1),
