@@ -209,19 +209,26 @@ def test_nothing_is_computed_when_a_photo_is_removed(
 
 
 @pytest.mark.parametrize(
-    ("groups", "carried"),
+    ("before", "after", "carried"),
     [
         # Pairs within a group share a camera as before, others do not any more.
-        ([ALL[:2], ALL[2:]], 1 + 6),
+        ([ALL[:4]], [ALL[:1], ALL[1:4]], 3),
         # The order of the ids turns between groups.
-        ([ALL[3:], ALL[:3]], 3 + 3),
+        ([ALL[:2], ALL[2:4]], [ALL[2:4], ALL[:2]], 2),
     ],
 )
 def test_pairs_of_other_cameras_are_matched_anew(
-    groups: list[list[str]], carried: int, work: Work, check: Callable[..., None]
+    before: list[list[str]],
+    after: list[list[str]],
+    carried: int,
+    photos: Path,
+    tmp_path: Path,
+    check: Callable[..., None],
 ) -> None:
-    assert work.run(*groups) == Ran((6, carried), {"features": 0, "pairs": 15 - carried})
-    check(work, *groups)
+    work = Work(tmp_path / "work", photos)
+    work.run(*before)
+    assert work.run(*after) == Ran((4, carried), {"features": 0, "pairs": 6 - carried})
+    check(work, *after)
 
 
 def test_cameras_that_a_geometry_suggests_have_the_new_ids(photos: Path, tmp_path: Path) -> None:
@@ -270,6 +277,20 @@ def test_photos_may_be_links_under_other_names(
         (work.photos / name).symlink_to(originals / original)
     assert work.run(names) == Ran((6, 15), {"features": 0, "pairs": 0})
     check(work, names)
+
+
+def test_photos_that_swap_names_are_matched_anew(
+    photos: Path, tmp_path: Path, check: Callable[..., None]
+) -> None:
+    """The order of their names turns, whatever becomes of their ids."""
+    work = Work(tmp_path / "work", photos)
+    work.run(["0.jpg"], ["1.jpg"])
+    work.photos = tmp_path / "photos"
+    work.photos.mkdir()
+    shutil.copyfile(photos / "0.jpg", work.photos / "1.jpg")
+    shutil.copyfile(photos / "1.jpg", work.photos / "0.jpg")
+    assert work.run(["1.jpg"], ["0.jpg"]) == Ran((2, 0), {"features": 0, "pairs": 1})
+    check(work, ["1.jpg"], ["0.jpg"])
 
 
 def test_nothing_is_carried_over_to_other_settings(work: Work) -> None:
@@ -322,6 +343,24 @@ def test_a_database_that_has_more_than_the_one_before_is_kept(
     assert carrying.set_aside(small.database).exists()
     assert small.run(ALL[:5]) == Ran((5, 10), {"features": 0, "pairs": 0})
     check(small, ALL[:5])
+
+
+def test_the_record_of_a_database_is_never_that_of_another(
+    photos: Path, tmp_path: Path, check: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill before one database takes the place of another, which has another 2.jpg."""
+    work = Work(tmp_path / "work", tmp_path / "photos")
+    shutil.copytree(photos, work.photos)
+    shutil.copyfile(photos / "5.jpg", work.photos / "2.jpg")
+    work.run(ALL[:3])
+    work.photos = photos
+    work.extract([ALL[:5]], Ran())
+    with monkeypatch.context() as patch:
+        Countdown(patch, 2).watch(Path, "replace")
+        with pytest.raises(Killed):
+            work.extract([ALL[2:5]], Ran())
+    assert work.run(ALL[:3]).computed == {"features": 0, "pairs": 3}
+    check(work, ALL[:3])
 
 
 class Killed(BaseException):
@@ -492,7 +531,7 @@ def test_the_command_goes_on_from_the_run_before(
     # that the database has no more.
     write_table(captures, "2016", "2023", "2023", "2023")
     with monkeypatch.context() as patch:
-        patch.setitem(worker.STEPS, "matches", "no_such_module:killed")
+        patch.setitem(worker.STEPS, "pairs", "no_such_module:killed")
         with pytest.raises(RegistrationError, match="no_such_module"):
             matched(captures)
     write_table(captures, "2016", "2023", "2023", "2023", "2016")
