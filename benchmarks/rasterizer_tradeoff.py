@@ -71,12 +71,14 @@ PER_THREAD_SUMS: tuple[Patch, ...] = (
         """        place = places[entry]
         touched[place] = 1
         store_sums(rows, lay.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
+        rows[lay.RECORD * place + lay.SUM_SIGN] = records[record + lay.V]
 """,
         """        store_sums(state, BACKWARD_NUMBERS - 16, (s, su, sv, suu, suv, svv, sr, sg, sb))
         home = base + lay.RECORD * gaussians[entry]
         for lane in range(0, 16, LANES):
             old = load(rows, home + lane)
             store(rows, home + lane, old + load(state, BACKWARD_NUMBERS - 16 + lane))
+        rows[home + lay.SUM_SIGN] = records[record + lay.V]
 """,
     ),
     (

@@ -21,7 +21,9 @@ from registration_images import ROUTES, options_for, print_outcome, work_folder
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
+from chronoscene.geometry import camera_centre
 from chronoscene.registration.captures import read_captures
+from chronoscene.registration.generated import pose_errors
 from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.model import Registered
 from chronoscene.registration.pipeline import run, run_into
@@ -111,8 +113,19 @@ def _compare(
         f"photos, {seconds:.0f} s",
         flush=True,
     )
+    _print_first(model, poses, common & (model.periods == 0))
     print_outcome(outcome, found[-1])
     return outcome
+
+
+def _print_first(model: Registered, poses: NDArray[np.float64], first: NDArray[np.bool_]) -> None:
+    """How the first period differs by itself: no other can differ less from the single model."""
+    rotation, centre = pose_errors(model.cam_from_world, poses, first)
+    extent = float(np.linalg.norm(np.ptp(camera_centre(poses[first]), axis=0)))
+    print(
+        f"  first period by itself: rotation {np.median(rotation[first]):.4f} degrees, centre "
+        f"{100 * np.median(centre[first]) / extent:.4f} % of its extent"
+    )
 
 
 def _run(
