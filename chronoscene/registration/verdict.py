@@ -105,7 +105,7 @@ THRESHOLDS: dict[str, Threshold] = {
         ),
         Threshold(
             "localised", "pose of images localised from the other period, beyond its noise",
-            "times 0.1 degrees or 0.2%", 0.5, 10.0, False,
+            "times 0.1 degrees or 0.2%", 0.4, 10.0, False,
             "the points of either period must put the images of the other where they are",
             "look at the flicker comparisons; if they jump, " + _CLICK,
         ),
