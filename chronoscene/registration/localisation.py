@@ -26,6 +26,15 @@ INLIER_PIXELS = 6.0
 
 
 @dataclass(frozen=True, slots=True)
+class Excess:
+    """What is left of differences when those that noise explains are taken off; 0 if it is all."""
+
+    value: float
+    low: float
+    """At least so much, by the spread of the images."""
+
+
+@dataclass(frozen=True, slots=True)
 class Localisation:
     """Difference between the poses of the model and those found from the other period."""
 
@@ -39,9 +48,9 @@ class Localisation:
     centre: float
     """Median, world units."""
     largest_centre: float
-    rotation_excess: float
-    """Degrees beyond what the noise of the points makes of it; 0 where it explains all."""
-    centre_excess: float
+    rotation_excess: Excess
+    """Degrees beyond what the noise of the points makes of it."""
+    centre_excess: Excess
     """World units."""
 
 
@@ -86,8 +95,8 @@ def localise(rays: Rays, placed: Placed) -> Localisation | str:
     )
 
 
-def _excess(size: Array, noise: Array) -> float:
-    """What is left of the squares when the expected ones are taken off, and twice their spread.
+def _excess(size: Array, noise: Array) -> Excess:
+    """What is left of the squares when the expected ones are taken off.
 
     Args:
         size: Differences of the images. [n]
@@ -96,7 +105,9 @@ def _excess(size: Array, noise: Array) -> float:
     beyond = size**2 - noise
     middle = float(np.median(beyond))
     spread = SIGMA * float(np.median(np.abs(beyond - middle))) / np.sqrt(len(size))
-    return float(np.sqrt(max(0.0, middle - 2 * spread)))
+    return Excess(
+        value=float(np.sqrt(max(0.0, middle))), low=float(np.sqrt(max(0.0, middle - 2 * spread)))
+    )
 
 
 def _expected(rays: Rays, xyz: Array, spread: Array, pose: Array) -> tuple[float, float]:

@@ -104,8 +104,8 @@ THRESHOLDS: dict[str, Threshold] = {
             _CLICK,
         ),
         Threshold(
-            "localised", "pose of images localised from the other period, beyond its noise",
-            "times 0.1 degrees or 0.2%", 0.4, 10.0, False,
+            "localised", "pose of images localised from the other period, less its noise",
+            "times 0.1 degrees or 0.2%", 0.6, 10.0, False,
             "the points of either period must put the images of the other where they are",
             "look at the flicker comparisons; if they jump, " + _CLICK,
         ),
@@ -276,14 +276,24 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Finding]:
     yield from _check("tied", min(pair.ties.tied_a, pair.ties.tied_b), place)
     for found in (pair.localised_b, pair.localised_a):
         if isinstance(found, Localisation) and found.images >= 3:
-            size = 100 * found.centre_excess / certificate.extent
-            worst = max(found.rotation_excess / _limit("rotation"), size / _limit("shift"))
-            yield from _check("localised", worst, place)
+            yield from _check("localised", _localised(found, certificate.extent), place)
     if isinstance(pair.clouds, CloudDistance):
         shift = pair.clouds.shift
         if shift.low > 0:
             yield from _check("clouds", 100 * shift.value / certificate.extent, place)
         yield from _check("surfaces", pair.clouds.beyond, place)
+
+
+def _localised(found: Localisation, extent: float) -> float:
+    """The larger of both errors against its limit; beyond doubt only as far as it is certain."""
+    turn, place = found.rotation_excess, found.centre_excess
+    likely, certain = (
+        max(r / _limit("rotation"), 100 * c / extent / _limit("shift"))
+        for r, c in ((turn.value, place.value), (turn.low, place.low))
+    )
+    bad = THRESHOLDS["localised"].fail
+    assert bad is not None
+    return certain if certain > bad else min(likely, bad)
 
 
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Finding]:
