@@ -9,7 +9,7 @@ import threading
 
 _TERM = {signal.SIGTERM}
 
-if threading.current_thread() is threading.main_thread():
+if hasattr(signal, "pthread_sigmask") and threading.current_thread() is threading.main_thread():
     _handler = signal.getsignal(signal.SIGTERM)
     # A signal that comes while pycolmap loads (about 0.3 s) waits for the right handler.
     _mask = signal.pthread_sigmask(signal.SIG_BLOCK, _TERM)
@@ -18,7 +18,7 @@ if threading.current_thread() is threading.main_thread():
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL if _handler is None else _handler)
         signal.pthread_sigmask(signal.SIG_SETMASK, _mask)
-else:  # handlers can be set by the main thread alone
+else:  # not on Windows; and handlers can be set by the main thread alone
     import pycolmap
 
 __all__ = ["pycolmap"]
