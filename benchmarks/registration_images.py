@@ -109,7 +109,7 @@ def _run_case(
     from registration import judged, refused
 
     found: list[Inspection] = []
-    start, cpu = time.perf_counter(), _cpu()
+    start, cpu = time.perf_counter(), cpu_seconds()
     try:
         if route == "frozen":
             model = _frozen(folder, found)
@@ -119,9 +119,9 @@ def _run_case(
             model = run(read_captures(folder / "photos"), out, options, inspected=found.append)
     except ChronoSceneError as error:
         print(f"{case.name}, {route}: refused: {error}", flush=True)
-        return refused(case.name, route, case.periods, _cpu() - cpu)
+        return refused(case.name, route, case.periods, cpu_seconds() - cpu)
     poses = np.stack([truth[Path(name).name] for name in model.names])
-    outcome = judged(case.name, route, model, poses, found[-1].verdict, _cpu() - cpu)
+    outcome = judged(case.name, route, model, poses, found[-1].verdict, cpu_seconds() - cpu)
     print(
         f"{case.name}, {route}: route {model.route}, {len(model.names)} of "
         f"{len(model.names) + len(model.unregistered)} photos, "
@@ -132,7 +132,7 @@ def _run_case(
     return outcome
 
 
-def _cpu() -> float:
+def cpu_seconds() -> float:
     """Seconds of this process and of those it started and waited for."""
     times = os.times()
     return times.user + times.system + times.children_user + times.children_system

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from registration_images import ROUTES, options_for, print_outcome, work_folder
+from registration_images import ROUTES, cpu_seconds, options_for, print_outcome, work_folder
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
@@ -90,7 +90,7 @@ def _compare(
     from registration import judged, refused
 
     found: list[Inspection] = []
-    start, count = time.perf_counter(), len(set(periods.values()))
+    start, cpu, count = time.perf_counter(), cpu_seconds(), len(set(periods.values()))
     try:
         if route == "frozen":
             model = _frozen(source, folder, periods, found)
@@ -99,15 +99,15 @@ def _compare(
             model = _run(source, folder, route, periods, chosen, found)
     except ChronoSceneError as error:
         print(f"{source.name}, {route}: refused: {error}", flush=True)
-        return refused(source.name, route, count, time.perf_counter() - start)
-    seconds = time.perf_counter() - start
+        return refused(source.name, route, count, cpu_seconds() - cpu)
+    seconds, cpu = time.perf_counter() - start, cpu_seconds() - cpu
     common = np.array([Path(name).name in reference for name in model.names])
     if (common & (model.periods == 0)).sum() < LEAST_COMMON:
         print(f"{source.name}, {route}: too few photos in common with the single model")
-        return refused(source.name, route, count, seconds)
+        return refused(source.name, route, count, cpu)
     poses = np.stack([reference.get(Path(name).name, np.eye(4)) for name in model.names])
     verdict = found[-1].verdict
-    outcome = judged(source.name, route, model, poses, verdict, seconds, where=common)
+    outcome = judged(source.name, route, model, poses, verdict, cpu, where=common)
     print(
         f"{source.name}, {route}: route {model.route}, {len(model.names)} of {len(periods)} "
         f"photos, {seconds:.0f} s",

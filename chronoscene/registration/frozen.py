@@ -71,6 +71,7 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     total = len(arguments["periods"])
     database = arguments["database"]
     model = place_rest(base, database, photos, scratch / "continued", threads, total, report)
+    take_out_misplaced(model, matches, remarks, sorted(old))
     new = [i for i in model.reg_image_ids() if i not in old]
     if not new:
         raise RegistrationError(
@@ -81,7 +82,6 @@ def run(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             "features and matches are kept",
         )
     remarks.append(f"{len(new)} new images placed")
-    take_out_misplaced(model, matches, remarks, sorted(old))
     report("adjusting", 0, 1)
     ended = adjust(model, constant=old, threads=threads)
     moved = _largest_move(model, arguments["poses"])
