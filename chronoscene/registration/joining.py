@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from chronoscene._pycolmap import pycolmap
 from chronoscene.registration.consistency import misplaced, pair_agreements
 from chronoscene.registration.georeferencing import finish
@@ -13,6 +16,9 @@ from chronoscene.registration.mapping import adjust, place_rest, triangulate
 from chronoscene.registration.sfm import verified_matches
 from chronoscene.registration.units import Combined, Priors, Unit, combine
 from chronoscene.registration.worker import Report
+
+Matches = Mapping[tuple[int, int], NDArray[np.int64]]
+"""Verified matches of all pairs of images, by image ids. [M, 2] each"""
 
 ROUNDS = 2
 """Of triangulation with all matches and adjustment, after merging."""
@@ -32,6 +38,7 @@ def join(
         remarks: Added to.
         report: Called with the progress.
     """
+    _, matches = verified_matches(arguments["database"])
     if len(units) == 1:
         combined = Combined(units[0].model, (units[0].label,), (), (), ())
         model = combined.model
@@ -40,7 +47,7 @@ def join(
         report("aligning", 0, 1)
         combined = combine(
             units,
-            verified_matches(arguments["database"])[1],
+            matches,
             Priors.of(arguments["priors"]),
             arguments["database"],
             keep_unplaced=arguments["keep_unplaced"],
@@ -48,7 +55,7 @@ def join(
         remarks += combined.remarks
         model = _adjusted(combined.model, arguments, report)
     if not arguments["keep_unplaced"]:  # those that wait for tie points would contradict the rest
-        model = _settled(model, arguments, remarks, report)
+        model = _settled(model, matches, arguments, remarks, report)
     report("adjusting", 0, 1)
     left = [list(group) for group in combined.left]
     unplaced = list(combined.unplaced)
@@ -69,12 +76,12 @@ def _adjusted(
 
 def _settled(
     model: pycolmap.Reconstruction,
+    matches: Matches,
     arguments: Mapping[str, Any],
     remarks: list[str],
     report: Report,
 ) -> pycolmap.Reconstruction:
     """Place what is missing, take out what the others contradict, and place that anew."""
-    _, matches = verified_matches(arguments["database"])
     for _ in range(ATTEMPTS):
         model = _complete(model, arguments, remarks, report)
         if not take_out_misplaced(model, matches, remarks):
@@ -85,7 +92,7 @@ def _settled(
 
 def take_out_misplaced(
     model: pycolmap.Reconstruction,
-    matches: Mapping[tuple[int, int], Any],
+    matches: Matches,
     remarks: list[str],
     trusted: Sequence[int] = (),
 ) -> int:
@@ -93,7 +100,7 @@ def take_out_misplaced(
 
     Args:
         model: Changed in place.
-        matches: Verified matches of all pairs of images, by image ids. [M, 2]
+        matches: Of all images.
         remarks: Added to.
         trusted: Ids of images that are right by definition.
     """
