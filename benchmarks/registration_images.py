@@ -20,9 +20,9 @@ from PIL import Image, ImageEnhance
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
+from chronoscene.geodesy import Georeference
 from chronoscene.geometry import camera_centre
 from chronoscene.registration.captures import read_captures
-from chronoscene.registration.georeference import Georeference
 from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.model import Registered
 from chronoscene.registration.pipeline import Options, run, run_into

@@ -14,7 +14,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from chronoscene.colmap import read_model
-from chronoscene.registration.georeference import Georeference, Positions
+from chronoscene.geodesy import Georeference
+from chronoscene.registration.georeference import Positions
 from chronoscene.registration.model import CrossMatches, HeldOutTracks, Registered, Route
 from chronoscene.registration.photo import Capture
 from chronoscene.scene import Camera, Frame, Points

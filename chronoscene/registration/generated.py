@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.geodesy import Georeference
 from chronoscene.geometry import Sim3, camera_centre, pose_from_rotation_translation
-from chronoscene.registration.georeference import Georeference
 from chronoscene.registration.misalignment import measure, transfers
 from chronoscene.registration.model import CrossMatches, HeldOutTracks, Registered
 from chronoscene.registration.rays import Rays, place, rays_of

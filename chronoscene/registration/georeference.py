@@ -1,23 +1,15 @@
-"""From GPS to metres: a local east-north-up frame, and which positions deserve belief.
-
-The frame is topocentric (EPSG method 9837) around the median position: no map projection, so no
-distortion, and no geoid grid is needed, because heights are taken as the photos state them. Heights
-above the sea instead of the ellipsoid shift the frame upwards as a whole and bend nothing.
-"""
+"""Which GPS positions of photos deserve belief, and the local frame around them."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.geodesy import Georeference, HeightKind, median_longitude
 from chronoscene.registration.photo import Capture
-
-HeightKind = Literal["as stated", "relative", "none"]
 
 GROSS_FACTOR = 20.0
 """A position this many times farther from the median than the median distance is wrong, whatever
@@ -28,57 +20,6 @@ GROSS_METRES = 200.0
 
 CONSTANT_METRES = 0.5
 """Positions that all lie within this radius say nothing about the motion of the camera."""
-
-
-@dataclass(frozen=True, slots=True)
-class Georeference:
-    """A local frame: x east, y north, z up, in metres, around an origin on WGS 84."""
-
-    latitude: float
-    """Degrees, of the origin."""
-    longitude: float
-    height: float
-    """Metres, of the origin, in the sense of ``height_kind``."""
-    height_kind: HeightKind
-    """``as stated`` (sea level or ellipsoid: cameras do not say), ``relative`` (above take-off, by
-    the barometer) or ``none`` (unknown: all are set to zero)."""
-
-    @property
-    def crs(self) -> str:
-        """The frame in words that PROJ understands: the last step of a pipeline."""
-        return (
-            f"+proj=topocentric +ellps=WGS84 +lat_0={self.latitude!r} +lon_0={self.longitude!r} "
-            f"+h_0={self.height!r}"
-        )
-
-    def to_enu(
-        self,
-        latitude: NDArray[np.float64],
-        longitude: NDArray[np.float64],
-        height: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Metres east, north and up of the origin. [N] each -> [N, 3]"""
-        x, y, z = _pipeline(self.crs).transform(longitude, latitude, height)
-        return np.stack([np.asarray(a, np.float64) for a in (x, y, z)], axis=-1)
-
-    def to_geodetic(self, enu: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Latitude, longitude (degrees) and height (metres): inverse of `to_enu`. [N, 3]"""
-        inverse: Any = "INVERSE"
-        lon, lat, height = _pipeline(self.crs).transform(
-            *np.moveaxis(enu, -1, 0), direction=inverse
-        )
-        return np.stack([lat, lon, height], axis=-1)
-
-
-def from_crs(crs: str | None) -> Georeference | None:
-    """The frame that `Georeference.crs` describes; None for any other text."""
-    number = r"([-+0-9.e]+)"
-    pattern = rf"\+proj=topocentric \+ellps=WGS84 \+lat_0={number} \+lon_0={number} \+h_0={number}"
-    found = re.fullmatch(pattern, crs or "")
-    if found is None:
-        return None
-    latitude, longitude, height = (float(value) for value in found.groups())
-    return Georeference(latitude, longitude, height, "as stated")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +63,7 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
     height, kind, remarks = _heights(captures, has)
     frame = frame or Georeference(
         latitude=round(float(np.nanmedian(latitude)), 7),
-        longitude=round(_median_angle(longitude[has]), 7),
+        longitude=round(median_longitude(longitude[has]), 7),
         height=round(float(np.median(height[has])), 2),
         height_kind=kind,
     )
@@ -164,13 +105,6 @@ def _heights(
     return np.zeros(count), "none", ["most photos state no height: all are taken as 0"]
 
 
-def _median_angle(degrees: NDArray[np.float64]) -> float:
-    """Median of longitudes, also across 180 degrees."""
-    first = degrees[0]
-    turned = (degrees - first + 180) % 360 - 180
-    return float((np.median(turned) + first + 180) % 360 - 180)
-
-
 def _plausible(
     captures: Sequence[Capture], enu: NDArray[np.float64], has: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], list[str]]:
@@ -193,13 +127,3 @@ def _sigma(capture: Capture, kind: HeightKind) -> NDArray[np.float64]:
     if kind == "none":
         sigma[2] = max(sigma[2], 100.0)
     return sigma
-
-
-def _pipeline(crs: str) -> Any:
-    """Longitude, latitude, height in degrees and metres to the frame."""
-    import pyproj
-
-    return pyproj.Transformer.from_pipeline(
-        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
-        f"+step +proj=cart +ellps=WGS84 +step {crs}"
-    )

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from chronoscene.errors import SceneError
+from chronoscene.geodesy import Georeference, from_crs
 from chronoscene.geometry import camera_centre
 from chronoscene.images import image_size
 from chronoscene.registration import prepare
 from chronoscene.registration.captures import Captures
 from chronoscene.registration.context import Context
 from chronoscene.registration.errors import RegistrationError
-from chronoscene.registration.georeference import Georeference, Positions, from_crs, locate
+from chronoscene.registration.georeference import Positions, locate
 from chronoscene.registration.photo import Capture
 from chronoscene.scene import Frame, Scene
 

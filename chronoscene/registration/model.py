@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.registration.georeference import Georeference
+from chronoscene.geodesy import Georeference
 from chronoscene.scene import Camera
 
 Route = Literal["joint", "frozen", "separate"]

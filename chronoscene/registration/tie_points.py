@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.errors import SceneError
-from chronoscene.registration.georeference import Georeference
+from chronoscene.geodesy import Georeference
 from chronoscene.splits import read_text
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.registration.georeference import Georeference
+from chronoscene.geodesy import Georeference
 from chronoscene.registration.model import Registered
 from chronoscene.registration.tie_alignment import (
     TieAlignment,

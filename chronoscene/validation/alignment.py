@@ -1,11 +1,11 @@
-"""Similarities between two sets of points, also mirrored ones, robust against outliers; WGS 84."""
+"""Similarities between two sets of points, also mirrored ones, robust against outliers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
@@ -18,8 +18,6 @@ MOST_JUDGED = 1000
 
 SIGMA = 1.4826
 """Standard deviation of normal numbers in units of the median of their absolute values."""
-
-_SEMI_MAJOR, _FLATTENING = 6378137.0, 1 / 298.257223563
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,31 +104,3 @@ def fit_robustly(
 
 def _distances(similarity: Similarity, source: Array, target: Array, axes: int) -> Array:
     return np.asarray(np.linalg.norm((similarity.apply(source) - target)[:, :axes], axis=1))
-
-
-def east_north_up(latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike) -> Array:
-    """Metres east, north and up of the median position, from degrees and metres. [N, 3]
-
-    Source: WGS 84 (NIMA TR8350.2), geodetic to geocentric coordinates in closed form.
-    """
-    places = np.stack([np.radians(latitude), np.radians(longitude), np.asarray(height)], axis=-1)
-    phi, lam, _ = origin = np.median(places, axis=0)
-    sin_phi, cos_phi, sin_lam, cos_lam = np.sin(phi), np.cos(phi), np.sin(lam), np.cos(lam)
-    axes = np.array(
-        [
-            [-sin_lam, cos_lam, 0],
-            [-sin_phi * cos_lam, -sin_phi * sin_lam, cos_phi],
-            [cos_phi * cos_lam, cos_phi * sin_lam, sin_phi],
-        ]
-    )
-    return np.asarray((_geocentric(places) - _geocentric(origin)) @ axes.T)
-
-
-def _geocentric(places: Array) -> Array:
-    """Latitude and longitude in radians and height in metres as x, y, z in metres. [..., 3]"""
-    phi, lam, height = np.moveaxis(places, -1, 0)
-    squared = _FLATTENING * (2 - _FLATTENING)
-    normal = _SEMI_MAJOR / np.sqrt(1 - squared * np.sin(phi) ** 2)
-    across = (normal + height) * np.cos(phi)
-    up = (normal * (1 - squared) + height) * np.sin(phi)
-    return np.stack([across * np.cos(lam), across * np.sin(lam), up], axis=-1)

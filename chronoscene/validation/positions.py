@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.validation.alignment import SIGMA, Similarity, east_north_up, fit_robustly
+from chronoscene.geodesy import Georeference, median_longitude
+from chronoscene.validation.alignment import SIGMA, Similarity, fit_robustly
 from chronoscene.validation.raw_scene import RawScene
 
 FEWEST = 6
@@ -45,7 +46,8 @@ def fit_gps(scene: RawScene) -> GpsFit | None:
     if len(rows) < FEWEST:
         return None
     latitude, longitude, altitude = np.array(places, np.float64).T
-    target = east_north_up(latitude, longitude, altitude)
+    middle = (float(np.median(latitude)), median_longitude(longitude), float(np.median(altitude)))
+    target = Georeference(*middle, "as stated").to_enu(latitude, longitude, altitude)
     spread = float(np.median(np.linalg.norm(target[:, :2], axis=1)))
     found = fit_robustly(scene.centres[rows], target, axes=2) if spread >= LEAST_SPREAD else None
     if found is None:

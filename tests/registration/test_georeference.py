@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from chronoscene.exif import ExifData
-from chronoscene.registration.georeference import Georeference, from_crs, locate
+from chronoscene.geodesy import Georeference
+from chronoscene.registration.georeference import locate
 from chronoscene.registration.photo import Capture, Gps
 
 PLACE = (51.5, 10.25)
@@ -40,24 +41,6 @@ def captures(
 
 
 GRID = np.array([[20.0 * i, 15.0 * j] for i in range(5) for j in range(4)])
-
-
-def test_metres_and_back() -> None:
-    frame = Georeference(*PLACE, 30.0, "as stated")
-    enu = np.array([[100.0, -50.0, 12.0], [0.0, 0.0, 0.0], [-3000.0, 4000.0, -20.0]])
-    geodetic = frame.to_geodetic(enu)
-    np.testing.assert_allclose(frame.to_enu(*geodetic.T), enu, atol=1e-6)
-    np.testing.assert_allclose(geodetic[1], [*PLACE, 30.0], atol=1e-10)
-    north = frame.to_enu(np.array([PLACE[0] + 1e-3]), np.array([PLACE[1]]), np.array([30.0]))
-    assert north[0, 1] == pytest.approx(111.26, abs=0.1)  # meridian arc at 51.5 degrees
-    assert abs(north[0, 0]) < 1e-6
-
-
-def test_the_frame_is_read_back_from_its_text() -> None:
-    frame = Georeference(51.5, -10.25, 30.0, "as stated")
-    assert from_crs(frame.crs) == frame
-    assert from_crs("EPSG:32632") is None
-    assert from_crs(None) is None
 
 
 def test_a_grid_keeps_its_shape() -> None:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from chronoscene.geometry import Sim3
-from chronoscene.validation.alignment import east_north_up, fit_robustly
+from chronoscene.validation.alignment import fit_robustly
 
 IMAGES, POINTS, WORLD = "sparse/0/images.txt", "sparse/0/points3D.txt", "sparse/world.json"
 PERIOD_1 = range(7, 14)
@@ -139,18 +139,3 @@ def test_robust_fit_with_outliers():
 def test_points_on_a_line_fix_nothing():
     line = np.linspace(0, 1, 20)[:, None] * [1.0, 2.0, 3.0]
     assert fit_robustly(line, line) is None
-
-
-def test_east_north_up_agrees_with_pyproj():
-    from pyproj import Transformer
-
-    rng = np.random.default_rng(0)
-    latitude, longitude = 39.99 + rng.uniform(-0.01, 0.01, 9), 116.3 + rng.uniform(-0.01, 0.01, 9)
-    height = rng.uniform(0, 300, 9)
-    pipeline = (
-        "+proj=pipeline +step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
-        f"+lat_0={np.median(latitude)} +lon_0={np.median(longitude)} +h_0={np.median(height)}"
-    )
-    expected = np.array(Transformer.from_pipeline(pipeline).transform(longitude, latitude, height))
-    found = east_north_up(latitude, longitude, height)
-    np.testing.assert_allclose(found, expected.T, atol=1e-6)

@@ -1,0 +1,85 @@
+"""Geodetic positions to metres in a local east-north-up frame, by PROJ.
+
+The frame is topocentric (EPSG method 9837) around a position: no map projection, so no distortion,
+and no geoid grid is needed, because heights are taken as they are stated. Heights above the sea
+instead of the ellipsoid shift the frame upwards as a whole and bend nothing.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+HeightKind = Literal["as stated", "relative", "none"]
+
+
+@dataclass(frozen=True, slots=True)
+class Georeference:
+    """A local frame: x east, y north, z up, in metres, around an origin on WGS 84."""
+
+    latitude: float
+    """Degrees, of the origin."""
+    longitude: float
+    height: float
+    """Metres, of the origin, in the sense of ``height_kind``."""
+    height_kind: HeightKind
+    """``as stated`` (sea level or ellipsoid: cameras do not say), ``relative`` (above take-off, by
+    the barometer) or ``none`` (unknown: all are set to zero)."""
+
+    @property
+    def crs(self) -> str:
+        """The frame in words that PROJ understands: the last step of a pipeline."""
+        return (
+            f"+proj=topocentric +ellps=WGS84 +lat_0={self.latitude!r} +lon_0={self.longitude!r} "
+            f"+h_0={self.height!r}"
+        )
+
+    def to_enu(
+        self,
+        latitude: NDArray[np.float64],
+        longitude: NDArray[np.float64],
+        height: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Metres east, north and up of the origin. [N] each -> [N, 3]"""
+        x, y, z = _pipeline(self.crs).transform(longitude, latitude, height)
+        return np.stack([np.asarray(a, np.float64) for a in (x, y, z)], axis=-1)
+
+    def to_geodetic(self, enu: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Latitude, longitude (degrees) and height (metres): inverse of `to_enu`. [N, 3]"""
+        inverse: Any = "INVERSE"
+        lon, lat, height = _pipeline(self.crs).transform(
+            *np.moveaxis(enu, -1, 0), direction=inverse
+        )
+        return np.stack([lat, lon, height], axis=-1)
+
+
+def from_crs(crs: str | None) -> Georeference | None:
+    """The frame that `Georeference.crs` describes; None for any other text."""
+    number = r"([-+0-9.e]+)"
+    pattern = rf"\+proj=topocentric \+ellps=WGS84 \+lat_0={number} \+lon_0={number} \+h_0={number}"
+    found = re.fullmatch(pattern, crs or "")
+    if found is None:
+        return None
+    latitude, longitude, height = (float(value) for value in found.groups())
+    return Georeference(latitude, longitude, height, "as stated")
+
+
+def median_longitude(degrees: NDArray[np.float64]) -> float:
+    """Median of longitudes, also across 180 degrees."""
+    first = degrees[0]
+    turned = (degrees - first + 180) % 360 - 180
+    return float((np.median(turned) + first + 180) % 360 - 180)
+
+
+def _pipeline(crs: str) -> Any:
+    """Longitude, latitude, height in degrees and metres to the frame."""
+    import pyproj
+
+    return pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
+        f"+step +proj=cart +ellps=WGS84 +step {crs}"
+    )

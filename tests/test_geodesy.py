@@ -1,0 +1,61 @@
+"""Geodetic positions to metres: against the closed form, and back."""
+
+import numpy as np
+import pytest
+
+from chronoscene.geodesy import Georeference, from_crs, median_longitude
+
+PLACE = (51.5, 10.25)
+SEMI_MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563
+"""Of WGS 84 (NIMA TR8350.2)."""
+
+
+def geocentric(latitude, longitude, height):
+    """Degrees and metres as x, y, z in metres, in closed form."""
+    phi, lam = np.radians(latitude), np.radians(longitude)
+    squared = FLATTENING * (2 - FLATTENING)
+    normal = SEMI_MAJOR / np.sqrt(1 - squared * np.sin(phi) ** 2)
+    across = (normal + height) * np.cos(phi)
+    up = (normal * (1 - squared) + height) * np.sin(phi)
+    return np.stack([across * np.cos(lam), across * np.sin(lam), up], axis=-1)
+
+
+def test_metres_agree_with_the_closed_form() -> None:
+    rng = np.random.default_rng(0)
+    frame = Georeference(39.99, 116.3, 50.0, "as stated")
+    latitude, longitude = 39.99 + rng.uniform(-0.01, 0.01, 9), 116.3 + rng.uniform(-0.01, 0.01, 9)
+    height = rng.uniform(0, 300, 9)
+    phi, lam = np.radians([frame.latitude, frame.longitude])
+    axes = np.array(
+        [
+            [-np.sin(lam), np.cos(lam), 0],
+            [-np.sin(phi) * np.cos(lam), -np.sin(phi) * np.sin(lam), np.cos(phi)],
+            [np.cos(phi) * np.cos(lam), np.cos(phi) * np.sin(lam), np.sin(phi)],
+        ]
+    )
+    origin = geocentric(frame.latitude, frame.longitude, frame.height)
+    expected = (geocentric(latitude, longitude, height) - origin) @ axes.T
+    np.testing.assert_allclose(frame.to_enu(latitude, longitude, height), expected, atol=1e-6)
+
+
+def test_metres_and_back() -> None:
+    frame = Georeference(*PLACE, 30.0, "as stated")
+    enu = np.array([[100.0, -50.0, 12.0], [0.0, 0.0, 0.0], [-3000.0, 4000.0, -20.0]])
+    geodetic = frame.to_geodetic(enu)
+    np.testing.assert_allclose(frame.to_enu(*geodetic.T), enu, atol=1e-6)
+    np.testing.assert_allclose(geodetic[1], [*PLACE, 30.0], atol=1e-10)
+    north = frame.to_enu(np.array([PLACE[0] + 1e-3]), np.array([PLACE[1]]), np.array([30.0]))
+    assert north[0, 1] == pytest.approx(111.26, abs=0.1)  # meridian arc at 51.5 degrees
+    assert abs(north[0, 0]) < 1e-6
+
+
+def test_the_frame_is_read_back_from_its_text() -> None:
+    frame = Georeference(51.5, -10.25, 30.0, "as stated")
+    assert from_crs(frame.crs) == frame
+    assert from_crs("EPSG:32632") is None
+    assert from_crs(None) is None
+
+
+def test_median_longitude_across_the_antimeridian() -> None:
+    assert median_longitude(np.array([179.9, -179.9, 179.8])) == pytest.approx(179.9)
+    assert median_longitude(np.array([10.0, 12.0, 11.0])) == pytest.approx(11.0)
