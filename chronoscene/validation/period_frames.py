@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.geometry import rotation_from_quaternion
+from chronoscene.projection import plane_of
 from chronoscene.validation.alignment import Similarity, fit_robustly
 from chronoscene.validation.raw_scene import RawScene
 
@@ -42,7 +43,7 @@ class Rays:
     """Observations of points by the images of one period (M observations)."""
 
     def __init__(self, scene: RawScene, period: int) -> None:
-        """Take those whose camera is a pinhole and whose pose is good.
+        """Take those whose camera is usable and whose pose is good.
 
         Args:
             scene: The scene, with its model.
@@ -52,12 +53,7 @@ class Rays:
         table = scene.point_periods
         assert images is not None and points is not None
         assert seen is not None and table is not None
-        pinhole = {i for i, camera in scene.usable_cameras.items() if camera.is_pinhole}
-        of_period = [
-            r
-            for r in scene.reprojections or ()
-            if scene.image_periods[r.image] == period and int(images.camera_ids[r.image]) in pinhole
-        ]
+        of_period = [r for r in scene.reprojections or () if scene.image_periods[r.image] == period]
         share = table.sum(axis=1) > 1
         rows = np.concatenate([np.zeros(0, np.int64), *(r.rows for r in of_period)])
         rows = rows[share[seen.point[rows]]]
@@ -69,17 +65,23 @@ class Rays:
         self.rotation = rotation_from_quaternion(images.quaternions)[self.image]
         self.translation = images.translations[self.image]
         self.centre = scene.centres[self.image]
-        K = np.array([scene.usable_cameras[int(c)].K for c in images.camera_ids[self.image]])
-        self.K = K.reshape(-1, 3, 3)
-        self.xy = images.keypoint_xy[seen.keypoint[rows]]
+        self.focal = np.ones((len(rows), 2))
+        """Pixels. [M, 2]"""
+        self.plane = images.keypoint_xy[seen.keypoint[rows]]
+        """Where the observations are on the plane one unit in front of the camera. [M, 2]"""
+        camera_ids = images.camera_ids[self.image]
+        for camera_id in np.unique(camera_ids).tolist():
+            camera, mine = scene.usable_cameras[camera_id], camera_ids == camera_id
+            self.focal[mine] = camera.K[[0, 1], [0, 1]]
+            self.plane[mine] = plane_of(camera, self.plane[mine])
 
     def error(self, world: Array, camera: Array) -> float:
-        """Median reprojection error in pixels with some axes of world and camera negated."""
+        """Median error in pixels, without distortion, with some axes of both negated."""
         local = np.einsum("nij,nj->ni", self.rotation, self.xyz * world) + self.translation
         local = local * camera
-        xy = local[:, :2] / local[:, 2:] * self.K[:, [0, 1], [0, 1]] + self.K[:, :2, 2]
-        distance = np.linalg.norm(xy - self.xy, axis=1)
-        distance[~(local[:, 2] > 0)] = np.inf
+        shift = (local[:, :2] / local[:, 2:] - self.plane) * self.focal
+        distance = np.linalg.norm(shift, axis=1)
+        distance[~(local[:, 2] > 0) | np.isnan(distance)] = np.inf
         return float(np.median(distance)) if len(distance) else np.inf
 
     def place_points(self) -> tuple[NDArray[np.int64], Array]:
@@ -87,8 +89,7 @@ class Rays:
 
         The position is the nearest to all rays: ``sum(I - d d^T) x = sum((I - d d^T) c)``.
         """
-        focal, middle = self.K[:, [0, 1], [0, 1]], self.K[:, :2, 2]
-        local = np.column_stack([(self.xy - middle) / focal, np.ones(len(self.xy))])
+        local = np.column_stack([self.plane, np.ones(len(self.plane))])
         direction = np.einsum("nji,nj->ni", self.rotation, local)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         away = np.linalg.norm(self.centre - np.median(self.centre, axis=0), axis=1)

@@ -187,15 +187,14 @@ class RawScene:
     def image_errors(self) -> NDArray[np.float64]:
         """Median reprojection error of each image in pixels, of the points in front of it.
 
-        NaN for images with fewer than `FEWEST` points, and for cameras with distortion. [I]
+        NaN for images with fewer than `FEWEST` points. What a camera cannot see by its distortion
+        is infinitely wrong. [I]
         """
         errors = np.full(len(self.images or ()), np.nan)
         for seen in self.reprojections or ():
-            assert self.images is not None
-            camera = self.usable_cameras[int(self.images.camera_ids[seen.image])]
             front = seen.error[seen.depth > 0]
-            if camera.is_pinhole and len(front) >= FEWEST:
-                errors[seen.image] = np.median(front)
+            if len(front) >= FEWEST:
+                errors[seen.image] = np.median(np.where(np.isnan(front), np.inf, front))
         return errors
 
     @cached_property

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from chronoscene.colmap_arrays import RawImages, RawPoints
 from chronoscene.geometry import rotation_from_quaternion
+from chronoscene.projection import pixels_of
 from chronoscene.scene import Camera
 from chronoscene.validation.observations import Observations
 
@@ -41,10 +42,7 @@ def good_poses(images: RawImages) -> NDArray[np.bool_]:
 def reproject(
     cameras: Mapping[int, Camera], images: RawImages, points: RawPoints, seen: Observations
 ) -> Iterator[Reprojection]:
-    """Project the points of every image that has a good pose, a camera and observations.
-
-    Distortion is not applied: errors mean something for pinhole cameras only.
-    """
+    """Project the points of every image that has a good pose, a camera and observations."""
     good = good_poses(images)
     with np.errstate(all="ignore"):
         rotations = rotation_from_quaternion(images.quaternions)
@@ -59,7 +57,7 @@ def reproject(
         place = xyz.take(seen.point.take(rows), axis=1)
         u, v = uv.take(seen.keypoint.take(rows), axis=1)
         with np.errstate(all="ignore"):  # infinite for absurd poses
-            depth, x, y = project(rotations[image], images.translations[image], camera.K, *place)
+            depth, x, y = project(rotations[image], images.translations[image], camera, *place)
             error = np.sqrt((x - u) ** 2 + (y - v) ** 2)
         # What is not finite in points and keypoints has rules of its own.
         known = np.isfinite(place).all(axis=0) & np.isfinite(u) & np.isfinite(v)
@@ -71,11 +69,14 @@ def reproject(
 
 
 def project(
-    rotation: Array, translation: Array, K: Array, x: Array, y: Array, z: Array
+    rotation: Array, translation: Array, camera: Camera, x: Array, y: Array, z: Array
 ) -> tuple[Array, Array, Array]:
-    """Depth, and pixel position along x and y, of points at ``x, y, z`` in the world. [m] each"""
+    """Depth, and pixel position along x and y, of points at ``x, y, z`` in the world. [m] each
+
+    Behind a camera with distortion, positions are NaN.
+    """
     right, down, depth = (
         row[0] * x + row[1] * y + row[2] * z + shift
         for row, shift in zip(rotation.tolist(), translation.tolist(), strict=True)
     )
-    return depth, right / depth * K[0, 0] + K[0, 2], down / depth * K[1, 1] + K[1, 2]
+    return depth, *pixels_of(camera, right, down, depth)

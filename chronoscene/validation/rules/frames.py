@@ -183,7 +183,7 @@ def common_view(scene: RawScene) -> NDArray[np.float64]:
         for image in _sample(known & (scene.image_periods == row), MOST_IMAGES // count).tolist():
             camera = scene.usable_cameras[int(images.camera_ids[image])]
             rotation, translation = rotations[image], images.translations[image]
-            depth, x, y = project(rotation, translation, camera.K, xyz[:, 0], xyz[:, 1], xyz[:, 2])
+            depth, x, y = project(rotation, translation, camera, *xyz.T)
             inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
             viewed |= inside & (depth > 0) & (depth < REACH * reach[row])
         for column in range(count):
