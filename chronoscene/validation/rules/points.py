@@ -6,11 +6,18 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from chronoscene.colmap_arrays import RawPoints
 from chronoscene.validation.finding import NOTHING, Hit, counted, shown
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
+
+FEWEST_SHARED = 10
+"""Points from which a similarity between two periods can be told from chance."""
+
+BLOCK = 10_000_000
+"""Points times periods that are counted at a time."""
 
 
 @rule(
@@ -153,21 +160,48 @@ def points_of_one_period(scene: RawScene) -> Iterator[Hit]:
     "CS508",
     "period-unconnected",
     "warning",
-    what="A period shares no point with any other, so nothing shows that they are in one frame.",
+    what=f"A period, or a group of periods, shares fewer than {FEWEST_SHARED} points with the "
+    "others, so nothing shows that they are in one frame.",
     remedy="match images across the periods; if they were aligned otherwise, ignore this rule",
-    bad="two models merged by hand",
+    bad="two models merged by hand; periods 0 and 1 share points, 2 and 3 do, 1 and 2 do not",
     needs=("observations", "periods", "point_periods"),
 )
 def period_unconnected(scene: RawScene) -> Iterator[Hit]:
     seen = scene.point_periods
     assert seen is not None
-    if np.count_nonzero(seen.any(axis=0)) < 2:
-        return  # nothing to be connected with
-    shared = seen.sum(axis=1) > 1
-    for column, period in enumerate(scene.period_ids):
-        if seen[:, column].any() and not seen[shared, column].any():
-            found = f"0 of {np.count_nonzero(seen[:, column])}"
-            yield Hit(f"period {period}", "points shared with another period", found)
+    groups = connected(common_points(seen), FEWEST_SHARED)
+    groups = [group for group in groups if seen[:, group].any()]  # else another rule's
+    for group in groups[1:]:
+        own = seen[:, group].any(axis=1)
+        shared = np.count_nonzero(own & np.delete(seen, group, axis=1).any(axis=1))
+        ids = [str(scene.period_ids[i]) for i in group]
+        place = f"period {ids[0]}" if len(ids) == 1 else f"periods {', '.join(ids)}"
+        found = f"{shared} of {np.count_nonzero(own)}"
+        yield Hit(place, f"{FEWEST_SHARED} points or more shared with the other periods", found)
+
+
+def common_points(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Points that two periods see, for each two. [P, T] -> [T, T]"""
+    rows = max(1, BLOCK // max(1, seen.shape[1]))
+    common = np.zeros((seen.shape[1],) * 2, np.int64)
+    for first in range(0, len(seen), rows):
+        block = seen[first : first + rows].astype(np.float32)
+        common += (block.T @ block).astype(np.int64)
+    return common
+
+
+def connected(common: NDArray[np.int64], fewest: int) -> list[NDArray[np.int64]]:
+    """Groups of periods that a chain of periods with so many common points links.
+
+    Returns:
+        Indices of the periods of each group, the group with the most points first.
+    """
+    reach = (common >= fewest) | np.eye(len(common), dtype=bool)
+    for _ in range(len(common).bit_length()):  # each time twice as many steps
+        reach = (reach.astype(np.float32) @ reach.astype(np.float32)) > 0
+    first = reach.argmax(axis=1)  # of the group
+    groups = [np.flatnonzero(first == label) for label in np.unique(first)]
+    return sorted(groups, key=lambda group: -int(np.diag(common)[group].sum()))
 
 
 @rule(
