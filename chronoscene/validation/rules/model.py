@@ -1,4 +1,4 @@
-"""CS10: the files of the COLMAP model, ids and names in it."""
+"""CS10: the files of the COLMAP model, and the ids in it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from chronoscene.colmap import MODEL_FILES
 from chronoscene.formats.chronoscene import MODEL
-from chronoscene.validation.finding import Hit, quote
-from chronoscene.validation.raw_scene import RawScene, is_safe
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
 
 MOST_IDS = 2**31 - 1
@@ -116,22 +116,6 @@ def duplicate_id(scene: RawScene) -> Iterator[Hit]:
 
 
 @rule(
-    "CS107",
-    "duplicate-name",
-    "error",
-    what="Two images of the model have the same name.",
-    remedy="keep one of them; if they are two photos, rename one file and register it again",
-    bad="`a.jpg` with image id 1 and with image id 2",
-    needs=("images",),
-)
-def duplicate_name(scene: RawScene) -> Iterator[Hit]:
-    assert scene.images is not None
-    for name, times in Counter(scene.images.names).items():
-        if times > 1:
-            yield Hit(scene.model_file("images"), "each name once", f"{quote(name)} {times} times")
-
-
-@rule(
     "CS108",
     "unknown-camera",
     "error",
@@ -164,36 +148,3 @@ def id_out_of_range(scene: RawScene) -> Iterator[Hit]:
     for stem, ids in (("cameras", cameras), ("images", images)):
         for wrong in sorted({i for i in ids if not 0 <= i < MOST_IDS}):
             yield Hit(scene.model_file(stem), f"ids from 0 to {MOST_IDS - 1}", f"id {wrong}")
-
-
-@rule(
-    "CS111",
-    "name-leaves-folder",
-    "error",
-    what="An image name is empty or leads out of `images/`.",
-    remedy="rename the image in the model to its path below images/",
-    bad="`../other/a.jpg`, `/home/me/a.jpg`",
-    needs=("images",),
-)
-def name_leaves_folder(scene: RawScene) -> Iterator[Hit]:
-    assert scene.images is not None
-    for name in scene.images.names:
-        if not is_safe(name):
-            yield Hit(scene.model_file("images"), "image names below images/", quote(name))
-
-
-@rule(
-    "CS112",
-    "name-not-text",
-    "error",
-    what="An image name is not UTF-8, or contains control characters.",
-    remedy="rename the file and the image in the model, with letters and digits",
-    bad="a name in Latin-1; a name with a line break",
-    needs=("images",),
-)
-def name_not_text(scene: RawScene) -> Iterator[Hit]:
-    assert scene.images is not None
-    for name in scene.images.names:
-        if any(ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) < 0xE000 for c in name):
-            place = scene.model_file("images")
-            yield Hit(place, "names in UTF-8 without control characters", quote(name))

@@ -199,8 +199,8 @@ def connected(common: NDArray[np.int64], fewest: int) -> list[NDArray[np.int64]]
     reach = (common >= fewest) | np.eye(len(common), dtype=bool)
     for _ in range(len(common).bit_length()):  # each time twice as many steps
         reach = (reach.astype(np.float32) @ reach.astype(np.float32)) > 0
-    first = reach.argmax(axis=1)  # of the group
-    groups = [np.flatnonzero(first == label) for label in np.unique(first)]
+    first = [int(np.flatnonzero(row)[0]) for row in reach]  # period of the group
+    groups = [np.flatnonzero(reach[period]) for period in sorted(set(first))]
     return sorted(groups, key=lambda group: -int(np.diag(common)[group].sum()))
 
 
