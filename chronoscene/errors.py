@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+LONGEST = 600
+"""Characters of a finding that a message shows."""
+
 
 class ChronoSceneError(Exception):
     """A problem with what the user gave us, never with our own invariants.
@@ -12,11 +15,13 @@ class ChronoSceneError(Exception):
     Args:
         place: File, file and line, option or argument where the problem sits.
         expected: What would have been right there.
-        found: What is there instead.
+        found: What is there instead; of more than `LONGEST` characters, beginning and end.
         todo: What the user can do about it.
     """
 
     def __init__(self, place: object, *, expected: str, found: str, todo: str) -> None:
+        if len(found) > LONGEST:  # it may quote a damaged file
+            found = f"{found[: LONGEST // 2]} ... {found[-LONGEST // 2 :]}"
         self.place = str(place)
         self.expected = expected
         self.found = found

@@ -77,6 +77,8 @@ def pinhole_camera(camera: Camera, *, center: bool = False) -> Camera:
         camera = replace(camera, model="PINHOLE", params=params)
     else:
         camera = undistorted_camera(camera)
+    if not np.isfinite(camera.params).all():
+        raise _camera_error(camera, "a camera that can be undistorted")
     if center:
         camera = _centred(camera)
     if max(camera.width, camera.height) > LARGEST_SIDE:
@@ -161,12 +163,12 @@ def sampling_map(change: CameraChange) -> tuple[NDArray[np.float32], NDArray[np.
     source, target = change.source, change.target
     fx, fy, cx, cy = target.params
     maps = np.empty((2, target.height, target.width), np.float32)
-    x = (np.arange(target.width) + 0.5 - cx) / fx
-    for first in range(0, target.height, ROWS):
-        rows = np.arange(first, min(first + ROWS, target.height))
-        y = (rows + 0.5 - cy) / fy
-        rays = np.ones((len(rows), len(x), 3))
-        rays[..., 0], rays[..., 1] = x, y[:, None]
-        pixels = project_points(source, rays.reshape(-1, 3)).reshape(len(rows), len(x), 2)
-        maps[:, rows] = np.moveaxis(pixels, -1, 0)
+    with np.errstate(over="ignore"):  # absurd cameras: what has no place becomes infinite
+        x = (np.arange(target.width) + 0.5 - cx) / fx
+        for first in range(0, target.height, ROWS):
+            rows = np.arange(first, min(first + ROWS, target.height))
+            rays = np.ones((len(rows), len(x), 3))
+            rays[..., 0], rays[..., 1] = x, ((rows + 0.5 - cy) / fy)[:, None]
+            pixels = project_points(source, rays.reshape(-1, 3)).reshape(len(rows), len(x), 2)
+            maps[:, rows] = np.moveaxis(pixels, -1, 0)
     return maps[0], maps[1]

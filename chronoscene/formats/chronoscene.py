@@ -10,6 +10,7 @@ import numpy as np
 
 from chronoscene.colmap import Model, PosedImage, read_model, write_model
 from chronoscene.errors import SceneError
+from chronoscene.formats.intrinsics import LARGEST_SIDE
 from chronoscene.formats.json_values import read_json
 from chronoscene.formats.labels import is_iso_date as is_iso_date  # it was here first
 from chronoscene.formats.labels import (
@@ -19,7 +20,7 @@ from chronoscene.formats.labels import (
     world_item,
 )
 from chronoscene.formats.writing import ImageSource, Progress, place_images, staged_folder
-from chronoscene.scene import Frame, Period, Scene, WorldFrame
+from chronoscene.scene import Camera, Frame, Period, Scene, WorldFrame
 from chronoscene.splits import (
     DEFAULT_RULE,
     FATAL,
@@ -107,14 +108,23 @@ def check_image(place: Path, image: PosedImage) -> None:
             found="NaN or infinity",
             todo="remove the image from the model, or register it again",
         )
-    focal = camera.K[[0, 1], [0, 1]] if camera.params else np.zeros(2)
-    if min(camera.width, camera.height) < 1 or not (np.isfinite(focal) & (focal > 0)).all():
+    if not is_usable(camera):
         raise SceneError(
             place,
-            expected=f"a camera {camera.camera_id} with positive size and focal length",
-            found=f"{camera.width} x {camera.height}, {camera.params}",
+            expected=f"a camera {camera.camera_id} with a plausible size, positive focal lengths "
+            "and finite parameters",
+            found=f"{camera.model} {camera.width} x {camera.height}, {camera.params}",
             todo="correct the camera",
         )
+
+
+def is_usable(camera: Camera) -> bool:
+    """Whether a camera has a size and parameters that a projection can use."""
+    if not (1 <= camera.width <= LARGEST_SIDE and 1 <= camera.height <= LARGEST_SIDE):
+        return False
+    if not np.isfinite(camera.params).all():
+        return False
+    return camera.model == "EQUIRECTANGULAR" or bool((camera.K[[0, 1], [0, 1]] > 0).all())
 
 
 def check_name(place: Path, name: str) -> None:

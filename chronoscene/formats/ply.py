@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
@@ -99,25 +100,50 @@ def _read_vertices(
 ) -> NDArray[np.void]:
     left = path.stat().st_size - file.tell()
     least = 2 * len(dtype.names or ()) if form == "ascii" else dtype.itemsize
-    if left + 1 < count * least:  # the last number of a text may end without a line break
+    if left + (form == "ascii") < count * least:  # the last line of a text may have no end
         raise _error(path, f"{count} vertices", f"{left} bytes after the header")
     if form != "ascii":
         return np.frombuffer(file.read(count * dtype.itemsize), dtype, count)
     vertices = np.zeros(count, dtype)
     names = dtype.names or ()
-    try:
-        rows = [file.readline().split()[: len(names)] for _ in range(count)]
-        values = np.array(rows, np.float64).reshape(count, len(names))
-    except ValueError as error:
-        raise _error(path, f"{len(names)} numbers for each vertex", "another line") from error
+    values = _read_table(path, file, count, len(names)) if count else np.zeros((0, len(names)))
     for i, name in enumerate(names):
-        vertices[name] = values[:, i]
+        kind = dtype[name]
+        if kind.kind in "iu" and not _fits(values[:, i], np.iinfo(kind)):
+            raise _error(path, f"whole numbers of type {kind} as {name}", "others")
+        with np.errstate(over="ignore"):  # infinite then, and refused where it matters
+            vertices[name] = values[:, i]
     return vertices
+
+
+def _read_table(path: Path, file: BinaryIO, rows: int, columns: int) -> NDArray[np.float64]:
+    """Numbers of a text, a vertex on each line. [rows, columns]"""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that there are none: they are counted below
+            values = np.loadtxt(
+                file,
+                comments=None,
+                usecols=range(columns),
+                max_rows=rows,
+                ndmin=2,
+                encoding="ascii",
+            )
+    except ValueError as error:  # UnicodeDecodeError is one
+        raise _error(path, f"{columns} numbers for each vertex", "another line") from error
+    if values.shape != (rows, columns):
+        raise _error(path, f"{rows} vertices", f"{len(values)} lines with numbers")
+    return values
+
+
+def _fits(values: NDArray[np.float64], limits: np.iinfo) -> bool:
+    return bool(((values >= limits.min) & (values <= limits.max)).all())
 
 
 def _to_points(path: Path, vertices: NDArray[np.void]) -> Points:
     names = vertices.dtype.names or ()
-    xyz = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
+    with np.errstate(invalid="ignore"):  # NaN is refused next
+        xyz = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
     if not np.isfinite(xyz).all():
         raise _error(path, "finite positions", "NaN or infinity")
     rgb = np.full((len(xyz), 3), UNKNOWN_COLOUR, np.uint8)

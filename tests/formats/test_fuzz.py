@@ -1,0 +1,312 @@
+"""Damaged scenes of every format by the thousand: our errors or a result, and nothing else.
+
+Each case damages one or two files of a good scene, then reads, converts and sometimes undistorts
+it. ``CHRONOSCENE_FUZZ_SECONDS`` is the time for all of it (default 10), ``CHRONOSCENE_FUZZ_SEED``
+the first seed; a failure names the seed of its case, and an abort of the process ends pytest.
+"""
+
+import copy
+import json
+import os
+import random
+import resource
+import shutil
+import struct
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from chronoscene.convert import convert
+from chronoscene.errors import ChronoSceneError
+from chronoscene.formats import FORMATS, detect_format, read_scene, writable_formats
+from chronoscene.formats.ply import read_points
+from chronoscene.split_making import SplitSettings, make_split
+from chronoscene.undistort import undistort
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, on damaged files
+
+SECONDS = float(os.environ.get("CHRONOSCENE_FUZZ_SECONDS", "10"))
+SEED = int(os.environ.get("CHRONOSCENE_FUZZ_SEED", "0"))
+
+SLOWEST = 10.0
+"""Seconds of computing for one case; a good one takes a hundredth."""
+
+MEMORY = 1_000_000
+"""Kilobytes by which the process may grow."""
+
+NUMBERS = (0, 1, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
+FLOATS = (float("nan"), float("inf"), -1e308, 1e308, 5e-324, 0.0, -0.0, 1e17)
+WORDS = (b"nan", b"inf", b"-1", b"1e999", b"9" * 5000, b"../../outside/secret.png", b"\0")
+VALUES = (
+    None, True, -1, 0, 2**70, 1.5, float("nan"), float("inf"), "", "../../outside/secret.png",
+    "/etc/passwd", "C:\\x.png", "a\0b", "\ud800", "x" * 5000, "a/" * 2000, [], [[]], {}, "images",
+    [[0] * 4] * 4, [[1e200] * 4] * 4, ["../outside/secret.png"], "points.ply", "transforms.json",
+)  # fmt: skip
+"""What may stand anywhere in a JSON file."""
+
+opened: list[str] = []
+"""Files that nobody is to open, and that were opened: outside of the scene, and pickles."""
+
+
+def watch(event, arguments):
+    if event == "open" and isinstance(arguments[0], str | bytes):
+        name = os.path.normpath(os.fsdecode(arguments[0]))
+        if name.endswith("0/outside/secret.png") or "cam_dict" in name:
+            opened.append(name)
+
+
+sys.addaudithook(watch)
+
+
+def damage_bytes(rng, data):
+    """A few random changes of some bytes."""
+    data = bytearray(data)
+    for _ in range(rng.choice([1, 1, 1, 2, 5, 20])):
+        if not data:
+            return rng.randbytes(rng.randrange(40))
+        at = rng.randrange(len(data))
+        end, new = rng.choice(
+            [
+                (at + 1, bytes([data[at] ^ 1 << rng.randrange(8)])),
+                (rng.choice([at + 8, len(data)]), b""),
+                (at, rng.randbytes(rng.randrange(1, 64))),
+                (at, data[rng.randrange(len(data)) :][:200]),
+                (at + 8, struct.pack("<Q", rng.choice(NUMBERS))),
+                (at + 8, struct.pack("<d", rng.choice(FLOATS))),
+            ]
+        )
+        data[at:end] = new
+    return bytes(data)
+
+
+def damage_words(rng, data):
+    """Some words of a text replaced, dropped or repeated, or those of a line."""
+    separator = rng.choice([b" ", b"\n", b","])
+    words = data.split(separator)
+    for _ in range(rng.choice([1, 1, 2, 5])):
+        at = rng.randrange(len(words))
+        words[at : at + rng.randrange(2)] = rng.choice([[rng.choice(WORDS)], [words[at]] * 2, []])
+        words = words or [b""]
+    return separator.join(words)
+
+
+def damage_json(rng, data):
+    """Some values, or names of keys, replaced."""
+    document = json.loads(data)
+    for _ in range(rng.choice([1, 1, 2, 5])):
+        inner = document
+        while True:
+            key = rng.choice(list(inner) if isinstance(inner, dict) else range(len(inner)))
+            if rng.random() < 0.3 or not isinstance(inner[key], dict | list) or not inner[key]:
+                break
+            inner = inner[key]
+        change = rng.randrange(4)
+        if change == 0:
+            del inner[key]
+        elif change == 1 and isinstance(inner, list):
+            inner.insert(0, copy.deepcopy(inner[key]))
+        else:
+            inner[key] = copy.deepcopy(rng.choice(VALUES))
+        if not document:
+            break
+    return json.dumps(document).encode()
+
+
+def damage(rng, path, data):
+    """Another content of a file, damaged in a way that suits its kind."""
+    kind = rng.random()
+    if path.suffix == ".json" and kind < 0.7:
+        return damage_json(rng, data)
+    if path.suffix in (".txt", ".json") and kind < 0.9:
+        return damage_words(rng, data)
+    return damage_bytes(rng, data)
+
+
+def many_cases(seconds, run):
+    """Run cases, each with its own random numbers, until the time is over; name one that fails."""
+    end, seed = time.monotonic() + seconds, SEED
+    while time.monotonic() < end or seed < SEED + 10:
+        began, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        try:
+            run(random.Random(seed))
+            assert time.process_time() - began < SLOWEST
+            assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MEMORY
+            assert not opened
+        except BaseException as error:
+            error.add_note(f"CHRONOSCENE_FUZZ_SEED={seed}")
+            raise
+        seed += 1
+    print(f"{seed - SEED} cases")  # shown by pytest -rP
+
+
+@pytest.fixture
+def run_damaged(tmp_path):
+    """Factory of a loop over damaged files of a folder, each of which a function is to survive."""
+    (tmp_path / "outside").mkdir()
+    Image.new("RGB", (8, 8)).save(tmp_path / "outside/secret.png")
+
+    def loop(files, seconds, survive):
+        refused = 0
+        opened.clear()
+
+        def run(rng):
+            nonlocal refused
+            chosen = rng.sample(files, min(len(files), rng.choice([1, 1, 1, 2])))
+            good = {path: path.read_bytes() for path in chosen}
+            try:
+                for path, data in good.items():
+                    path.write_bytes(damage(rng, path, data))
+                survive(rng)
+            except ChronoSceneError as error:
+                assert "Traceback" not in str(error) and "\n" not in str(error)
+                assert all((error.place, error.expected, error.found, error.todo))
+                assert len(error.found) < 2000, error.found[:200]
+                refused += 1
+            finally:
+                for path, data in good.items():
+                    path.write_bytes(data)
+
+        many_cases(seconds, run)
+        assert refused
+
+    return loop
+
+
+def use(rng, folder, name, out):
+    """What a user may do with a scene; whatever is written has to be in ``out``."""
+    shutil.rmtree(out, ignore_errors=True)
+    beside = sorted(folder.parent.iterdir())
+    try:
+        if rng.random() < 0.2:
+            detect_format(folder)
+        scene = read_scene(folder, format=name)
+        strategy = rng.choice(["stratified", "blocked", "date"])
+        try:
+            make_split(scene, SplitSettings(strategy))
+        except ChronoSceneError as error:
+            assert "\n" not in str(error)
+        if rng.random() < 0.2:
+            undistort(scene, out, center=rng.random() < 0.5, threads=1)
+        else:
+            source = rng.choice(["copy", "link", "symlink", "none"])
+            target = rng.choice(writable_formats())
+            convert(folder, out, source_format=name, target=target, image_source=source)
+            read_scene(out, format=target)
+    finally:
+        assert {p for p in folder.parent.iterdir() if p != out} == {p for p in beside if p != out}
+
+
+def damageable(folder):
+    """All files but images, of which one is enough."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file() and "cam_dict" not in p.name)
+    images = [p for p in files if p.suffix == ".png"]
+    return [p for p in files if p.suffix != ".png"] + images[:1]
+
+
+@pytest.fixture
+def variants(builders, colmap_folder, level, tmp_path):
+    """Scenes of every format, as text and with all optional files; by name and format."""
+
+    def of_text():
+        names = [f"{task}/{i}.png" for task in ("t1", "t2") for i in range(3)]
+        return colmap_folder(names, name="text", form="text", tests=["t1/0.png"])
+
+    def of_level():
+        root = level()
+        data = json.loads((root / "add/transforms_train.json").read_text())
+        for file, frames in (("test", data["frames"][:1]), ("train", data["frames"][1:])):
+            text = json.dumps(data | {"frames": frames})
+            (root / f"add/transforms_{file}.json").write_text(text)
+        return root
+
+    def of_studio():
+        root = builders["nerfstudio"]()
+        data = json.loads((root / "transforms.json").read_text())
+        data |= {
+            "applied_scale": 2.0,
+            "applied_transform": [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]],
+        }
+        data |= {"world": {"unit": "metre"}, "periods": [{"id": 0}, {"id": 1, "label": "b"}]}
+        data |= {"train_filenames": [f["file_path"] for f in data["frames"][1:]]}
+        data |= {"test_filenames": [data["frames"][0]["file_path"]], "k1": 0.01}
+        for i, frame in enumerate(data["frames"]):
+            frame |= {"colmap_im_id": i + 1, "time": frame["period"] / 2, "mask_path": "m.png"}
+        (root / "transforms.json").write_text(json.dumps(data))
+        return root
+
+    def of_pointz():
+        root = builders["neusc"]()
+        names = "\n".join(sorted(p.name for p in (root / "dense/images").iterdir()))
+        (root / "annots/train.txt").write_text(names)
+        (root / "trash.txt").write_text(names.splitlines()[3])
+        return root
+
+    def of_city():
+        root = builders["matrixcity"]()
+        data = json.loads((root / "before/block_A/transforms.json").read_text())
+        for frame in data["frames"]:
+            frame["file_path"] = f"../../before/block_A/{frame.pop('frame_index'):04d}.png"
+            pose = frame["transform_matrix"] = frame.pop("rot_mat")
+            pose[:3] = [[x * 100 for x in row[:3]] + [row[3]] for row in pose[:3]]
+        shutil.rmtree(root / "after")
+        (root / "before/block_A/transforms.json").unlink()
+        for part in ("train", "test"):
+            folder = root / "pose" / "block_A"
+            folder.mkdir(parents=True, exist_ok=True)
+            chosen = data["frames"][1:] if part == "train" else data["frames"][:1]
+            (folder / f"transforms_{part}.json").write_text(json.dumps(data | {"frames": chosen}))
+        return root
+
+    return {
+        **{name: (name, make) for name, make in builders.items()},
+        "text": ("colmap-folders", of_text),
+        "level": ("cl-splats", of_level),
+        "nerfstudio": ("nerfstudio", of_studio),
+        "neusc": ("neusc", of_pointz),
+        "prepared": ("matrixcity", of_city),
+    }
+
+
+VARIANTS = (*sorted(FORMATS), "text", "level", "prepared")
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_damaged_scenes(variants, run_damaged, tmp_path, variant):
+    name, make = variants[variant]
+    folder = make()
+    out = tmp_path / "out"
+    use(random.Random(0), folder, name, out)  # it is good
+    seconds = SECONDS / (len(VARIANTS) + 2)
+    run_damaged(damageable(folder), seconds, lambda rng: use(rng, folder, name, out))
+    assert not (tmp_path / "exploded").exists()
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary"])
+def test_damaged_point_clouds(run_damaged, tmp_path, form):
+    path = tmp_path / "points.ply"
+    if form == "ascii":
+        header = ["ply", "format ascii 1.0", "element vertex 50", "property float x"]
+        header += ["property float y", "property float z", "property uchar red"]
+        header += ["property uchar green", "property uchar blue", "end_header"]
+        path.write_text("\n".join([*header, *(f"{i} {i / 3} -{i} 1 2 3" for i in range(50))]))
+    else:
+        header = "ply\nformat binary_little_endian 1.0\nelement vertex 50\n"
+        header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+        path.write_bytes(header.encode() + bytes(50 * 24))
+    assert len(read_points(path)) == 50
+    run_damaged([path], SECONDS / (len(VARIANTS) + 2), lambda rng: read_points(path))
+
+
+def test_points_that_a_header_only_claims(tmp_path):
+    path = Path(tmp_path / "points.ply")
+    for count in (10**6, 10**12, 2**63, 10**30):
+        for form in ("ascii", "binary_little_endian"):
+            path.write_text(
+                f"ply\nformat {form} 1.0\nelement vertex {count}\nproperty float x\n"
+                "property float y\nproperty float z\nend_header\n0 0 0\n"
+            )
+            with pytest.raises(ChronoSceneError, match=f"expected {count} vertices"):
+                read_points(path)
