@@ -1,4 +1,4 @@
-"""CS519 to CS522: the frames of the periods against each other, and of the scene against metres."""
+"""CS519 to CS521: the frames of the periods against each other, and of the scene against metres."""
 
 from __future__ import annotations
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 
+import numpy as np
+
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.pixels import Header
 from chronoscene.validation.raw_scene import RawScene
@@ -20,6 +22,9 @@ KINDS = {
     ".webp": ("WEBP",),
 }
 """Extension to Pillow's names of what is in such a file. Cameras put MPO into ``.jpg``."""
+
+BLANK = 2.0
+"""Grey levels between the means of the darkest and the brightest part of an image."""
 
 ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 """Pillow's modes with transparency."""
@@ -120,6 +125,27 @@ def image_misnamed(scene: RawScene) -> Iterator[Hit]:
         known = KINDS.get(suffix.lower())
         if known is not None and header.kind not in known:
             yield Hit(f"images/{name}", f"a {known[0]} file", f"a {header.kind} file")
+
+
+@rule(
+    "CS216",
+    "image-blank",
+    "warning",
+    what="An image is of one colour all over (needs `--decode`).",
+    remedy="remove the image from the model: it shows nothing, and trains or tests on nothing",
+    bad="a black frame from a video; a photo with the lens cap on",
+    needs=("pixels",),
+)
+def image_blank(scene: RawScene) -> Iterator[Hit]:
+    for name, pixels in (scene.pixels or {}).items():
+        thumbnail = pixels.thumbnail
+        if thumbnail is not None and np.ptp(thumbnail, axis=(0, 1)).max() <= BLANK:
+            red, green, blue = (round(float(c)) for c in thumbnail.mean(axis=(0, 1)))
+            yield Hit(
+                f"images/{name}",
+                "an image that shows something",
+                f"one colour, #{red:02x}{green:02x}{blue:02x}",
+            )
 
 
 def _headers(scene: RawScene) -> Iterator[tuple[str, Header]]:

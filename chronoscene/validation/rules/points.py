@@ -16,6 +16,15 @@ from chronoscene.validation.rule import rule
 FEWEST_SHARED = 10
 """Points from which a similarity between two periods can be told from chance."""
 
+FEWEST_COLOURED = 100
+"""Points whose colours mean something."""
+
+SAME_COLOUR = 0.95
+"""Share of points of one colour; snow and night skies have many shades."""
+
+COLOURED_SAMPLE = 50_000
+"""Points whose colours are looked at."""
+
 BLOCK = 10_000_000
 """Points times periods that are counted at a time."""
 
@@ -260,6 +269,29 @@ def no_training_points(scene: RawScene) -> Iterator[Hit]:
     if len(scene.points or ()) and not train[seen.image[seen.valid]].any():
         found = f"0 of {len(scene.points or ())}"
         yield Hit(scene.model_file("points3D"), "points that training images see", found)
+
+
+@rule(
+    "CS522",
+    "points-without-colours",
+    "warning",
+    what="Nearly all points have the same colour, which tells methods nothing that start from the "
+    "colours of the points.",
+    remedy="extract the colours (colmap color_extractor) and write the model again",
+    bad="a model triangulated without colours: all points are black",
+    needs=("points",),
+)
+def points_without_colours(scene: RawScene) -> Iterator[Hit]:
+    points = scene.points
+    assert points is not None
+    if len(points) < FEWEST_COLOURED:
+        return
+    packed = points.rgb.astype(np.int64) @ [65536, 256, 1]
+    colours, numbers = np.unique(packed[:: len(packed) // COLOURED_SAMPLE + 1], return_counts=True)
+    most = int(numbers.argmax())
+    if numbers[most] > SAME_COLOUR * numbers.sum():
+        found = f"#{colours[most]:06x} for {100 * numbers[most] / numbers.sum():.1f} % of them"
+        yield Hit(scene.model_file("points3D"), "points in the colours of the photos", found)
 
 
 def _some_points(

@@ -18,6 +18,10 @@ FAR = 1000.0
 """Distance from the origin in extents of the scene. Single precision has 7 digits: at this distance
 it resolves a ten-thousandth of the scene, about a pixel."""
 
+STRAY = 20.0
+"""Distance of a camera from the middle of all, in units of the distance that nine tenths of the
+cameras, or half of the points, do not exceed."""
+
 
 @rule(
     "CS121",
@@ -76,3 +80,34 @@ def far_from_origin(scene: RawScene) -> Iterator[Hit]:
     if extent > 0 and distance > FAR * extent:
         found = f"cameras {distance:.3g} away from it, within {extent:.3g} of their median"
         yield Hit(scene.model_file("images"), "cameras near the origin of the world", found)
+
+
+@rule(
+    "CS124",
+    "far-camera",
+    "warning",
+    what="A camera is absurdly far from the others and from the points; methods that take the size "
+    "of the scene from its cameras get it wrong.",
+    remedy="look at the pose: the image was probably registered in a wrong place; take it out of "
+    "the model or register it again",
+    bad="a camera 3 km from a square of 100 m",
+    needs=("images",),
+)
+def far_camera(scene: RawScene) -> Iterator[Hit]:
+    assert scene.images is not None
+    posed = np.flatnonzero(~np.isnan(scene.centres).any(axis=1))
+    if not len(posed):
+        return
+    middle = np.median(scene.centres[posed], axis=0)
+    distance = np.linalg.norm(scene.centres[posed] - middle, axis=1)
+    typical = float(np.percentile(distance, 90))
+    if scene.points is not None and len(scene.points):
+        typical = max(
+            typical, float(np.nanmedian(np.linalg.norm(scene.points.xyz - middle, axis=1)))
+        )
+    if not 0 < typical < np.inf:
+        return
+    for i in np.flatnonzero(distance > STRAY * typical).tolist():
+        place = scene.image_place(scene.images.names[posed[i]])
+        expected = f"a camera within {STRAY * typical:.3g} of the middle of all"
+        yield Hit(place, expected, f"one {distance[i]:.3g} away")

@@ -77,3 +77,15 @@ def test_image_misnamed(scene):
 def test_image_without_extension_has_no_wrong_one(scene):
     scene.save("a000.png", noise(), as_name="a000", format="JPEG")
     assert {f.code for f in scene.validate().findings} == {"CS507"}
+
+
+def test_image_blank(scene):
+    scene.save("a000.png", Image.new("RGB", (64, 48), (0, 128, 255)))
+    scene.expect("CS216", place="images/a000.png", found="one colour, #0080ff", decode=True)
+
+
+def test_dark_image_that_shows_something_is_not_blank(scene):
+    pixels = np.zeros((48, 64, 3), np.uint8)
+    pixels[20:, 30:] = 4
+    scene.save("a000.png", Image.fromarray(pixels))
+    assert "CS216" not in {f.code for f in scene.validate(decode=True).findings}

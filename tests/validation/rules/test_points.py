@@ -157,3 +157,19 @@ def test_no_training_points(scene):
     """All points are seen by the two test images alone."""
     keep_images(scene, range(40), (4, 11))
     scene.expect("CS514", place=POINTS, found="0 of 40", also={"CS509"})
+
+
+def test_points_without_colours(make_scene):
+    """As COLMAP triangulates them: black, but for a few."""
+    scene = make_scene(points=200, form="text")
+    lines = [line.split() for line in scene.lines(POINTS) if not line.startswith("#")]
+    for words in lines[:-5]:
+        words[4:7] = ["0", "0", "0"]
+    scene.write(POINTS, [" ".join(words) for words in lines])
+    (finding,) = [f for f in scene.validate().findings if f.code == "CS522"]
+    assert (finding.place, finding.found) == (POINTS, "#000000 for 97.5 % of them")
+
+
+def test_points_with_colours(make_scene):
+    scene = make_scene(points=200, form="text")
+    assert "CS522" not in {f.code for f in scene.validate().findings}

@@ -33,3 +33,22 @@ def test_far_from_origin(scene):
         words[1:4] = [f"{float(w) + s:.17g}" for w, s in zip(words[1:4], shift, strict=True)]
     scene.write("sparse/0/points3D.txt", [" ".join(words) for words in points])
     scene.expect("CS123", place="images.txt", found="cameras 4.45e+06 away")
+
+
+def test_far_camera(scene):
+    scene.change_poses(lambda r, t: (r, t + np.array([0, 0, 500.0])), [3])
+    report = scene.validate()
+    (finding,) = [f for f in report.findings if f.code == "CS124"]
+    assert finding.place == f"{IMAGES} (a003.png)"
+    assert finding.found == "one 504 away"
+
+
+def test_camera_a_little_aside_is_silent(scene):
+    scene.change_poses(lambda r, t: (r, t + np.array([0, 0, 50.0])), [3])
+    assert "CS124" not in {f.code for f in scene.validate().findings}
+
+
+def test_cameras_in_one_place_are_silent(scene):
+    """A panorama: its size is that of the points."""
+    scene.change_poses(lambda r, t: (r, 1e-6 * t), range(13))
+    assert "CS124" not in {f.code for f in scene.validate().findings}
