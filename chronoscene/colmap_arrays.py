@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.scene import select_tracks
+
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE",
     "PINHOLE",
@@ -76,3 +78,20 @@ class RawPoints:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def select(self, keep: NDArray[np.bool_]) -> RawPoints:
+        """Some of the points, in the same order, each with all of its observations.
+
+        Args:
+            keep: Which points. [P]
+        """
+        track_start, observed = select_tracks(self.track_start, keep)
+        return RawPoints(
+            ids=self.ids[keep],
+            xyz=self.xyz[keep],
+            rgb=self.rgb[keep],
+            error=self.error[keep],
+            track_start=track_start,
+            track_image=self.track_image[observed],
+            track_keypoint=self.track_keypoint[observed],
+        )

@@ -106,17 +106,29 @@ class Points:
         Args:
             keep: Which points. [P]
         """
-        lengths = np.diff(self.track_start)
-        observed = np.repeat(keep, lengths)
+        track_start, observed = select_tracks(self.track_start, keep)
         return Points(
             ids=self.ids[keep],
             xyz=self.xyz[keep],
             rgb=self.rgb[keep],
             error=self.error[keep],
-            track_start=np.concatenate([[0], np.cumsum(lengths[keep])]),
+            track_start=track_start,
             track_frame=self.track_frame[observed],
             track_xy=self.track_xy[observed],
         )
+
+
+def select_tracks(
+    track_start: NDArray[np.int64], keep: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Where the tracks of some points begin [kept + 1], and which observations are theirs [M].
+
+    Args:
+        track_start: Of all points. [P + 1]
+        keep: Which points. [P]
+    """
+    lengths = np.diff(track_start)
+    return np.concatenate([[0], np.cumsum(lengths[keep])]), np.repeat(keep, lengths)
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,12 +37,12 @@ def repair_model(images: RawImages, points: RawPoints) -> tuple[RawImages, RawPo
     if not keep.all():
         gone = counted(int(np.count_nonzero(~keep)), "point")
         repairs.append(Repair("CS502", f"{gone} without finite coordinates removed"))
-        points = _select(points, keep)
+        points = points.select(keep)
     long = np.diff(points.track_start) >= 2
     if not long.all() and np.count_nonzero(long) >= LEAST_KEPT * len(points):
         gone = counted(int(np.count_nonzero(~long)), "point")
         repairs.append(Repair("CS503", f"{gone} with fewer than two observations removed"))
-        points = _select(points, long)
+        points = points.select(long)
     return _without_points(images, before, points), points, repairs
 
 
@@ -77,20 +77,6 @@ def _without_broken_observations(
         track_start=np.concatenate([[0], np.cumsum(lengths)]),
         track_image=points.track_image[sound],
         track_keypoint=points.track_keypoint[sound],
-    )
-
-
-def _select(points: RawPoints, keep: NDArray[np.bool_]) -> RawPoints:
-    lengths = np.diff(points.track_start)
-    rows = np.repeat(keep, lengths)
-    return RawPoints(
-        ids=points.ids[keep],
-        xyz=points.xyz[keep],
-        rgb=points.rgb[keep],
-        error=points.error[keep],
-        track_start=np.concatenate([[0], np.cumsum(lengths[keep])]),
-        track_image=points.track_image[rows],
-        track_keypoint=points.track_keypoint[rows],
     )
 
 
