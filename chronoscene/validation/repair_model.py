@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chronoscene.colmap_arrays import RawImages, RawPoints
 from chronoscene.validation.finding import counted
