@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,8 +11,11 @@ import numpy as np
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.formats import load_format, read_scene, writable_formats
+from chronoscene.formats.colmap_folders import names_in_folders, period_folders
+from chronoscene.formats.grouping import label_date
 from chronoscene.formats.writing import ImageSource, Progress
 from chronoscene.scene import Scene, WorldFrame
+from chronoscene.splits import IMAGE_SUFFIXES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +59,7 @@ def convert(
     check_choice("--to", target, writable_formats())
     check_outside(source, out)
     scene = read_scene(source, format=source_format, period_by=period_by)
-    warnings = (*_remarks(scene), *losses(scene, target), *obstacles(scene))
+    warnings = (*remarks_on(scene), *losses(scene, target), *obstacles(scene))
     load_format(target).write(scene, out, image_source=image_source, progress=progress)
     return Conversion(scene, out, target, warnings)
 
@@ -75,10 +79,26 @@ def check_outside(source: Path, out: Path) -> None:
         )
 
 
-def _remarks(scene: Scene) -> list[str]:
+def remarks_on(scene: Scene) -> list[str]:
     """What the source has that we do not read."""
     module = load_format(scene.format)
-    return list(module.remarks(scene.root)) if hasattr(module, "remarks") else []
+    said = list(module.remarks(scene.root)) if hasattr(module, "remarks") else []
+    if scene.images_root != scene.root and (count := _unused_images(scene)):
+        where = scene.images_root.relative_to(scene.root)
+        said.append(f"{count} image files in {where}/ are not in the scene, and not converted")
+    return said
+
+
+def _unused_images(scene: Scene) -> int:
+    """Number of image files below the folder of images that no frame uses."""
+    used = {os.path.normpath(scene.image_path(frame)) for frame in scene.frames}
+    found = (
+        os.path.normpath(os.path.join(folder, file))
+        for folder, _, files in os.walk(scene.images_root)
+        for file in files
+        if file.lower().endswith(IMAGE_SUFFIXES)
+    )
+    return sum(path not in used for path in found)
 
 
 def losses(scene: Scene, target: str) -> list[str]:
@@ -87,11 +107,16 @@ def losses(scene: Scene, target: str) -> list[str]:
     if target == "nerfstudio" and len(scene.points.track_frame):
         lost.append("the observations of points, their ids and errors")
     if target == "colmap-folders":
-        if any(period.date not in (None, period.label) for period in scene.periods):
+        folders = period_folders(scene.periods)
+        if folders != [period.label for period in scene.periods]:
+            lost.append(f"the labels of the periods as they are (folders: {', '.join(folders)})")
+        if any(p.date != label_date(f) for p, f in zip(scene.periods, folders, strict=True)):
             lost.append("the dates of the periods")
+        if any(new != old for old, new in names_in_folders(scene).items()):
+            lost.append("these image names, which get the folder of their period")
         if scene.world != WorldFrame():
             lost.append("unit and reference system of the world")
-    return [f"{target} has no place for {', '.join(lost)}"] if lost else []
+    return [f"{target} has no place for {item}" for item in lost]
 
 
 def obstacles(scene: Scene) -> list[str]:

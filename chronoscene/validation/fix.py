@@ -20,6 +20,7 @@ from chronoscene.files import write_text_atomic
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST
 from chronoscene.splits import parse_split_text, parse_test_text
 from chronoscene.validation.finding import counted, shown
+from chronoscene.validation.origin import other_format
 from chronoscene.validation.raw_model import FORMS, RawModel
 from chronoscene.validation.raw_scene import RawScene, TextFile, read_text_file
 from chronoscene.validation.repair_images import set_upright
@@ -27,8 +28,9 @@ from chronoscene.validation.repair_model import Repair, repair_model
 from chronoscene.validation.repair_texts import repair_split, repair_test
 from chronoscene.validation.rules import split as split_rules
 from chronoscene.validation.rules import testlist as test_rules
-from chronoscene.validation.rules.images import images_of_other_shape, spelling
+from chronoscene.validation.rules.images import images_of_other_shape
 from chronoscene.validation.run import quiet_numbers
+from chronoscene.validation.spelling import spelling
 
 
 def fix_scene(root: Path, out: Path) -> list[Repair]:
@@ -42,9 +44,11 @@ def fix_scene(root: Path, out: Path) -> list[Repair]:
         What was done.
 
     Raises:
-        ConfigError: If ``out`` is in use, inside the scene, or cannot be written.
+        ConfigError: If ``out`` is in use, inside the scene, or cannot be written, or the scene is
+            of another format.
     """
     _check_out(root, out)
+    _check_format(root)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
@@ -75,6 +79,17 @@ def _check_out(root: Path, out: Path) -> None:
             expected="a new or empty folder beside the scene",
             found=found,
             todo="choose another folder",
+        )
+
+
+def _check_format(root: Path) -> None:
+    name = other_format(root)
+    if name is not None:
+        raise ConfigError(
+            f"--fix of {root}",
+            expected="a scene in the ChronoScene format",
+            found=f"one in {name}",
+            todo="chronoscene convert makes one of it, which can be corrected",
         )
 
 

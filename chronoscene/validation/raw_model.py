@@ -8,6 +8,7 @@ with the size of the file.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +65,15 @@ def model_files(folder: Path) -> dict[str, str]:
         if len(files) == len(MODEL_FILES):
             return files
     return {**text, **binary}
+
+
+def numbered_models(scene: Path) -> list[Path]:
+    """Folders ``sparse/0``, ``sparse/1`` ... that have files of a model, in this order."""
+    try:
+        folders = [p for p in (scene / "sparse").iterdir() if re.fullmatch("[0-9]{1,9}", p.name)]
+    except OSError:
+        return []
+    return [p for p in sorted(folders, key=lambda p: (int(p.name), p.name)) if model_files(p)]
 
 
 def read_raw_model(folder: Path) -> RawModel:

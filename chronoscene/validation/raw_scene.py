@@ -35,6 +35,7 @@ from chronoscene.splits import (
     parse_test_text,
 )
 from chronoscene.validation.observations import Observations, observe
+from chronoscene.validation.origin import Origin
 from chronoscene.validation.pixels import (
     Header,
     Pixels,
@@ -42,7 +43,7 @@ from chronoscene.validation.pixels import (
     read_headers,
     read_pixels,
 )
-from chronoscene.validation.raw_model import FORMS, RawModel, read_raw_model
+from chronoscene.validation.raw_model import FORMS, RawModel, numbered_models, read_raw_model
 from chronoscene.validation.reprojection import Reprojection, good_poses, reproject
 
 T = TypeVar("T")
@@ -97,16 +98,25 @@ class TextFile:
 class RawScene:
     """One scene folder. Every attribute is read when it is first used, then kept."""
 
-    def __init__(self, root: Path, *, decode: bool = False, track: Track = no_progress) -> None:
+    def __init__(
+        self,
+        root: Path,
+        *,
+        decode: bool = False,
+        track: Track = no_progress,
+        origin: Origin | None = None,
+    ) -> None:
         """Read nothing yet.
 
         Args:
             root: The scene folder.
             decode: Whether rules may decode all images.
             track: Shows the progress of what takes long.
+            origin: The other format that the scene has come from.
         """
         self.root = root
         self.decode = decode
+        self.origin = origin
         self._track = track
 
     def reason(self, attribute: str) -> str:
@@ -125,7 +135,8 @@ class RawScene:
         for place in MODEL_PLACES:
             if any((self.root / place / f"{s}{e}").is_file() for s in MODEL_FILES for e in FORMS):
                 return place
-        return None
+        numbered = numbered_models(self.root)  # the first one may have been deleted
+        return f"sparse/{numbered[0].name}" if numbered else None
 
     @cached_property
     def model(self) -> RawModel | None:
@@ -354,7 +365,8 @@ def read_text_file(path: Path) -> TextFile | None:
         if not path.is_file():  # a pipe would block
             return None
         data = path.read_bytes()
-        return TextFile(data, decode_text(data))
+        text = decode_text(data)
+        return None if "\0" in text else TextFile(data, text)  # UTF-16 without its mark
     except (OSError, UnicodeDecodeError):
         return None
 

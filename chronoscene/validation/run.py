@@ -12,10 +12,12 @@ import numpy as np
 
 from chronoscene.errors import SceneError
 from chronoscene.validation.finding import SEVERITIES, Finding, Hit, printable
+from chronoscene.validation.origin import in_our_format, other_format
 from chronoscene.validation.raw_model import model_files
 from chronoscene.validation.raw_scene import RawScene, Track, no_progress
 from chronoscene.validation.report import SceneReport, Skipped, Summary, summarise
 from chronoscene.validation.rule import Rule, all_rules
+from chronoscene.validation.rules.other_formats import OF_ORIGINS
 
 RULE_FAILED = "CS000"
 """Code of the finding that a rule itself failed: our mistake, reported as such."""
@@ -24,7 +26,8 @@ RULE_FAILED = "CS000"
 def find_folders(path: Path) -> list[Path]:
     """The folder itself if it looks like a scene, else the folders in it that do, sorted.
 
-    Looking like a scene is not much: it has ``sparse/`` or ``images/``, or files of a model.
+    Looking like a scene is not much: it has ``sparse/`` or ``images/``, or files of a model, or the
+    marks of another format.
 
     Raises:
         SceneError: If there is nothing that looks like a scene.
@@ -51,7 +54,8 @@ def find_folders(path: Path) -> list[Path]:
 
 
 def _like_scene(path: Path) -> bool:
-    return any((path / name).is_dir() for name in ("sparse", "images")) or bool(model_files(path))
+    ours = any((path / name).is_dir() for name in ("sparse", "images")) or bool(model_files(path))
+    return ours or other_format(path) is not None
 
 
 def validate_scene(
@@ -63,14 +67,21 @@ def validate_scene(
 ) -> SceneReport:
     """Run rules on one scene folder. Reads only; never raises for what is in the folder.
 
+    A scene of another format is checked as `chronoscene convert` would write it.
+
     Args:
         path: The scene folder.
         rules: Rules to run (see `chronoscene.validation.rule.choose_rules`); None for all.
         decode: Whether to decode all images: slower, finds damaged pixels and copied images.
         track: Shows the progress of what takes long.
     """
-    with quiet_numbers():
-        return _validate(RawScene(Path(path), decode=decode, track=track), rules)
+    chosen = all_rules() if rules is None else rules
+    with quiet_numbers(), in_our_format(Path(path)) as (root, origin):
+        scene = RawScene(root, decode=decode, track=track, origin=origin)
+        report = _validate(scene, chosen)
+    if origin is None:
+        return report
+    return replace(report, name=printable(Path(path).resolve().name), path=Path(path))
 
 
 @contextmanager
@@ -81,10 +92,10 @@ def quiet_numbers() -> Iterator[None]:
         yield
 
 
-def _validate(scene: RawScene, rules: Sequence[Rule] | None) -> SceneReport:
+def _validate(scene: RawScene, rules: Sequence[Rule]) -> SceneReport:
     findings: list[Finding] = []
     skipped: list[Skipped] = []
-    for rule in sorted(all_rules() if rules is None else rules, key=lambda r: (r.last, r.code)):
+    for rule in sorted(rules, key=lambda r: (r.last, r.code)):
         try:
             reason = _reason_to_skip(rule, scene, findings)
             if reason is not None:
@@ -104,6 +115,8 @@ def _validate(scene: RawScene, rules: Sequence[Rule] | None) -> SceneReport:
 
 
 def _reason_to_skip(rule: Rule, scene: RawScene, findings: Sequence[Finding]) -> str | None:
+    if scene.origin is not None and scene.origin.error is not None and rule.code not in OF_ORIGINS:
+        return f"it cannot be read as {scene.origin.format}"
     for attribute in rule.needs:
         if getattr(scene, attribute) is None:
             return scene.reason(attribute)

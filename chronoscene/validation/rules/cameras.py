@@ -21,7 +21,7 @@ WIDEST, NARROWEST = 150.0, 1.0
 UNEQUAL = 0.1
 """Relative difference of fx and fy; pixels are square to a few percent in any camera."""
 
-UNDISTORT = "undistort the images and the model (colmap image_undistorter)"
+UNDISTORT = "undistort the images and the model: chronoscene undistort SCENE OUT"
 DROP = "write the camera as PINHOLE or SIMPLE_PINHOLE; its distortion is below half a pixel"
 
 
@@ -144,6 +144,8 @@ def principal_point_outside(scene: RawScene) -> Iterator[Hit]:
 def camera_unused(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
     used = set(scene.images.camera_ids.tolist())
+    if not used or not used <= {camera.camera_id for camera in _cameras(scene)}:
+        return  # cameras and images do not belong together, which is an error of its own
     for camera in _cameras(scene):
         if camera.camera_id not in used:
             yield Hit(_place(scene, camera), "images of this camera", "none")

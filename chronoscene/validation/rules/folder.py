@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from itertools import count
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.validation.finding import Hit, shown
-from chronoscene.validation.raw_model import model_files
+from chronoscene.validation.raw_model import numbered_models
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.reader_check import reader_complaint
 from chronoscene.validation.rule import rule
@@ -54,15 +53,14 @@ def model_misplaced(scene: RawScene) -> Iterator[Hit]:
     bad="`sparse/0/` and `sparse/1/`, a period in each",
 )
 def several_models(scene: RawScene) -> Iterator[Hit]:
-    names = (str(i) for i in count(1))
-    others = []
-    for name in names:
-        if not (scene.root / "sparse" / name).is_dir():
-            break
-        if model_files(scene.root / "sparse" / name):
-            others.append(f"sparse/{name}")
+    place = scene.model_place
+    others = [
+        f"sparse/{folder.name}"
+        for folder in numbered_models(scene.root)
+        if f"sparse/{folder.name}" not in (place, our_format.MODEL)
+    ]
     if others:
-        yield Hit("sparse", "one model, sparse/0", f"{shown(others)} too", count=len(others))
+        yield Hit("sparse", f"one model, {place}", f"{shown(others)} too", count=len(others))
 
 
 @rule(
@@ -78,10 +76,12 @@ def bad_periods_json(scene: RawScene) -> Iterator[Hit]:
     ids = scene.period_ids
     if ids != list(range(len(ids))):
         return  # they have their own rule
+    if len(scene.periods or ()) < len(scene.names):
+        return  # some period may be missing, which is reported
     try:
         our_format.read_periods(scene.root, len(ids))
     except ChronoSceneError as error:
-        yield _hit(scene, error, our_format.PERIODS)
+        yield relative_hit(scene, error, our_format.PERIODS)
 
 
 @rule(
@@ -96,7 +96,7 @@ def bad_world_json(scene: RawScene) -> Iterator[Hit]:
     try:
         our_format.read_world(scene.root)
     except ChronoSceneError as error:
-        yield _hit(scene, error, our_format.WORLD)
+        yield relative_hit(scene, error, our_format.WORLD)
 
 
 @rule(
@@ -116,7 +116,7 @@ def reader_refuses(scene: RawScene) -> Iterator[Hit]:
         yield Hit(error.place, error.expected, error.found, error.todo)
 
 
-def _hit(scene: RawScene, error: ChronoSceneError, place: str) -> Hit:
+def relative_hit(scene: RawScene, error: ChronoSceneError, place: str) -> Hit:
     """The same message with a place relative to the scene folder."""
     root = os.path.join(scene.root, "")
     where = error.place.removeprefix(root) if error.place.startswith(root) else place

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import unicodedata
+import os
 from collections.abc import Iterator
-from pathlib import PurePosixPath
 
 from chronoscene.scene import Camera
 from chronoscene.validation.finding import Hit, quote
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
+from chronoscene.validation.spelling import Spellings
 
 GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "I;16B", "I;16L", "I;16N")
 """Pillow's modes without colour."""
@@ -27,18 +27,25 @@ GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "I;16B", "I;16L", "I;16N")
 def image_missing(scene: RawScene) -> Iterator[Hit]:
     if not (scene.root / "images").is_dir():
         return  # one finding says it for all
-    present = set(scene.present)
-    spellings: dict[str, str] = {}
-    for file in scene.files:
-        for key in (spelling(PurePosixPath(file).name), spelling(file)):
-            spellings[key] = file
+    present, others = set(scene.present), Spellings(_unregistered(scene))
     for name in scene.names:
         if name not in present:
-            near = spellings.get(spelling(name)) or spellings.get(
-                spelling(PurePosixPath(name).name)
-            )
-            found = "nothing" + (f"; there is {quote(near)}" if near else "")
+            near = others.find(name)
+            found = _instead(scene, name) + (f"; there is {quote(near)}" if near else "")
             yield Hit(_place(name), "an image", found)
+
+
+def _instead(scene: RawScene, name: str) -> str:
+    """What is where an image file should be."""
+    path = scene.image_path(name)
+    if os.path.isdir(path):
+        return "a folder"
+    return "a link to nothing" if os.path.islink(path) else "nothing"
+
+
+def _unregistered(scene: RawScene) -> list[str]:
+    registered = set(scene.names)
+    return [file for file in scene.files if file not in registered]
 
 
 @rule(
@@ -51,9 +58,15 @@ def image_missing(scene: RawScene) -> Iterator[Hit]:
     needs=("images",),
 )
 def image_unregistered(scene: RawScene) -> Iterator[Hit]:
-    registered = set(scene.names)
-    for file in scene.files:
-        if file not in registered:
+    assert scene.images is not None
+    if not scene.names:
+        return  # an error of its own
+    files, present = _unregistered(scene), set(scene.present)
+    spellings = Spellings(files)
+    # What a missing image or one with an impossible name probably is has been named there.
+    named = {spellings.find(name) for name in set(scene.images.names) - present}
+    for file in files:
+        if file not in named:
             yield Hit(_place(file), "a registered image", "one that the model does not have")
 
 
@@ -135,7 +148,10 @@ def image_damaged(scene: RawScene) -> Iterator[Hit]:
     needs=("images",),
 )
 def orientation_tag(scene: RawScene) -> Iterator[Hit]:
+    turned = images_of_other_shape(scene) if scene.cameras is not None else set()
     for name, header in scene.headers.items():
+        if name in turned:
+            continue  # has an error that names the tag
         if header.problem is None and header.orientation in range(2, 9):
             yield Hit(_place(name), "no orientation tag", f"orientation {header.orientation}")
 
@@ -165,11 +181,6 @@ def _same_shape(size: tuple[int, ...], camera: Camera) -> bool:
 
 def _expected(camera: Camera) -> str:
     return f"{camera.width} x {camera.height} as in camera {camera.camera_id}"
-
-
-def spelling(name: str) -> str:
-    """A key that ignores case and the two Unicode spellings of accented letters."""
-    return unicodedata.normalize("NFC", name).casefold()
 
 
 def _place(name: str) -> str:

@@ -10,7 +10,7 @@ from pathlib import PurePosixPath
 from chronoscene.validation.finding import Hit, counted, quote, shown
 from chronoscene.validation.raw_scene import RawScene, is_safe
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.images import spelling
+from chronoscene.validation.spelling import spelling
 
 FORBIDDEN = re.compile(r'[<>:"|?*\\]|[ .]$')
 """What a file or folder name cannot have, or end in, on Windows (Microsoft, *Naming Files, Paths,

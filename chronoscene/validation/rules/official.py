@@ -53,10 +53,13 @@ def official_split_line(scene: RawScene) -> Iterator[Hit]:
         yield Hit(SPLIT, "UTF-8 or ASCII", "UTF-16, which it does not read")
         return
     wrong = {p.line for p in scene.split_problems if p.kind in ("fields", "period")}
+    flat = not any("/" in name for name in scene.names)
     for number, line in enumerate(_lines(scene.split_text.text), start=1):
         problem = official_failure(line)
+        if problem is None and flat and "/" in line:  # else they have their own rule
+            problem = "a name with folders"
         if problem is not None and number not in wrong:
-            yield Hit(f"{SPLIT}:{number}", "one blank between name and period", problem)
+            yield Hit(f"{SPLIT}:{number}", "<file name> <period>", problem)
 
 
 def official_failure(line: str) -> str | None:

@@ -9,7 +9,7 @@ from chronoscene.splits import check_period_ids
 from chronoscene.validation.finding import Hit, counted
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.split import problem_hit
+from chronoscene.validation.rules.split import in_other_words, meant_in_split, problem_hit
 
 FEW = 5
 """Training views below which a period can hardly be reconstructed."""
@@ -35,6 +35,10 @@ UNEQUAL = 10
 )
 def period_ids(scene: RawScene) -> Iterator[Hit]:
     entries = scene.split or []
+    if not entries and any(p.kind in ("fields", "period") for p in scene.split_problems):
+        return  # no line could be read, which is reported
+    if in_other_words(scene):
+        return  # nor is known what is missing
     for problem in check_period_ids(entries, {entry.period for entry in entries}):
         hit = problem_hit(SPLIT, problem)
         yield Hit(hit.place, hit.expected, hit.found)
@@ -50,7 +54,11 @@ def period_ids(scene: RawScene) -> Iterator[Hit]:
     needs=("images", "split"),
 )
 def period_empty(scene: RawScene) -> Iterator[Hit]:
+    if not scene.names:
+        return  # an error of its own
+    images = meant_in_split(scene)
     listed = {entry.period for entry in scene.split or ()}
+    listed -= {entry.period for entry in scene.split or () if entry.line in images}
     for period in sorted(listed - set(scene.period_ids)):
         yield Hit(SPLIT, f"a registered image of period {period}", "none")
 
@@ -111,7 +119,7 @@ def period_few_views(scene: RawScene) -> Iterator[Hit]:
     needs=("periods",),
 )
 def single_period(scene: RawScene) -> Iterator[Hit]:
-    if len(scene.period_ids) == 1:
+    if len(scene.period_ids) == 1 and len(scene.periods or ()) == len(scene.names):
         yield Hit(SPLIT, "two periods or more", "one")
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator
 
 from chronoscene.formats.chronoscene import SPLIT
-from chronoscene.splits import Problem, ProblemKind
-from chronoscene.validation.finding import Hit, counted
+from chronoscene.splits import NameIndex, Problem, ProblemKind
+from chronoscene.validation.finding import Hit, counted, quote
 from chronoscene.validation.raw_scene import RawScene, TextFile
 from chronoscene.validation.rule import rule
+from chronoscene.validation.spelling import Spellings
 
 ELSEWHERE = ("split.txt", "sparse/0/split.txt", "images/split.txt")
 
@@ -24,6 +26,52 @@ def problem_hit(file: str, problem: Problem) -> Hit:
 def problem_hits(file: str, problems: Iterable[Problem], kind: ProblemKind) -> Iterator[Hit]:
     """The problems of one kind as hits."""
     return (problem_hit(file, problem) for problem in problems if problem.kind == kind)
+
+
+def meant(scene: RawScene, problems: Iterable[Problem], lines: dict[int, str]) -> dict[int, str]:
+    """By line, the image that a name which is none probably means.
+
+    Args:
+        scene: The scene.
+        problems: Of one file.
+        lines: The names in this file, by line.
+    """
+    spellings = Spellings(scene.names)
+    found = {
+        p.line: spellings.find(lines[p.line]) for p in problems if p.kind == "unknown" and p.line
+    }
+    return {line: name for line, name in found.items() if name is not None}
+
+
+def meant_in_split(scene: RawScene) -> dict[int, str]:
+    """The same for ``split.txt``."""
+    return meant(scene, scene.split_problems, {e.line: e.name for e in scene.split or ()})
+
+
+def unknown_hits(file: str, problems: Iterable[Problem], images: dict[int, str]) -> Iterator[Hit]:
+    """Names that are no images, with those that they probably mean by line."""
+    for problem in problems:
+        if problem.kind == "unknown":
+            hit, image = problem_hit(file, problem), images.get(problem.line or 0)
+            found = hit.found if image is None else f"{hit.found}; there is {quote(image)}"
+            yield Hit(hit.place, hit.expected, found, hit.remedy)
+
+
+def in_other_words(scene: RawScene) -> set[str]:
+    """Images without a period because of a line that has a finding of its own."""
+    if scene.split_text is None:
+        return set()
+    lines = re.split("\r\n|\r|\n", scene.split_text.text)
+    index = NameIndex(scene.names)
+    found: set[str] = set()
+    for problem in scene.split_problems:
+        if problem.line is None or problem.kind not in ("fields", "period", "ambiguous"):
+            continue
+        line = lines[problem.line - 1]
+        # With commas instead of blanks the name ends there.
+        names = (line.rsplit(maxsplit=1)[0], re.split("[,;]", line)[0].strip())
+        found.update(*(index.find(name) for name in names))
+    return found
 
 
 def not_text(scene: RawScene, file: str, text: TextFile | None) -> Iterator[Hit]:
@@ -98,9 +146,9 @@ def split_period(scene: RawScene) -> Iterator[Hit]:
     needs=("images", "split"),
 )
 def image_without_period(scene: RawScene) -> Iterator[Hit]:
-    # An ambiguous line leaves several images without a period; it is reported by itself.
+    reported = in_other_words(scene) | set(meant_in_split(scene).values())
     for name in scene.names:
-        if scene.periods is not None and name not in scene.periods:
+        if scene.periods is not None and name not in scene.periods and name not in reported:
             yield Hit(f"{scene.image_place(name)}", f"a line in {SPLIT}", "none that names it")
 
 
@@ -148,12 +196,18 @@ def split_duplicate(scene: RawScene) -> Iterator[Hit]:
     "split-unknown",
     "warning",
     what="`split.txt` names an image that is not in the model; the line has no effect.",
-    remedy="correct the name, or delete the line if the image could not be registered",
+    remedy="correct the name (nothing but blanks between it and the period), or delete the line if "
+    "the image could not be registered",
     bad="`IMG_1.jpg 0`, the image is `IMG_0001.jpg`",
     needs=("images", "split"),
 )
 def split_unknown(scene: RawScene) -> Iterator[Hit]:
-    return problem_hits(SPLIT, scene.split_problems, "unknown")
+    images, known = meant_in_split(scene), set(scene.period_ids)
+    period = {entry.line: entry.period for entry in scene.split or ()}
+    worth = [  # that a period has no image at all is one finding, not one for each line
+        p for p in scene.split_problems if p.line in images or period.get(p.line or 0) in known
+    ]
+    yield from unknown_hits(SPLIT, worth, images)
 
 
 @rule(

@@ -11,7 +11,7 @@ from chronoscene.splits import DEFAULT_RULE
 from chronoscene.validation.finding import Hit, counted, quote
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.split import not_text, problem_hits
+from chronoscene.validation.rules.split import meant, not_text, problem_hits, unknown_hits
 
 ELSEWHERE = ("test.txt", "sparse/test.txt", "images/test.txt")
 
@@ -63,12 +63,18 @@ def list_not_text(scene: RawScene) -> Iterator[Hit]:
     "warning",
     what="`test.txt` names an image that is not in the model; the line has no effect, so the image "
     "that is meant may be among the training images.",
-    remedy="correct the name, or delete the line",
+    remedy="correct the name (there are only names in test.txt, no periods), or delete the line",
     bad="`IMG_1` in `test.txt`, the image is `IMG_0001.jpg`",
     needs=("images", "test"),
 )
 def list_unknown(scene: RawScene) -> Iterator[Hit]:
-    return problem_hits(TEST, scene.test_problems, "unknown")
+    if not scene.names:
+        return iter(())  # an error of its own
+    lines = {entry.line: entry.name for entry in scene.test or ()}
+    images = meant(scene, scene.test_problems, lines)
+    with_period = {line: text.rsplit(maxsplit=1)[0] for line, text in lines.items()}
+    images |= meant(scene, scene.test_problems, with_period)
+    return unknown_hits(TEST, scene.test_problems, images)
 
 
 @rule(
