@@ -110,7 +110,7 @@ def split_place(place: str) -> tuple[str, int | None, str | None]:
     """
     if place.startswith("images/"):
         return place, None, None  # names of photos may hold anything
-    if re.fullmatch(r"period -?[0-9]+", place):
+    if re.fullmatch(r"period -?[0-9]+|periods -?[0-9]+(, -?[0-9]+)+", place):
         return SPLIT, None, place
     parts = re.fullmatch(
         r"(?P<file>.*?)(?::(?P<line>[1-9][0-9]{0,8}))?(?: \((?P<what>.*)\))?", place, re.DOTALL

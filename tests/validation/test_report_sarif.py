@@ -89,6 +89,7 @@ def test_strict_makes_errors_of_warnings(scene):
         ("images/a (1):2.jpg", ("images/a (1):2.jpg", None, None)),
         ("images", ("images", None, None)),
         ("period 12", ("sparse/split.txt", None, "period 12")),
+        ("periods 2, 3", ("sparse/split.txt", None, "periods 2, 3")),
         ("colmap/sparse/0/images.txt (b.jpg)", ("colmap/sparse/0/images.txt", None, "b.jpg")),
         ("./frames.bin", ("frames.bin", None, None)),
         (".", (".", None, None)),
