@@ -266,7 +266,7 @@ def test_orientation_tag_that_the_camera_agrees_with_stays(scene, fix):
     scene.save("a000.png", Image.new("RGB", (64, 48)), as_name="a000.jpg")
     scene.write("images/a000.jpg", tagged(Image.new("RGB", (48, 64)), 6))
     fixed, after, _ = fix()
-    assert fixed == set() and {"CS204", "CS207"} <= after
+    assert fixed == set() and "CS204" in after
 
 
 @given(st.binary(max_size=60), st.integers(0, 200))

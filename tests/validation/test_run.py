@@ -34,7 +34,7 @@ def test_all_problems_are_collected(scene):
     scene.edit_fields("sparse/0/images.txt", 4, {5: "nan"})
     scene.edit_fields("sparse/0/points3D.txt", 0, {1: "inf"})
     codes = {f.code for f in scene.validate().findings}
-    assert {"CS201", "CS304", "CS305", "CS121", "CS502"} <= codes
+    assert {"CS201", "CS304", "CS121", "CS502"} <= codes
 
 
 def test_findings_are_sorted_by_severity_then_code(scene):

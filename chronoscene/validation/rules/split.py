@@ -141,15 +141,20 @@ def split_period(scene: RawScene) -> Iterator[Hit]:
     "image-without-period",
     "error",
     what="A registered image is not in `split.txt`.",
-    remedy="add a line for it",
+    remedy="add a line for it, or correct the name in its line",
     bad="`images.bin` has `a.jpg`, `split.txt` does not name it",
     needs=("images", "split"),
 )
 def image_without_period(scene: RawScene) -> Iterator[Hit]:
-    reported = in_other_words(scene) | set(meant_in_split(scene).values())
+    reported = in_other_words(scene)
+    entries = {entry.line: entry for entry in scene.split or ()}
+    misspelt = {name: entries[line] for line, name in meant_in_split(scene).items()}
     for name in scene.names:
         if scene.periods is not None and name not in scene.periods and name not in reported:
-            yield Hit(f"{scene.image_place(name)}", f"a line in {SPLIT}", "none that names it")
+            found, entry = "none that names it", misspelt.get(name)
+            if entry is not None:
+                found += f"; line {entry.line} names {quote(entry.name)}"
+            yield Hit(scene.image_place(name), f"a line in {SPLIT}", found)
 
 
 @rule(
@@ -196,16 +201,19 @@ def split_duplicate(scene: RawScene) -> Iterator[Hit]:
     "split-unknown",
     "warning",
     what="`split.txt` names an image that is not in the model; the line has no effect.",
-    remedy="correct the name (nothing but blanks between it and the period), or delete the line if "
-    "the image could not be registered",
+    remedy="correct the name, or delete the line if the image could not be registered",
     bad="`IMG_1.jpg 0`, the image is `IMG_0001.jpg`",
     needs=("images", "split"),
 )
 def split_unknown(scene: RawScene) -> Iterator[Hit]:
     images, known = meant_in_split(scene), set(scene.period_ids)
     period = {entry.line: entry.period for entry in scene.split or ()}
-    worth = [  # that a period has no image at all is one finding, not one for each line
-        p for p in scene.split_problems if p.line in images or period.get(p.line or 0) in known
+    periods = scene.periods or {}
+    worth = [
+        p
+        for p in scene.split_problems
+        # That a period or an image has nothing at all is one finding: an error of its own.
+        if (images[p.line] in periods if p.line in images else period.get(p.line or 0) in known)
     ]
     yield from unknown_hits(SPLIT, worth, images)
 

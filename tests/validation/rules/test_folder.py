@@ -59,3 +59,10 @@ def test_reader_is_not_asked_where_other_rules_found_errors(scene):
     scene.path("images/a000.png").unlink()
     report = scene.validate()
     assert ("CS009", "other rules found errors") in [(s.code, s.reason) for s in report.skipped]
+
+
+def test_models_behind_a_gap_and_without_the_first_one(scene):
+    shutil.copytree(scene.path("sparse/0"), scene.path("sparse/3"))
+    scene.expect("CS003", found="'sparse/3' too")
+    shutil.rmtree(scene.path("sparse/0"))
+    scene.expect("CS002", place="sparse/0", found="one in sparse/3/", also={"CS321", "CS706"})

@@ -30,7 +30,7 @@ def test_missing_image_with_another_spelling_or_folder(scene, file):
     scene.path("images/sub").mkdir()
     scene.path("images/a000.png").rename(scene.path(f"images/{file}"))
     found = f"nothing; there is '{file}'"
-    scene.expect("CS201", place="images/a000.png", found=found, also={"CS202"})
+    scene.expect("CS201", place="images/a000.png", found=found)
 
 
 def test_missing_image_in_the_other_unicode_spelling(scene):
@@ -39,7 +39,7 @@ def test_missing_image_in_the_other_unicode_spelling(scene):
     scene.path("images/a000.png").rename(scene.path(f"images/{other}"))
     for place in (IMAGES, SPLIT):
         scene.replace(place, "a000.png", name)
-    scene.expect("CS201", found="nothing; there is", also={"CS202"})
+    scene.expect("CS201", found="nothing; there is")
 
 
 def test_unregistered_image(scene):
@@ -116,7 +116,7 @@ def test_shape_as_the_orientation_tag_says(scene):
     exif[0x0112] = 6
     Image.fromarray(noise(48, 64)).save(scene.path("images/a000.png"), exif=exif)
     found = "turned by 90 degrees, as its orientation tag 6 says"
-    scene.expect("CS204", place="images/a000.png", found=found, also={"CS207"})
+    scene.expect("CS204", place="images/a000.png", found=found)
 
 
 def test_pixels_are_decoded_only_on_demand(scene):

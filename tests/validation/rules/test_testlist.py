@@ -1,3 +1,4 @@
+import pytest
 from PIL import Image
 
 TEST = "sparse/0/test.txt"
@@ -38,3 +39,9 @@ def test_ambiguous(scene):
 def test_duplicate(scene):
     scene.write(TEST, [*scene.lines(TEST), "a003.png"])
     scene.expect("CS326", place=TEST, found="'a003.png' 2 times")
+
+
+@pytest.mark.parametrize("line", ["A001.PNG", "a001.png 0"])
+def test_what_a_misspelt_name_means_is_said(scene, line):
+    scene.write(TEST, [*scene.lines(TEST), line])
+    scene.expect("CS324", place=f"{TEST}:3", found="; there is 'a001.png'")
