@@ -18,7 +18,7 @@ from chronoscene.validation.report import SceneReport, counts
 from chronoscene.validation.report_html import write_html
 from chronoscene.validation.report_json import write_json
 from chronoscene.validation.report_sarif import write_sarif
-from chronoscene.validation.report_text import write_text
+from chronoscene.validation.report_text import describe_rule, write_text
 from chronoscene.validation.rule import choose_rules
 from chronoscene.validation.run import find_folders, validate_scene
 
@@ -26,6 +26,14 @@ WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html":
 
 NOT_VALID = 1
 """Exit status when there are errors."""
+
+
+def _explain(context: click.Context, option: click.Parameter, value: str | None) -> None:
+    """Print what is known about some rules, and end."""
+    if value is not None:
+        rules = choose_rules(_codes([value]), place="--explain")
+        emit("\n".join(map(describe_rule, rules)), None)
+        context.exit(0)
 
 
 @click.command("validate")
@@ -45,6 +53,14 @@ NOT_VALID = 1
     "--select", multiple=True, metavar="CODES", help="Run these rules only: CS201,CS3,split-line."
 )
 @click.option("--ignore", multiple=True, metavar="CODES", help="Leave these rules out.")
+@click.option(
+    "--explain",
+    metavar="CODES",
+    expose_value=False,
+    is_eager=True,
+    callback=_explain,
+    help="Print what these rules look for, and what to do, and end; CS for all.",
+)
 @click.option("--strict", is_flag=True, help="Warnings make a scene not valid, too.")
 @click.option(
     "--decode/--no-decode",

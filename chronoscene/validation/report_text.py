@@ -9,7 +9,7 @@ import click
 
 from chronoscene.validation.finding import NOTHING, SEVERITIES, Finding, Severity, counted
 from chronoscene.validation.report import SceneReport, Summary, counts
-from chronoscene.validation.rule import RULES
+from chronoscene.validation.rule import RULES, Rule
 
 FIRST = 3
 """Places that are named of equal findings."""
@@ -27,6 +27,13 @@ def write_text(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
         bad = sum(bool(r.count("error") or (strict and r.count("warning"))) for r in reports)
         blocks.append([f"{counted(len(reports), 'scene')}, {bad} not valid: {_total(reports)}"])
     return "\n\n".join("\n".join(block) for block in blocks) + "\n"
+
+
+def describe_rule(rule: Rule) -> str:
+    """What a rule looks for, with an example and what to do."""
+    head = click.style(f"{rule.severity} {rule.code}", fg=COLOURS[rule.severity])
+    lines = (f"{head} {rule.name}: {rule.what}", f"  for example: {rule.bad}")
+    return "\n".join([*lines, f"  to do: {rule.remedy}"]) + "\n"
 
 
 def _scene(report: SceneReport) -> list[str]:

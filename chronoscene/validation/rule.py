@@ -100,18 +100,21 @@ def all_rules() -> tuple[Rule, ...]:
     return tuple(RULES[code] for code in sorted(RULES))
 
 
-def choose_rules(select: Iterable[str] = (), ignore: Iterable[str] = ()) -> tuple[Rule, ...]:
+def choose_rules(
+    select: Iterable[str] = (), ignore: Iterable[str] = (), *, place: str = "--select"
+) -> tuple[Rule, ...]:
     """Rules to run.
 
     Args:
         select: Codes, beginnings of codes (``CS2``) or names; nothing selects all.
         ignore: The same, taken away afterwards.
+        place: Option that ``select`` comes from, for errors.
 
     Raises:
         ConfigError: If one fits no rule.
     """
     rules = all_rules()
-    wanted = [_matching("--select", text, rules) for text in select]
+    wanted = [_matching(place, text, rules) for text in select]
     unwanted = [_matching("--ignore", text, rules) for text in ignore]
     codes = set().union(*wanted) if wanted else {r.code for r in rules}
     codes -= set().union(*unwanted)

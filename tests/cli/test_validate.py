@@ -173,3 +173,19 @@ def test_fix_into_the_scene_is_refused(good, monkeypatch, capsys):
         main()
     assert stopped.value.code == 2
     assert "one inside the scene; choose another folder" in capsys.readouterr().err
+
+
+def test_explain():
+    status, text = run("--explain", "pose-leak,CS201")
+    assert status == 0
+    assert text.startswith("error CS201 image-missing: A registered image has no file.\n  for exam")
+    assert "\nwarning CS605 pose-leak: A test image has the pose" in text
+    assert text.count("  to do: ") == 2
+
+
+def test_explain_nothing_that_is_there(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "validate", "--explain", "CS999"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    assert "--explain: expected codes of rules" in capsys.readouterr().err
