@@ -147,7 +147,9 @@ def test_unknown_target_and_grouping(make_scene_folder, tmp_path):
 
 def test_losses(make_scene_folder):
     scene = read_scene(make_scene_folder())
-    assert losses(scene, "chronoscene") == losses(scene, "colmap-folders") == []
+    assert losses(scene, "chronoscene") == []
+    (names,) = losses(scene, "colmap-folders")
+    assert names.endswith("these image names, which get the folder of their period")
     assert losses(scene, "nerfstudio") == [
         "nerfstudio has no place for the observations of points, their ids and errors"
     ]
@@ -156,10 +158,28 @@ def test_losses(make_scene_folder):
         periods=(Period(0, "a", "2016"), Period(1, "2023", "2023")),
         world=WorldFrame("metre"),
     )
-    assert losses(dated, "colmap-folders") == [
-        "colmap-folders has no place for the dates of the periods, unit and reference system of "
-        "the world"
+    assert [text.split(" for ")[1] for text in losses(dated, "colmap-folders")] == [
+        "the labels of the periods as they are (folders: 0_a, 1_2023)",
+        "the dates of the periods",
+        "these image names, which get the folder of their period",
+        "unit and reference system of the world",
     ]
+
+
+def test_nothing_is_lost_where_folders_are_the_periods(make_scene_folder):
+    scene = read_scene(make_scene_folder({"2016/a.png": 0, "2023/a.png": 1}))
+    dated = dataclasses.replace(
+        scene, periods=(Period(0, "2016", "2016"), Period(1, "2023", "2023"))
+    )
+    assert losses(dated, "colmap-folders") == []
+
+
+def test_images_that_are_not_registered_are_remarked_upon(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    (folder / "images/a/late.JPG").write_bytes(b"x")
+    (folder / "images/notes.txt").write_text("")
+    done = convert(folder, tmp_path / "out")
+    assert done.warnings == ("1 image files in images/ are not in the scene, and not converted",)
 
 
 def test_other_files_are_remarked_upon(make_scene_folder, tmp_path):

@@ -45,6 +45,9 @@ MODEL = "sparse/0"
 PERIODS = "sparse/periods.json"
 WORLD = "sparse/world.json"
 
+LARGEST_COORDINATE = 1e100
+"""Beyond any world; squares and sums of such numbers are still finite."""
+
 MOST_PERIODS = 100_000
 """Far beyond any real scene: more come from a mistaken id, and would fill the memory."""
 
@@ -101,11 +104,11 @@ def check_image(place: Path, image: PosedImage) -> None:
     """Refuse an image that no method could use: its name, its pose, its camera."""
     check_name(place, image.name)
     camera = image.camera
-    if not np.isfinite(image.cam_from_world).all():
+    if not (np.abs(image.cam_from_world) < LARGEST_COORDINATE).all():
         raise SceneError(
             place,
             expected=f"a finite pose of {image.name!r}",
-            found="NaN or infinity",
+            found="NaN, infinity, or more than any place can have",
             todo="remove the image from the model, or register it again",
         )
     if not is_usable(camera):

@@ -131,7 +131,7 @@ def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list
     shots = []
     for i, frame in enumerate(read_frames(place, data)):
         where = f"{place}: frames[{i}]"
-        name = image_name(where, folder, frame.get("file_path"), suffix=".png")
+        name = image_name(where, path, folder, frame.get("file_path"))
         pose = pose_from_opengl(where, matrix(where, frame.get("transform_matrix")))
         keys = {key: value for key, value in data.items() if key != "frames"} | frame
         shots.append(Shot(name, cameras.camera(where, keys, path / name), pose))

@@ -92,7 +92,9 @@ def _model(place: object, data: Mapping[str, Any]) -> tuple[str, tuple[float, ..
     values = _distortion(place, data)
     named = data.get("camera_model")
     if named is not None and named not in tuple(MODEL_KEYS):
-        raise json_error(place, f"a camera_model {', '.join(MODEL_KEYS)}", repr(named)[:40])
+        known = f"a camera_model {', '.join(MODEL_KEYS)}"
+        todo = "render perspective views first" if named == "EQUIRECTANGULAR" else "correct it"
+        raise json_error(place, known, repr(named)[:40], todo)
     used = {key for key, value in values.items() if value}
     if data.get("is_fisheye"):
         named = "OPENCV_FISHEYE"

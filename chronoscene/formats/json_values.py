@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,12 @@ def read_json(place: Path, kind: type) -> Any:
     """
     text = read_text(place)
     try:
-        data = json.loads(text)
+        data = json.loads(text, object_pairs_hook=_distinct)
         if re.search(r"\\u[dD][89a-fA-F]", text):  # half of a pair of codes, perhaps alone
             json.dumps(data, ensure_ascii=False).encode()
-    except (ValueError, RecursionError) as error:
+    except RecursionError as error:
+        raise json_error(place, "JSON", "lists or objects nested too deeply") from error
+    except ValueError as error:
         raise json_error(place, "JSON", str(error)) from error
     if not isinstance(data, kind):
         expected = "a list" if kind is list else "an object"
@@ -31,9 +34,20 @@ def read_json(place: Path, kind: type) -> Any:
     return data
 
 
-def json_error(place: object, expected: str, found: str) -> SceneError:
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object; of two equal keys, one would be lost without a word."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"the key {twice[:40]!r} twice in an object")
+    return found
+
+
+def json_error(
+    place: object, expected: str, found: str, todo: str = "see DATASET.md"
+) -> SceneError:
     """Something wrong in a JSON file."""
-    return SceneError(place, expected=expected, found=found, todo="see DATASET.md")
+    return SceneError(place, expected=expected, found=found, todo=todo)
 
 
 def is_number(value: object) -> bool:

@@ -188,7 +188,7 @@ def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[Shot]:
             world_from_cam = matrix(where, frame.get("transform_matrix"))
             world_from_cam[:3, 3] *= PREPARED_UNIT
             file_path = frame.get("file_path")
-        name = image_name(where, file.folder, file_path, suffix=".png")
+        name = image_name(where, path, file.folder, file_path)
         keys = {key: value for key, value in data.items() if key != "frames"} | frame
         if "w" not in keys or "h" not in keys:  # images of a block are of one size
             known = shots[0].camera if shots else None

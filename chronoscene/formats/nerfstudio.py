@@ -7,6 +7,8 @@
   left out where there is a ``train_filenames``, as nerfstudio does.
 - ``applied_transform`` and ``applied_scale`` say what was done to the original world; both are
   undone, so scenes are in the original world. ``ply_file_path`` is in the world of the file.
+  Without the first, and with the model in ``colmap/sparse/0``, the axes were swapped as old
+  versions did it.
 - nerfstudio's own centring and scaling of poses are not applied: they belong to training.
 
 Source: the data parser of ``nerfstudio-project/nerfstudio``.
@@ -14,6 +16,7 @@ Source: the data parser of ``nerfstudio-project/nerfstudio``.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats.chronoscene import MOST_PERIODS
+from chronoscene.formats.chronoscene import LARGEST_COORDINATE, MOST_PERIODS
 from chronoscene.formats.grouping import (
     OPTION,
     TABLE,
@@ -40,6 +43,7 @@ from chronoscene.formats.ply import read_points
 from chronoscene.formats.transforms import (
     Shot,
     check_distinct,
+    file_name,
     head_has,
     image_name,
     make_scene,
@@ -59,8 +63,11 @@ MARKS = FILE
 PERIOD_BY = ("period", "time", "gap:X", "count:N", "table:FILE")
 """The key ``period`` or ``time``, groups of times, or a CSV file with columns file and period."""
 
-SUFFIX = ".png"
-"""Of images whose names have none, as instant-ngp reads them."""
+COLMAP = "colmap/sparse/0"
+"""The model that a file without ``applied_transform`` was made from, in old versions."""
+
+HISTORICAL = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))
+"""What these versions did to the world of that model, and did not write down."""
 
 RAW_MATRIXCITY = '"rot_mat"'
 """A key of the raw files of MatrixCity, which have the same name."""
@@ -87,7 +94,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     frames = read_frames(place, data)
     shots = _read_shots(path, data, frames)
     extras = {shot.name: frame for shot, frame in zip(shots, frames, strict=True)}
-    shots, tests, rule = _apply_lists(place, data, _with_image(path, shots))
+    shots, tests, rule = _apply_lists(path, data, shots)
     grouped = _group(place, data, {shot.name: extras[shot.name] for shot in shots}, period_by)
     scene = make_scene(
         path,
@@ -100,7 +107,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     )
     world = data.get("world")
     return replace(
-        _to_original(place, data, scene),
+        _to_original(path, data, scene),
         world=parse_world(place, world) if isinstance(world, dict) else WorldFrame(),
     )
 
@@ -114,12 +121,22 @@ def remarks(path: Path) -> list[str]:
         for key, what in (("mask_path", "masks"), ("depth_file_path", "depth maps"))
         if (count := sum(key in frame for frame in frames))
     ]
-    shots = _with_image(path, _read_shots(path, data, frames))
-    if len(shots) < len(frames):
-        found.append(f"{len(frames) - len(shots)} frames are left out, as their image is missing")
-    kept, _, _ = _apply_lists(path / FILE, data, shots)
-    if len(kept) < len(shots):
-        found.append(f"{len(shots) - len(kept)} frames are left out, as no list names them")
+    if "fisheye_crop_radius" in data:
+        found.append("fisheye_crop_radius is not read: the border of the images is kept")
+    if (path / COLMAP).is_dir():
+        if "applied_transform" not in data:
+            found.append(
+                f"there is no applied_transform and a model in {COLMAP}: the swap of axes that old "
+                "versions of nerfstudio made is undone"
+            )
+        found.append(f"{COLMAP} is not read, which has observations of points")
+    shots = _read_shots(path, data, frames)
+    there = _with_image(path, shots)
+    if len(there) < len(frames):
+        found.append(f"{len(frames) - len(there)} frames are left out, as their image is missing")
+    kept, _, _ = _apply_lists(path, data, shots)
+    if len(kept) < len(there):
+        found.append(f"{len(there) - len(kept)} frames are left out, as no list names them")
     return found
 
 
@@ -129,7 +146,7 @@ def _with_image(path: Path, shots: list[Shot]) -> list[Shot]:
     Raises:
         SceneError: If none is.
     """
-    there = [shot for shot in shots if (path / shot.name).is_file()]
+    there = [shot for shot in shots if os.path.isfile(path / shot.name)]
     if not there:
         raise SceneError(
             path / shots[0].name, expected="an image", found="nothing", todo="copy the images there"
@@ -142,7 +159,7 @@ def _read_shots(path: Path, data: Mapping[str, Any], frames: list[dict[str, Any]
     shared = {key: value for key, value in data.items() if key != "frames"}
     for i, frame in enumerate(frames):
         place = f"{path / FILE}: frames[{i}]"
-        name = image_name(place, "", frame.get("file_path"), suffix=SUFFIX)
+        name = image_name(place, path, "", frame.get("file_path"))
         world_from_cam = matrix(place, frame.get("transform_matrix"), (3, 4))
         image_id = frame.get("colmap_im_id")
         shots.append(
@@ -158,10 +175,12 @@ def _read_shots(path: Path, data: Mapping[str, Any], frames: list[dict[str, Any]
 
 
 def _apply_lists(
-    place: Path, data: Mapping[str, Any], shots: list[Shot]
+    path: Path, data: Mapping[str, Any], shots: list[Shot]
 ) -> tuple[list[Shot], set[str] | None, str]:
     """Frames that are used, and the test images with the rule in words; None for the default."""
-    lists = {key: _names(place, data, f"{key}_filenames") for key in ("train", "val", "test")}
+    place, known = path / FILE, {shot.name for shot in shots}
+    lists = {key: _names(path, data, f"{key}_filenames", known) for key in ("train", "val", "test")}
+    shots = _with_image(path, shots)
     if all(names is None for names in lists.values()):
         return shots, None, DEFAULT_RULE
     tests = (lists["val"] or set()) | (lists["test"] or set())
@@ -175,13 +194,16 @@ def _apply_lists(
     return shots, tests, "the lists of file names in transforms.json"
 
 
-def _names(place: Path, data: Mapping[str, Any], key: str) -> set[str] | None:
-    names = data.get(key)
+def _names(path: Path, data: Mapping[str, Any], key: str, known: set[str]) -> set[str] | None:
+    names, place = data.get(key), f"{path / FILE}: {key}"
     if names is None:
         return None
     if not isinstance(names, list):
-        raise json_error(place, f"a list {key}", type(names).__name__)
-    return {image_name(f"{place}: {key}", "", name, suffix=SUFFIX) for name in names}
+        raise json_error(place, "a list", type(names).__name__)
+    found = {image_name(place, path, "", name) for name in names}
+    if lost := sorted(found - known):
+        raise json_error(place, "names of frames", repr(lost[0]), "correct the list")
+    return found
 
 
 def _group(
@@ -242,17 +264,20 @@ def _read_points(path: Path, data: Mapping[str, Any]) -> Points:
     file = data.get("ply_file_path")
     if file is None:
         return Points.empty()
-    return read_points(path / image_name(f"{path / FILE}: ply_file_path", "", file))
+    return read_points(path / file_name(f"{path / FILE}: ply_file_path", "", file))
 
 
-def _to_original(place: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
+def _to_original(path: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
     """Undo ``applied_transform`` and ``applied_scale``."""
+    place = path / FILE
     scale = number(place, data, "applied_scale")
     applied = data.get("applied_transform")
+    if applied is None and (path / COLMAP).is_dir():
+        applied = HISTORICAL
     if scale is None and applied is None:
         return scene
     scale = 1.0 if scale is None else scale
-    if scale <= 0:
+    if not 1 / LARGEST_COORDINATE < scale < LARGEST_COORDINATE:
         raise json_error(place, "a positive applied_scale", f"{scale:g}")
     full = np.eye(4) if applied is None else matrix(f"{place}: applied_transform", applied, (3, 4))
     rotation = nearest_rotation(f"{place}: applied_transform", full[:3, :3])

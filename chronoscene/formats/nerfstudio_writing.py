@@ -72,21 +72,24 @@ def _document(scene: Scene) -> dict[str, Any]:
 
 
 def _camera_keys(camera: Camera) -> dict[str, Any]:
-    if camera.model not in MODEL_KEYS:
+    model, keys = camera.model, MODEL_KEYS.get(camera.model)
+    if model == "FULL_OPENCV" and not any(camera.distortion[5:]):
+        model, keys = "OPENCV", (*MODEL_KEYS["OPENCV"], "k3")
+    if keys is None:
         raise SceneError(
             f"camera {camera.camera_id}",
             expected=f"a camera model that nerfstudio has: {', '.join(MODEL_KEYS)}",
-            found=camera.model,
+            found=model,
             todo="run chronoscene undistort first",
         )
     K = camera.K
     return {
-        "camera_model": camera.model,
+        "camera_model": model,
         "w": camera.width,
         "h": camera.height,
         "fl_x": K[0, 0].item(),
         "fl_y": K[1, 1].item(),
         "cx": K[0, 2].item(),
         "cy": K[1, 2].item(),
-        **dict(zip(MODEL_KEYS[camera.model], camera.distortion, strict=True)),
+        **dict(zip(keys, camera.distortion, strict=False)),
     }

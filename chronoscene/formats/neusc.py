@@ -87,6 +87,14 @@ def remarks(path: Path) -> list[str]:
             f"left out without a date, not in train.txt, or in trash.txt: {left_out} of "
             f"{len(model.images)} images"
         )
+    index = NameIndex(image.name for image in model.images)
+    for file in ("train.txt", "trash.txt"):
+        places = [path / folder / file for folder in LISTS if (path / folder / file).exists()]
+        if len(places) > 1:
+            found.append(f"{file} beside {LISTS[0]}/ is not read, as there is one in it")
+        entries = parse_test_text(read_text(places[0])) if places else []
+        if unknown := sum(not index.find(entry.name) for entry in entries):
+            found.append(f"{file} has {unknown} names that fit no registered image")
     if (path / "semantic_maps").is_dir():
         found.append("semantic_maps/ (sky, people) is not read")
     return found

@@ -7,6 +7,7 @@ and image paths must stay inside the scene folder.
 
 from __future__ import annotations
 
+import os
 import posixpath
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,9 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.formats.chronoscene import LARGEST_COORDINATE
 from chronoscene.formats.json_values import json_error
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
-from chronoscene.splits import split_of
+from chronoscene.splits import IMAGE_SUFFIXES, split_of
+
+EXTENSIONS = (".png", *(s for s in IMAGE_SUFFIXES if s != ".png"), *map(str.upper, IMAGE_SUFFIXES))
+"""Of images whose names have none, in the order in which they are tried: loaders take .png."""
 
 _NOT_RIGID = 1e-3
 """Deviation from a rotation beyond which a matrix is refused; below, the nearest is taken."""
@@ -54,14 +59,13 @@ def head_has(path: Path, text: str, *, length: int = 65536) -> bool:
         return False
 
 
-def image_name(place: object, folder: str, file_path: object, *, suffix: str = "") -> str:
-    """Path of an image below the scene folder.
+def file_name(place: object, folder: str, file_path: object) -> str:
+    """Path below the scene folder of a file that another one names.
 
     Args:
         place: For the message.
-        folder: Folder of the file, below the scene folder; "" if it is directly there.
-        file_path: What the file says, relative to its folder.
-        suffix: Extension to add where there is none.
+        folder: Folder of the other file, below the scene folder; "" if it is directly there.
+        file_path: What it says, relative to its folder.
 
     Raises:
         SceneError: If the path is absolute, leads out of the scene folder, or is no text.
@@ -72,8 +76,29 @@ def image_name(place: object, folder: str, file_path: object, *, suffix: str = "
     name = posixpath.normpath(posixpath.join(folder, given))
     outside = name in (".", "..") or name.startswith(("../", "/"))
     if outside or given.startswith("/") or PureWindowsPath(given).drive:
-        raise json_error(place, "a file_path inside the scene folder", repr(file_path))
-    return name if PurePosixPath(name).suffix or not suffix else name + suffix
+        todo = "write the path as it is below the scene folder"
+        raise json_error(place, "a file_path inside the scene folder", repr(file_path), todo)
+    return name
+
+
+def image_name(place: object, root: Path, folder: str, file_path: object) -> str:
+    """Path of an image below the scene folder; an extension that is left out is found out.
+
+    Args:
+        place: For the message.
+        root: The scene folder.
+        folder: As for `file_name`.
+        file_path: As for `file_name`. ``a.1`` may mean ``a.1.png``.
+
+    Raises:
+        SceneError: As `file_name`.
+    """
+    name = file_name(place, folder, file_path)
+    suffix = PurePosixPath(name).suffix
+    if suffix.lower() in IMAGE_SUFFIXES or os.path.isfile(root / name):
+        return name
+    there = (name + s for s in EXTENSIONS if os.path.isfile(root / (name + s)))
+    return next(there, name if suffix else name + EXTENSIONS[0])
 
 
 def matrix(place: object, value: object, rows: tuple[int, ...] = (4,)) -> NDArray[np.float64]:
@@ -82,8 +107,12 @@ def matrix(place: object, value: object, rows: tuple[int, ...] = (4,)) -> NDArra
         array = np.asarray(value, np.float64)
     except (ValueError, TypeError, OverflowError):
         array = np.zeros(0)
-    if array.shape not in [(n, 4) for n in rows] or not np.isfinite(array).all():
-        raise json_error(place, f"a matrix of {' or '.join(map(str, rows))} x 4 numbers", "another")
+    expected = f"a matrix of {' or '.join(map(str, rows))} x 4 numbers"
+    if array.shape not in [(n, 4) for n in rows]:
+        found = " x ".join(map(str, array.shape)) if array.ndim == 2 else "something else"
+        raise json_error(place, expected, found)
+    if not (np.abs(array) < LARGEST_COORDINATE).all():
+        raise json_error(place, expected, "NaN, infinity, or more than any place can have")
     full = np.eye(4)
     full[: len(array)] = array
     if full[3].tolist() != [0, 0, 0, 1]:
@@ -97,11 +126,17 @@ def nearest_rotation(place: object, block: NDArray[np.float64]) -> NDArray[np.fl
     Raises:
         SceneError: If it is none: scaled, mirrored or skewed.
     """
-    u, _, vt = np.linalg.svd(block)
+    u, sizes, vt = np.linalg.svd(block)
     rotation: NDArray[np.float64] = u @ vt
-    if np.abs(rotation - block).max() > _NOT_RIGID or np.linalg.det(rotation) < 0:
-        raise json_error(place, "a rotation in the camera-to-world matrix", "another matrix")
-    return rotation
+    if np.linalg.det(rotation) < 0:
+        found = "a mirrored one"
+    elif sizes.max() - sizes.min() > 2 * _NOT_RIGID:
+        found = "a skewed one"
+    elif np.abs(rotation - block).max() > _NOT_RIGID:
+        found = f"one scaled by {sizes.mean():.4g}"
+    else:
+        return rotation
+    raise json_error(place, "a rotation in the matrix", found, "export the poses again")
 
 
 def pose_from_opengl(place: object, world_from_cam: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -4,14 +4,16 @@ import dataclasses
 import json
 import os
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from chronoscene.colmap import PosedImage
 from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 from chronoscene.formats import detect_format, find_scenes, read_scene
-from chronoscene.formats.chronoscene import is_iso_date, read_periods, write
-from chronoscene.scene import Period, WorldFrame
+from chronoscene.formats.chronoscene import check_image, is_iso_date, read_periods, write
+from chronoscene.scene import Camera, Period, WorldFrame
 from chronoscene.splits import DEFAULT_RULE
 
 
@@ -140,6 +142,37 @@ def test_cameras_without_a_focal_length_are_refused(make_scene_folder, params):
     put(folder, "sparse/0/cameras.txt", f"1 PINHOLE 64 48 {params}\n")
     with pytest.raises(SceneError):
         read_scene(folder)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        Camera(1, "OPENCV", 64, 48, (50, 50, 32, 24, np.nan, 0, 0, 0)),
+        Camera(1, "PINHOLE", 64, 48, (50, 50, np.inf, 24)),
+        Camera(1, "PINHOLE", 64, 10_000_000, (50, 50, 32, 24)),
+        Camera(1, "EQUIRECTANGULAR", 0, 48, (64, 48)),
+    ],
+)
+def test_cameras_of_no_use_are_refused(camera):
+    with pytest.raises(SceneError, match="expected a camera 1 with a plausible size"):
+        check_image(Path("place"), PosedImage(1, "a.png", camera, np.eye(4)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
+def test_poses_of_no_use_are_refused(value):
+    pose = np.eye(4)
+    pose[1, 3] = value
+    image = PosedImage(1, "a.png", Camera(1, "PINHOLE", 64, 48, (50, 50, 32, 24)), pose)
+    with pytest.raises(SceneError, match=r"expected a finite pose of 'a\.png'"):
+        check_image(Path("place"), image)
+
+
+def test_panoramas_are_read(make_scene_folder):
+    """They have no focal length; it is for methods and undistortion to refuse them."""
+    folder = make_scene_folder(form="text")
+    put(folder, "sparse/0/cameras.txt", "1 EQUIRECTANGULAR 64 48 64 48\n")
+    camera = read_scene(folder).frames[0].camera
+    assert camera.model == "EQUIRECTANGULAR" and not camera.is_pinhole
 
 
 def test_periods_and_world(make_scene_folder):

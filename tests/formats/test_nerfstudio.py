@@ -193,6 +193,36 @@ def test_names_without_extension_are_png(nerfstudio_folder):
     assert [f.name for f in scene.select(split="test")] == ["2.png"]
 
 
+@pytest.mark.parametrize("suffix", [".jpg", ".v1.png", ".2016.JPG"])
+def test_left_out_extensions_are_found_out(nerfstudio_folder, suffix):
+    """instant-ngp takes .png; files say what else there is, also behind other dots."""
+    folder = nerfstudio_folder(NAMES)
+    for path in list((folder / "images").iterdir()):
+        path.rename(path.with_suffix(suffix))
+    written = suffix.rpartition(".")[0]
+    edit_frames(folder, lambda i, frame: frame.update(file_path=f"images/{i}{written}"))
+    edit(folder, test_filenames=[f"images/2{written}"])
+    scene = read_scene(folder)
+    assert [f.name for f in scene.frames] == [f"{i}{suffix}" for i in range(4)]
+    assert [f.name for f in scene.select(split="test")] == [f"2{suffix}"]
+
+
+def test_names_that_no_disk_can_hold_count_as_missing(nerfstudio_folder):
+    folder = nerfstudio_folder(NAMES)
+    long = "x" * 300
+    edit_frames(folder, lambda i, f: f.update(file_path=f"images/{long}.png") if i == 0 else None)
+    assert len(read_scene(folder).frames) == 3
+
+
+def test_lists_with_names_of_no_frame_are_refused(nerfstudio_folder):
+    folder = nerfstudio_folder(NAMES)
+    edit(folder, val_filenames=["images/0.png", "images/9.png"])
+    with pytest.raises(
+        SceneError, match=r"val_filenames: expected names of frames, found 'images/"
+    ):
+        read_scene(folder)
+
+
 def test_images_beside_the_folder_of_images(nerfstudio_folder):
     folder = nerfstudio_folder(NAMES)
     (folder / "images/3.png").rename(folder / "3.png")
@@ -210,9 +240,12 @@ def test_images_beside_the_folder_of_images(nerfstudio_folder):
     [
         ({"transform_matrix": [[1, 0, 0, 0]] * 4}, "a last row 0 0 0 1"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "a last row 0 0 0 1"),
-        ({"transform_matrix": np.diag([2, 2, 2, 1]).tolist()}, "expected a rotation"),
-        ({"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}, "expected a rotation"),
-        ({"transform_matrix": [[float("nan")] * 4] * 4}, "3 or 4 x 4 numbers"),
+        ({"transform_matrix": np.diag([2, 2, 2, 1]).tolist()}, "a rotation .* one scaled by 2"),
+        ({"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}, "a rotation .* a mirrored one"),
+        ({"transform_matrix": np.diag([1, 1.1, 1, 1]).tolist()}, "a rotation .* a skewed one"),
+        ({"transform_matrix": [[float("nan")] * 4] * 4}, "x 4 numbers, found NaN"),
+        ({"transform_matrix": [[1e200] * 4] * 4}, "more than any place can have"),
+        ({"transform_matrix": np.eye(5).tolist()}, "found 5 x 5"),
         ({"transform_matrix": "eye"}, "3 or 4 x 4 numbers"),
         ({"transform_matrix": None}, "3 or 4 x 4 numbers"),
         ({"file_path": "images/0.png"}, "each image once"),
@@ -225,7 +258,20 @@ def test_frames_that_are_refused(nerfstudio_folder, change, message):
         read_scene(folder)
 
 
-@pytest.mark.parametrize("text", ["[]", "{", '{"frames": []}', '{"frames": [1]}', "[" * 100_000])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[]",
+        "{",
+        '{"frames": []}',
+        '{"frames": [1]}',
+        '{"frames": [{}], "frames": [{}]}',
+        "[" * 1_000_000,
+        '{"a":' * 1_000_000,
+        '{"w": ' + "9" * 10_000 + "}",
+    ],
+    ids=lambda text: text[:20],
+)
 def test_files_that_are_refused(nerfstudio_folder, text):
     folder = nerfstudio_folder(NAMES)
     (folder / "transforms.json").write_text(text)
@@ -257,6 +303,31 @@ def test_applied_transform_and_scale_are_undone(nerfstudio_folder, exact):
     edit(folder, applied_scale=-1)
     with pytest.raises(SceneError, match="a positive applied_scale"):
         read_scene(folder)
+
+
+def test_the_swap_of_axes_of_old_versions_is_undone(nerfstudio_folder):
+    """Files beside the model they were made from, without a word on what was done to it."""
+    folder = nerfstudio_folder(NAMES)
+    plain = read_scene(folder)
+    swap = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+
+    def move(i, frame):
+        frame["transform_matrix"] = (swap @ frame["transform_matrix"]).tolist()
+
+    edit_frames(folder, move)
+    swapped = read_scene(folder)
+    (folder / "colmap/sparse/0").mkdir(parents=True)
+    undone = read_scene(folder)
+    for a, b, c in zip(plain.frames, swapped.frames, undone.frames, strict=True):
+        assert np.abs(a.cam_from_world - b.cam_from_world).max() > 0.1
+        np.testing.assert_allclose(a.cam_from_world, c.cam_from_world, atol=1e-9)
+    np.testing.assert_allclose(undone.points.xyz @ swap[:3, :3].T, plain.points.xyz, atol=1e-9)
+    assert "swap of axes" in nerfstudio.remarks(folder)[0]
+    edit(folder, applied_transform=np.eye(4)[:3].tolist())
+    explicit = read_scene(folder)
+    np.testing.assert_array_equal(
+        explicit.frames[0].cam_from_world, swapped.frames[0].cam_from_world
+    )
 
 
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q) > 1e-3)
@@ -291,6 +362,15 @@ def test_written_points_project_to_where_they_were_seen(make_scene_folder, tmp_p
         x, y, z, _ = np.linalg.inv(keys["transform_matrix"]) @ [*xyz[i], 1]
         pixel = keys["fl_x"] * x / -z + keys["cx"], keys["fl_y"] * -y / -z + keys["cy"]
         np.testing.assert_allclose(pixel, scene.points.track_xy[j], atol=1e-6)
+
+
+def test_a_third_radial_parameter_is_written(nerfstudio_folder, tmp_path):
+    folder = nerfstudio_folder(NAMES)
+    edit(folder, k1=0.1, p2=0.02, k3=0.03)
+    scene = read_scene(folder)
+    assert scene.frames[0].camera.model == "FULL_OPENCV"
+    again = read_scene(nerfstudio.write(scene, tmp_path / "out"))
+    assert again.frames[0].camera == scene.frames[0].camera
 
 
 def test_models_that_the_format_lacks_are_refused(make_scene_folder, tmp_path):

@@ -67,6 +67,15 @@ def test_lists(pointz):
     assert [(f.name, f.split) for f in scene.frames] == [(NAMES[0], "train"), (NAMES[3], "test")]
 
 
+def test_what_lists_say_beyond_the_scene_is_remarked_upon(pointz):
+    folder = pointz(NAMES, train=[*NAMES, "2010-01-01_lost.png"])
+    for place in ("", "annots"):
+        (folder / place / "trash.txt").write_text(f"{NAMES[1]}\n")
+    remarks = neusc.remarks(folder)
+    assert "train.txt has 1 names that fit no registered image" in remarks
+    assert "trash.txt beside annots/ is not read, as there is one in it" in remarks
+
+
 def test_every_10th_of_the_list_is_for_testing(pointz):
     names = [f"2010-01-{i + 1:02d}_x.png" for i in range(12)]
     scene = read_scene(pointz(names, train=names[::-1]))

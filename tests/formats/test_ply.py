@@ -78,7 +78,11 @@ def test_agrees_with_another_reader(tmp_path):
     [
         ({"body": "1 2 3 4 5 6", "count": 2}, "expected 2 vertices, found 11 bytes"),
         ({"body": b"", "form": "binary_little_endian", "count": 10**15}, "vertices, found 0 bytes"),
+        ({"body": b"x" * 14, "form": "binary_little_endian"}, "1 vertices, found 14 bytes"),
         ({"body": "1 2 nan 4 5 6"}, "finite positions"),
+        ({"body": "1 2 3 4 5 256"}, "whole numbers of type uint8 as blue"),
+        ({"body": "1 2 3 4 nan 6"}, "whole numbers of type uint8 as green"),
+        ({"body": " " * 20 + "\n" * 20}, "1 vertices, found 0 lines|6 numbers for each"),
         ({"body": "1 2 x 4 5 6"}, "6 numbers for each vertex"),
         ({"body": "1 2 3 4 5\n..."}, "6 numbers for each vertex"),
         ({"body": "", "form": "zip"}, "expected a format ascii|expected a format binary"),
