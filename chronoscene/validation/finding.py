@@ -36,6 +36,8 @@ class Hit:
     """Only where the remedy of the rule is not specific enough."""
     count: int = 1
     """Number of things (points, images) that this is about."""
+    also: tuple[str, ...] = ()
+    """Names of other images that this is about, to look at beside that of the place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +52,8 @@ class Finding:
     found: str
     remedy: str
     count: int
+    also: tuple[str, ...] = ()
+    """See `Hit.also`."""
 
     def __str__(self) -> str:
         return f"{self.place}: expected {self.expected}, found {self.found}"

@@ -20,12 +20,16 @@ from PIL import Image
 from chronoscene.errors import ImageError
 from chronoscene.exif import ExifData, exif_of
 from chronoscene.images import load_rgb
+from chronoscene.validation.jpeg import has_end, jpeg_damage
 
 THUMBNAIL = 32
 """Pixels along each side of a thumbnail."""
 
 END_MARKS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND"}
 """What ends a file. Compressed JPEG data cannot contain its mark."""
+
+JPEG = ("JPEG", "MPO")
+"""Pillow's names of JPEG files."""
 
 TAIL = 4096
 """Bytes at the end of a file in which its mark is looked for."""
@@ -106,7 +110,7 @@ def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
         kind=kind,
         deep=_is_deep(image),
         moving=kind not in ("MPO", "TIFF") and bool(getattr(image, "is_animated", False)),
-        cut_off=_is_cut_off(path, file, kind),
+        cut_off=_is_cut_off(path, file, image),
         exif=exif,
     )
 
@@ -119,18 +123,40 @@ def _is_deep(image: Image.Image) -> bool:
     return any(";16" in str(argument) for argument in tiles[0][3:])
 
 
-def _is_cut_off(path: Path, file: BinaryIO, kind: str) -> bool:
-    """Whether the mark at the end of the file is missing and its pixels cannot be decoded.
+def _is_cut_off(path: Path, file: BinaryIO, image: Image.Image) -> bool:
+    """Whether a file ends before its image does.
 
-    Without the mark the file may still be whole: phones append what they like. Only such files are
-    decoded.
+    A file without the mark of its end may still be whole: phones append what they like. Only such
+    files are read to their end and, if the mark is really missing, decoded.
     """
+    kind = image.format or ""
+    size = file.seek(0, os.SEEK_END)
+    if kind == "TIFF":
+        return _tiff_end(image) > size
     mark = END_MARKS.get(kind)
     if mark is None:
         return False
-    size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - TAIL))
-    return mark not in file.read() and read_pixels_of(path).problem is not None
+    if mark in file.read():
+        return False
+    if kind in JPEG:
+        file.seek(0)
+        data = file.read()
+        if has_end(data):
+            return False
+        if jpeg_damage(data) is not None:
+            return True
+    return read_pixels_of(path).problem is not None
+
+
+def _tiff_end(image: Image.Image) -> int:
+    """Where the last strip or tile of a TIFF file should end; 0 if its tags do not say."""
+    tags = getattr(image, "tag_v2", {})
+    ends = [0]
+    for offsets, lengths in ((273, 279), (324, 325)):
+        pairs = zip(tags.get(offsets, ()), tags.get(lengths, ()), strict=False)
+        ends += [int(offset) + int(length) for offset, length in pairs]
+    return max(ends)
 
 
 def hash_files(
@@ -175,6 +201,8 @@ def read_pixels_of(path: Path) -> Pixels:
         return Pixels(_without_path(error.found, path))
     except Exception as error:  # damaged files make Pillow raise almost anything
         return Pixels(_problem(error))
+    if (damage := jpeg_damage(path.read_bytes())) is not None:
+        return Pixels(damage)
     digest = hashlib.sha256(repr(rgb.shape).encode() + rgb.tobytes()).digest()
     small = Image.fromarray(rgb).resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX)
     return Pixels(None, digest, np.asarray(small, np.float32))

@@ -22,8 +22,11 @@ from chronoscene.validation.report import SceneReport, counts
 from chronoscene.validation.report_page import PAGE
 from chronoscene.validation.rule import RULES
 
-PICTURES = 12
+PICTURES = 24
 """Pictures for one scene."""
+
+SIDE_BY_SIDE = 3
+"""Pictures of one finding."""
 
 PICTURE_SIDE = 160
 """Pixels."""
@@ -42,8 +45,8 @@ class _Row:
     place: str
     expected: str
     found: str
-    picture: str | None
-    """As a data URI."""
+    pictures: tuple[str, ...]
+    """As data URIs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +101,8 @@ def _block(findings: list[Finding], pictures: Pictures) -> _Block:
         name=first.name,
         what=RULES[first.code].what if first.code in RULES else first.expected,
         rows=tuple(
-            _Row(f.place, f.expected, f.found, pictures.of(f.place)) for f in findings[:ROWS]
+            _Row(f.place, f.expected, f.found, pictures.of(f.place, f.also))
+            for f in findings[:ROWS]
         ),
         total=len(findings),
         remedies=tuple(dict.fromkeys(f.remedy for f in findings if f.remedy != NOTHING))[:5],
@@ -118,13 +122,14 @@ class Pictures:
         self._images = root / "images"
         self._left = PICTURES
 
-    def of(self, place: str) -> str | None:
-        """Data URI of the image that a place names; None if there is none, or no more."""
-        for name in islice(_names(place), 2):
+    def of(self, place: str, also: Sequence[str] = ()) -> tuple[str, ...]:
+        """Data URIs of the image that a place names and of some others, as far as there are any."""
+        found: list[str] = []
+        for name in islice((*_names(place), *also), SIDE_BY_SIDE):
             if self._left > 0 and (picture := self._draw(name)) is not None:
                 self._left -= 1
-                return picture
-        return None
+                found.append(picture)
+        return tuple(found)
 
     def _draw(self, name: str) -> str | None:
         try:

@@ -42,7 +42,7 @@ ul { list-style: none; margin: .5rem 0; padding: 0; }
 li { display: flex; gap: .75rem; margin: .35rem 0; padding: .35rem 0 .35rem .75rem;
   border-left: 3px solid var(--line); }
 li div { min-width: 0; overflow-wrap: anywhere; }
-img { width: 5rem; height: 4rem; object-fit: cover; border-radius: .3rem; flex: none; }
+img { width: 7.5rem; height: 6rem; object-fit: cover; border-radius: .3rem; flex: none; }
 .todo { margin: .25rem 0 .25rem .75rem; }
 footer { margin: 2rem 0 1rem; font-size: .9rem; }
 </style>
@@ -100,7 +100,7 @@ footer { margin: 2rem 0 1rem; font-size: .9rem; }
 {{ block.what|replace("`", "") }}</summary>
 <ul>
 {% for row in block.rows %}
-<li>{% if row.picture %}<img src="{{ row.picture }}" alt="">{% endif %}
+<li>{% for picture in row.pictures %}<img src="{{ picture }}" alt="">{% endfor %}
 <div><code>{{ row.place }}</code><br>
 expected {{ row.expected }},<br>found {{ row.found }}</div></li>
 {% endfor %}

@@ -153,4 +153,5 @@ def _finding(rule: Rule, hit: Hit) -> Finding:
         found=printable(hit.found),
         remedy=printable(hit.remedy or rule.remedy),
         count=hit.count,
+        also=tuple(map(printable, hit.also)),
     )

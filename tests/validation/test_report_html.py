@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import pytest
 from PIL import Image
 
-from chronoscene.validation.report_html import PICTURES, Pictures, write_html
+from chronoscene.validation.report_html import PICTURES, SIDE_BY_SIDE, Pictures, write_html
 
 VOID = {"meta", "img", "br"}
 
@@ -69,21 +69,26 @@ def test_names_from_the_scene_are_escaped(scene):
 
 def test_pictures_of_the_first_images(bad):
     sources = [s for s in Page(write_html([bad.validate()])).sources if s.startswith("data:")]
-    assert len(sources) == 3  # one is of the finding that both are the same
+    assert len(sources) == 4  # two side by side are of the finding that both are the same
     pictures = Pictures(bad.root)
     drawn = [pictures.of("images/a001.png") for _ in range(PICTURES + 1)]
-    assert all(drawn[:-1]) and drawn[-1] is None
+    assert all(len(d) == 1 for d in drawn[:-1]) and not drawn[-1]
+
+
+def test_pictures_side_by_side(scene):
+    also = tuple(f"b00{i}.png" for i in range(5))
+    assert len(Pictures(scene.root).of("images/a001.png", also)) == SIDE_BY_SIDE
 
 
 def test_no_pictures_of_files_outside(scene, tmp_path):
     Image.new("RGB", (8, 8)).save(tmp_path / "secret.png")
     scene.path("images/link.png").symlink_to(tmp_path / "secret.png")
     pictures = Pictures(scene.root)
-    assert pictures.of("images/link.png") is None
-    assert pictures.of("images/../../secret.png") is None
-    assert pictures.of(f"images/{tmp_path}/secret.png") is None
-    assert pictures.of("images/absent.png") is None
-    assert pictures.of("sparse/0/images.txt (a000.png)") is not None
+    assert pictures.of("images/link.png") == ()
+    assert pictures.of("images/../../secret.png") == ()
+    assert pictures.of(f"images/{tmp_path}/secret.png") == ()
+    assert pictures.of("images/absent.png") == ()
+    assert pictures.of("sparse/0/images.txt (a000.png)")
 
 
 def test_errors_of_periods_are_shown(scene):

@@ -83,6 +83,7 @@ def test_json_has_every_finding():
         "found": "nothing",
         "remedy": "copy it",
         "count": 1,
+        "also": [],
     }
     assert scene["summary"]["periods"][0] == {
         "id": 0,

@@ -57,7 +57,8 @@ def leak_train_test(scene: RawScene) -> Iterator[Hit]:
         test = [n for n in group if n in scene.tests]
         if train and test:
             found = f"the same {kind} in training: {shown(train)}"
-            yield Hit(f"images/{test[0]}", "a test image that no training image equals", found)
+            expected = "a test image that no training image equals"
+            yield Hit(f"images/{test[0]}", expected, found, also=tuple(train))
 
 
 @rule(
@@ -76,7 +77,7 @@ def leak_periods(scene: RawScene) -> Iterator[Hit]:
         if len(periods) > 1:
             listed = " and ".join(map(str, sorted(periods)))
             found = f"the same {kind} in periods {listed}: {shown(group)}"
-            yield Hit(f"images/{group[0]}", "an image of one period", found)
+            yield Hit(f"images/{group[0]}", "an image of one period", found, also=tuple(group[1:]))
 
 
 @rule(
@@ -94,7 +95,8 @@ def image_twice(scene: RawScene) -> Iterator[Hit]:
         roles = {(scene.periods[n], n in scene.tests) for n in group}
         if len(roles) == 1:
             found = f"the same {kind} in {shown(group[1:])}"
-            yield Hit(f"images/{group[0]}", "an image that no other equals", found)
+            expected = "an image that no other equals"
+            yield Hit(f"images/{group[0]}", expected, found, also=tuple(group[1:]))
 
 
 @rule(
@@ -113,7 +115,8 @@ def near_leak(scene: RawScene) -> Iterator[Hit]:
     for a, b, distance in near_pairs({n: p for n, p in scene.pixels.items() if n in role}, role):
         place, other = (b, a) if role[b][1] and not role[a][1] else (a, b)
         found = f"a thumbnail {distance:.2g} grey levels from that of {shown([other])}"
-        yield Hit(f"images/{place}", "an image of its own", found + _apart(scene, a, b))
+        found += _apart(scene, a, b)
+        yield Hit(f"images/{place}", "an image of its own", found, also=(other,))
 
 
 def _apart(scene: RawScene, a: str, b: str) -> str:
@@ -154,8 +157,9 @@ def pose_leak(scene: RawScene) -> Iterator[Hit]:
         near=SAME_PLACE * typical_depth(scene),
     )
     for a, b in pairs:
-        found = f"that of {shown([images.names[posed[b]]])}"
-        yield Hit(scene.image_place(images.names[posed[a]]), "a pose of its own", found)
+        name, other = images.names[posed[a]], images.names[posed[b]]
+        found = f"that of {shown([other])}"
+        yield Hit(scene.image_place(name), "a pose of its own", found, also=(other,))
 
 
 def twins(

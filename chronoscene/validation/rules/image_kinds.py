@@ -40,10 +40,9 @@ ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
     needs=("images",),
 )
 def image_cut_off(scene: RawScene) -> Iterator[Hit]:
-    if scene.decode:
-        return
+    pixels = scene.pixels or {}
     for name, header in _headers(scene):
-        if header.cut_off:
+        if header.cut_off and (name not in pixels or pixels[name].problem is None):
             yield Hit(f"images/{name}", f"a whole {header.kind} file", "one without its end")
 
 
