@@ -96,7 +96,7 @@ footer { margin: 2rem 0 1rem; font-size: .9rem; }
 {% for block in blocks %}
 <details{% if severity != "info" %} open{% endif %}>
 <summary><b class="{{ severity }}">{{ block.code }}</b> <code>{{ block.name }}</code>
-{% if block.total > 1 %}<span class="dim">({{ block.total }})</span>{% endif %}
+{% if block.total > 1 %}<span class="dim">({{ block.total }})</span> {% endif %}
 {{ block.what|replace("`", "") }}</summary>
 <ul>
 {% for row in block.rows %}

@@ -22,7 +22,8 @@ MOST_IDS = 2**31 - 1
     "model-absent",
     "error",
     what="There is no COLMAP model.",
-    remedy="write the model to sparse/0/ (cameras, images, points3D; all .bin or all .txt)",
+    remedy="write the model to sparse/0/ (cameras, images, points3D; all .bin or all .txt); photos "
+    "without poses need registering: chronoscene register",
     bad="an empty folder `sparse/0/`",
 )
 def model_absent(scene: RawScene) -> Iterator[Hit]:

@@ -95,7 +95,18 @@ def split_absent(scene: RawScene) -> Iterator[Hit]:
         if elsewhere:
             yield Hit(SPLIT, "the periods of the images", f"{elsewhere[0]} instead", "move it")
         else:
-            yield Hit(SPLIT, "the periods of the images", "no such file")
+            yield Hit(SPLIT, "the periods of the images", "no such file", _by_folders(scene))
+
+
+def _by_folders(scene: RawScene) -> str | None:
+    """What to do where the folders of the images may be the periods."""
+    folders = sorted({name.split("/")[0] for name in scene.names if "/" in name})
+    if len(folders) < 2 or not all("/" in name for name in scene.names):
+        return None
+    return (
+        'write it: "<image name> <period id>" for each image; if the folders '
+        f"{shown(folders)} are the periods, chronoscene convert DIR OUT makes a scene of them"
+    )
 
 
 @rule(

@@ -20,6 +20,13 @@ def test_split_absent(scene):
     scene.expect("CS301", place=SPLIT, found="no such file")
 
 
+def test_split_absent_where_folders_may_be_periods(make_scene):
+    scene = make_scene()
+    scene.path(SPLIT).unlink()
+    (finding,) = [f for f in scene.validate().findings if f.code == "CS301"]
+    assert "if the folders 'a', 'b' are the periods, chronoscene convert" in finding.remedy
+
+
 def test_split_misplaced(scene):
     scene.path(SPLIT).rename(scene.path("sparse/0/split.txt"))
     report = scene.expect("CS301", place=SPLIT, found="sparse/0/split.txt instead")
