@@ -23,6 +23,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
+
 from chronoscene.errors import SceneError
 from chronoscene.formats.colmap_layout import scan
 from chronoscene.formats.grouping import Grouped, group_labels, natural_key, rule_error
@@ -30,6 +32,7 @@ from chronoscene.formats.intrinsics import CameraTable
 from chronoscene.formats.json_values import json_error, read_json
 from chronoscene.formats.transforms import (
     Shot,
+    check_distinct,
     head_has,
     image_name,
     make_scene,
@@ -55,6 +58,9 @@ RAW_KEY = '"rot_mat"'
 ROTATION_SCALE = 100.0
 PREPARED_UNIT = 100.0
 """Metres."""
+
+SAME_POSE = 0.01
+"""Metres, or entries of a rotation, by which two files may differ: prepared ones are rounded."""
 
 PARTS_OF_A_CITY = ("train", "test", "train_dense", "pose", "aerial", "street")
 """Folders that say what images are for, or how they were flown: neither blocks nor periods."""
@@ -107,7 +113,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     tests: set[str] = set()
     for file in _pose_files(path):
         for shot in _read_file(path, file, cameras):
-            shots.setdefault(shot.name, shot)
+            _check_same(path, shots.setdefault(shot.name, shot), shot)
             labels.setdefault(shot.name, file.labels)
             if file.is_test:
                 tests.add(shot.name)
@@ -124,9 +130,28 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     return replace(scene, world=WorldFrame("metre"))
 
 
+def _check_same(path: Path, first: Shot, second: Shot) -> None:
+    """Refuse two poses of an image: files may repeat it, as merged ones do, but must agree."""
+    if np.abs(first.cam_from_world - second.cam_from_world).max() > SAME_POSE:
+        raise SceneError(
+            path / first.name,
+            expected="the same pose in all files of poses",
+            found="two that differ",
+            todo="remove the files that are wrong",
+        )
+
+
 def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
-    return ["the poses come without points, so the scene has none"]
+    found = ["the poses come without points, so the scene has none"]
+    read = _pose_files(path)
+    if left := [file for files, _ in _walk(path) for file in files if file not in read]:
+        named = ", ".join(str(PurePosixPath(file.folder) / file.name) for file in left[:3])
+        found.append(
+            f"{len(left)} files of poses are not read, as raw ones win over prepared ones and "
+            f"train over train_dense: {named}{', ...' if len(left) > 3 else ''}"
+        )
+    return found
 
 
 def _walk(path: Path) -> Iterator[tuple[list[PoseFile], str | None]]:
@@ -196,6 +221,7 @@ def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[Shot]:
             keys |= {"w": size[0], "h": size[1]}
         camera = cameras.camera(where, keys, path / name)
         shots.append(Shot(name, camera, pose_from_opengl(where, world_from_cam)))
+    check_distinct(place, shots)
     return shots
 
 

@@ -153,3 +153,42 @@ def test_says_that_there_are_no_points(raw_city):
     folder = raw_city(["block_A"])
     assert len(read_scene(folder).points) == 0
     assert "without points" in matrixcity.remarks(folder)[0]
+
+
+def test_an_image_twice_in_a_file_is_refused(raw_city):
+    folder = raw_city(["block_A"])
+    file = folder / "block_A/transforms.json"
+    data = json.loads(file.read_text())
+    data["frames"][2]["frame_index"] = 1
+    file.write_text(json.dumps(data))
+    with pytest.raises(SceneError, match=r"each image once, found 'block_A/0001\.png' twice"):
+        read_scene(folder)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_files_that_repeat_images_must_agree(raw_city, shift):
+    folder = raw_city(["block_A"])
+    frames = json.loads((folder / "block_A/transforms.json").read_text())["frames"]
+    (folder / "block_A/transforms.json").unlink()
+    for block, step in (("block_A", 0.0), ("block_all", shift)):
+        listed = []
+        for i, frame in enumerate(frames):
+            pose = np.array(frame["rot_mat"])
+            pose[:3, :3] *= 100
+            pose[:3, 3] = (pose[:3, 3] + step) / 100
+            listed.append({"file_path": f"../../block_A/{i:04d}.png"})
+            listed[-1]["transform_matrix"] = pose.tolist()
+        (folder / "pose" / block).mkdir(parents=True)
+        text = json.dumps({"camera_angle_x": 1.0, "frames": listed})
+        (folder / "pose" / block / "transforms_train.json").write_text(text)
+    if shift:
+        with pytest.raises(SceneError, match="the same pose in all files"):
+            read_scene(folder)
+    else:
+        assert len(read_scene(folder).frames) == 3
+
+
+def test_files_that_are_not_read_are_remarked_upon(raw_city):
+    folder = raw_city(["train/block_A", "train_dense/block_A", "test/block_B"])
+    (remark,) = matrixcity.remarks(folder)[1:]
+    assert remark.startswith("1 files of poses") and "train_dense/block_A/transforms" in remark
