@@ -28,6 +28,9 @@ THUMBNAIL = 32
 END_MARKS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND"}
 """What ends a file. Compressed JPEG data cannot contain its mark."""
 
+ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
+"""Pillow's modes with transparency. Other modes may have one transparent colour."""
+
 JPEG = ("JPEG", "MPO")
 """Pillow's names of JPEG files."""
 
@@ -55,6 +58,8 @@ class Header:
     """Pillow's name of the file format."""
     deep: bool = False
     """Whether it has more than 8 bits per channel."""
+    transparent: bool = False
+    """Whether it may have transparent pixels."""
     moving: bool = False
     """Whether it has several frames."""
     cut_off: bool = False
@@ -109,6 +114,7 @@ def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
         orientation=exif.orientation,
         kind=kind,
         deep=_is_deep(image),
+        transparent=image.mode in ALPHA_MODES or "transparency" in image.info,
         moving=kind not in ("MPO", "TIFF") and bool(getattr(image, "is_animated", False)),
         cut_off=_is_cut_off(path, file, image),
         exif=exif,

@@ -26,9 +26,6 @@ KINDS = {
 BLANK = 2.0
 """Grey levels between the means of the darkest and the brightest part of an image."""
 
-ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
-"""Pillow's modes with transparency."""
-
 
 @rule(
     "CS208",
@@ -90,7 +87,7 @@ def image_cmyk(scene: RawScene) -> Iterator[Hit]:
 )
 def image_transparent(scene: RawScene) -> Iterator[Hit]:
     for name, header in _headers(scene):
-        if header.mode in ALPHA_MODES:
+        if header.transparent:
             yield Hit(f"images/{name}", "opaque pixels", f"pixels of kind {header.mode}")
 
 

@@ -59,6 +59,8 @@ def period_empty(scene: RawScene) -> Iterator[Hit]:
     images = meant_in_split(scene)
     listed = {entry.period for entry in scene.split or ()}
     listed -= {entry.period for entry in scene.split or () if entry.line in images}
+    ambiguous = {p.line for p in scene.split_problems if p.kind == "ambiguous"}
+    listed -= {entry.period for entry in scene.split or () if entry.line in ambiguous}
     for period in sorted(listed - set(scene.period_ids)):
         yield Hit(SPLIT, f"a registered image of period {period}", "none")
 
@@ -103,6 +105,8 @@ def period_without_test(scene: RawScene) -> Iterator[Hit]:
     needs=("tests",),
 )
 def period_few_views(scene: RawScene) -> Iterator[Hit]:
+    if len(scene.periods or ()) < len(scene.names):
+        return  # images without a period are an error; they may belong here
     for period, (train, _test) in _views(scene).items():
         if 0 < train < FEW:
             place = f"period {period}"

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 
 from chronoscene.formats.chronoscene import SPLIT
 from chronoscene.splits import NameIndex, Problem, ProblemKind
-from chronoscene.validation.finding import Hit, counted, quote
+from chronoscene.validation.finding import Hit, counted, quote, shown
 from chronoscene.validation.raw_scene import RawScene, TextFile
 from chronoscene.validation.rule import rule
 from chronoscene.validation.spelling import Spellings
@@ -68,8 +68,8 @@ def in_other_words(scene: RawScene) -> set[str]:
         if problem.line is None or problem.kind not in ("fields", "period", "ambiguous"):
             continue
         line = lines[problem.line - 1]
-        # With commas instead of blanks the name ends there.
-        names = (line.rsplit(maxsplit=1)[0], re.split("[,;]", line)[0].strip())
+        # Some have the period in front; with commas instead of blanks the name ends there.
+        names = (line.rsplit(maxsplit=1)[0], line.split()[-1], re.split("[,;]", line)[0].strip())
         found.update(*(index.find(name) for name in names))
     return found
 
