@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from errno import EISDIR
+from os import strerror
 from pathlib import Path
 from tempfile import TemporaryFile
 
@@ -12,6 +14,8 @@ import click
 
 from chronoscene.errors import ConfigError
 from chronoscene.files import write_text_atomic
+
+FILE = "a file that can be written"
 
 
 def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
@@ -31,8 +35,9 @@ def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
         encoding = sys.stdout.encoding or "utf-8"
         click.echo(text.encode(encoding, "backslashreplace").decode(encoding), nl=False)
         return
-    with writing_to(option, out, expected="a file that can be written"):
-        write_text_atomic(out, click.unstyle(text))
+    whole = click.unstyle(text).encode("utf-8", "backslashreplace").decode()  # names may be bytes
+    with writing_to(option, out, expected=FILE):
+        write_text_atomic(out, whole)
 
 
 @contextmanager
@@ -64,4 +69,23 @@ def check_place(option: str, folder: Path) -> None:
     with writing_to(option, folder):
         nearest = next(p for p in (folder, *folder.absolute().parents) if p.exists())
         with TemporaryFile(dir=nearest):
+            pass
+
+
+def check_file(option: str, file: Path | None) -> None:
+    """See that a file can be written, before long work; leaves nothing there.
+
+    Args:
+        option: What the user named the file with.
+        file: None where there is none to write.
+
+    Raises:
+        ConfigError: If it cannot.
+    """
+    if file is None:
+        return
+    with writing_to(option, file, expected=FILE):
+        if file.is_dir():
+            raise IsADirectoryError(EISDIR, strerror(EISDIR))
+        with TemporaryFile(dir=file.absolute().parent):
             pass

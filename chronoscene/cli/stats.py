@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from shutil import get_terminal_size
+from typing import Any, Literal
 
 import click
 
-from chronoscene.cli.output import emit, writing_to
+from chronoscene.cli.output import check_file, check_place, emit, writing_to
 from chronoscene.cli.progress import tracked
-from chronoscene.errors import ConfigError
+from chronoscene.errors import ChronoSceneError, ConfigError
 from chronoscene.formats import find_scenes, format_names, read_scene
 from chronoscene.parallel import map_parallel
 from chronoscene.stats import (
@@ -22,12 +24,18 @@ from chronoscene.stats import (
     CountRule,
     SceneCount,
     SceneStatistics,
+    Unreadable,
     count_scene,
     measure_scene,
 )
+from chronoscene.stats.published import in_paper_order, published
+from chronoscene.validation.finding import printable
 
 Layout = Literal["full", "paper"]
 FIGURE_FORMATS = ("png", "pdf", "svg")
+
+SOME_FAILED, ALL_FAILED = 1, 2
+"""Exit status when scenes cannot be read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +103,13 @@ class Request:
     type=click.Choice(format_names()),
     help="Format of the scenes.  [default: found out]",
 )
+@click.pass_context
 def command(
-    folders: tuple[Path, ...], output_format: str, out: Path | None, **options: object
+    context: click.Context,
+    folders: tuple[Path, ...],
+    output_format: str,
+    out: Path | None,
+    **options: object,
 ) -> None:
     """What is in a scene, by period: images, points, tracks, error, overlap, coverage.
 
@@ -112,28 +125,41 @@ def command(
     between observation and projection. The baseline is the distance from a camera to the nearest
     of its period, relative to the median depth of what it sees. Coverage is the share of the space
     with points in which a period sees some. "Also seen by" is the share of the points of a period
-    that another one sees, too.
+    that another one sees, too; "In view of" the share that another one's cameras look at.
+
+    A scene that cannot be read is named, and the others are reported. Exit status: 0 all scenes
+    were read, 1 some, 2 none, or wrong usage.
     """
     request = Request(**options)  # type: ignore[arg-type]
-    paths = [p for f in folders for p in find_scenes(f, format=request.dataset_format)]
-    _check_places(request, paths)
+    paths = [
+        p for f in folders for p in in_paper_order(find_scenes(f, format=request.dataset_format))
+    ]
+    _check_places(request, out, paths)
     items = list(zip(paths, _file_names(paths), strict=True))
     work = map_parallel(partial(examine, request), items)
     results = list(tracked(work, "scenes", total=len(items)))
-    counts = [r if isinstance(r, SceneCount) else r.counts for r in results]
+    unreadable = [r for r in results if isinstance(r, Unreadable)]
     full = [r for r in results if isinstance(r, SceneStatistics)]
-    text = WRITERS[output_format](counts) if not full else DETAIL_WRITERS[output_format](full)
-    emit(text, out)
-    if request.figures is not None:
-        from chronoscene.figures.bars import draw_bars
+    counts = [s.counts for s in full] or [r for r in results if isinstance(r, SceneCount)]
+    if counts:
+        writers = DETAIL_WRITERS if full else WRITERS
+        extra: dict[str, dict[str, Any]] = {
+            "table": {"width": _width(out)},
+            "json": {"unreadable": unreadable},
+        }
+        text = writers[output_format](full or counts, **extra.get(output_format, {}))
+        emit(text, out)
+        if request.figures is not None:
+            _draw_bars(counts, request.figures / f"counts.{request.figure_format}")
+    for remark in [*unseen(counts), *against_paper(counts)]:
+        click.echo(printable(remark), err=True)
+    for scene in unreadable:
+        click.secho(printable(f"error: {scene.error}"), fg="red", err=True)
+    if unreadable:
+        context.exit(SOME_FAILED if counts else ALL_FAILED)
 
-        bars = request.figures / f"counts.{request.figure_format}"
-        with writing_to("--figures", bars):
-            draw_bars(counts, bars)
-    _remark_on_unseen(counts)
 
-
-def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStatistics:
+def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStatistics | Unreadable:
     """Read one scene, measure it, and draw what is asked for.
 
     Args:
@@ -141,7 +167,12 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
         item: Folder of the scene, and the name of its figure and page.
     """
     path, name = item
-    scene = read_scene(path, format=request.dataset_format)
+    try:
+        scene = read_scene(path, format=request.dataset_format)
+    except ChronoSceneError as error:
+        return Unreadable(str(path), str(error))
+    except OSError as error:
+        return Unreadable(str(path), f"{error.filename or path}: {error.strerror or error}")
     if request.figures is not None:
         from chronoscene.figures.projections import draw_projections
 
@@ -159,39 +190,94 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
     return measure_scene(scene, count=request.count)
 
 
+def _width(out: Path | None) -> int | None:
+    """Of the terminal, if the table goes to one."""
+    return get_terminal_size().columns if out is None and sys.stdout.isatty() else None
+
+
+def _draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
+    from chronoscene.figures.bars import draw_bars
+
+    with writing_to("--figures", path):
+        draw_bars(counts, path)
+
+
 def _file_names(paths: Sequence[Path]) -> list[str]:
     """Names of the scenes, numbered where folders of several places have the same name."""
     names: list[str] = []
     for path in paths:
-        name, number = path.resolve().name or "scene", 1
+        folder = path.resolve().name or "scene"
+        plain = "".join(c if c.isprintable() else "_" for c in folder)
+        name, number = plain, 1
         while name in names:
             number += 1
-            name = f"{path.resolve().name}_{number}"
+            name = f"{plain}_{number}"
         names.append(name)
     return names
 
 
-def _check_places(request: Request, paths: Iterable[Path]) -> None:
+def _check_places(request: Request, out: Path | None, paths: Iterable[Path]) -> None:
     """Make the folders for figures and pages; refuse to write into a scene."""
-    for option, place in (("--figures", request.figures), ("--pages", request.pages)):
-        if place is None:
-            continue
-        if any(place.resolve().is_relative_to(path.resolve()) for path in paths):
+    places = (("--out", out), ("--figures", request.figures), ("--pages", request.pages))
+    for option, place in places:
+        if place is not None and any(_is_in(place, path) for path in paths):
             raise ConfigError(
                 f"{option} {place}",
-                expected="a folder outside of the scenes",
+                expected="a place outside of the scenes",
                 found="one inside",
                 todo="choose another place: nothing is written into a dataset",
             )
-        with writing_to(option, place, expected="a folder that can be made"):
-            place.mkdir(parents=True, exist_ok=True)
+    check_file("--out", out)
+    for option, place in places[1:]:
+        if place is not None:
+            with writing_to(option, place, expected="a folder that can be made"):
+                place.mkdir(parents=True, exist_ok=True)
+            check_place(option, place)
 
 
-def _remark_on_unseen(counts: list[SceneCount]) -> None:
+def _is_in(place: Path, folder: Path) -> bool:
+    return place.resolve().is_relative_to(folder.resolve())
+
+
+def unseen(counts: Sequence[SceneCount]) -> Iterator[str]:
+    """What there is to say about points that no image sees."""
     for scene in counts:
         if scene.points_without_period:
-            click.echo(
-                f"{scene.name}: {scene.points_without_period} points are seen by no image; "
-                "they count in the total and in no period",
-                err=True,
+            number = scene.points_without_period
+            yield (
+                f"{scene.name}: {number:,} {'point is' if number == 1 else 'points are'} seen by "
+                "no image: in the total, and in no period"
             )
+
+
+def against_paper(counts: Sequence[SceneCount]) -> Iterator[str]:
+    """Whether scenes with names of the paper have its counts."""
+    same = []
+    for scene in counts:
+        paper = published(scene.name)
+        if paper is None:
+            continue
+        here = [(p.images, p.points) for p in scene.periods]
+        if here == list(paper):
+            same.append(scene.name)
+        else:
+            yield f"{scene.name}: {_difference(scene, paper)}"
+    if same:
+        yield f"images and points of all periods are those of the paper: {', '.join(same)}"
+
+
+def _difference(scene: SceneCount, paper: Sequence[tuple[int, int]]) -> str:
+    images, points = ([row[i] for row in paper] for i in (0, 1))
+    if [p.images for p in scene.periods] == images and scene.points == sum(points):
+        return (
+            "images of all periods and points in all are those of the paper, which does not say "
+            f"how it splits points into periods: it has {_listed(points)}"
+        )
+    return (
+        f"the paper has {_listed(images)} images and {_listed(points)} points in the periods of "
+        "its scene of this name"
+    )
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return " + ".join(f"{n:,}" for n in numbers)

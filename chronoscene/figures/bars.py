@@ -7,9 +7,11 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
-from chronoscene.figures.canvas import GREY, GRID, new_figure, quiet_axes, save
+from chronoscene.figures.canvas import GREY, GRID, new_figure, plain, quiet_axes, save
 from chronoscene.figures.colors import period_colors
 from chronoscene.stats.counts import PeriodCount, SceneCount
+from chronoscene.stats.titles import period_title
+from chronoscene.validation.finding import printable
 
 BAR = 0.3
 """Inches per scene."""
@@ -25,9 +27,11 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
         counts: One per scene.
         path: File to write; the suffix says the format.
     """
+    from rich.cells import cell_len
+
     periods = max(len(c.periods) for c in counts)
     colors = period_colors(periods)
-    longest = max(len(_name(c)) for c in counts)
+    longest = max(cell_len(_name(c)) for c in counts)
     left, top, bottom = 0.25 + 0.075 * longest, 0.42, 0.5
     height = top + bottom + BAR * (len(counts) + 0.4)
     figure = new_figure(WIDTH, height)
@@ -43,14 +47,15 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
         axes = figure.add_axes((box[0] / WIDTH, box[1] / height, box[2] / WIDTH, box[3] / height))
         values = [[of(p) for p in c.periods] for c in counts]
         _draw_panel(axes, what, values, colors)
-        axes.set_yticks(range(len(counts)), [_name(c) for c in counts] if i == 0 else [])
+        axes.set_yticks(range(len(counts)), [plain(_name(c)) for c in counts] if i == 0 else [])
         axes.tick_params(axis="y", length=0, labelsize=9)
-    _legend(figure, colors, 1 - 0.1 / height)
+    _legend(figure, _period_names(counts, periods), colors, 1 - 0.1 / height)
     save(figure, path)
 
 
 def _name(count: SceneCount) -> str:
-    return shorten(count.name, 28, placeholder="...") or count.name[:28]
+    name = printable(count.name)
+    return shorten(name, 28, placeholder="...") or name[:28]
 
 
 def _draw_panel(
@@ -80,25 +85,40 @@ def _draw_panel(
     axes.set_xlim(0, 1.17 * largest)
     axes.set_ylim(len(values) - 0.45, -0.55)
     axes.locator_params(axis="x", nbins=6, integer=True)
-    axes.xaxis.set_major_formatter(_short)
+    axes.xaxis.set_major_formatter(_short(largest))
     axes.set_xlabel(f"{what}, {sum(sums):,} in all", fontsize=9)
 
 
-def _short(value: float, _: int) -> str:
-    if value >= 1e6:
-        return f"{value / 1e6:g}M"
-    return f"{value / 1000:g}k" if value >= 10_000 else f"{value:,.0f}"
+def _short(largest: int) -> Callable[[float, int], str]:
+    """Numbers of an axis, all in the same unit."""
+    for size, sign in ((1_000_000, "M"), (10_000, "k")):
+        if largest >= size:
+            unit = 1000 if sign == "k" else size
+            return lambda value, _: f"{value / unit:,g}{sign}" if value else "0"
+    return lambda value, _: f"{value:,.0f}"
 
 
-def _legend(figure: Any, colors: Sequence[str], top: float) -> None:
+def _period_names(counts: Sequence[SceneCount], periods: int) -> list[str]:
+    """What the legend calls the periods: by their names if those are the same in all scenes."""
+    names = []
+    for i in range(periods):
+        titles = {period_title(i, p.label, p.date) for c in counts for p in c.periods if p.id == i}
+        names.append(titles.pop() if len(titles) == 1 else str(i))
+    if all(name == str(i) for i, name in enumerate(names)):
+        return [f"Period {i}" if i == 0 or periods < 7 else str(i) for i in range(periods)]
+    return [shorten(printable(name), 28, placeholder="...") or name[:28] for name in names]
+
+
+def _legend(figure: Any, names: Sequence[str], colors: Sequence[str], top: float) -> None:
     """Names of the periods above the panels; of many only some."""
     from matplotlib.patches import Patch
 
-    step = -(-len(colors) // MOST_IN_LEGEND)
+    fitting = int((WIDTH - 0.3) / (0.45 + 0.075 * max(map(len, names))))
+    step = -(-len(colors) // min(MOST_IN_LEGEND, max(fitting, 1)))
     shown = range(0, len(colors), step)
     figure.legend(
         [Patch(color=colors[i]) for i in shown],
-        [f"Period {i}" if i == 0 or len(shown) < 7 else str(i) for i in shown],
+        [plain(names[i]) for i in shown],
         loc="upper center",
         bbox_to_anchor=(0.5, top),
         borderaxespad=0,

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from warnings import catch_warnings, filterwarnings
 
 from chronoscene.files import replacing
+from chronoscene.validation.finding import printable
 
 DPI = 200
 """Pixels per inch of PNG files, and of the density inside PDF and SVG files."""
+WIDE_FONTS = (
+    *("Noto Sans CJK SC", "Noto Sans CJK JP", "Noto Sans SC", "Source Han Sans SC"),
+    *("WenQuanYi Zen Hei", "WenQuanYi Micro Hei", "Droid Sans Fallback", "Arial Unicode MS"),
+    *("PingFang SC", "Heiti TC", "Microsoft YaHei", "SimHei", "Malgun Gothic", "Noto Sans"),
+)
+"""With letters that are not European, on the usual systems."""
 GREY = "#555555"
 GRID = "#dddddd"
 
@@ -21,6 +29,11 @@ def new_figure(width: float, height: float) -> Any:
     figure = Figure(figsize=(width, height), dpi=DPI)
     FigureCanvasAgg(figure)
     return figure
+
+
+def plain(text: str) -> str:
+    """A name as matplotlib shows it: no formula, and nothing that it cannot draw."""
+    return printable(text).replace("$", r"\$")
 
 
 def save(figure: Any, path: Path) -> None:
@@ -36,7 +49,9 @@ def save(figure: Any, path: Path) -> None:
         "svg": {"metadata": {"Date": None}},
     }
     settings: Any = {"svg.hashsalt": "chronoscene", "pdf.fonttype": 42}
-    with rc_context(settings), replacing(path) as partial:
+    _choose_fonts(figure)
+    with rc_context(settings), replacing(path) as partial, catch_warnings():
+        filterwarnings("ignore", "Glyph .* missing")  # no font here has it: boxes stand for it
         figure.savefig(partial, format=form, dpi=DPI, **by_format[form])
 
 
@@ -47,3 +62,15 @@ def quiet_axes(axes: Any) -> None:
         spine.set_linewidth(0.6)
     axes.tick_params(labelsize=8, colors=GREY, width=0.6, length=3)
     axes.set_axisbelow(True)
+
+
+def _choose_fonts(figure: Any) -> None:
+    """Fonts of this machine for names that the usual one lacks letters for."""
+    from matplotlib.font_manager import fontManager
+    from matplotlib.text import Text
+
+    other = [text for text in figure.findobj(Text) if not text.get_text().isascii()]
+    if other:
+        here = {font.name for font in fontManager.ttflist}
+        for text in other:
+            text.set_fontfamily(["DejaVu Sans", *(f for f in WIDE_FONTS if f in here)])

@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 from chronoscene.geometry import camera_centre
 from chronoscene.scene import Scene
 from chronoscene.stats.counts import assign_points
+from chronoscene.stats.extent import robust_range
+from chronoscene.stats.titles import period_name
+from chronoscene.validation.finding import printable
 
 Array = NDArray[np.float64]
 
-ROBUST = (2.0, 98.0)
-"""Percentiles of the points that the panels show, and `BEYOND` that; strays are left out, and
-counted."""
-BEYOND = 0.08
-"""Of the distance between the two: an even spread of points is shown to its ends."""
 MARGIN = 0.03
 """Of the longest edge, on every side."""
 SMALLEST_EDGE = 0.18
@@ -37,6 +35,11 @@ class Box:
     def edges(self) -> Array:
         return self.high - self.low
 
+    def holds(self, xyz: Array) -> NDArray[np.bool_]:
+        """Which places are inside. [n, 3] -> [n]"""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(((xyz >= self.low) & (xyz <= self.high)).all(axis=1))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
@@ -45,7 +48,7 @@ class Cloud:
     name: str
     unit: str
     labels: tuple[str, ...]
-    """Of the periods."""
+    """Of the periods; a number where nothing else is known."""
     xyz: Array
     """[P, 3]"""
     period: NDArray[np.int64]
@@ -64,9 +67,9 @@ def cloud_of(scene: Scene) -> Cloud:
     """The points and cameras of a scene."""
     poses = np.stack([f.cam_from_world for f in scene.frames])
     return Cloud(
-        name=scene.name,
+        name=printable(scene.name),
         unit=scene.world.unit,
-        labels=tuple(p.label for p in scene.periods),
+        labels=tuple(printable(period_name(p.id, p.label, p.date)) for p in scene.periods),
         xyz=scene.points.xyz,
         period=assign_points(scene),
         centres=camera_centre(poses),
@@ -79,20 +82,11 @@ def cloud_of(scene: Scene) -> Cloud:
 def shown_box(cloud: Cloud, *, cameras: bool) -> Box:
     """Robust limits of the points (and of the cameras), wide enough for a readable panel."""
     good = (cloud.period >= 0) & np.isfinite(cloud.xyz).all(axis=1)
-    corners = _robust_range(cloud.xyz[good]) if good.any() else np.zeros((0, 3))
+    corners = robust_range(cloud.xyz[good]) if good.any() else np.zeros((0, 3))
     if cameras or not len(corners):
-        corners = np.concatenate([corners, _robust_range(cloud.centres)])
+        corners = np.concatenate([corners, robust_range(cloud.centres)])
     low, high = corners.min(axis=0), corners.max(axis=0)
     longest = float((high - low).max()) or 1.0
     middle = (low + high) / 2
     half = np.maximum((high - low) / 2 + MARGIN * longest, SMALLEST_EDGE * longest / 2)
     return Box(middle - half, middle + half)
-
-
-def _robust_range(xyz: Array) -> Array:
-    """Ends without strays, per axis. [2, 3]"""
-    low, high = np.percentile(xyz, ROBUST, axis=0)
-    beyond = BEYOND * (high - low)
-    return np.stack(
-        [np.maximum(low - beyond, xyz.min(axis=0)), np.minimum(high + beyond, xyz.max(axis=0))]
-    )

@@ -25,7 +25,7 @@ DARK_QUANTILE = 0.97
 """Of the pixels with points: the opacity of this many points is 1."""
 DOT_SHARE = 0.35
 """Dots grow until about this share of the occupied area is covered."""
-LARGEST_DOT = 3
+LARGEST_DOT = 6
 """Radius in pixels."""
 
 

@@ -6,7 +6,8 @@ y axis, and the corner that is left says how much is shown.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.figures.canvas import DPI, GREY, GRID, new_figure, quiet_axes, save
+from chronoscene.figures.canvas import DPI, GREY, GRID, new_figure, plain, quiet_axes, save
 from chronoscene.figures.cloud import Box, Cloud, cloud_of, shown_box
 from chronoscene.figures.colors import period_colors
 from chronoscene.figures.density import Window, count_points, dot_radius, grow_dots, shade
@@ -32,6 +33,12 @@ LEFT, RIGHT, BOTTOM = 0.62, 0.15, 0.5
 TITLE, LINE = 0.4, 0.24
 """Height in inches of the title and of each line of the legend."""
 LEAST_WIDTH = 3.5
+BEHIND = 0.7
+"""Strength of the points where cameras are drawn, too."""
+PATCH = 16
+"""Pixels along each side of the squares by which the area with points is measured."""
+FAR = 20.0
+"""Times the longest edge: coordinates beyond would be numbers with more digits than differ."""
 AXES = "xyz"
 
 
@@ -48,6 +55,7 @@ def draw_projections(scene: Scene, path: Path, *, cameras: bool = False) -> None
 
 def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
     """Draw points and cameras; see `draw_projections`."""
+    cloud, axis_names = readable(cloud, shown_box(cloud, cameras=cameras))
     box = shown_box(cloud, cameras=cameras)
     dx, dy, dz = box.edges
     scale = min((DRAWING[0] - GAP) / (dx + dz), (DRAWING[1] - GAP) / (dy + dz))
@@ -58,20 +66,52 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
     height = BOTTOM + (dz + dy) * scale + GAP + top
     figure = new_figure(width, height)
     colors = period_colors(len(names))
-    dots = dot_radius(int((cloud.period >= 0).sum()), int(DPI**2 * DRAWING[0] * DRAWING[1] / 3))
     x_right, y_top = LEFT + dx * scale + GAP, BOTTOM + dz * scale + GAP
     places = {(0, 1): (LEFT, y_top), (0, 2): (LEFT, BOTTOM), (2, 1): (x_right, y_top)}
+    dots = _dot_radius(cloud, box, scale, places)
     for plane, (x, y) in places.items():
         size = (box.edges[plane[0]] * scale, box.edges[plane[1]] * scale)
         place = (x / width, y / height, size[0] / width, size[1] / height)
         axes = figure.add_axes(place)
-        _draw_points(axes, cloud, box, plane, size, colors, dots)
+        image = _draw_points(axes, cloud, box, plane, size, colors, dots)
         if cameras:
+            image.set_alpha(BEHIND)
             _draw_cameras(axes, cloud, box, plane, colors)
-        _label_axes(axes, plane, cloud.unit)
+        _label_axes(axes, plane, axis_names, size)
     _write_texts(figure, cloud, box, (x_right / width, (y_top - GAP) / height))
     _draw_legend(figure, names, colors, columns, 1 - TITLE / height)
     save(figure, path)
+
+
+def readable(cloud: Cloud, box: Box) -> tuple[Cloud, tuple[str, ...]]:
+    """The cloud in numbers that fit beside an axis, and the names of the axes, which say how.
+
+    Places far from the origin are moved, and very small or large scenes scaled.
+    """
+    edge = float(box.edges.max())
+    offset = np.zeros(3)
+    far = np.maximum(np.abs(box.low), np.abs(box.high)) > FAR * edge
+    step = 10.0 ** np.ceil(np.log10(edge))
+    offset[far] = np.round((box.low + box.high)[far] / 2 / step) * step
+    thousands = int(np.floor((np.log10(edge) + 1) / 3))  # 0 for edges from 0.1 to 99
+    power = 0 if edge < 10_000 and thousands == 1 else 3 * thousands
+    if cloud.unit == "metre":
+        power = max(-3, min(3, power))
+    moved = replace(
+        cloud,
+        xyz=(cloud.xyz - offset) / 10.0**power,
+        centres=(cloud.centres - offset) / 10.0**power,
+    )
+    units = {-3: " [mm]", 0: " [m]", 3: " [km]"}
+    unit = units[power] if cloud.unit == "metre" else f" [$10^{{{power}}}$]" if power else ""
+    return moved, tuple(
+        f"{axis}{_minus(shift)}{unit}" for axis, shift in zip(AXES, offset, strict=True)
+    )
+
+
+def _minus(shift: float) -> str:
+    """What is taken from a coordinate."""
+    return f" {'-' if shift > 0 else '+'} {abs(shift):,.12g}" if shift else ""
 
 
 def legend_names(labels: Sequence[str]) -> list[str]:
@@ -83,6 +123,18 @@ def legend_names(labels: Sequence[str]) -> list[str]:
     return [shorten(name, 28, placeholder="...") or name[:28] for name in names]
 
 
+def _dot_radius(cloud: Cloud, box: Box, scale: float, planes: Iterable[tuple[int, int]]) -> int:
+    """Radius of the dots in pixels, by the room for them in the middle one of the panels."""
+    shown = cloud.xyz[cloud.period >= 0]
+    shown = shown[box.holds(shown)]
+    if not len(shown):
+        return 0
+    cells = np.floor((shown - box.low) * (scale * DPI / PATCH)).astype(np.int64)
+    side = int(max(DRAWING) * DPI / PATCH) + 2
+    areas = [np.count_nonzero(np.bincount(cells[:, i] * side + cells[:, j])) for i, j in planes]
+    return dot_radius(len(shown), PATCH**2 * int(np.median(areas)))
+
+
 def _draw_points(
     axes: Any,
     cloud: Cloud,
@@ -91,8 +143,8 @@ def _draw_points(
     size: tuple[float, float],
     colors: Sequence[str],
     dots: int,
-) -> None:
-    """The density of the points. ``dots``: their radius in pixels."""
+) -> Any:
+    """The density of the points, as an image. ``dots``: their radius in pixels."""
     quiet_axes(axes)
     dpi = DPI if dots else DPI / CELL
     pixels = [max(1, round(edge * dpi)) for edge in size]
@@ -101,53 +153,66 @@ def _draw_points(
     counts = count_points(cloud.xyz[:, plane], cloud.period, len(colors), window)
     image = shade(grow_dots(counts, dots), colors)
     extent = (low[0], high[0], low[1], high[1])
-    axes.imshow(image, extent=extent, interpolation="nearest", aspect="auto", zorder=1)
     axes.grid(color=GRID, linewidth=0.5, zorder=0)
+    return axes.imshow(image, extent=extent, interpolation="nearest", aspect="auto", zorder=1)
 
 
 def _draw_cameras(
     axes: Any, cloud: Cloud, box: Box, plane: tuple[int, int], colors: Sequence[str]
 ) -> None:
-    """A dot with a line in the viewing direction for each camera."""
+    """A dot with a line in the viewing direction for each camera, on white."""
     from matplotlib.collections import LineCollection
 
     length = 0.02 * float(box.edges.max())
     centres = cloud.centres[:, plane]
     ends = centres + length * cloud.directions[:, plane]
     own = [colors[p] for p in cloud.camera_period]
-    lines = LineCollection(list(np.stack([centres, ends], axis=1)), colors="#222222")
-    lines.set(linewidth=0.4, zorder=2)
-    axes.add_collection(lines, autolim=False)
-    area = float(np.clip(1500 / len(centres), 2.0, 8.0))
-    axes.scatter(*centres.T, s=area, c=own, edgecolors="#222222", linewidths=0.3, zorder=3)
+    views = list(np.stack([centres, ends], axis=1))
+    size = float(np.clip(1500 / len(centres), 3.0, 9.0))
+    for color, wide in (("white", 1.8), ("#333333", 0.6)):
+        lines = LineCollection(views, colors=color, linewidths=wide, zorder=2)
+        axes.add_collection(lines, autolim=False)
+    axes.scatter(*centres.T, s=2.2 * size, c="white", linewidths=0, zorder=3)
+    axes.scatter(*centres.T, s=size, c=own, edgecolors="#333333", linewidths=0.3, zorder=3)
 
 
-def _label_axes(axes: Any, plane: tuple[int, int], unit: str) -> None:
-    """Ticks and names on the outer sides; panels that share an axis name it once."""
-    names = [f"{AXES[i]} [m]" if unit == "metre" else AXES[i] for i in plane]
-    axes.locator_params(nbins=6 if plane[0] == 0 else 3, axis="x")
-    axes.locator_params(nbins=6 if plane[1] == 1 else 3, axis="y")
+def _label_axes(
+    axes: Any, plane: tuple[int, int], names: Sequence[str], size: tuple[float, float]
+) -> None:
+    """Ticks and names on the outer sides; panels that share an axis name it once.
+
+    ``size``: width and height in inches, for which there are as many ticks as fit.
+    """
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+    for axis, edge, each in ((axes.xaxis, size[0], 0.55), (axes.yaxis, size[1], 0.35)):
+        axis.set_major_locator(MaxNLocator(int(np.clip(edge / each, 1, 6))))
+        axis.set_major_formatter(FuncFormatter(_number))
     axes.tick_params(labelbottom=plane != (0, 1), labelleft=plane[0] == 0)
     if plane != (0, 1):
-        axes.set_xlabel(names[0], fontsize=9, labelpad=2)
+        axes.set_xlabel(names[plane[0]], fontsize=9, labelpad=2)
     if plane[0] == 0:
-        axes.set_ylabel(names[1], fontsize=9, labelpad=2)
-    title = "ZY" if plane == (2, 1) else "".join(AXES[i] for i in plane).upper()
+        axes.set_ylabel(names[plane[1]], fontsize=9, labelpad=2)
+    title = "".join(sorted(AXES[i] for i in plane)).upper()
     box = {"color": "white", "alpha": 0.8, "pad": 1.5, "linewidth": 0}
     style = {"fontsize": 8, "weight": "bold", "color": GREY, "bbox": box, "zorder": 4}
     at = {"xy": (0, 1), "xycoords": "axes fraction", "textcoords": "offset points"}
     axes.annotate(title, xytext=(4, -4), va="top", **at, **style)
 
 
+def _number(value: float, _: int) -> str:
+    return f"{round(value, 9):,.10g}".replace("-", "\N{MINUS SIGN}")
+
+
 def _write_texts(figure: Any, cloud: Cloud, box: Box, corner: tuple[float, float]) -> None:
     """The title, and in the corner what is shown and what not."""
     width, height = figure.get_size_inches()
     left, top = LEFT / width, 1 - 0.1 / height
-    figure.text(left, top, shorten(cloud.name, 60) or cloud.name[:60], fontsize=11, va="top")
+    longest = int((width - LEFT) / 0.095)
+    name = shorten(cloud.name, longest, placeholder="...") or cloud.name[:longest]
+    figure.text(left, top, plain(name), fontsize=11, va="top")
     counted = cloud.period >= 0
-    with np.errstate(invalid="ignore"):
-        inside = ((cloud.xyz >= box.low) & (cloud.xyz <= box.high)).all(axis=1)
-    outside = int((counted & ~inside).sum())
+    outside = int((counted & ~box.holds(cloud.xyz)).sum())
     lines = [f"{int(counted.sum()):,} points", f"{len(cloud.centres):,} cameras"]
     if outside:
         lines.insert(1, f"{outside:,} outside")
@@ -160,14 +225,17 @@ def _draw_legend(
 ) -> None:
     from matplotlib.patches import Patch
 
+    columns = min(columns, len(names))
+    # Legends are filled column by column; ours is read line by line.
+    order = [i for column in range(columns) for i in range(column, len(names), columns)]
     figure.legend(
-        [Patch(color=color) for color in colors],
-        names,
+        [Patch(color=colors[i]) for i in order],
+        [plain(names[i]) for i in order],
         loc="upper left",
         bbox_to_anchor=(LEFT / figure.get_size_inches()[0], top),
         borderaxespad=0,
         borderpad=0,
-        ncol=min(columns, len(names)),
+        ncol=columns,
         frameon=False,
         fontsize=9,
         handlelength=1.0,

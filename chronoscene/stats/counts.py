@@ -7,17 +7,18 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene import __version__
 from chronoscene.scene import Scene
 from chronoscene.splits import split_hash
+from chronoscene.stats.published import published
+from chronoscene.stats.text import latex_row, markdown_table, text_table
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
+SCHEMA_VERSION = 1
 CountRule = Literal["assigned", "seen"]
 COUNT_RULES = ("assigned", "seen")
 
@@ -52,6 +53,14 @@ class SceneCount:
     """All points of the model, each once."""
     points_without_period: int
     """Points that no image sees; they are in `points` and in no period."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unreadable:
+    """A scene that is missing in the tables."""
+
+    path: str
+    error: str
 
 
 def observation_counts(scene: Scene) -> NDArray[np.int64]:
@@ -133,10 +142,15 @@ def _period_names(counts: Sequence[SceneCount]) -> list[str]:
     return [*(f"Period {i}" for i in range(periods)), "Total"]
 
 
-def _text(cell: int | str | None) -> str:
-    if cell is None:
-        return "-"
-    return cell if isinstance(cell, str) else f"{cell:,}"
+def _cells(counts: Sequence[SceneCount]) -> list[list[str]]:
+    """The table as it is read."""
+
+    def text(cell: int | str | None) -> str:
+        if cell is None:
+            return "-"
+        return cell if isinstance(cell, str) else f"{cell:,}"
+
+    return [list(map(text, row)) for row in count_table(counts)]
 
 
 def to_csv(counts: Sequence[SceneCount]) -> str:
@@ -154,46 +168,63 @@ def to_markdown(counts: Sequence[SceneCount]) -> str:
     heads = ["Scene"]
     for name in _period_names(counts):
         heads += [f"{name} images", f"{name} points"]
-    rows = [[_text(cell).replace("|", "\\|") for cell in row] for row in count_table(counts)]
-    rows[-1] = [f"**{cell}**" for cell in rows[-1]]
-    lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
-_LATEX_ESCAPES = str.maketrans(
-    {c: f"\\{c}" for c in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-)
-
-
-def escape_latex(text: str) -> str:
-    """Text as LaTeX prints it."""
-    return text.translate(_LATEX_ESCAPES)
+    return markdown_table(heads, _cells(counts), named=1)
 
 
 def to_latex(counts: Sequence[SceneCount]) -> str:
     """A ``tabular`` for the booktabs package."""
     names = _period_names(counts)
-    rows = [[escape_latex(_text(cell)) for cell in row] for row in count_table(counts)]
+    *rows, total = map(latex_row, _cells(counts))
+    rules = "".join(rf"\cmidrule(lr){{{2 * i + 2}-{2 * i + 3}}}" for i in range(len(names)))
     lines = [
         r"\begin{tabular}{l" + "rr" * len(names) + "}",
         r"\toprule",
         "Scene & " + " & ".join(rf"\multicolumn{{2}}{{c}}{{{name}}}" for name in names) + r" \\",
+        rules,
         " & " + " & ".join(["Images & Points"] * len(names)) + r" \\",
         r"\midrule",
-        *(" & ".join(row) + r" \\" for row in rows[:-1]),
+        *rows,
         r"\midrule",
-        " & ".join(rows[-1]) + r" \\",
+        total,
         r"\bottomrule",
         r"\end{tabular}",
     ]
     return "\n".join(lines) + "\n"
 
 
-def to_json(counts: Sequence[SceneCount]) -> str:
+def to_json(counts: Sequence[SceneCount], *, unreadable: Sequence[Unreadable] = ()) -> str:
     """Everything that was counted, with train and test images and the split's fingerprint."""
-    data = {"scenes": [asdict(c) for c in counts], "totals": totals(counts)}
-    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+    return document([asdict(c) | {"paper": compared(c)} for c in counts], counts, unreadable)
+
+
+def document(
+    scenes: Sequence[dict[str, Any]],
+    counts: Sequence[SceneCount],
+    unreadable: Sequence[Unreadable],
+) -> str:
+    """JSON of some scenes. Keys are only added; the version changes when one changes meaning."""
+    data = {
+        "schema_version": SCHEMA_VERSION,
+        "chronoscene_version": __version__,
+        "scenes": scenes,
+        "totals": totals(counts),
+        "unreadable": [asdict(u) for u in unreadable],
+    }
+    return json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def compared(count: SceneCount) -> dict[str, Any] | None:
+    """The counts that the paper prints for a scene, and whether these are the same; None for
+    scenes that are not in it."""
+    paper = published(count.name)
+    if paper is None:
+        return None
+    return {
+        "images": sum(images for images, _ in paper),
+        "points": sum(points for _, points in paper),
+        "periods": [{"images": images, "points": points} for images, points in paper],
+        "same": [(p.images, p.points) for p in count.periods] == list(paper),
+    }
 
 
 def totals(counts: Sequence[SceneCount]) -> dict[str, Any]:
@@ -203,42 +234,20 @@ def totals(counts: Sequence[SceneCount]) -> dict[str, Any]:
     return {"periods": pairs[:-1], "all": pairs[-1]}
 
 
-def to_text(counts: Sequence[SceneCount]) -> str:
-    """Table for a terminal, without colours."""
-    return plain_text(_rich_table(counts))
+def to_text(counts: Sequence[SceneCount], *, width: int | None = None) -> str:
+    """Table for a terminal of this width, without colours; None for as wide as it is."""
+    heads = [("Scene", "")]
+    for name in _period_names(counts):
+        heads += [(name, "images"), ("", "points")]
+    return text_table(heads, _cells(counts), named=1, ends={len(counts) - 1}, width=width)
 
 
-def plain_text(table: Table) -> str:
-    """A table as text, as wide as it is; markup in its cells is only text."""
-    from rich.console import Console
-
-    out = io.StringIO()
-    console = Console(file=out, width=10_000, color_system=None, markup=False, emoji=False)
-    console.print(table)
-    return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
-
-
-def _rich_table(counts: Sequence[SceneCount]) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, show_footer=True)
-    *rows, totals = [[_text(cell) for cell in row] for row in count_table(counts)]
-    table.add_column("Scene\n", footer=totals[0], no_wrap=True)
-    for i, name in enumerate(_period_names(counts)):
-        for what, total in zip(("images", "points"), totals[1 + 2 * i :], strict=False):
-            head = f"{name}\n{what}" if what == "images" else f"\n{what}"
-            table.add_column(head, footer=total, justify="right", no_wrap=True)
-    for row in rows:
-        table.add_row(*row)
-    return table
-
-
-WRITERS: dict[str, Callable[[Sequence[SceneCount]], str]] = {
+WRITERS: dict[str, Callable[..., str]] = {
     "table": to_text,
     "csv": to_csv,
     "markdown": to_markdown,
     "latex": to_latex,
     "json": to_json,
 }
-"""Output format to the function that writes it."""
+"""Output format to the function that writes it. ``table`` takes a ``width``, ``json`` the scenes
+that are ``unreadable``."""

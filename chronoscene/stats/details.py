@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from chronoscene.stats.counts import escape_latex, plain_text, totals
+from chronoscene.stats.counts import Unreadable, compared, document
 from chronoscene.stats.measures import Measures, SceneStatistics
+from chronoscene.stats.text import Head, latex_heads, latex_row, markdown_table, text_table
+from chronoscene.stats.titles import period_title
 
 MOST_SHOWN = 8
 """Periods up to which the overlaps fit into a table for reading; CSV and JSON have them all."""
@@ -22,8 +23,7 @@ class Column:
 
     name: str
     """In CSV; a field of `Measures`, or of the counts."""
-    head: tuple[str, str]
-    """Two lines."""
+    head: Head
     factor: float = 1.0
     """From the stored value to the shown one."""
     decimals: int = 0
@@ -34,8 +34,9 @@ class Column:
 
 COLUMNS = (
     Column("images", ("Images", "")),
-    Column("test", ("of these", "test")),
+    Column("test", ("", "test")),
     Column("points", ("Points", "")),
+    Column("points_seen", ("", "seen")),
     Column("observations", ("Observations", "")),
     Column("track_mean", ("Track", "mean"), decimals=2),
     Column("track_median", ("", "median"), decimals=1),
@@ -58,27 +59,26 @@ class Row:
     """By the names of `COLUMNS`."""
     overlap: tuple[float | None, ...]
     """With each period; empty for the whole scene."""
+    in_view: tuple[float | None, ...]
+    """Of each period; empty for the whole scene."""
 
     @property
     def title(self) -> str:
-        if self.period is None:
-            return "all"
-        known = self.label != str(self.period)
-        return f"{self.period}: {self.label}" if known else self.label
+        return "all" if self.period is None else period_title(self.period, self.label, self.date)
 
 
 def rows_of(statistics: SceneStatistics) -> list[Row]:
     """A row for each period and one for the scene."""
     counts = statistics.counts
     rows = []
-    for count, measures, overlap in zip(
-        counts.periods, statistics.periods, statistics.overlap, strict=True
+    for count, measures, overlap, in_view in zip(
+        counts.periods, statistics.periods, statistics.overlap, statistics.in_view, strict=True
     ):
         values = _values(count.images, count.test, count.points, measures)
-        rows.append(Row(counts.name, count.id, count.label, count.date, values, overlap))
+        rows.append(Row(counts.name, count.id, count.label, count.date, values, overlap, in_view))
     tests = sum(count.test for count in counts.periods)
     values = _values(counts.images, tests, counts.points, statistics.whole)
-    return [*rows, Row(counts.name, None, "all", None, values, ())]
+    return [*rows, Row(counts.name, None, "all", None, values, (), ())]
 
 
 def _values(images: int, test: int, points: int, measures: Measures) -> dict[str, float | None]:
@@ -90,86 +90,96 @@ def _most_periods(statistics: Sequence[SceneStatistics]) -> int:
 
 
 def details_csv(statistics: Sequence[SceneStatistics]) -> str:
-    """One line per row in the stored units; empty cells where there is no value."""
+    """One line per row in the stored units; empty cells where there is no value.
+
+    The number of the period is empty for a whole scene, so that the column is of numbers.
+    """
     periods = _most_periods(statistics)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    overlaps = [f"overlap_{i}" for i in range(periods)]
-    writer.writerow(["scene", "period", "label", "date", *(c.name for c in COLUMNS), *overlaps])
+    shares = [f"{what}_{i}" for what in ("overlap", "in_view") for i in range(periods)]
+    writer.writerow(["scene", "period", "label", "date", *(c.name for c in COLUMNS), *shares])
     for scene in statistics:
         for row in rows_of(scene):
-            period = "all" if row.period is None else row.period
             cells = [row.values[c.name] for c in COLUMNS]
-            missing = [None] * (periods - len(row.overlap))
-            writer.writerow(
-                [row.scene, period, row.label, row.date, *cells, *row.overlap, *missing]
-            )
+            for known in (row.overlap, row.in_view):
+                cells += [*known, *[None] * (periods - len(known))]
+            writer.writerow([row.scene, row.period, row.label, row.date, *cells])
     return out.getvalue()
 
 
-def details_json(statistics: Sequence[SceneStatistics]) -> str:
+def details_json(
+    statistics: Sequence[SceneStatistics], *, unreadable: Sequence[Unreadable] = ()
+) -> str:
     """Counts and measures of every period and scene, and the overlaps, in the stored units."""
-    data = {
-        "scenes": [_scene_item(s) for s in statistics],
-        "totals": totals([s.counts for s in statistics]),
-    }
-    return json.dumps(data, indent=1, ensure_ascii=False) + "\n"
+    scenes = [_scene_item(s) for s in statistics]
+    return document(scenes, [s.counts for s in statistics], unreadable)
 
 
 def _scene_item(statistics: SceneStatistics) -> dict[str, Any]:
     item = asdict(statistics.counts) | asdict(statistics.whole)
-    periods = zip(item["periods"], statistics.periods, statistics.overlap, strict=True)
+    periods = zip(
+        item["periods"],
+        statistics.periods,
+        statistics.overlap,
+        statistics.in_view,
+        strict=True,
+    )
     item["periods"] = [
-        count | asdict(measures) | {"overlap": list(overlap)}
-        for count, measures, overlap in periods
+        count | asdict(measures) | {"overlap": list(overlap), "in_view": list(in_view)}
+        for count, measures, overlap, in_view in periods
     ]
-    return item | {"unit": statistics.unit}
+    return item | {"unit": statistics.unit, "paper": compared(statistics.counts)}
 
 
-def _grid(statistics: Sequence[SceneStatistics]) -> tuple[list[tuple[str, str]], list[list[str]]]:
+def _grid(statistics: Sequence[SceneStatistics]) -> tuple[list[Head], list[list[str]]]:
     """Heads in two lines, and cells as text."""
     periods = _most_periods(statistics)
     shown = periods if 1 < periods <= MOST_SHOWN else 0
-    overlaps = [("Also seen by" if i == 0 else "", f"{i} [%]") for i in range(shown)]
-    heads = [("Scene", ""), ("Period", ""), *(c.head for c in COLUMNS), *overlaps]
+    titles = [
+        (title if i == 0 else "", f"{i} [%]")
+        for title in ("Also seen by", "In view of")
+        for i in range(shown)
+    ]
+    heads = [("Scene", ""), ("Period", ""), *(c.head for c in COLUMNS), *titles]
     lines = []
     for scene in statistics:
         for row in rows_of(scene):
             name = row.scene if row.period == 0 else ""
             cells = [c.show(row.values[c.name]) for c in COLUMNS]
-            with_others = [_percent(row, i) for i in range(shown)]
-            lines.append([name, row.title, *cells, *with_others])
+            for shares in (row.overlap, row.in_view):
+                cells += [_percent(row, shares, i) for i in range(shown)]
+            lines.append([name, row.title, *cells])
     return heads, lines
 
 
-def _percent(row: Row, other: int) -> str:
-    if other == row.period:
-        return "-"
-    value = row.overlap[other] if other < len(row.overlap) else None
-    return "" if value is None else f"{100 * value:.1f}"
+def _percent(row: Row, shares: tuple[float | None, ...], other: int) -> str:
+    if other >= len(shares):
+        return ""
+    value = None if other == row.period else shares[other]
+    return "-" if value is None else f"{100 * value:.1f}"
 
 
-def details_text(statistics: Sequence[SceneStatistics]) -> str:
-    """Table for a terminal, without colours."""
-    from rich import box
-    from rich.table import Table
-
+def details_text(statistics: Sequence[SceneStatistics], *, width: int | None = None) -> str:
+    """Table for a terminal of this width, without colours; None for as wide as it is."""
     heads, lines = _grid(statistics)
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), collapse_padding=True)
-    for i, head in enumerate(heads):
-        table.add_column("\n".join(head), justify="left" if i < 2 else "right", no_wrap=True)
-    for line in lines:
-        table.add_row(*line, end_section=line[1] == "all")
-    return plain_text(table)
+    ends = {i for i, line in enumerate(lines) if i + 1 < len(lines) and lines[i + 1][0]}
+    return text_table(heads, lines, named=2, ends=ends, width=width)
 
 
 def details_markdown(statistics: Sequence[SceneStatistics]) -> str:
     """Pipe table."""
     heads, lines = _grid(statistics)
-    titles = [" ".join(filter(None, head)) for head in heads]
-    rule = ["---", "---", *["---:"] * (len(heads) - 2)]
-    rows = [[cell.replace("|", "\\|") for cell in line] for line in lines]
-    return "".join(f"| {' | '.join(line)} |\n" for line in [titles, rule, *rows])
+    return markdown_table(_whole_heads(heads), lines, named=2)
+
+
+def _whole_heads(heads: Sequence[Head]) -> list[str]:
+    """Heads in one line, each of which says everything."""
+    whole, first = [], ""
+    for head in heads:
+        first = head[0] or first
+        whole.append(" ".join(filter(None, (first, head[1]))))
+    return whole
 
 
 def details_latex(statistics: Sequence[SceneStatistics]) -> str:
@@ -179,12 +189,12 @@ def details_latex(statistics: Sequence[SceneStatistics]) -> str:
     for i, line in enumerate(lines):
         if i and line[0]:
             body.append(r"\midrule")
-        body.append(" & ".join(map(escape_latex, line)) + r" \\")
+        body.append(latex_row(line))
     return "\n".join(
         [
             r"\begin{tabular}{ll" + "r" * (len(heads) - 2) + "}",
             r"\toprule",
-            *(" & ".join(escape_latex(head[i]) for head in heads) + r" \\" for i in (0, 1)),
+            *latex_heads(heads),
             r"\midrule",
             *body,
             r"\bottomrule",
@@ -194,11 +204,11 @@ def details_latex(statistics: Sequence[SceneStatistics]) -> str:
     )
 
 
-DETAIL_WRITERS: dict[str, Callable[[Sequence[SceneStatistics]], str]] = {
+DETAIL_WRITERS: dict[str, Callable[..., str]] = {
     "table": details_text,
     "csv": details_csv,
     "markdown": details_markdown,
     "latex": details_latex,
     "json": details_json,
 }
-"""Output format to the function that writes it."""
+"""Output format to the function that writes it, like `chronoscene.stats.counts.WRITERS`."""

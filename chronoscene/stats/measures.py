@@ -8,22 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.geometry import camera_centre
-from chronoscene.scene import Camera, Scene
+from chronoscene.scene import Scene
 from chronoscene.stats.counts import CountRule, SceneCount, count_scene, observation_counts
+from chronoscene.stats.extent import robust_range
+from chronoscene.stats.projection import project
+from chronoscene.stats.views import common_view
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 CELLS = 50
 """Cubes along the longest edge of a scene for its coverage."""
-ROBUST = (1.0, 99.0)
-"""Percentiles of the points between which a scene lies; the rest are strays."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measures:
     """Of one period, or of a whole scene. None where there is nothing to measure."""
 
+    points_seen: int
+    """Points that images of the period see, however the points are counted."""
     observations: int
     """Of points by images of the period."""
     track_mean: float | None
@@ -50,6 +53,9 @@ class SceneStatistics:
     """Tracks over all periods; cameras compared within their periods."""
     overlap: tuple[tuple[float | None, ...], ...]
     """Row a, column b: share of the points that period a sees which period b sees, too. [T, T]"""
+    in_view: tuple[tuple[float | None, ...], ...]
+    """Row a, column b: share of the points that period a sees which cameras of period b have in
+    view, whether b sees them or not; see `chronoscene.stats.views`. [T, T]"""
     unit: str
     """Of the world: ``metre`` or ``unknown``."""
 
@@ -58,16 +64,17 @@ def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatis
     """Count and measure a scene; ``count`` is that of `count_scene`."""
     seen = observation_counts(scene)
     periods = np.array([f.period for f in scene.frames], np.int64)
-    residual, depths = reproject(scene)
-    baselines = camera_baselines(scene, depths)
+    found = reproject(scene)
+    baselines = camera_baselines(scene, found.depth_of_frame)
     coverage = period_coverage(scene.points.xyz, seen > 0)
     observed_in = periods[scene.points.track_frame]
     by_period = tuple(
         Measures(
+            points_seen=int(np.count_nonzero(seen[:, p])),
             observations=int(seen[:, p].sum()),
             track_mean=_mean(_positive(seen[:, p])),
             track_median=_median(_positive(seen[:, p])),
-            reprojection_error=_mean(residual[observed_in == p]),
+            reprojection_error=_mean(found.residual[observed_in == p]),
             baseline=_median(baselines[periods == p]),
             coverage=coverage[p],
         )
@@ -75,44 +82,56 @@ def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatis
     )
     length = _positive(seen.sum(axis=1))
     whole = Measures(
+        points_seen=len(length),
         observations=int(seen.sum()),
         track_mean=_mean(length),
         track_median=_median(length),
-        reprojection_error=_mean(residual),
+        reprojection_error=_mean(found.residual),
         baseline=_median(baselines),
         coverage=None if not len(length) else 1.0,
     )
-    overlap = period_overlap(seen > 0)
     return SceneStatistics(
-        count_scene(scene, count=count), by_period, whole, overlap, scene.world.unit
+        counts=count_scene(scene, count=count),
+        periods=by_period,
+        whole=whole,
+        overlap=period_overlap(seen > 0),
+        in_view=common_view(scene, seen > 0, found.depth),
+        unit=scene.world.unit,
     )
 
 
-def reproject(scene: Scene) -> tuple[Array, Array]:
-    """Project every observed point, distortion included.
+@dataclass(frozen=True, slots=True, eq=False)
+class Reprojection:
+    """Where the points of a scene lie for the cameras that see them."""
 
-    Returns:
-        residual: Of each observation in pixels; NaN where the point is not in front of the camera
-            or not finite. [M]
-        depths: Median depth of what each frame sees in front of it, in world units; NaN where it
-            sees nothing. [frames]
-    """
+    residual: Array
+    """Of each observation in pixels; NaN where the point is not in front of the camera or not
+    finite. [M]"""
+    depth: Array
+    """Of the point of each observation, in world units; NaN where it is not in front. [M]"""
+    depth_of_frame: Array
+    """Median depth of what each frame sees in front of it; NaN where it sees nothing. [frames]"""
+
+
+def reproject(scene: Scene) -> Reprojection:
+    """Project every observed point, distortion included."""
     points = scene.points
     of = np.repeat(np.arange(len(points), dtype=np.int32), np.diff(points.track_start))
     order, ends = _by_frame(points.track_frame, len(scene.frames))
-    residual = np.full(len(order), np.nan)
-    depths = np.full(len(scene.frames), np.nan)
+    residual, depth = np.full((2, len(order)), np.nan)
+    depth_of_frame = np.full(len(scene.frames), np.nan)
     with np.errstate(all="ignore"):  # absurd poses and points give NaN, which is left out
         for i, frame in enumerate(scene.frames):
             rows = order[ends[i] : ends[i + 1]]
             local = points.xyz[of[rows]] @ frame.cam_from_world[:3, :3].T
             local += frame.cam_from_world[:3, 3]
-            shift = _project(frame.camera, local) - points.track_xy[rows]
+            shift = project(frame.camera, local) - points.track_xy[rows]
             ahead = local[:, 2] > 0
             residual[rows] = np.where(ahead, np.hypot(shift[:, 0], shift[:, 1]), np.nan)
+            depth[rows] = np.where(ahead, local[:, 2], np.nan)
             if ahead.any():
-                depths[i] = np.median(local[ahead, 2])
-    return residual, depths
+                depth_of_frame[i] = np.median(local[ahead, 2])
+    return Reprojection(residual, depth, depth_of_frame)
 
 
 def _by_frame(track_frame: NDArray[np.int32], frames: int) -> tuple[Index, Index]:
@@ -123,25 +142,12 @@ def _by_frame(track_frame: NDArray[np.int32], frames: int) -> tuple[Index, Index
     return np.argsort(keys, kind="stable"), np.concatenate([[0], np.cumsum(counts)])
 
 
-def _project(camera: Camera, local: Array) -> Array:
-    """Points in the frame of a camera to its pixels. [n, 3] -> [n, 2]"""
-    if camera.is_pinhole:
-        K = camera.K
-        return np.asarray(local[:, :2] / local[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2])
-    from chronoscene.colmap import to_pycolmap
-
-    finite = np.isfinite(local).all(axis=1) & (local[:, 2] > 0)
-    at = np.full((len(local), 2), np.nan)
-    at[finite] = to_pycolmap(camera).img_from_cam(local[finite])
-    return at
-
-
 def camera_baselines(scene: Scene, depths: Array) -> Array:
     """Distance to the nearest camera of the same period over the median depth of what is seen.
 
     Args:
         scene: The scene.
-        depths: As `reproject` gives them. [frames]
+        depths: Median depth of what each frame sees. [frames]
 
     Returns:
         NaN for cameras without points, and for one that is alone in its period. [frames]
@@ -185,7 +191,7 @@ def period_coverage(xyz: Array, seen: NDArray[np.bool_]) -> list[float | None]:
     if not used.any():
         return [None] * seen.shape[1]
     xyz, seen = xyz[used], seen[used]
-    low, high = np.percentile(xyz, ROBUST, axis=0)
+    low, high = robust_range(xyz)
     inside = ((xyz >= low) & (xyz <= high)).all(axis=1)
     if not inside.any():
         low, high, inside = xyz.min(axis=0), xyz.max(axis=0), np.ones(len(xyz), bool)

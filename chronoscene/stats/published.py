@@ -6,7 +6,8 @@ CVPR 2026 (arXiv 2511.18794). Facts only; nothing here was measured by us.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 PAPER_COUNTS: Mapping[str, tuple[tuple[int, int], ...]] = {
     "Lawncourt": ((234, 85_655), (193, 57_884), (277, 117_595)),
@@ -32,3 +33,17 @@ PAPER_TOTALS = (
     (8_891, 4_945_315),
 )
 """The last row of the table as printed: images and points of periods 0 to 3, and of all."""
+
+
+def published(name: str) -> tuple[tuple[int, int], ...] | None:
+    """Images and points of each period as printed, if a scene of this name is in the paper."""
+    return PAPER_COUNTS.get(_BY_NAME.get(name.casefold(), ""))
+
+
+def in_paper_order(folders: Sequence[Path]) -> list[Path]:
+    """Scenes of the paper as its table lists them, then all others in the order they have."""
+    ranks = {name: rank for rank, name in enumerate(PAPER_COUNTS)}
+    return sorted(folders, key=lambda p: ranks.get(_BY_NAME.get(p.name.casefold(), ""), len(ranks)))
+
+
+_BY_NAME = {name.casefold(): name for name in PAPER_COUNTS}

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from chronoscene.cli import cli, table
-from chronoscene.cli.output import check_place, emit, writing_to
+from chronoscene.cli.output import check_file, check_place, emit, writing_to
 from chronoscene.errors import ConfigError
 
 
@@ -76,6 +76,23 @@ def test_places_are_looked_at_and_left_alone(tmp_path: Path) -> None:
     check_place("--out", tmp_path)
     check_place("--out", tmp_path / "a/b/c")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_files_are_looked_at_and_left_alone(tmp_path: Path) -> None:
+    check_file("--out", None)
+    check_file("--out", tmp_path / "new")
+    (tmp_path / "old").write_text("old")
+    check_file("--out", tmp_path / "old")
+    assert [p.name for p in tmp_path.iterdir()] == ["old"]
+    assert (tmp_path / "old").read_text() == "old"
+    for place in (tmp_path, tmp_path / "no/file", tmp_path / "old/file"):
+        with pytest.raises(ConfigError, match=r"^--out .*: expected a file that can be written"):
+            check_file("--out", place)
+
+
+def test_names_that_are_not_text_can_be_written(tmp_path: Path) -> None:
+    emit("bad\udcff\n", tmp_path / "text")
+    assert (tmp_path / "text").read_text(encoding="utf-8") == "bad\\udcff\n"
 
 
 def test_written_text_has_no_colours(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import io
 import json
+import os
 import re
 import subprocess
 import sys
@@ -13,7 +14,11 @@ import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import cli
-from chronoscene.stats import WRITERS
+from chronoscene.cli.stats import against_paper
+from chronoscene.errors import ConfigError
+from chronoscene.stats import WRITERS, PeriodCount, SceneCount
+from chronoscene.stats.published import PAPER_COUNTS
+from chronoscene.synth.skeleton import write_skeleton
 
 
 def run(*args: object):
@@ -83,7 +88,7 @@ def test_points_that_no_image_sees_are_mentioned(make_scene_folder):
     with (folder / "sparse/0/points3D.txt").open("a") as file:
         file.write("99 1 2 3 4 5 6 0.5\n")
     result = run(folder)
-    assert "scene: 1 points are seen by no image" in result.stderr
+    assert "scene: 1 point is seen by no image" in result.stderr
     assert "no image" not in result.stdout
 
 
@@ -135,10 +140,85 @@ def test_several_scenes_are_read_in_several_processes(make_scene_folder, tmp_pat
     scenes = json.loads(done.stdout)["scenes"]
     assert [(s["name"], s["points"]) for s in scenes] == [("0", 20), ("1", 21), ("2", 22)]
     (folders[1] / "sparse/split.txt").write_text("a/0001.png\n")
-    done = shell(tmp_path / "set")
+
+
+@pytest.mark.parametrize("layout", ["full", "paper"])
+def test_a_scene_that_cannot_be_read_does_not_cost_the_others(make_scene_folder, tmp_path, layout):
+    folders = [make_scene_folder(name=f"set/{i}") for i in range(3)]
+    (folders[1] / "sparse/split.txt").write_text("a/0001.png\n")
+    out = tmp_path / "out"
+    options = ("--layout", layout, "--figures", out)
+    done = shell(tmp_path / "set", *options, "--format", "json")
+    assert done.returncode == 1
+    place = folders[1] / "sparse/split.txt"
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"error: {place}:1: expected")
+    data = json.loads(done.stdout)
+    assert [s["name"] for s in data["scenes"]] == ["0", "2"]
+    assert [u["path"] for u in data["unreadable"]] == [str(folders[1])]
+    assert line == f"error: {data['unreadable'][0]['error']}"
+    assert {p.name for p in out.iterdir()} == {"counts.png", "0_points.png", "2_points.png"}
+    for folder in folders:
+        (folder / "sparse/split.txt").write_text("a/0001.png\n")
+    done = shell(tmp_path / "set", *options)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"error: {folders[1] / 'sparse/split.txt'}:1: expected")
-    assert len(done.stderr.splitlines()) == 1
+    assert len(done.stderr.splitlines()) == 3
+
+
+def test_out_is_looked_at_before_the_work(make_scene_folder, tmp_path, monkeypatch):
+    folder = make_scene_folder()
+    monkeypatch.setattr("chronoscene.cli.stats.read_scene", lambda *_, **__: pytest.fail("work"))
+    for out in (tmp_path, tmp_path / "no" / "file.txt", folder / "table.txt"):
+        assert isinstance(run(folder, "--out", out).exception, ConfigError)
+
+
+def test_counts_are_compared_with_those_of_the_paper(tmp_path):
+    paper = PAPER_COUNTS["Lawncourt"]
+    write_skeleton(tmp_path / "lawncourt", [(a, b // 100) for a, b in paper])
+    write_skeleton(tmp_path / "other", [(3, 10)])
+    result = run(tmp_path / "other", tmp_path / "lawncourt", "--layout", "paper")
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("lawncourt: the paper has 234 + 193 + 277 images and 85,655 + 57,884")
+    data = json.loads(run(tmp_path / "lawncourt", "--format", "json").stdout)
+    found = data["scenes"][0]["paper"]
+    assert (found["same"], found["points"], found["images"]) == (False, 261_134, 704)
+
+
+def test_what_is_said_about_the_paper():
+    def counted(name: str, rows) -> SceneCount:
+        periods = tuple(PeriodCount(i, str(i), None, a, a, 0, b) for i, (a, b) in enumerate(rows))
+        sums = [sum(column) for column in zip(*rows, strict=True)]
+        return SceneCount(name, name, "x", "r", "h", "assigned", periods, sums[0], sums[1], 0)
+
+    same = [counted(name, PAPER_COUNTS[name]) for name in ("Aerial1", "Canteen")]
+    (line,) = against_paper(same)
+    assert line == "images and points of all periods are those of the paper: Aerial1, Canteen"
+    (a, b), *rest = PAPER_COUNTS["TriPlot"]
+    shifted = [(a, b - 7), (rest[0][0], rest[0][1] + 7), rest[1]]
+    (line,) = against_paper([counted("TriPlot", shifted)])
+    assert "points in all are those of the paper" in line and "150,896 + 50,081" in line
+    assert not list(against_paper([counted("Elsewhere", rest)]))
+
+
+def test_scenes_of_the_paper_are_in_its_order(make_scene_folder, tmp_path):
+    for name in ("Aerial1", "Lawncourt", "Zoo", "Canteen", "Abbey"):
+        make_scene_folder(name=f"set/{name}")
+    data = json.loads(run(tmp_path / "set", "--format", "json").stdout)
+    names = [s["name"] for s in data["scenes"]]
+    assert names == ["Lawncourt", "Canteen", "Aerial1", "Abbey", "Zoo"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are not bytes here")
+def test_names_that_are_not_text(make_scene_folder, tmp_path):
+    folder = make_scene_folder().rename(os.fsdecode(bytes(tmp_path) + b"/bad\xff$x$"))
+    for output_format in WRITERS:
+        result = run(folder, "--format", output_format, "--out", tmp_path / "table")
+        assert result.exit_code == 0, result.exception
+        assert "bad" in (tmp_path / "table").read_text(encoding="utf-8")
+    out = tmp_path / "out"
+    result = run(folder, "--figures", out, "--pages", out, "--figure-format", "svg")
+    assert result.exit_code == 0, result.exception
+    assert len(list(out.iterdir())) == 3
 
 
 def test_figures_and_pages_of_every_scene(make_scene_folder, tmp_path):

@@ -3,12 +3,17 @@
 import csv
 import io
 import json
+import re
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from chronoscene.formats import read_scene
 from chronoscene.stats import DETAIL_WRITERS, SceneStatistics, measure_scene
+from chronoscene.stats.counts import SCHEMA_VERSION
 from chronoscene.stats.details import COLUMNS, MOST_SHOWN, rows_of
+from chronoscene.stats.titles import period_title
 
 
 @pytest.fixture
@@ -22,13 +27,23 @@ def statistics(make_scene_folder) -> SceneStatistics:
 
 def test_csv_has_every_value_in_its_stored_unit(statistics):
     rows = list(csv.DictReader(io.StringIO(DETAIL_WRITERS["csv"]([statistics]))))
-    assert [row["period"] for row in rows] == ["0", "1", "all"]
+    assert [row["period"] for row in rows] == ["0", "1", ""]
     assert [row["label"] for row in rows] == ["before | after", "1", "all"]
     assert [row["images"] for row in rows] == ["2", "2", "4"]
     assert [row["test"] for row in rows] == ["0", "1", "1"]
     assert float(rows[1]["baseline"]) == statistics.periods[1].baseline
     assert float(rows[0]["overlap_1"]) == statistics.overlap[0][1]
-    assert rows[2]["overlap_0"] == rows[2]["overlap_1"] == ""
+    assert float(rows[0]["in_view_1"]) == statistics.in_view[0][1]
+    assert rows[2]["overlap_0"] == rows[2]["overlap_1"] == rows[2]["in_view_0"] == ""
+
+
+def test_csv_has_numbers_where_pandas_wants_them(statistics):
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.read_csv(io.StringIO(DETAIL_WRITERS["csv"]([statistics])))
+    text = {"scene", "label", "date"}
+    assert {c for c in frame if not pandas.api.types.is_numeric_dtype(frame[c])} <= text
+    assert frame[frame.period == 1].label.tolist() == ["1"]
+    assert frame[frame.period.isna()].images.tolist() == [4]
 
 
 def test_json_has_counts_measures_and_totals(statistics):
@@ -38,7 +53,18 @@ def test_json_has_counts_measures_and_totals(statistics):
     assert scene["periods"][0]["overlap"] == list(statistics.overlap[0])
     assert scene["periods"][1]["reprojection_error"] == statistics.periods[1].reprojection_error
     assert data["totals"]["all"] == {"images": 8, "points": 60}
+    assert scene["periods"][1]["in_view"] == list(statistics.in_view[1])
     assert scene["unit"] == "unknown"
+    assert scene["paper"] is None
+    assert (data["schema_version"], data["unreadable"]) == (SCHEMA_VERSION, [])
+
+
+def test_all_keys_are_in_the_documentation(statistics):
+    text = (Path(__file__).parents[2] / "docs/statistics.md").read_text(encoding="utf-8")
+    data = json.loads(DETAIL_WRITERS["json"]([statistics]))
+    scene = data["scenes"][0]
+    for key in {*data, *scene, *scene["periods"][0]}:
+        assert f"`{key}`" in text, key
 
 
 def test_text_markdown_and_latex_have_one_line_per_row(statistics):
@@ -49,11 +75,13 @@ def test_text_markdown_and_latex_have_one_line_per_row(statistics):
     assert error in first.split()
     lines = DETAIL_WRITERS["markdown"]([statistics]).splitlines()
     assert len(lines) == 5
-    assert {line.replace("\\|", "").count("|") for line in lines} == {len(COLUMNS) + 5}
+    assert {line.replace("\\|", "").count("|") for line in lines} == {len(COLUMNS) + 7}
     latex = DETAIL_WRITERS["latex"]([statistics, statistics])
     assert latex.count(r"old\_town") == 2 and latex.count(r"\midrule") == 2
     body = [line for line in latex.splitlines() if line.endswith(r"\\")]
-    assert {line.replace(r"\&", "").count("&") for line in body} == {len(COLUMNS) + 3}
+    wide = [sum(int(n) - 1 for n in re.findall(r"multicolumn{(\d+)}", line)) for line in body]
+    columns = [line.count("&") + n for line, n in zip(body, wide, strict=True)]
+    assert set(columns) == {len(COLUMNS) + 5}
 
 
 def test_one_period_has_no_overlap_columns(make_scene_folder):
@@ -72,3 +100,32 @@ def test_many_periods_keep_the_table_narrow(make_scene_folder):
 def test_markup_in_names_is_only_text(make_scene_folder):
     scene = measure_scene(read_scene(make_scene_folder(name="[red]x:smile:")))
     assert "[red]x:smile:" in DETAIL_WRITERS["table"]([scene])
+
+
+def test_narrow_terminals_get_the_table_in_blocks(statistics):
+    text = DETAIL_WRITERS["table"]([statistics], width=60)
+    assert max(map(len, text.splitlines())) <= 60
+    assert text.count("old_town") == text.count("Scene") > 1
+    for title in ("Observations", "Coverage", "Also seen by", "In view of"):
+        assert text.count(title) == 1
+    wide = DETAIL_WRITERS["table"]([statistics])
+    needed = max(map(len, wide.splitlines()))
+    assert DETAIL_WRITERS["table"]([statistics], width=needed + 2) == wide
+    assert set(re.findall(r"[\d.,]+", text)) == set(re.findall(r"[\d.,]+", wide))
+
+
+@pytest.mark.parametrize("output_format", ["table", "markdown", "latex"])
+def test_names_cannot_break_a_line(make_scene_folder, output_format):
+    scene = measure_scene(read_scene(make_scene_folder()))
+    nasty = replace(scene, counts=replace(scene.counts, name="a\nb\x1b[31m"))
+    text = DETAIL_WRITERS[output_format]([nasty])
+    plain = DETAIL_WRITERS[output_format]([scene])
+    assert "\x1b" not in text and text.count("\n") == plain.count("\n")
+
+
+def test_a_period_is_called_by_what_is_known():
+    assert period_title(1, "1", None) == "1"
+    assert period_title(1, "flood", None) == "1: flood"
+    assert period_title(1, "1", "2016-07") == "1: 2016-07"
+    assert period_title(1, "flood", "2016-07") == "1: flood, 2016-07"
+    assert period_title(1, "summer 2016", "2016") == "1: summer 2016"

@@ -87,6 +87,7 @@ def test_everything_equals_plain_loops(scene: Scene) -> None:
             if depths[j]
         ]
         assert measured.observations == sum(lengths)
+        assert measured.points_seen == len(lengths)
         assert measured.track_mean == pytest.approx(np.mean(lengths))
         assert measured.track_median == np.median(lengths)
         assert measured.reprojection_error == pytest.approx(np.mean(errors))
@@ -137,11 +138,13 @@ def test_coverage_is_that_of_the_cubes(scale: float) -> None:
     assert shares[2] == 1.0
 
 
-def test_strays_do_not_change_coverage() -> None:
-    xyz = np.random.default_rng(0).uniform(0, 1, (5000, 3))
+@pytest.mark.parametrize("strays", [20, 600])
+def test_strays_do_not_change_coverage(strays: int) -> None:
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(0, 1, (5000, 3))
     seen = np.column_stack([xyz[:, 0] < 0.3, np.ones(5000, bool)])
     before = period_coverage(xyz, seen)
-    xyz[:20] = 1e5
+    xyz[:strays] += rng.uniform(-1e5, 1e5, (strays, 3))
     assert period_coverage(xyz, seen)[0] == pytest.approx(before[0], abs=0.02)
 
 
@@ -153,14 +156,15 @@ def test_coverage_without_points_and_of_one_point() -> None:
 
 def test_what_cannot_be_projected_is_left_out() -> None:
     scene = small_scene(PINHOLE, [(0.0, 0), (1.0, 0)], [[0, 1], [0], [1]])
-    expected, _ = reproject(scene)
+    expected = reproject(scene).residual
     assert np.isfinite(expected).all()
     xyz = scene.points.xyz.copy()
     xyz[0, 2], xyz[1] = 20.0, np.nan  # above the cameras; nowhere
     broken = replace(scene, points=replace(scene.points, xyz=xyz))
-    residual, depths = reproject(broken)
-    assert np.isnan(residual[:3]).all() and residual[3] == expected[3]
-    assert np.isnan(depths[0]) and depths[1] == 10.0
+    found = reproject(broken)
+    assert np.isnan(found.residual[:3]).all() and found.residual[3] == expected[3]
+    assert np.isnan(found.depth[:3]).all() and found.depth[3] == 10.0
+    assert np.isnan(found.depth_of_frame[0]) and found.depth_of_frame[1] == 10.0
     measured = measure_scene(broken)
     assert measured.whole.observations == 4
     assert measured.whole.reprojection_error == pytest.approx(expected[3])
@@ -172,13 +176,13 @@ def test_a_scene_without_points_has_counts_and_nothing_to_measure() -> None:
     for measured in (*found.periods, found.whole):
         assert measured.observations == 0
         assert measured.track_mean is measured.reprojection_error is measured.coverage is None
-    assert found.overlap == ((None, None), (None, None))
+    assert found.overlap == found.in_view == ((None, None), (None, None))
 
 
 def test_distortion_is_applied() -> None:
     radial = Camera(1, "SIMPLE_RADIAL", 64, 48, (50.0, 30.0, 25.5, -0.1))
     scene = small_scene(radial, [(0.0, 0)], [[0], [0], [0]])
-    residual, _ = reproject(scene)
+    residual = reproject(scene).residual
     for i, x in enumerate((0.0, 0.1, 0.2)):  # depth 10, so x / z
         u = 50.0 * x * (1 - 0.1 * x * x) + 30.0
         assert residual[i] == pytest.approx(np.hypot(u, 25.5), abs=1e-9)
