@@ -76,22 +76,21 @@ def choose_blocks(
         wanted: Number of blocks.
         seed: Of the random order.
     """
-    order = np.random.default_rng(seed).permutation(int(block.max()) + 1).tolist()
-    has = {b: set(periods[block == b].tolist()) for b in order}
-    missing, chosen = set(periods.tolist()), set[int]()
-    while len(chosen) < wanted or missing:
-        left = [
-            b for b in order if b not in chosen and _leaves_training(block, periods, chosen | {b})
-        ]
-        best = max(left, key=lambda b: len(has[b] & missing), default=None)
-        if best is None or (len(chosen) >= wanted and not has[best] & missing):
+    order = np.random.default_rng(seed).permutation(int(block.max()) + 1)
+    kinds, period = np.unique(periods, return_inverse=True)
+    counts = np.zeros((len(order), len(kinds)), np.int64)
+    np.add.at(counts, (block, period), 1)
+    counts = counts[order]  # the first of equals is the first in this order
+    training, missing = counts.sum(axis=0), np.ones(len(kinds), bool)
+    free, chosen = np.ones(len(order), bool), set[int]()
+    while len(chosen) < wanted or missing.any():
+        possible = free & (counts < training).all(axis=1)
+        brings = np.where(possible, (counts[:, missing] > 0).sum(axis=1), -1)
+        best = int(np.argmax(brings))
+        if brings[best] < 0 or (len(chosen) >= wanted and not brings[best]):
             break
-        chosen.add(best)
-        missing -= has[best]
+        chosen.add(int(order[best]))
+        free[best] = False
+        training -= counts[best]
+        missing &= counts[best] == 0
     return chosen
-
-
-def _leaves_training(
-    block: NDArray[np.int64], periods: NDArray[np.int64], chosen: set[int]
-) -> bool:
-    return len(set(periods[~np.isin(block, list(chosen))].tolist())) == len(set(periods.tolist()))

@@ -127,6 +127,13 @@ def _check_targets(source: Path, out: Path | None, scene_out: Path | None) -> No
             check_outside(source, target)
     if scene_out is not None:
         check_place("--scene-out", scene_out)
+    if out is not None and _json_beside(out) == out:
+        raise ConfigError(
+            out,
+            expected="a name for the list that does not end in .json",
+            found="one that does",
+            todo="name it test.txt; what made it goes to test.json beside it",
+        )
     for file in (out, out and _json_beside(out)):
         if file is not None and file.exists():
             raise ConfigError(

@@ -93,3 +93,12 @@ def test_errors(scene, tmp_path, monkeypatch, capsys, arguments, message):
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
     assert snapshot(tmp_path) == before
+
+
+def test_a_list_that_its_record_would_replace_is_refused(scene, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["chronoscene", "split", str(scene), str(tmp_path / "a.json")])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    assert "expected a name for the list that does not end in .json" in capsys.readouterr().err
+    assert not (tmp_path / "a.json").exists()
