@@ -36,13 +36,15 @@ legend { padding: 0; margin-bottom: 4px; font-size: 12.5px; color: var(--soft); 
 button { flex: 1; min-width: 44px; padding: 5px 4px; border: 1px solid var(--line);
   border-radius: 5px; font: inherit; background: var(--ground); color: var(--ink);
   cursor: pointer; }
+#which { min-width: 2.6em; }
+#play { flex: none; }
 button[aria-pressed="true"] { border-color: #2368c4; box-shadow: inset 0 0 0 1px #2368c4; }
 #periods label { display: flex; align-items: center; gap: 7px; padding: 2px 0; }
 #periods i { width: 12px; height: 12px; border-radius: 3px; flex: none; }
 #periods span { flex: 1; min-width: 0; overflow: hidden; text-overflow: ellipsis;
   white-space: nowrap; }
 #periods small, output { color: var(--soft); font-variant-numeric: tabular-nums; }
-label.line { display: flex; align-items: center; gap: 8px; padding: 2px 0; }
+.line { display: flex; align-items: center; gap: 8px; padding: 2px 0; }
 input[type="range"] { width: 100%; min-width: 0; flex: 1; }
 input { accent-color: #2368c4; }
 kbd { font: inherit; border: 1px solid var(--line); border-radius: 3px; padding: 0 3px; }
@@ -62,24 +64,29 @@ kbd { font: inherit; border: 1px solid var(--line); border-radius: 3px; padding:
 <button data-view="yz">YZ</button><button data-view="home">3D</button></div></fieldset>
 <fieldset><legend>Periods</legend><div id="periods"></div></fieldset>
 <fieldset id="single"><legend>One period at a time</legend>
-<label class="line"><input id="one" type="range" min="-1" step="1" value="-1"
- aria-label="One period at a time"><output id="which">all</output></label></fieldset>
+<div class="line"><input id="one" type="range" min="-1" step="1" value="-1"
+ aria-label="One period at a time"><output id="which">all</output>
+<button id="play" aria-pressed="false">play</button></div></fieldset>
 <fieldset><legend>Show</legend>
-<label class="line"><input id="cameras" type="checkbox"> cameras</label>
-<label class="line"><input id="photo" type="checkbox"> colours of the photos</label>
+<label class="line"><input id="with-cameras" type="checkbox"> cameras</label>
+<label class="line"><input id="with-photo" type="checkbox"> colours of the photos</label>
 <label class="line">dots <input id="size" type="range" min="1" max="6" step="1" value="2"></label>
 <div class="row"><button id="theme">dark or light</button></div></fieldset>
 <p>Drag to turn, with <kbd>Shift</kbd> or two fingers to move, wheel or pinch to zoom.
 Keys: arrows turn, with <kbd>Shift</kbd> move, <kbd>+</kbd> <kbd>-</kbd> zoom, <kbd>1</kbd> XY,
 <kbd>2</kbd> XZ, <kbd>3</kbd> YZ, <kbd>0</kbd> 3D, <kbd>[</kbd> <kbd>]</kbd> period,
-<kbd>c</kbd> cameras.</p>
+<kbd>p</kbd> play, <kbd>c</kbd> cameras.</p>
 </aside>
 <script type="application/json" id="data">@@DATA@@</script>
 <script>
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const get = id => document.getElementById(id);
-const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
+function bytes(text) {
+  const plain = atob(text), array = new Uint8Array(plain.length);
+  for (let i = 0; i < array.length; i++) array[i] = plain.charCodeAt(i);
+  return array;
+}
 const floats = text => new Float32Array(bytes(text).buffer);
 const xyz = floats(data.xyz), rgb = bytes(data.rgb);
 const centres = floats(data.centres), directions = floats(data.directions);
@@ -139,7 +146,7 @@ function draw() {
   depth.fill(-Infinity);
   for (let p = 0; p < T; p++) if (on[p]) drawPoints(p, moving ? slow : 1);
   ctx.putImageData(image, 0, 0);
-  if (get("cameras").checked) drawCameras(dark);
+  if (get("with-cameras").checked) drawCameras(dark);
   drawScale(dark);
   const took = performance.now() - before;
   if (moving) slow = Math.min(16, Math.max(1, slow * (took > 45 ? 1.5 : took < 20 ? 0.8 : 1)));
@@ -148,7 +155,7 @@ function draw() {
 }
 
 function drawPoints(p, step) {
-  const photo = get("photo").checked, dot = Math.round(get("size").value * ratio), off = dot >> 1;
+  const photo = get("with-photo").checked, dot = Math.round(get("size").value * ratio), off = dot >> 1;
   const [a, b, c] = R, [x0, y0, z0] = at, cx = W / 2, cy = H / 2, color = colors[p];
   const last = start[p] + Math.ceil((start[p + 1] - start[p]) / step);
   for (let i = start[p]; i < last; i++) {
@@ -268,9 +275,10 @@ canvas.addEventListener("wheel", e => {
 const KEYS = {
   "1": () => look("xy"), "2": () => look("xz"), "3": () => look("yz"), "0": () => look("home"),
   "+": () => zoomBy(1.2), "=": () => zoomBy(1.2), "-": () => zoomBy(1 / 1.2),
-  "[": () => only(Math.max(-1, +get("one").value - 1)),
-  "]": () => only(Math.min(T - 1, +get("one").value + 1)),
-  c: () => get("cameras").click(),
+  "[": () => { stop(); only(Math.max(-1, +get("one").value - 1)); },
+  "]": () => { stop(); only(Math.min(T - 1, +get("one").value + 1)); },
+  p: () => get("play").click(),
+  c: () => get("with-cameras").click(),
 };
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 document.addEventListener("keydown", e => {
@@ -291,11 +299,12 @@ const boxes = data.periods.map((period, p) => {
   box.type = "checkbox"; box.checked = true;
   swatch.style.background = period.color;
   name.textContent = period.label === String(p) ? `Period ${p}` : `${p}: ${period.label}`;
-  name.title = `${period.cameras} cameras`;
+  name.title = `${name.textContent} (${number.format(period.cameras)} cameras)`;
   count.textContent = number.format(period.points);
   label.append(box, swatch, name, count);
   get("periods").append(label);
   box.addEventListener("change", () => {
+    stop();
     on[p] = box.checked; get("one").value = -1; get("which").value = "some"; redraw();
     if (on.every(Boolean)) get("which").value = "all";
   });
@@ -307,10 +316,22 @@ function only(p) {
   boxes.forEach((box, i) => { box.checked = on[i] = p < 0 || i === p; });
   redraw();
 }
+let player = 0;
+function stop() {
+  clearInterval(player); player = 0;
+  get("play").textContent = "play"; get("play").setAttribute("aria-pressed", "false");
+}
+function play() {
+  if (T < 2) return;
+  const next = () => only((+get("one").value + 1) % T);
+  next(); player = setInterval(next, 1200);
+  get("play").textContent = "stop"; get("play").setAttribute("aria-pressed", "true");
+}
+get("play").addEventListener("click", () => { if (player) stop(); else play(); });
 get("one").max = T - 1;
 get("single").hidden = T < 2;
-get("one").addEventListener("input", e => only(+e.target.value));
-for (const id of ["cameras", "photo", "size"]) get(id).addEventListener("input", redraw);
+get("one").addEventListener("input", e => { stop(); only(+e.target.value); });
+for (const id of ["with-cameras", "with-photo", "size"]) get(id).addEventListener("input", redraw);
 document.querySelectorAll("#views button").forEach(
   b => b.addEventListener("click", () => look(b.dataset.view)));
 get("theme").addEventListener("click", () => {
@@ -326,16 +347,19 @@ get("counts").textContent = (shown < data.points
   : `${number.format(shown)} points`)
   + `, ${number.format(data.camera_period.length)} cameras`
   + (data.left_out ? `; ${number.format(data.left_out)} that no image sees are left out` : "");
+// Few points are easier to see as large dots, many do not clot as small ones.
+get("size").value = [[150000, 1], [3000, 2], [300, 3], [30, 5]].find(([n]) => shown > n)?.[1] || 6;
 canvas.setAttribute("aria-label", `Points of ${data.name}, coloured by period`);
-// What a link asks for: #view=xy&period=1&cameras&dark
+// What a link asks for: #view=xy&period=1&cameras&photo&play&dark
 const asked = new URLSearchParams(location.hash.slice(1));
 if (asked.has("dark")) document.documentElement.classList.toggle("dark", asked.get("dark") !== "0");
-if (asked.has("cameras")) get("cameras").checked = true;
-if (asked.has("photo")) get("photo").checked = true;
+if (asked.has("cameras")) get("with-cameras").checked = true;
+if (asked.has("photo")) get("with-photo").checked = true;
 new ResizeObserver(resize).observe(canvas);
 resize();
 if (asked.get("view") in VIEWS) look(asked.get("view"));
 if (asked.has("period")) only(Math.min(T - 1, Math.max(-1, Math.round(+asked.get("period")) || 0)));
+if (asked.has("play")) play();
 </script>
 </body>
 </html>

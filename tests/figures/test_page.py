@@ -149,8 +149,13 @@ try {
   boxes[0].click(); report.without = count(); boxes[0].click();
   only(1); report.one = count(); report.which = get("which").value;
   key("["); report.before = get("one").value; key("["); report.every = on.every(Boolean);
+  only(2); key("p"); report.played = [get("one").value, get("play").textContent];
+  clearInterval(player);  // time stands still here
+  player = setInterval(() => {}, 1e6); only(1); key("["); report.stopped = [player, get("one").value];
+  only(-1);
+  report.dots = get("size").value;
   key("1"); draw(); report.xy = R;
-  report.pressed = document.querySelector("[aria-pressed=true]").dataset.view;
+  report.pressed = document.querySelector("#views [aria-pressed=true]").dataset.view;
   key("3"); report.yz = R;
   const inside = () => {
     const a = [];
@@ -175,7 +180,7 @@ try {
   key("0"); const far = zoom;
   fingers.set(1, [100, 100]); fingers.set(2, [200, 100]); drag(2, 300, 100);
   report.pinched = zoom / far; fingers.clear();
-  key("c"); report.cameras = get("cameras").checked; draw();
+  key("c"); report.cameras = get("with-cameras").checked; draw();
   get("theme").click(); report.dark = count().reduce((a, b) => a + b) > 0;
   report.labels = [...document.querySelectorAll("#periods span")].map(s => s.textContent);
   report.text = get("counts").textContent;
@@ -210,6 +215,8 @@ def test_in_a_browser(cloud, tmp_path):
     assert report["one"][0] == 0 and report["one"][1] == report["without"][1]
     assert (report["which"], report["before"], report["every"]) == ("1", "0", True)
     assert report["xy"] == [[1, 0, 0], [0, 1, 0], [0, 0, 1]] and report["pressed"] == "xy"
+    assert report["played"] == ["0", "stop"] and report["stopped"] == [0, "0"]
+    assert report["dots"] == "3"
     assert report["yz"] == [[0, 1, 0], [0, 0, 1], [1, 0, 0]]
     assert report["fits"] == [True] * 4
     assert report["moved"] > 0
