@@ -155,7 +155,8 @@ function draw() {
 }
 
 function drawPoints(p, step) {
-  const photo = get("with-photo").checked, dot = Math.round(get("size").value * ratio), off = dot >> 1;
+  const photo = get("with-photo").checked;
+  const dot = Math.round(get("size").value * ratio), off = dot >> 1;
   const [a, b, c] = R, [x0, y0, z0] = at, cx = W / 2, cy = H / 2, color = colors[p];
   const last = start[p] + Math.ceil((start[p + 1] - start[p]) / step);
   for (let i = start[p]; i < last; i++) {

@@ -151,7 +151,8 @@ try {
   key("["); report.before = get("one").value; key("["); report.every = on.every(Boolean);
   only(2); key("p"); report.played = [get("one").value, get("play").textContent];
   clearInterval(player);  // time stands still here
-  player = setInterval(() => {}, 1e6); only(1); key("["); report.stopped = [player, get("one").value];
+  player = setInterval(() => {}, 1e6); only(1); key("[");
+  report.stopped = [player, get("one").value];
   only(-1);
   report.dots = get("size").value;
   key("1"); draw(); report.xy = R;
