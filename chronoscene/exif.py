@@ -14,7 +14,7 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,6 +33,11 @@ LONGEST_NAME = 100
 
 EARLIEST = 1990
 """Year; clocks that were never set say less."""
+
+_DATE = re.compile(
+    r"(\d{4})[-:./](\d{1,2})[-:./](\d{1,2})(?!\d)(?:[ T]+(\d{1,2})\D(\d{1,2})(?:\D(\d{1,2}))?)?",
+    re.ASCII,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +137,7 @@ def _parse(
     altitude, below = _number(gps.get(6)), _integer(gps.get(5)) in (1, 3)
     orientation = _integer(main.get(_ORIENTATION)) or 1
     return ExifData(
-        date=_date(exif.get(_TAKEN)) or _date(exif.get(_DIGITISED)),
+        date=_date(exif.get(_TAKEN)) or _date(exif.get(_DIGITISED)) or _gps_date(gps),
         latitude=latitude,
         longitude=longitude,
         altitude=altitude if altitude is None or not below else -altitude,
@@ -173,15 +178,33 @@ def _drone(xmp: Any) -> DroneData | None:
 
 
 def _date(value: Any) -> datetime | None:
-    text = _text(value) or ""
-    found = re.match(r"(\d{4})\D(\d{2})\D(\d{2})\D(\d{2})\D(\d{2})\D(\d{2})", text, re.ASCII)
+    """Date and time as Exif writes them, and as programs do that do not read Exif closely.
+
+    Without a time of day, or with an impossible one, midnight. A fraction of a second and a time
+    zone that follow are left out: clocks of cameras are not that good.
+    """
+    found = _DATE.match(_text(value) or "")
     if not found:
         return None
-    try:
-        date = datetime(*map(int, found.groups()))  # type: ignore[arg-type]
-    except ValueError:
-        return None
-    return date if date.year >= EARLIEST else None
+    year, month, day, *time = (int(group or 0) for group in found.groups())
+    for clock in (time, (0, 0, 0)):
+        try:
+            date = datetime(year, month, day, *clock)
+        except ValueError:
+            continue
+        return date if year >= EARLIEST else None
+    return None
+
+
+def _gps_date(gps: Mapping[int, Any]) -> datetime | None:
+    """Date and time of a GPS fix, in UTC."""
+    date, time = _date(gps.get(29)), gps.get(7)
+    if date is None or not isinstance(time, tuple | list) or len(time) != 3:
+        return date
+    hour, minute, second = (_number(part) for part in time)
+    if hour is None or minute is None or second is None or not 0 <= hour < 24:
+        return date
+    return date + timedelta(hours=hour, minutes=minute % 60, seconds=second % 60)
 
 
 def _degrees(value: Any, ref: Any, negative: str, limit: float) -> float | None:

@@ -165,3 +165,27 @@ def test_any_xmp(text):
     xmp = f'drone-dji:RtkFlag="{text}" drone-dji:GimbalYawDegree={text}'
     drone = read(photo(xmp=xmp.encode("utf-8", "surrogatepass"))).drone
     assert drone is None or drone.rtk_flag is None or isinstance(drone.rtk_flag, int)
+
+
+@pytest.mark.parametrize(
+    ("text", "date"),
+    [
+        ("2016:05:03 12:30:05.25", datetime(2016, 5, 3, 12, 30, 5)),
+        ("2016:05:03 12:30:05+02:00", datetime(2016, 5, 3, 12, 30, 5)),
+        ("2016-05-03T12:30:05Z", datetime(2016, 5, 3, 12, 30, 5)),
+        ("2016/05/03 12:30", datetime(2016, 5, 3, 12, 30)),
+        ("2016:5:3 9:5:0", datetime(2016, 5, 3, 9, 5)),
+        ("2016:05:03", datetime(2016, 5, 3)),
+        ("2016:05:03 24:00:00", datetime(2016, 5, 3)),
+        ("2016:05:031 12:00:00", None),
+    ],
+)
+def test_dates_as_programs_write_them(text, date):
+    assert read(photo(exif={0x9003: text})).date == date
+
+
+def test_date_of_the_gps_fix_where_there_is_no_other():
+    gps = {29: "2016:05:03", 7: (9.0, 30.0, 15.5)}
+    assert read(photo(gps=gps)).date == datetime(2016, 5, 3, 9, 30, 15, 500000)
+    assert read(photo(gps=gps, exif={0x9003: "2017:05:03 12:00:00"})).date.year == 2017
+    assert read(photo(gps={29: "2016:05:03", 7: (99.0, 0.0, 0.0)})).date == datetime(2016, 5, 3)

@@ -2,6 +2,7 @@
 
 from chronoscene.validation.rules import (
     cameras,
+    dates,
     duplicates,
     exif,
     folder,
@@ -24,6 +25,7 @@ from chronoscene.validation.rules import (
 
 __all__ = [
     "cameras",
+    "dates",
     "duplicates",
     "exif",
     "folder",

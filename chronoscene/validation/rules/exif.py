@@ -59,14 +59,14 @@ FOCAL_RATIO = 1.4
     needs=("periods",),
 )
 def exif_period_order(scene: RawScene) -> Iterator[Hit]:
-    medians = _median_dates(scene)
+    medians = median_dates(scene)
     ordered = sorted(medians)
     for earlier, later in pairwise(ordered):
         if medians[earlier] - medians[later] >= DAY:
             expected = f"photos later than {medians[earlier]:%Y-%m-%d}, as of period {earlier}"
             found = f"{medians[later]:%Y-%m-%d} (median)"
             yield Hit(f"period {later}", expected, found)
-    for period, stated in _stated_dates(scene).items():
+    for period, stated in stated_dates(scene).items():
         first = date.fromisoformat(stated + "-01" * (2 - stated.count("-"))).toordinal()
         last_day = DAYS[stated.count("-")]
         if (
@@ -87,17 +87,25 @@ def exif_period_order(scene: RawScene) -> Iterator[Hit]:
     needs=("periods",),
 )
 def exif_other_period(scene: RawScene) -> Iterator[Hit]:
-    medians = _median_dates(scene)
+    for name, (taken, own, period) in of_other_period(scene).items():
+        found = f"{taken:%Y-%m-%d}, as in period {period}"
+        yield Hit(f"images/{name}", f"a date about {own:%Y-%m-%d}", found)
+
+
+def of_other_period(scene: RawScene) -> dict[str, tuple[datetime, datetime, int]]:
+    """Photos by name with the date of another period: date, date of their own, the other one."""
+    wrong = {}
+    medians = median_dates(scene)
     ordered = sorted((median, period) for period, median in medians.items())
-    for name, taken in _dates(scene).items():
+    for name, taken in dates_of(scene).items():
         own = medians.get((scene.periods or {})[name])
         if own is None:
             continue
         at = bisect(ordered, (taken, 0))
         median, period = min(ordered[max(0, at - 1) : at + 1], key=lambda m: abs(m[0] - taken))
         if abs(median - own) >= DAY and abs(taken - median) < MUCH_NEARER * abs(taken - own):
-            found = f"{taken:%Y-%m-%d}, as in period {period}"
-            yield Hit(f"images/{name}", f"a date about {own:%Y-%m-%d}", found)
+            wrong[name] = (taken, own, period)
+    return wrong
 
 
 @rule(
@@ -173,17 +181,17 @@ def exif_focal(scene: RawScene) -> Iterator[Hit]:
             yield Hit(place, expected, f"{focal:.4g} px")
 
 
-def _dates(scene: RawScene) -> dict[str, datetime]:
+def dates_of(scene: RawScene) -> dict[str, datetime]:
     """When the images that have a period were taken."""
     headers = {n: scene.headers[n] for n in scene.periods or () if n in scene.headers}
     exif: dict[str, ExifData] = {name: header.exif for name, header in headers.items()}
     return {name: data.date for name, data in exif.items() if data.date is not None}
 
 
-def _median_dates(scene: RawScene) -> dict[int, datetime]:
+def median_dates(scene: RawScene) -> dict[int, datetime]:
     """Of the periods with enough dates."""
     by_period: dict[int, list[datetime]] = {}
-    for name, taken in _dates(scene).items():
+    for name, taken in dates_of(scene).items():
         by_period.setdefault((scene.periods or {})[name], []).append(taken)
     return {
         period: sorted(dates)[len(dates) // 2]
@@ -192,7 +200,7 @@ def _median_dates(scene: RawScene) -> dict[int, datetime]:
     }
 
 
-def _stated_dates(scene: RawScene) -> dict[int, str]:
+def stated_dates(scene: RawScene) -> dict[int, str]:
     """Dates in ``periods.json`` by period; none where the file has its own finding."""
     ids = scene.period_ids
     if ids != list(range(len(ids))):
