@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.validation.finding import Hit, shown
+from chronoscene.validation.likeness import relit_pairs
 from chronoscene.validation.pixels import THUMBNAIL, Pixels
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
@@ -112,9 +113,14 @@ def image_twice(scene: RawScene) -> Iterator[Hit]:
 def near_leak(scene: RawScene) -> Iterator[Hit]:
     assert scene.periods is not None and scene.tests is not None and scene.pixels is not None
     role = {n: (period, n in scene.tests) for n, period in scene.periods.items()}
-    for a, b, distance in near_pairs({n: p for n, p in scene.pixels.items() if n in role}, role):
+    pixels = {n: p for n, p in scene.pixels.items() if n in role}
+    near = {(a, b): f"{d:.2g} grey levels from that" for a, b, d in near_pairs(pixels, role)}
+    for a, b, alike in relit_pairs(pixels, role):
+        if pixels[a].digest != pixels[b].digest:
+            near.setdefault((a, b), f"that is, but for brightness, {alike:.2%} that")
+    for (a, b), how in near.items():
         place, other = (b, a) if role[b][1] and not role[a][1] else (a, b)
-        found = f"a thumbnail {distance:.2g} grey levels from that of {shown([other])}"
+        found = f"a thumbnail {how} of {shown([other])}"
         found += _apart(scene, a, b)
         yield Hit(f"images/{place}", "an image of its own", found, also=(other,))
 
