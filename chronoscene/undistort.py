@@ -7,7 +7,6 @@ Images whose camera does not change are copied byte for byte.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,9 +18,9 @@ from PIL import Image
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats.writing import Progress, place_image, staged_folder
+from chronoscene.formats.writing import ImageSource, Progress, place_image, staged_folder
 from chronoscene.images import load_rgb
-from chronoscene.scene import Frame, Scene
+from chronoscene.scene import Scene
 from chronoscene.threads import available_threads
 from chronoscene.undistort_cameras import (
     CameraChange,
@@ -35,7 +34,13 @@ JPEG_QUALITY = 95
 
 WRITABLE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
-_METADATA_FORMATS = (".png", ".jpg", ".jpeg", ".webp")
+_METADATA_FORMATS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+
+_KEPT_TAGS = (0x010F, 0x0110, 0x0112, 0x0132)
+"""Maker, model, orientation and time; a TIFF has the layout of its pixels among its tags."""
+
+_KEPT_BLOCKS = (0x8769, 0x8825)
+"""EXIF proper, and GPS."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +62,7 @@ def undistort(
     *,
     center: bool = False,
     threads: int | None = None,
+    image_source: ImageSource = "copy",
     progress: Progress | None = None,
 ) -> Undistortion:
     """Write a scene in the ChronoScene format whose cameras are all PINHOLE.
@@ -69,6 +75,7 @@ def undistort(
         out: Folder that does not exist yet, or is empty.
         center: Crop the images so that the principal point is in their centre.
         threads: Images that are worked on at the same time; None for one per processor.
+        image_source: Copy or link the images that stay as they are.
         progress: Called after each image.
 
     Raises:
@@ -81,7 +88,7 @@ def undistort(
     new, observations_lost, points_lost = move_observations(scene, changes)
     with staged_folder(out) as staged:
         our_format.write_texts(new, staged)
-        _write_images(scene, staged / "images", changes, threads, progress)
+        _write_images(scene, staged / "images", changes, image_source, threads, progress)
     distinct = tuple(dict.fromkeys(changes))
     done = replace(new, root=out, images_root=out / "images", format=our_format.NAME)
     return Undistortion(done, distinct, observations_lost, points_lost)
@@ -106,28 +113,31 @@ def _write_images(
     scene: Scene,
     root: Path,
     changes: list[CameraChange],
+    image_source: ImageSource,
     threads: int | None,
     progress: Progress | None,
 ) -> None:
     """Write all images; those of one camera after each other, so that its map is made once."""
     order = sorted(range(len(changes)), key=lambda i: changes[i].target.camera_id)
-    tasks = [(scene.frames[i], changes[i]) for i in order]
     pool = ThreadPoolExecutor(threads or available_threads())
+
+    def write(i: int) -> None:
+        source, target = scene.image_path(scene.frames[i]), root / scene.frames[i].name
+        if changes[i].is_copy:
+            place_image(source, target, image_source)
+        else:
+            _resample(source, target, changes[i])
+
     try:
-        results: Iterator[Any] = pool.map(lambda task: _write_image(scene, root, *task), tasks)
-        for done, _ in enumerate(results, start=1):
+        for done, _ in enumerate(pool.map(write, order), start=1):
             if progress is not None:
-                progress(done, len(tasks))
+                progress(done, len(order))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
         sampling_map.cache_clear()
 
 
-def _write_image(scene: Scene, root: Path, frame: Frame, change: CameraChange) -> None:
-    source, target = scene.image_path(frame), root / frame.name
-    if change.is_copy:
-        place_image(source, target, "copy")
-        return
+def _resample(source: Path, target: Path, change: CameraChange) -> None:
     pixels = undistort_pixels(load_rgb(source), change)
     target.parent.mkdir(parents=True, exist_ok=True)
     options: dict[str, Any] = {}
@@ -141,8 +151,24 @@ def _write_image(scene: Scene, root: Path, frame: Frame, change: CameraChange) -
     Image.fromarray(pixels).save(target, **options)
 
 
-def _metadata(path: Path) -> dict[str, bytes]:
-    """EXIF block and colour profile as they are: dates of capture are in the first."""
+def _metadata(path: Path) -> dict[str, Any]:
+    """EXIF, which has the date of capture, and the colour profile if it is one of RGB colours."""
     with Image.open(path) as image:
-        blocks = {key: image.info.get(key) for key in ("exif", "icc_profile")}
-    return {key: block for key, block in blocks.items() if isinstance(block, bytes)}
+        kept: dict[str, Any] = {"exif": image.info.get("exif")}
+        if image.format == "TIFF":
+            kept["exif"] = _tiff_metadata(image)
+        profile = image.info.get("icc_profile")
+    if isinstance(profile, bytes) and profile[16:20] == b"RGB ":
+        kept["icc_profile"] = profile
+    return {key: block for key, block in kept.items() if block}
+
+
+def _tiff_metadata(image: Image.Image) -> Image.Exif:
+    """What a TIFF says about its capture, without what it says about its pixels."""
+    found, kept = image.getexif(), Image.Exif()
+    kept.update({tag: found[tag] for tag in _KEPT_TAGS if tag in found})
+    for block in _KEPT_BLOCKS:
+        if tags := found.get_ifd(block):
+            kept.get_ifd(block).update(tags)
+            kept[block] = 0  # Pillow puts the place of the block here
+    return kept

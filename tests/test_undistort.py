@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -11,10 +12,11 @@ from chronoscene.colmap import from_pycolmap, to_pycolmap
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
+from chronoscene.images import load_rgb
 from chronoscene.scene import Camera, Period, WorldFrame
 from chronoscene.splits import split_hash
 from chronoscene.undistort import undistort, undistort_pixels
-from chronoscene.undistort_cameras import CameraChange, move_pixels, pinhole_camera
+from chronoscene.undistort_cameras import CameraChange, move_pixels, pinhole_camera, sampling_map
 
 SIZE = (256, 192)
 F, CX, CY = 210.0, 120.5, 101.25
@@ -49,6 +51,48 @@ def distort(model, params, x, y):
     radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
     u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return fx * u + cx, fy * v + cy
+
+
+OTHER_CAMERAS = {
+    "FOV": (F, F + 4, CX, CY, 0.6),
+    "FISHEYE": (F, F + 4, CX, CY),
+    "SIMPLE_FISHEYE": (F, CX, CY),
+    "SIMPLE_RADIAL_FISHEYE": (F, CX, CY, 0.05),
+    "RADIAL_FISHEYE": (F, CX, CY, 0.05, -0.02),
+    "THIN_PRISM_FISHEYE": (F, F + 4, CX, CY, 0.05, -0.02, 1e-3, 2e-3, 3e-3, 1e-3, 2e-3, -1e-3),
+    "EUCM": (F, F + 4, CX, CY, 0.5, 1.1),
+    "DIVISION": (F, F + 4, CX, CY, -0.1),
+    "SIMPLE_DIVISION": (F, CX, CY, -0.1),
+}
+
+
+def distort_other(model, params, x, y):
+    """The same for the models that are rare."""
+    single = model.startswith(("SIMPLE_", "RADIAL_"))
+    fx, fy, cx, cy = (params[0], *params[:3]) if single else params[:4]
+    k, r = params[3:] if single else params[4:], np.hypot(x, y)
+    if model == "FOV":
+        factor = np.arctan(2 * r * np.tan(k[0] / 2)) / (r * k[0])
+    elif model == "EUCM":
+        factor = 1 / (k[0] * np.sqrt(k[1] * r**2 + 1) + 1 - k[0])
+    elif model.endswith("DIVISION"):  # r = s / (1 + k s^2), solved for s / r
+        factor = 2 / (1 + np.sqrt(1 - 4 * k[0] * r**2))
+    else:
+        factor = np.arctan(r) / r
+    u, v = x * factor, y * factor
+    if model == "THIN_PRISM_FISHEYE":
+        k1, k2, p1, p2, k3, k4, s1, s2 = k
+        q = u * u + v * v
+        radial = k1 * q + k2 * q**2 + k3 * q**3 + k4 * q**4
+        u, v = (
+            u + u * radial + 2 * p1 * u * v + p2 * (q + 2 * u * u) + s1 * q,
+            v + v * radial + p1 * (q + 2 * v * v) + 2 * p2 * u * v + s2 * q,
+        )
+    elif model in ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"):
+        q = u * u + v * v
+        radial = 1 + k[0] * q + (k[1] * q**2 if len(k) > 1 else 0)
+        u, v = u * radial, v * radial
     return fx * u + cx, fy * v + cy
 
 
@@ -147,6 +191,40 @@ def test_pixels_are_where_the_formula_says(camera, make_distorted, tmp_path, cen
             np.testing.assert_allclose(centroid(result, (u, v)), [u, v], atol=0.05)
             found += 1
     assert found > 20
+
+
+@pytest.mark.parametrize("center", [False, True])
+@pytest.mark.parametrize("model", OTHER_CAMERAS)
+def test_rare_models_follow_their_formulas(model, center):
+    """The map of pixels, and observations, which go the other way."""
+    camera = Camera(1, model, *SIZE, OTHER_CAMERAS[model])
+    change = CameraChange(camera, pinhole_camera(camera, center=center))
+    K = change.target.K
+    maps = np.stack(sampling_map(change))
+    columns, rows = np.meshgrid(np.arange(maps.shape[2]) + 0.5, np.arange(maps.shape[1]) + 0.5)
+    x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
+    np.testing.assert_allclose(maps, distort_other(model, camera.params, x, y), atol=1e-4)
+    places = maps[:, 5:-5:7, 5:-5:7].reshape(2, -1).T.astype(float)
+    expected = np.stack([columns, rows], axis=-1)[5:-5:7, 5:-5:7].reshape(-1, 2)
+    np.testing.assert_allclose(move_pixels(change, places), expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
+def test_agrees_with_opencv(model):
+    """Its pixels are counted from the centre of the first one."""
+    camera = Camera(1, model, *SIZE, CAMERAS[model])
+    change = CameraChange(camera, pinhole_camera(camera))
+    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    make = cv2.fisheye if model == "OPENCV_FISHEYE" else cv2
+    maps = make.initUndistortRectifyMap(
+        camera.K - half,
+        np.array(camera.distortion),
+        np.eye(3),
+        change.target.K - half,
+        (change.target.width, change.target.height),
+        cv2.CV_32FC1,
+    )
+    np.testing.assert_allclose(np.array(sampling_map(change)) - 0.5, maps, atol=1e-4)
 
 
 def test_agrees_with_the_undistorter_of_colmap(camera):
@@ -298,6 +376,48 @@ def test_exif_and_quality_of_jpegs(make_distorted, tmp_path):
     with Image.open(new.image_path(new.frames[0])) as result:
         assert result.format == "JPEG"
         assert result.getexif().get_ifd(0x8769)[0x9003] == "2020:01:02 03:04:05"
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif"])
+def test_exif_of_every_kind_of_file(make_distorted, tmp_path, suffix):
+    """Dates and positions of capture stay, and so does the orientation tag: pixels do not turn."""
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F] = 6, "Maker"
+    exif.get_ifd(0x8769)[0x9003] = "2020:01:02 03:04:05"
+    exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 7.0, 30.5)})
+    exif[0x8769] = exif[0x8825] = 0  # where the blocks are; Pillow fills it in
+    camera = Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"])
+    scene = make_distorted(camera, suffix=suffix, exif=exif)
+    plain = make_distorted(camera, suffix=suffix, name="plain")
+    new, straight = (
+        undistort(source, tmp_path / f"out{i}").scene for i, source in enumerate((scene, plain))
+    )
+    paths = [s.image_path(s.frames[0]) for s in (new, straight)]
+    np.testing.assert_array_equal(load_rgb(paths[0]), load_rgb(paths[1]))
+    with Image.open(paths[0]) as result:
+        found = result.getexif()
+        assert (found[0x0112], found[0x010F]) == (6, "Maker")
+        assert found.get_ifd(0x8769)[0x9003] == "2020:01:02 03:04:05"
+        assert found.get_ifd(0x8825)[1] == "N"
+
+
+@pytest.mark.parametrize(("space", "kept"), [(b"RGB ", True), (b"GRAY", False), (b"CMYK", False)])
+def test_colour_profiles_of_other_colours_are_dropped(make_distorted, tmp_path, space, kept):
+    profile = bytes(16) + space + bytes(108)
+    camera = Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"])
+    new = undistort(make_distorted(camera, icc_profile=profile), tmp_path / "out").scene
+    with Image.open(new.image_path(new.frames[0])) as result:
+        assert result.info.get("icc_profile") == (profile if kept else None)
+
+
+@pytest.mark.parametrize("source", ["link", "symlink"])
+def test_images_that_stay_may_be_linked(make_distorted, tmp_path, source):
+    as_opencv = Camera(1, "OPENCV", *SIZE, (F, F, CX, CY, 0, 0, 0, 0))
+    scene = make_distorted(as_opencv)
+    new = undistort(scene, tmp_path / "out", image_source=source).scene
+    for a, b in zip(scene.frames, new.frames, strict=True):
+        assert new.image_path(b).samefile(scene.image_path(a))
+        assert new.image_path(b).is_symlink() == (source == "symlink")
 
 
 def test_the_number_of_threads_does_not_matter(make_distorted, tmp_path):

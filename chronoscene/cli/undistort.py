@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.convert import describe
+from chronoscene.cli.convert import LINKS, describe
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
@@ -29,13 +29,23 @@ from chronoscene.undistort_cameras import CameraChange
     help="Images worked on at the same time.  [default: one per processor]",
 )
 @click.option(
+    "--link",
+    type=click.Choice(["hard", "sym"]),
+    help="Link images that need no change instead of copying them.",
+)
+@click.option(
     "--format",
     "scene_format",
     type=click.Choice(format_names()),
     help="Format of the scene.  [default: found out]",
 )
 def command(
-    source: Path, out: Path, center: bool, threads: int | None, scene_format: str | None
+    source: Path,
+    out: Path,
+    center: bool,
+    threads: int | None,
+    link: str | None,
+    scene_format: str | None,
 ) -> None:
     """Write SCENE into the new folder OUT with undistorted images and PINHOLE cameras.
 
@@ -47,7 +57,12 @@ def command(
     scene = read_scene(source, format=scene_format)
     with progress_bar() as bar:
         done = undistort(
-            scene, out, center=center, threads=threads, progress=partial(bar, "images")
+            scene,
+            out,
+            center=center,
+            threads=threads,
+            image_source=LINKS[link],
+            progress=partial(bar, "images"),
         )
     emit(report(done), None)
 
