@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.geometry import camera_centre
+from chronoscene.projection import pixels_of
 from chronoscene.scene import Scene
 from chronoscene.stats.counts import CountRule, SceneCount, count_scene, observation_counts
 from chronoscene.stats.extent import robust_range
-from chronoscene.stats.projection import project
 from chronoscene.stats.views import common_view
 
 Array = NDArray[np.float64]
@@ -125,9 +125,11 @@ def reproject(scene: Scene) -> Reprojection:
             rows = order[ends[i] : ends[i + 1]]
             local = points.xyz[of[rows]] @ frame.cam_from_world[:3, :3].T
             local += frame.cam_from_world[:3, 3]
-            shift = project(frame.camera, local) - points.track_xy[rows]
+            u, v = pixels_of(frame.camera, *local.T)
+            seen = points.track_xy[rows]
             ahead = local[:, 2] > 0
-            residual[rows] = np.where(ahead, np.hypot(shift[:, 0], shift[:, 1]), np.nan)
+            error = np.hypot(u - seen[:, 0], v - seen[:, 1])
+            residual[rows] = np.where(ahead, error, np.nan)
             depth[rows] = np.where(ahead, local[:, 2], np.nan)
             if ahead.any():
                 depth_of_frame[i] = np.median(local[ahead, 2])

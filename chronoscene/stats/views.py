@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.projection import pixels_of
 from chronoscene.scene import Camera, Frame, Scene
-from chronoscene.stats.projection import project
 
 Array = NDArray[np.float64]
 
@@ -94,19 +94,17 @@ def _limit(camera: Camera) -> float:
         return np.inf
     angle = np.arange(DIRECTIONS)[:, None] * (2 * np.pi / DIRECTIONS)
     tangent = np.linspace(0, WIDEST, STEPS)
-    rays = np.stack(
-        [np.cos(angle) * tangent, np.sin(angle) * tangent, np.ones_like(angle + tangent)]
-    )
-    at = project(camera, rays.reshape(3, -1).T).reshape(DIRECTIONS, STEPS, 2)
-    outward = np.diff(np.linalg.norm(at - at[:, :1], axis=2), axis=1) > 0
+    x, y = np.cos(angle) * tangent, np.sin(angle) * tangent
+    u, v = pixels_of(camera, x.ravel(), y.ravel(), np.ones(x.size))
+    u, v = u.reshape(x.shape), v.reshape(x.shape)
+    outward = np.diff(np.hypot(u - u[:, :1], v - v[:, :1]), axis=1) > 0
     return float(tangent[outward.all(axis=0).argmin()]) if not outward.all() else np.inf
 
 
 def _inside(camera: Camera, local: Array, limit: float) -> NDArray[np.bool_]:
     """Which points in front of a camera are in its image. [n, 3] -> [n]"""
-    at = project(camera, local)
-    size = np.array([camera.width, camera.height])
-    inside = ((at >= 0) & (at <= size)).all(axis=1)
+    u, v = pixels_of(camera, *local.T)
+    inside = (u >= 0) & (v >= 0) & (u <= camera.width) & (v <= camera.height)
     if np.isfinite(limit):
         inside &= np.hypot(local[:, 0], local[:, 1]) <= limit * local[:, 2]
     return np.asarray(inside)
