@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from chronoscene.colmap import MODEL_FILES
 from chronoscene.colmap_arrays import RawImages, RawPoints
 from chronoscene.errors import SceneError
-from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name
+from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name, is_usable
 from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.scene import Camera
 from chronoscene.splits import (
@@ -61,9 +61,6 @@ FEWEST_IMAGES = 3
 
 MOST_CELLS = 500_000_000
 """Points times periods, in bytes: a table of more is not made. Real scenes have a few percent."""
-
-LARGEST_SIDE = 10**6
-"""Pixels; a camera that claims more is a damaged record."""
 
 _REASONS = {
     "model": f"there is no COLMAP model in {MODEL}",
@@ -167,7 +164,8 @@ class RawScene:
     @cached_property
     def usable_cameras(self) -> dict[int, Camera]:
         """Cameras by id, those with a size and focal lengths that mean something."""
-        return {c.camera_id: c for c in self.cameras or () if is_usable(c)}
+        usable = (c for c in self.cameras or () if is_usable(c) and c.model != "EQUIRECTANGULAR")
+        return {camera.camera_id: camera for camera in usable}
 
     @cached_property
     def observations(self) -> Observations | None:
@@ -378,13 +376,3 @@ def is_safe(name: str) -> bool:
     except SceneError:
         return False
     return True
-
-
-def is_usable(camera: Camera) -> bool:
-    """Whether a camera has a size and focal lengths that a projection can use."""
-    if not (1 <= camera.width <= LARGEST_SIDE and 1 <= camera.height <= LARGEST_SIDE):
-        return False
-    if camera.model == "EQUIRECTANGULAR" or not np.isfinite(camera.params).all():
-        return False
-    K = camera.K
-    return bool(K[0, 0] > 0 and K[1, 1] > 0)

@@ -7,9 +7,10 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.formats.chronoscene import is_usable
 from chronoscene.scene import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.raw_scene import RawScene, is_usable
+from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
 
 VISIBLE = 0.5
@@ -36,7 +37,7 @@ DROP = "write the camera as PINHOLE or SIMPLE_PINHOLE; its distortion is below h
 )
 def camera_unusable(scene: RawScene) -> Iterator[Hit]:
     for camera in _cameras(scene):
-        if not is_usable(camera) and camera.model != "EQUIRECTANGULAR":
+        if not is_usable(camera):
             expected = "a plausible size, positive focal lengths and finite parameters"
             params = ", ".join(f"{p:g}" for p in camera.params)
             found = f"{camera.width} x {camera.height}, parameters {params}"
