@@ -84,7 +84,8 @@ def shown_box(cloud: Cloud, *, cameras: bool) -> Box:
     good = (cloud.period >= 0) & np.isfinite(cloud.xyz).all(axis=1)
     corners = robust_range(cloud.xyz[good]) if good.any() else np.zeros((0, 3))
     if cameras or not len(corners):
-        corners = np.concatenate([corners, robust_range(cloud.centres)])
+        known = cloud.centres[np.isfinite(cloud.centres).all(axis=1)]
+        corners = np.concatenate([corners, robust_range(known if len(known) else np.zeros((1, 3)))])
     low, high = corners.min(axis=0), corners.max(axis=0)
     longest = float((high - low).max()) or 1.0
     middle = (low + high) / 2

@@ -37,6 +37,8 @@ BEHIND = 0.7
 """Strength of the points where cameras are drawn, too."""
 PATCH = 16
 """Pixels along each side of the squares by which the area with points is measured."""
+PLAIN = (0.1, 10_000.0)
+"""Longest edges for which coordinates are written as they are."""
 FAR = 20.0
 """Times the longest edge: coordinates beyond would be numbers with more digits than differ."""
 AXES = "xyz"
@@ -55,8 +57,7 @@ def draw_projections(scene: Scene, path: Path, *, cameras: bool = False) -> None
 
 def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
     """Draw points and cameras; see `draw_projections`."""
-    cloud, axis_names = readable(cloud, shown_box(cloud, cameras=cameras))
-    box = shown_box(cloud, cameras=cameras)
+    cloud, box, axis_names = readable(cloud, shown_box(cloud, cameras=cameras))
     dx, dy, dz = box.edges
     scale = min((DRAWING[0] - GAP) / (dx + dz), (DRAWING[1] - GAP) / (dy + dz))
     width = max(LEFT + (dx + dz) * scale + GAP + RIGHT, LEAST_WIDTH)
@@ -83,29 +84,30 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
     save(figure, path)
 
 
-def readable(cloud: Cloud, box: Box) -> tuple[Cloud, tuple[str, ...]]:
-    """The cloud in numbers that fit beside an axis, and the names of the axes, which say how.
+def readable(cloud: Cloud, box: Box) -> tuple[Cloud, Box, tuple[str, ...]]:
+    """Cloud and box in numbers that fit beside an axis, and the names of the axes, which say how.
 
     Places far from the origin are moved, and very small or large scenes scaled.
     """
     edge = float(box.edges.max())
-    offset = np.zeros(3)
+    digits = np.log10(edge)
     far = np.maximum(np.abs(box.low), np.abs(box.high)) > FAR * edge
-    step = 10.0 ** np.ceil(np.log10(edge))
-    offset[far] = np.round((box.low + box.high)[far] / 2 / step) * step
-    thousands = int(np.floor((np.log10(edge) + 1) / 3))  # 0 for edges from 0.1 to 99
-    power = 0 if edge < 10_000 and thousands == 1 else 3 * thousands
+    step = 10.0 ** np.ceil(digits)
+    offset = np.where(far, np.round((box.low + box.high) / 2 / step) * step, 0.0)
+    power = 0 if PLAIN[0] <= edge < PLAIN[1] else 3 * int(np.floor(digits / 3))
     if cloud.unit == "metre":
         power = max(-3, min(3, power))
+    factor = 10.0**power
     moved = replace(
-        cloud,
-        xyz=(cloud.xyz - offset) / 10.0**power,
-        centres=(cloud.centres - offset) / 10.0**power,
+        cloud, xyz=(cloud.xyz - offset) / factor, centres=(cloud.centres - offset) / factor
     )
+    box = Box((box.low - offset) / factor, (box.high - offset) / factor)
     units = {-3: " [mm]", 0: " [m]", 3: " [km]"}
     unit = units[power] if cloud.unit == "metre" else f" [$10^{{{power}}}$]" if power else ""
-    return moved, tuple(
-        f"{axis}{_minus(shift)}{unit}" for axis, shift in zip(AXES, offset, strict=True)
+    return (
+        moved,
+        box,
+        tuple(f"{axis}{_minus(shift)}{unit}" for axis, shift in zip(AXES, offset, strict=True)),
     )
 
 

@@ -16,8 +16,8 @@ ENDS = (2.0, 98.0)
 """Percentiles of what is left that are the ends of the scene, and `BEYOND` that."""
 BEYOND = 0.08
 """Of the distance between the two ends: an even spread of points is inside as a whole."""
-ENOUGH = 100_000
-"""Points from which percentiles are taken: of more, an even choice."""
+ENOUGH = 50_000
+"""Points that tell: of more, an even choice is looked at."""
 
 
 def robust_range(xyz: Array) -> Array:
@@ -29,17 +29,14 @@ def robust_range(xyz: Array) -> Array:
     Returns:
         The lowest and the highest coordinates; points beyond are strays. [2, 3]
     """
-    low, high = np.percentile(_some(xyz), CORE, axis=0)
+    xyz = xyz[:: -(-len(xyz) // ENOUGH)]
+    low, high = np.percentile(xyz, CORE, axis=0)
     reach = REACH * (high - low).max()
     near = xyz[((xyz >= low - reach) & (xyz <= high + reach)).all(axis=1)]
     if 2 * len(near) < len(xyz):  # few points, or clusters: there is no middle
         near = xyz
-    low, high = np.percentile(_some(near), ENDS, axis=0)
+    low, high = np.percentile(near, ENDS, axis=0)
     beyond = BEYOND * (high - low)
     return np.stack(
         [np.maximum(low - beyond, near.min(axis=0)), np.minimum(high + beyond, near.max(axis=0))]
     )
-
-
-def _some(xyz: Array) -> Array:
-    return xyz[:: -(-len(xyz) // ENOUGH)]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from chronoscene.figures import projections
-from chronoscene.figures.bars import draw_bars
+from chronoscene.figures.bars import _period_names, draw_bars
 from chronoscene.figures.cloud import Cloud, shown_box
 from chronoscene.figures.colors import EIGHT, FOUR, period_colors, rgb_of
 from chronoscene.figures.density import (
@@ -22,7 +22,7 @@ from chronoscene.figures.density import (
     opacity,
     shade,
 )
-from chronoscene.figures.projections import draw_cloud, legend_names
+from chronoscene.figures.projections import draw_cloud, legend_names, readable
 from chronoscene.stats import PeriodCount, SceneCount
 from chronoscene.stats.published import PAPER_COUNTS
 
@@ -218,6 +218,56 @@ def test_the_colours_of_all_periods_are_in_the_picture(cloud, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("scale", "place", "unit", "names"),
+    [
+        (1, (0, 0, 0), "metre", ("x [m]", "y [m]", "z [m]")),
+        (1, (0, 0, 0), "unknown", ("x", "y", "z")),
+        (1, (442e3, -4427e3, 90), "metre", ("x - 442,000 [m]", "y + 4,427,000 [m]", "z [m]")),
+        (1e-3, (0, 0, 0), "metre", ("x [mm]", "y [mm]", "z [mm]")),
+        (1e-3, (0, 0, 0), "unknown", tuple(f"{a} [$10^{{-3}}$]" for a in "xyz")),
+        (5e3, (0, 0, 0), "metre", ("x [km]", "y [km]", "z [km]")),
+        (1e6, (0, 0, 0), "unknown", tuple(f"{a} [$10^{{6}}$]" for a in "xyz")),
+    ],
+)
+def test_numbers_beside_the_axes_are_short(cloud, scale, place, unit, names):
+    there = replace(
+        cloud, xyz=cloud.xyz * scale + place, centres=cloud.centres * scale + place, unit=unit
+    )
+    shown = shown_box(there, cameras=True)
+    moved, box, found = readable(there, shown)
+    assert found == names
+    assert 0.1 <= box.edges.max() < 10_000
+    assert max(abs(box.low.min()), abs(box.high.max())) < 25 * box.edges.max()
+    np.testing.assert_array_equal(box.holds(moved.xyz), shown.holds(there.xyz))
+    ratio = box.edges / shown.edges
+    np.testing.assert_allclose(ratio, ratio[0])  # one factor for all axes
+
+
+def test_names_with_marks_of_formulas_are_only_text(cloud, tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(projections, "save", lambda figure, path: kept.append(figure))
+    odd = replace(cloud, name=r"$\no $x_1$", labels=("$a$", r"\$^$", "2"))
+    draw_cloud(odd, tmp_path / "a.svg", cameras=True)
+    (figure,) = kept
+    figure.canvas.draw()  # a formula that is none would raise
+    draw_bars([counted(r"$\no $x_1$", [(1, 2)])], tmp_path / "b.svg")
+
+
+def test_the_legend_is_read_line_by_line(cloud, tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(projections, "save", lambda figure, path: kept.append(figure))
+    labels = tuple(f"survey of {2000 + i}" for i in range(11))
+    many = replace(cloud_with(cloud.xyz, np.arange(3000) % 11, 11), labels=labels)
+    draw_cloud(many, tmp_path / "a.png")
+    (figure,) = kept
+    figure.canvas.draw()
+    texts = figure.legends[0].get_texts()
+    boxes = {t.get_text(): t.get_window_extent() for t in texts}
+    order = sorted(boxes, key=lambda name: (-round(boxes[name].y0), boxes[name].x0))
+    assert order == legend_names(labels)
+
+
+@pytest.mark.parametrize(
     "xyz",
     [np.zeros((0, 3)), np.ones((1, 3)), np.full((5, 3), np.nan), np.full((4, 3), 4.5e6)],
     ids=["none", "one", "nowhere", "all in one place, far away"],
@@ -261,6 +311,13 @@ def test_bars_are_as_long_as_the_counts(tmp_path, monkeypatch):
         (round(b.get_y() + b.get_height() / 2), b.get_x(), b.get_width()) for b in points.patches
     )
     assert bars == [(0, 0, 50), (0, 50, 10), (1, 0, 20)]
+
+
+def test_the_legend_of_the_bars_has_names_that_all_scenes_share():
+    one = counted("a", [(3, 50), (2, 10)])
+    named = replace(one, periods=tuple(replace(p, date=f"201{p.id}") for p in one.periods))
+    assert _period_names([named, named], 2) == ["0: 2010", "1: 2011"]
+    assert _period_names([named, one], 2) == ["Period 0", "Period 1"]
 
 
 @pytest.mark.parametrize("rows", [[(1, 0)], [(0, 0)] * 2, [(2, 30)] * 50])
