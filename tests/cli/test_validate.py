@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import cli, main
+from chronoscene.errors import ConfigError
 
 PERIODS = {f"{'ab'[p]}{i}.png": p for p in (0, 1) for i in range(7)}
 
@@ -189,3 +190,19 @@ def test_explain_nothing_that_is_there(capsys, monkeypatch):
         main()
     assert end.value.code == 2
     assert "--explain: expected codes of rules" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--out", "--sarif", "--html"])
+def test_reports_are_not_written_into_a_scene(broken, option, monkeypatch):
+    with pytest.raises(ConfigError, match=f"{option} .*: expected a place outside of the scenes"):
+        run(broken, option, broken / "report")
+    assert not (broken / "report").exists()
+
+
+@pytest.mark.parametrize("option", ["--out", "--sarif", "--html"])
+def test_places_of_reports_are_tried_first(broken, option, tmp_path, monkeypatch):
+    monkeypatch.setattr("chronoscene.cli.validate.validate_scene", lambda *_, **__: 1 / 0)
+    with pytest.raises(ConfigError, match=f"{option} .*found Is a directory"):
+        run(broken, option, tmp_path)
+    with pytest.raises(ConfigError, match=f"{option} .*found No such file"):
+        run(broken, option, tmp_path / "absent/report")

@@ -2,6 +2,7 @@
 
 from chronoscene.validation.rules import (
     cameras,
+    contents,
     dates,
     duplicates,
     exif,
@@ -25,6 +26,7 @@ from chronoscene.validation.rules import (
 
 __all__ = [
     "cameras",
+    "contents",
     "dates",
     "duplicates",
     "exif",
