@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,9 +12,9 @@ from typing import Any, Literal
 
 import click
 
-from chronoscene.cli.output import check_file, check_place, emit, writing_to
+from chronoscene.cli.output import check_file, check_outside, check_place, emit, writing_to
 from chronoscene.cli.progress import tracked
-from chronoscene.errors import ChronoSceneError, ConfigError
+from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import find_scenes, format_names, read_scene
 from chronoscene.parallel import map_parallel
 from chronoscene.stats import (
@@ -216,27 +216,16 @@ def _file_names(paths: Sequence[Path]) -> list[str]:
     return names
 
 
-def _check_places(request: Request, out: Path | None, paths: Iterable[Path]) -> None:
+def _check_places(request: Request, out: Path | None, paths: Sequence[Path]) -> None:
     """Make the folders for figures and pages; refuse to write into a scene."""
-    places = (("--out", out), ("--figures", request.figures), ("--pages", request.pages))
-    for option, place in places:
-        if place is not None and any(_is_in(place, path) for path in paths):
-            raise ConfigError(
-                f"{option} {place}",
-                expected="a place outside of the scenes",
-                found="one inside",
-                todo="choose another place: nothing is written into a dataset",
-            )
+    check_outside("--out", out, paths)
     check_file("--out", out)
-    for option, place in places[1:]:
+    for option, place in (("--figures", request.figures), ("--pages", request.pages)):
         if place is not None:
+            check_outside(option, place, paths)
             with writing_to(option, place, expected="a folder that can be made"):
                 place.mkdir(parents=True, exist_ok=True)
             check_place(option, place)
-
-
-def _is_in(place: Path, folder: Path) -> bool:
-    return place.resolve().is_relative_to(folder.resolve())
 
 
 def unseen(counts: Sequence[SceneCount]) -> Iterator[str]:

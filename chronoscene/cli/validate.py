@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.output import emit
+from chronoscene.cli.output import check_file, check_outside, emit
 from chronoscene.cli.progress import tracked
 from chronoscene.parallel import map_parallel
 from chronoscene.validation.finding import counted, printable
@@ -97,6 +97,9 @@ def command(
     check = partial(_check, _codes(select), _codes(ignore), decode)
     choose_rules(_codes(select), _codes(ignore))  # whatever is wrong with them is said first
     folders = find_folders(folder)
+    for option, file in (("--out", out), ("--sarif", sarif), ("--html", html)):
+        check_outside(option, file, folders)
+        check_file(option, file)
     if fix is not None:
         folders = _fix(folder, folders, fix)
     if len(folders) == 1:
