@@ -36,6 +36,9 @@ WRITABLE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 _METADATA_FORMATS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
+LONGEST_EXIF = 65533
+"""Bytes; what a JPEG file can hold. Some cameras write two blocks, which come as a longer one."""
+
 _KEPT_TAGS = (0x010F, 0x0110, 0x0112, 0x0132)
 """Maker, model, orientation and time; a TIFF has the layout of its pixels among its tags."""
 
@@ -160,15 +163,32 @@ def _metadata(path: Path) -> dict[str, Any]:
         profile = image.info.get("icc_profile")
     if isinstance(profile, bytes) and profile[16:20] == b"RGB ":
         kept["icc_profile"] = profile
+    if isinstance(kept["exif"], bytes) and len(kept["exif"]) > LONGEST_EXIF:
+        del kept["exif"]
     return {key: block for key, block in kept.items() if block}
 
 
 def _tiff_metadata(image: Image.Image) -> Image.Exif:
     """What a TIFF says about its capture, without what it says about its pixels."""
     found, kept = image.getexif(), Image.Exif()
-    kept.update({tag: found[tag] for tag in _KEPT_TAGS if tag in found})
+    kept.update({tag: found[tag] for tag in _KEPT_TAGS if tag in found and _fits(tag, found[tag])})
     for block in _KEPT_BLOCKS:
-        if tags := found.get_ifd(block):
+        tags = {tag: v for tag, v in found.get_ifd(block).items() if _fits(tag, v, block)}
+        if tags:
             kept.get_ifd(block).update(tags)
             kept[block] = 0  # Pillow puts the place of the block here
     return kept
+
+
+def _fits(tag: int, value: Any, block: int | None = None) -> bool:
+    """Whether Pillow can write a tag that it has read: not where its type is a wrong one."""
+    probe = Image.Exif()
+    if block is None:
+        probe[tag] = value
+    else:
+        probe.get_ifd(block)[tag] = value
+        probe[block] = 0
+    try:
+        return bool(probe.tobytes())
+    except Exception:  # struct.error, TypeError, OverflowError, AttributeError were seen
+        return False

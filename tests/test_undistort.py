@@ -1,6 +1,7 @@
 """Undistorted scenes: pixels and observations are where the formulas of the models say."""
 
 import dataclasses
+import struct
 
 import cv2
 import numpy as np
@@ -399,6 +400,37 @@ def test_exif_of_every_kind_of_file(make_distorted, tmp_path, suffix):
         assert (found[0x0112], found[0x010F]) == (6, "Maker")
         assert found.get_ifd(0x8769)[0x9003] == "2020:01:02 03:04:05"
         assert found.get_ifd(0x8825)[1] == "N"
+
+
+def test_exif_that_no_file_can_hold_is_dropped(make_distorted, tmp_path):
+    """Two blocks come as one of twice the length; a tag of a wrong type cannot be written."""
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]), suffix=".jpg")
+    block = b"Exif\0\0" + bytes(60_000)
+    segment = b"\xff\xe1" + (len(block) + 2).to_bytes(2, "big") + block
+    for frame in scene.frames:
+        path = scene.image_path(frame)
+        path.write_bytes(path.read_bytes()[:2] + 2 * segment + path.read_bytes()[2:])
+    new = undistort(scene, tmp_path / "out").scene
+    with Image.open(new.image_path(new.frames[0])) as result:
+        assert "exif" not in result.info
+
+
+def test_tiff_tags_of_wrong_types_are_dropped(make_distorted, tmp_path):
+    exif = Image.Exif()
+    exif[0x010F] = "Maker"
+    exif.get_ifd(0x8769).update({0x829A: 0.01, 0x9003: "2020:01:02 03:04:05"})
+    exif[0x8769] = 0
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]), suffix=".tif", exif=exif)
+    for frame in scene.frames:
+        path = scene.image_path(frame)
+        data = path.read_bytes()
+        fraction, text = struct.pack("<HH", 0x829A, 5), struct.pack("<HH", 0x829A, 2)
+        assert data.count(fraction) == 1
+        path.write_bytes(data.replace(fraction, text))
+    new = undistort(scene, tmp_path / "out").scene
+    with Image.open(new.image_path(new.frames[0])) as result:
+        assert result.getexif()[0x010F] == "Maker"
+        assert result.getexif().get_ifd(0x8769) == {0x9003: "2020:01:02 03:04:05"}
 
 
 @pytest.mark.parametrize(("space", "kept"), [(b"RGB ", True), (b"GRAY", False), (b"CMYK", False)])

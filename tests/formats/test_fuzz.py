@@ -279,9 +279,35 @@ def test_damaged_scenes(variants, run_damaged, tmp_path, variant):
     folder = make()
     out = tmp_path / "out"
     use(random.Random(0), folder, name, out)  # it is good
-    seconds = SECONDS / (len(VARIANTS) + 2)
+    seconds = SECONDS / (len(VARIANTS) + 6)
     run_damaged(damageable(folder), seconds, lambda rng: use(rng, folder, name, out))
     assert not (tmp_path / "exploded").exists()
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".webp", ".bmp"])
+def test_damaged_images_are_undistorted_or_refused(colmap_folder, run_damaged, tmp_path, suffix):
+    folder = colmap_folder(["a/0.png", "b/0.png"], form="text")
+    (folder / "sparse/0/cameras.txt").write_text("1 OPENCV 64 48 50 52 30 25.5 0.1 0 0 0\n")
+    images = folder / "sparse/0/images.txt"
+    images.write_text(images.read_text().replace(".png", suffix))
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F] = 6, "Maker"
+    exif.get_ifd(0x8769).update({0x9003: "2016:05:03 12:00:00", 0xA405: 28})
+    exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 7.0, 30.5)})
+    exif[0x8769] = exif[0x8825] = 0  # where the blocks are; Pillow fills it in
+    files = []  # plain ones are small, so that their heads are hit
+    for path in sorted((folder / "images").rglob("*.png")):
+        files.append(path.with_suffix(suffix))
+        Image.new("RGB", (64, 48), "red").save(files[-1], exif=exif)
+    scene = read_scene(folder)
+
+    def survive(rng):
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        make_split(scene, SplitSettings("date"))
+        undistort(scene, tmp_path / "out", center=rng.random() < 0.5, threads=1)
+        make_split(read_scene(tmp_path / "out"), SplitSettings("date"))
+
+    run_damaged(files, SECONDS / (len(VARIANTS) + 6), survive)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary"])
@@ -297,7 +323,7 @@ def test_damaged_point_clouds(run_damaged, tmp_path, form):
         header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
         path.write_bytes(header.encode() + bytes(50 * 24))
     assert len(read_points(path)) == 50
-    run_damaged([path], SECONDS / (len(VARIANTS) + 2), lambda rng: read_points(path))
+    run_damaged([path], SECONDS / (len(VARIANTS) + 6), lambda rng: read_points(path))
 
 
 def test_points_that_a_header_only_claims(tmp_path):
