@@ -418,19 +418,20 @@ def test_exif_that_no_file_can_hold_is_dropped(make_distorted, tmp_path):
 def test_tiff_tags_of_wrong_types_are_dropped(make_distorted, tmp_path):
     exif = Image.Exif()
     exif[0x010F] = "Maker"
-    exif.get_ifd(0x8769).update({0x829A: 0.01, 0x9003: "2020:01:02 03:04:05"})
-    exif[0x8769] = 0
-    scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]), suffix=".tif", exif=exif)
+    exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 7.0, 30.5)})
+    exif[0x8825] = 0
+    camera = Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"])
+    scene = make_distorted(camera, suffix=".tif", exif=exif)
     for frame in scene.frames:
         path = scene.image_path(frame)
         data = path.read_bytes()
-        fraction, text = struct.pack("<HH", 0x829A, 5), struct.pack("<HH", 0x829A, 2)
-        assert data.count(fraction) == 1
-        path.write_bytes(data.replace(fraction, text))
+        fractions, text = struct.pack("<HHI", 2, 5, 3), struct.pack("<HHI", 2, 2, 3)
+        assert data.count(fractions) == 1
+        path.write_bytes(data.replace(fractions, text))
     new = undistort(scene, tmp_path / "out").scene
     with Image.open(new.image_path(new.frames[0])) as result:
         assert result.getexif()[0x010F] == "Maker"
-        assert result.getexif().get_ifd(0x8769) == {0x9003: "2020:01:02 03:04:05"}
+        assert result.getexif().get_ifd(0x8825) == {1: "N"}
 
 
 @pytest.mark.parametrize(("space", "kept"), [(b"RGB ", True), (b"GRAY", False), (b"CMYK", False)])
