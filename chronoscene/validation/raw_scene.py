@@ -217,6 +217,26 @@ class RawScene:
                 medians[period] = float(np.median(errors))
         return medians
 
+    @cached_property
+    def _front(self) -> dict[int, NDArray[np.float64]]:
+        """Depths of the observations in front of their cameras by index of the period."""
+        by_period: dict[int, list[NDArray[np.float64]]] = {}
+        for seen in self.reprojections or ():
+            front = seen.depth[(seen.depth > 0) & np.isfinite(seen.depth)]
+            if len(front):
+                by_period.setdefault(int(self.image_periods[seen.image]), []).append(front)
+        return {period: np.concatenate(depths) for period, depths in by_period.items()}
+
+    def depths(self, percent: float) -> dict[int, float]:
+        """Percentile of the depths by index of the period, of the periods that have some."""
+        return {period: float(np.percentile(d, percent)) for period, d in self._front.items()}
+
+    @cached_property
+    def typical_depth(self) -> float:
+        """Median distance of the points from the cameras that see them; 0 if unknown."""
+        every = np.concatenate([np.zeros(0), *self._front.values()])
+        return float(np.median(every)) if len(every) else 0.0
+
     # Periods and split.
 
     @cached_property

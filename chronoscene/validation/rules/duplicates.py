@@ -131,7 +131,7 @@ def _apart(scene: RawScene, a: str, b: str) -> str:
     if a not in names or b not in names:
         return ""
     shift = np.linalg.norm(scene.centres[names.index(a)] - scene.centres[names.index(b)])
-    extent = typical_depth(scene)
+    extent = scene.typical_depth
     if not np.isfinite(shift) or not extent:
         return ""
     if shift <= SAME_PLACE * extent:
@@ -160,7 +160,7 @@ def pose_leak(scene: RawScene) -> Iterator[Hit]:
         rotations,
         scene.image_periods[posed],
         test,
-        near=SAME_PLACE * typical_depth(scene),
+        near=SAME_PLACE * scene.typical_depth,
     )
     for a, b in pairs:
         name, other = images.names[posed[a]], images.names[posed[b]]
@@ -195,13 +195,6 @@ def twins(
         turned = np.linalg.norm(rotations[others] - rotations[i], axis=(1, 2))
         if len(alike := others[close & (turned <= SAME_DIRECTION)]):
             yield i, int(alike[0])
-
-
-def typical_depth(scene: RawScene) -> float:
-    """Median distance of the points from the cameras that see them; 0 if unknown."""
-    depths = [s.depth[(s.depth > 0) & np.isfinite(s.depth)] for s in scene.reprojections or ()]
-    every = np.concatenate([np.zeros(0), *depths])
-    return float(np.median(every)) if len(every) else 0.0
 
 
 def near_pairs(

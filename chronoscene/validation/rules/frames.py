@@ -11,15 +11,11 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import WORLD, read_world
 from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.period_frames import explain
 from chronoscene.validation.positions import fit_gps
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.reprojection import project
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.reprojection import pose_limit
-
-MOST_WRONG = 0.5
-"""Share of the images of a period with a pose that does not fit: beyond, the period is at fault."""
+from chronoscene.validation.rules.own_frames import own_frames
 
 DEPTH_RATIO = 10.0
 """Between the median depths of two periods without shared points: nothing else tells scales."""
@@ -56,38 +52,23 @@ REACH = 3.0
     needs=("images", "periods", "reprojections", "point_periods"),
 )
 def period_frame(scene: RawScene) -> Iterator[Hit]:
-    limits: dict[int, float | None] = {}
-    for index in range(len(scene.period_ids)):
-        mine = np.flatnonzero(scene.image_periods == index)
-        mine = mine[~np.isnan(scene.image_errors[mine]) | _behind(scene, mine)]
-        allowed = np.array([pose_limit(scene, i) for i in mine.tolist()])
-        wrong = np.count_nonzero(~(scene.image_errors[mine] <= allowed))
-        limits[index] = float(np.median(allowed)) if wrong > MOST_WRONG * len(mine) else None
-    if any(limit is None for limit in limits.values()):  # else there is no frame to be in
-        for index, limit in limits.items():
-            explained = None if limit is None else explain(scene, index, limit)
-            if explained is not None:
-                place = f"period {scene.period_ids[index]}"
-                yield Hit(place, "the frame of the other periods", explained)
-    yield from _other_depths(scene)
+    for index, explained in own_frames(scene).items():
+        place = f"period {scene.period_ids[index]}"
+        yield Hit(place, "the frame of the other periods", explained)
+    yield from _other_depths(scene).values()
 
 
-def _behind(scene: RawScene, images: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which images have most of their points behind them."""
-    behind = {
-        r.image
-        for r in scene.reprojections or ()
-        if len(r.depth) and np.count_nonzero(~(r.depth > 0)) > MOST_WRONG * len(r.depth)
-    }
-    return np.isin(images, sorted(behind))
+def _other_depths(scene: RawScene) -> dict[int, Hit]:
+    """Periods without shared points whose depths are of another order than those of the rest.
 
-
-def _other_depths(scene: RawScene) -> Iterator[Hit]:
-    """Periods without shared points whose depths are of another order than those of the rest."""
+    Returns:
+        One hit for each, by the index of the period.
+    """
+    hits = {}
     seen = scene.point_periods
     assert seen is not None
     shared = seen[seen.sum(axis=1) > 1].any(axis=0)
-    medians = _depths(scene, 50)
+    medians = scene.depths(50)
     for index, period in enumerate(scene.period_ids):
         others = [d for i, d in medians.items() if i != index]
         if shared[index] or index not in medians or not others:
@@ -97,16 +78,6 @@ def _other_depths(scene: RawScene) -> Iterator[Hit]:
             expected = "a frame scaled like those of the other periods"
             found = f"points {ratio:.3g} times as far from the cameras, and none shared"
             yield Hit(f"period {period}", expected, found)
-
-
-def _depths(scene: RawScene, percent: float) -> dict[int, float]:
-    """Percentile of the depths by the index of the period, of the periods that have some."""
-    by_period: dict[int, list[NDArray[np.float64]]] = {}
-    for seen in scene.reprojections or ():
-        front = seen.depth[(seen.depth > 0) & np.isfinite(seen.depth)]
-        if len(front):
-            by_period.setdefault(int(scene.image_periods[seen.image]), []).append(front)
-    return {i: float(np.percentile(np.concatenate(d), percent)) for i, d in by_period.items()}
 
 
 @rule(
@@ -132,7 +103,7 @@ def frame_scale(scene: RawScene) -> Iterator[Hit]:
             found = f"{scale:.4g} m for one unit, by the GPS of {len(fit.images)} photos"
             yield Hit(WORLD, "a world in metres", found)
         return
-    for index, depth in _depths(scene, 50).items():
+    for index, depth in scene.depths(50).items():
         if index >= 0 and not NEAREST <= depth <= FARTHEST:
             place = f"period {scene.period_ids[index]}"
             yield Hit(place, "a world in metres", f"points {depth:.3g} m from the cameras (median)")
@@ -154,7 +125,10 @@ def period_apart(scene: RawScene) -> Iterator[Hit]:
         return
     share = common_view(scene)
     share[~(np.diag(share) >= OWN)] = np.nan  # cameras that miss their own points tell nothing
+    elsewhere = own_frames(scene).keys() | _other_depths(scene).keys()
     for index, period in enumerate(scene.period_ids):
+        if index in elsewhere:
+            continue  # what is seen in a wrong frame says nothing of places
         both = np.fmax(np.delete(share[index], index), np.delete(share[:, index], index))
         if np.isfinite(both).any() and np.nanmax(both) < APART:
             found = f"at most {100 * np.nanmax(both):.1f} % of the points in common view"
@@ -170,7 +144,7 @@ def common_view(scene: RawScene) -> NDArray[np.float64]:
     assert images is not None and points is not None and seen is not None
     count = len(scene.period_ids)
     share = np.full((count, count), np.nan)
-    reach = _depths(scene, 95)
+    reach = scene.depths(95)
     finite = np.isfinite(points.xyz).all(axis=1)
     owners = [_sample(finite & seen[:, i], MOST_POINTS // count) for i in range(count)]
     xyz = points.xyz[np.concatenate([np.zeros(0, np.int64), *owners])]

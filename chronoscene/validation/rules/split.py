@@ -100,8 +100,8 @@ def split_absent(scene: RawScene) -> Iterator[Hit]:
 
 def _by_folders(scene: RawScene) -> str | None:
     """What to do where the folders of the images may be the periods."""
-    folders = sorted({name.split("/")[0] for name in scene.names if "/" in name})
-    if len(folders) < 2 or not all("/" in name for name in scene.names):
+    folders = sorted({file.split("/")[0] for file in scene.files if "/" in file})
+    if len(folders) < 2 or not all("/" in file for file in scene.files):
         return None
     return (
         'write it: "<image name> <period id>" for each image; if the folders '
