@@ -9,9 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +21,7 @@ from chronoscene.bench.identity import code_version, scene_hash
 from chronoscene.bench.jobs import Job, check_job, write_job
 from chronoscene.bench.protocol import check_scene, effective_strategy
 from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.files import stoppable
 from chronoscene.formats import read_scene
 from chronoscene.images import MAX_WIDTH, ImageStore
 from chronoscene.methods import MethodSpec, load_spec
@@ -273,24 +272,6 @@ def _fresh_staging(folder: Path) -> Path:
     staging = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     staging.mkdir(parents=True)
     return staging
-
-
-@contextmanager
-def stoppable() -> Iterator[None]:
-    """Turn SIGTERM (of a batch system, say) into an exit that ends the worker and cleans up."""
-
-    def stop(number: int, frame: object) -> None:
-        raise SystemExit(128 + number)
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        # None stands for a handler that was not set in Python, which cannot be put back.
-        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
