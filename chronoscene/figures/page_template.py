@@ -41,8 +41,8 @@ button { flex: 1; min-width: 44px; padding: 5px 4px; border: 1px solid var(--lin
 button[aria-pressed="true"] { border-color: #2368c4; box-shadow: inset 0 0 0 1px #2368c4; }
 #periods label { display: flex; align-items: center; gap: 7px; padding: 2px 0; }
 #periods i { width: 12px; height: 12px; border-radius: 3px; flex: none; }
-#periods span { flex: 1; min-width: 0; overflow: hidden; text-overflow: ellipsis;
-  white-space: nowrap; }
+#periods span { flex: 1; min-width: 0; overflow: hidden; overflow-wrap: anywhere; line-height: 1.25;
+  display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 2; }
 #periods small, output { color: var(--soft); font-variant-numeric: tabular-nums; }
 .line { display: flex; align-items: center; gap: 8px; padding: 2px 0; }
 input[type="range"] { width: 100%; min-width: 0; flex: 1; }

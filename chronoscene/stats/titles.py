@@ -4,9 +4,9 @@ from __future__ import annotations
 
 
 def period_name(period: int, label: str, date: str | None) -> str:
-    """Its label, and its date where the label lacks it; the number if there is neither."""
+    """Its label, and its date where the label lacks the year; the number if there is neither."""
     names = [label] if label != str(period) else []
-    if date is not None and date not in label:
+    if date is not None and date[:4] not in label:
         names.append(date)
     return ", ".join(names) or str(period)
 

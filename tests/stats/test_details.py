@@ -128,4 +128,4 @@ def test_a_period_is_called_by_what_is_known():
     assert period_title(1, "flood", None) == "1: flood"
     assert period_title(1, "1", "2016-07") == "1: 2016-07"
     assert period_title(1, "flood", "2016-07") == "1: flood, 2016-07"
-    assert period_title(1, "summer 2016", "2016") == "1: summer 2016"
+    assert period_title(1, "summer 2016", "2016-07") == "1: summer 2016"
