@@ -188,7 +188,8 @@ def _label_axes(
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 
     for axis, edge, each in ((axes.xaxis, size[0], 0.55), (axes.yaxis, size[1], 0.35)):
-        axis.set_major_locator(MaxNLocator(int(np.clip(edge / each, 1, 6))))
+        most = int(np.clip(edge / each, 1, 6))
+        axis.set_major_locator(MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]))
         axis.set_major_formatter(FuncFormatter(_number))
     axes.tick_params(labelbottom=plane != (0, 1), labelleft=plane[0] == 0)
     if plane != (0, 1):

@@ -12,8 +12,9 @@ from chronoscene.scene import Camera, Frame, Scene
 
 Array = NDArray[np.float64]
 
-MOST_POINTS = 4000
-"""Points of all periods together that are looked for: a share is known to about a percent."""
+MOST_POINTS, LEAST_POINTS = 4000, 400
+"""Points of all periods together that are looked for, and of each: a share is known to a percent or
+two."""
 DEEP, FARTHER = 95.0, 1.5
 """Percentile of the depths at which the images of a period see points, and how many times as far
 they could see some."""
@@ -39,7 +40,8 @@ def common_view(
         no point. [T, T]
     """
     periods = seen.shape[1]
-    chosen = [_evenly(np.flatnonzero(column), MOST_POINTS // periods) for column in seen.T]
+    most = max(MOST_POINTS // periods, LEAST_POINTS)
+    chosen = [_evenly(np.flatnonzero(column), most) for column in seen.T]
     owner = np.repeat(np.arange(periods), [len(rows) for rows in chosen])
     counts = np.bincount(owner, minlength=periods)
     xyz = scene.points.xyz[np.concatenate(chosen)]
@@ -72,7 +74,7 @@ def _evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     """At most ``most`` of them, evenly spread."""
     if len(rows) <= most:
         return rows
-    return rows[np.linspace(0, len(rows) - 1, max(most, 1)).astype(np.int64)]
+    return rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
 
 
 def _reach(scene: Scene, depths: Array) -> Array:
