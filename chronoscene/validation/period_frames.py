@@ -36,6 +36,17 @@ would pull all points away."""
 FITS = 0.02
 """Median distance after the similarity, as a share of the extent of the points."""
 
+BETTER = 1 / 3
+"""Share of the median distance before the similarity that may be left after it."""
+
+WELL = 0.5
+"""Share of the limit, and of what a similarity leaves, that may be left where a factor explains all
+errors: cameras that look at one place from one distance see a wrong scale nearly like a wrong focal
+length."""
+
+SAME_FOCAL = 0.002
+"""Relative difference of focal lengths that explains nothing."""
+
 AXES = "xyz"
 
 
@@ -84,6 +95,26 @@ class Rays:
         distance[~(local[:, 2] > 0) | np.isnan(distance)] = np.inf
         return float(np.median(distance)) if len(distance) else np.inf
 
+    def error_in(self, similarity: Similarity) -> float:
+        """Median error in pixels with the points in the frame that a similarity leads from."""
+        own = np.linalg.solve(similarity.matrix, (self.xyz - similarity.translation).T).T
+        local = np.einsum("nij,nj->ni", self.rotation, own) + self.translation
+        shift = (local[:, :2] / local[:, 2:] - self.plane) * self.focal
+        distance = np.linalg.norm(shift, axis=1)
+        return float(np.median(np.where(np.isnan(distance), np.inf, distance)))
+
+    def focal_factor(self) -> tuple[float, float]:
+        """Factor of the focal lengths that fits best, and the median error in pixels with it."""
+        local = np.einsum("nij,nj->ni", self.rotation, self.xyz) + self.translation
+        projected, observed = local[:, :2] / local[:, 2:] * self.focal, self.plane * self.focal
+        known = (local[:, 2] > 0) & np.isfinite(projected).all(axis=1)
+        known &= np.isfinite(observed).all(axis=1)
+        if not known.any():
+            return 1.0, np.inf
+        projected, observed = projected[known], observed[known]
+        factor = float(np.median((projected * observed).sum(axis=1) / (projected**2).sum(axis=1)))
+        return factor, float(np.median(np.linalg.norm(projected * factor - observed, axis=1)))
+
     def place_points(self) -> tuple[NDArray[np.int64], Array]:
         """Indices and positions of the points by these rays alone, those with enough parallax.
 
@@ -131,7 +162,21 @@ def explain(scene: RawScene, period: int, limit: float) -> str | None:
     extent = float(np.median(np.linalg.norm(target - np.median(target, axis=0), axis=1)))
     if found is None or not np.median(found[1]) <= FITS * extent:
         return None
+    before = float(np.median(np.linalg.norm(own - target, axis=1)))
+    if not np.median(found[1]) <= BETTER * before:
+        return None
+    _, focal_error = rays.focal_factor()
+    if focal_error <= WELL * min(limit, rays.error_in(found[0])):
+        return None  # not the frame is wrong, but the camera
     return _moved(found[0], own, target)
+
+
+def focal_factor(rays: Rays, limit: float) -> float | None:
+    """What the focal lengths should be multiplied with, if that alone explains a period."""
+    if len(rays.point) < FEWEST_POINTS:
+        return None
+    factor, error = rays.focal_factor()
+    return factor if error <= WELL * limit and abs(factor - 1) > SAME_FOCAL else None
 
 
 def _negated(world: Array, camera: Array) -> str:

@@ -64,7 +64,7 @@ def _other_depths(scene: RawScene) -> dict[int, Hit]:
     Returns:
         One hit for each, by the index of the period.
     """
-    hits = {}
+    hits: dict[int, Hit] = {}
     seen = scene.point_periods
     assert seen is not None
     shared = seen[seen.sum(axis=1) > 1].any(axis=0)
@@ -77,7 +77,8 @@ def _other_depths(scene: RawScene) -> dict[int, Hit]:
         if not 1 / DEPTH_RATIO <= ratio <= DEPTH_RATIO:
             expected = "a frame scaled like those of the other periods"
             found = f"points {ratio:.3g} times as far from the cameras, and none shared"
-            yield Hit(f"period {period}", expected, found)
+            hits[index] = Hit(f"period {period}", expected, found)
+    return hits
 
 
 @rule(

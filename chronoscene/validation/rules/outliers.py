@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.validation.finding import Hit, counted, shown
+from chronoscene.validation.period_frames import Rays, focal_factor
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
+from chronoscene.validation.rules.own_frames import (
+    LEAST_ERROR,
+    WORSE,
+    own_frames,
+    period_limit,
+)
 from chronoscene.validation.rules.reprojection import pose_limit
-
-WORSE = 3.0
-"""Ratio of median reprojection errors, of a period to the best one or of an image to its period."""
-
-LEAST_ERROR = 1.0
-"""Pixels; below, everything is well whatever its ratio to the rest."""
 
 MOST_DUPLICATES = 0.05
 """Share of points on top of another one. COLMAP's models were seen with one percent."""
@@ -37,15 +38,24 @@ FAR = 100.0
 def period_error(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
     medians = scene.period_errors
-    limit = max(LEAST_ERROR, WORSE * min(medians.values(), default=0.0))
+    limit = period_limit(scene)
     for period, median in medians.items():
-        if median > limit:
+        if median > limit and scene.period_ids.index(period) not in own_frames(scene):
             mine = np.flatnonzero(scene.image_periods == scene.period_ids.index(period))
             known = mine[~np.isnan(scene.image_errors[mine])]
             worst = known[np.argsort(-scene.image_errors[known])]
             named = shown([scene.images.names[i] for i in worst])
             found = f"{median:.3g} px; worst are {named}"
+            found += _other_focal(scene, scene.period_ids.index(period), limit)
             yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
+
+
+def _other_focal(scene: RawScene, index: int, limit: float) -> str:
+    """In words, that other focal lengths explain the errors of a period, if they do."""
+    if scene.point_periods is None:
+        return ""
+    factor = focal_factor(Rays(scene, index), limit)
+    return "" if factor is None else f"; it fits with focal lengths times {factor:.4g}"
 
 
 @rule(

@@ -72,6 +72,30 @@ def test_mirrored_period(scene):
     scene.expect("CS519", place="period 1", found=found, also=seen & {"CS512", "CS513", "CS515"})
 
 
+@pytest.mark.parametrize(
+    ("similarity", "found"),
+    [
+        (Sim3(1.25, np.eye(3), np.zeros(3)), "scaled by 0.8, turned by 0 degrees"),
+        (Sim3(1.0, turn("x", 12), np.zeros(3)), "scaled by 1, turned by 12 degrees"),
+        (Sim3(1.0, np.eye(3), np.array([0.2, 0, 0])), "turned by 0 degrees and moved by 0.2"),
+    ],
+)
+def test_period_that_is_a_little_off(scene, similarity, found):
+    """Far less than what makes a single pose wrong, and still not the frame of the others."""
+    in_frame_of_its_own(scene, similarity)
+    scene.expect("CS519", place="period 1", found=found)
+
+
+def test_focal_length_of_one_period(scene):
+    """Not the frame is wrong, although nearly every error can be explained by one."""
+    scene.write(
+        "sparse/0/cameras.txt", ["1 PINHOLE 64 48 50 50 32 24", "2 PINHOLE 64 48 62.5 62.5 32 24"]
+    )
+    for row in range(14, 28, 2):
+        scene.edit_fields(IMAGES, row, {8: "2"})
+    scene.expect("CS515", place="period 1", found="it fits with focal lengths times 0.8")
+
+
 def test_opengl_axes_in_one_period(scene):
     flip = np.diag([1.0, -1.0, -1.0])
     scene.change_poses(lambda r, t: (flip @ r, flip @ t), PERIOD_1)

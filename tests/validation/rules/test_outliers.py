@@ -4,12 +4,13 @@ IMAGES, POINTS = "sparse/0/images.txt", "sparse/0/points3D.txt"
 
 
 def move_keypoints(scene, rows, pixels):
-    """Shift the keypoints of some images along x, and those of all a little."""
+    """Shift the keypoints of some images along x to both sides, and those of all a little."""
     lines = scene.lines(IMAGES)
     for row in range(14):
         words = np.array(lines[2 * row + 1].split(), dtype=object)
         shift = pixels if row in rows else 0.3
-        words[0::3] = [f"{float(x) + shift:.17g}" for x in words[0::3]]
+        shifts = shift * (-1.0) ** np.arange(len(words) // 3)
+        words[0::3] = [f"{float(x) + s:.17g}" for x, s in zip(words[0::3], shifts, strict=True)]
         lines[2 * row + 1] = " ".join(words)
     scene.write(IMAGES, lines)
 

@@ -1,0 +1,67 @@
+"""Which periods disagree with the others, and what explains it: asked by several rules."""
+
+from __future__ import annotations
+
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.validation.period_frames import explain
+from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.rules.reprojection import pose_limit
+
+WORSE = 3.0
+"""Ratio of median reprojection errors, of a period to the best one or of an image to its period."""
+
+LEAST_ERROR = 1.0
+"""Pixels; below, everything is well whatever its ratio to the rest."""
+
+MOST_WRONG = 0.5
+"""Share of the images of a period with a pose that does not fit: beyond, the period is at fault."""
+
+_EXPLAINED: WeakKeyDictionary[RawScene, dict[int, str]] = WeakKeyDictionary()
+
+
+def period_limit(scene: RawScene) -> float:
+    """Median reprojection error in pixels beyond which a period stands out among the others."""
+    return max(LEAST_ERROR, WORSE * min(scene.period_errors.values(), default=0.0))
+
+
+def own_frames(scene: RawScene) -> dict[int, str]:
+    """Periods in a frame of their own by index, with what brings them into that of the others."""
+    if scene not in _EXPLAINED:
+        _EXPLAINED[scene] = _explain_all(scene)
+    return _EXPLAINED[scene]
+
+
+def _explain_all(scene: RawScene) -> dict[int, str]:
+    if scene.point_periods is None:
+        return {}
+    limits = {i: _limit_of_wrong(scene, i) for i in range(len(scene.period_ids))}
+    if all(limit is not None for limit in limits.values()):
+        return {}  # there is no frame to be in
+    found = {i: explain(scene, i, limit) for i, limit in limits.items() if limit is not None}
+    return {i: words for i, words in found.items() if words is not None}
+
+
+def _limit_of_wrong(scene: RawScene, index: int) -> float | None:
+    """Error in pixels that most images of a period exceed, if they do."""
+    mine = np.flatnonzero(scene.image_periods == index)
+    mine = mine[~np.isnan(scene.image_errors[mine]) | _behind(scene, mine)]
+    if not len(mine):
+        return None
+    usual = period_limit(scene) if len(scene.period_errors) > 1 else np.inf
+    limit = min(usual, float(np.median([pose_limit(scene, i) for i in mine.tolist()])))
+    wrong = np.count_nonzero(~(scene.image_errors[mine] <= limit))
+    return limit if wrong > MOST_WRONG * len(mine) else None
+
+
+def _behind(scene: RawScene, images: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which images have most of their points behind them."""
+    behind = {
+        r.image
+        for r in scene.reprojections or ()
+        if len(r.depth) and np.count_nonzero(~(r.depth > 0)) > MOST_WRONG * len(r.depth)
+    }
+    return np.isin(images, sorted(behind))
