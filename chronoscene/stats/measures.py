@@ -123,10 +123,10 @@ def reproject(scene: Scene) -> Reprojection:
     with np.errstate(all="ignore"):  # absurd poses and points give NaN, which is left out
         for i, frame in enumerate(scene.frames):
             rows = order[ends[i] : ends[i + 1]]
-            local = points.xyz[of[rows]] @ frame.cam_from_world[:3, :3].T
+            local = points.xyz.take(of.take(rows), axis=0) @ frame.cam_from_world[:3, :3].T
             local += frame.cam_from_world[:3, 3]
             u, v = pixels_of(frame.camera, *local.T)
-            seen = points.track_xy[rows]
+            seen = points.track_xy.take(rows, axis=0)
             ahead = local[:, 2] > 0
             error = np.hypot(u - seen[:, 0], v - seen[:, 1])
             residual[rows] = np.where(ahead, error, np.nan)
