@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-FOUR = ("#b5121b", "#f5c211", "#1f6fd1", "#4db36a")
+FOUR = ("#b5121b", "#f5c211", "#2458c8", "#55c878")
 """Red, yellow, blue, green: the colours of the paper's figures for up to four periods. The red is
 dark and the green light, so that they differ for the colour-blind, too."""
 
 EIGHT = (
-    *("#0072b2", "#e69f00", "#009e73", "#cc79a7"),
-    *("#56b4e9", "#d55e00", "#5c5c5c", "#e6dc32"),
+    *("#124595", "#ff9103", "#00a769", "#a468d0"),
+    *("#32cfff", "#c83b11", "#694557", "#ffd151"),
 )
-"""Told apart with any common form of colour blindness.
+"""Told apart on white and on dark grounds with any form of colour blindness.
 
-Source: Okabe and Ito 2008, with grey for black and a darker yellow, for white and dark grounds.
+Source: hues of Okabe and Ito 2008, with grey for black, moved apart until the smallest distance
+between two of them, or one and a ground, was largest for all three forms in the model of Machado,
+Oliveira and Fernandes 2009.
 """
 
 _RAMP = ("#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0da39", "#e8d21d")

@@ -68,8 +68,11 @@ DEUTERANOPIA = [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0
 PROTANOPIA = [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]]
 
 
-@pytest.mark.parametrize("matrix", [np.eye(3), DEUTERANOPIA, PROTANOPIA])
-@pytest.mark.parametrize(("palette", "least"), [(FOUR, 100), (EIGHT, 45)])
+TRITANOPIA = [[1.256, -0.077, -0.179], [-0.078, 0.931, 0.148], [0.005, 0.691, 0.304]]
+
+
+@pytest.mark.parametrize("matrix", [np.eye(3), DEUTERANOPIA, PROTANOPIA, TRITANOPIA])
+@pytest.mark.parametrize(("palette", "least"), [(FOUR, 100), (EIGHT, 85)])
 def test_colours_differ_for_the_colour_blind(palette, least, matrix):
     linear = (np.array([rgb_of(c) for c in palette]) / 255) ** 2.2
     seen = 255 * np.clip(linear @ np.array(matrix).T, 0, 1) ** (1 / 2.2)
