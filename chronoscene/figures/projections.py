@@ -165,14 +165,15 @@ def _draw_cameras(
     """A dot with a line in the viewing direction for each camera, on white."""
     from matplotlib.collections import LineCollection
 
-    length = 0.02 * float(box.edges.max())
+    crowd = float(np.clip((300 / len(cloud.centres)) ** 0.5, 0.4, 1.0))
+    length = 0.02 * crowd * float(box.edges.max())
     centres = cloud.centres[:, plane]
     ends = centres + length * cloud.directions[:, plane]
     own = [colors[p] for p in cloud.camera_period]
     views = list(np.stack([centres, ends], axis=1))
     size = float(np.clip(1500 / len(centres), 3.0, 9.0))
     for color, wide in (("white", 1.8), ("#333333", 0.6)):
-        lines = LineCollection(views, colors=color, linewidths=wide, zorder=2)
+        lines = LineCollection(views, colors=color, linewidths=crowd * wide, zorder=2)
         axes.add_collection(lines, autolim=False)
     axes.scatter(*centres.T, s=2.2 * size, c="white", linewidths=0, zorder=3)
     axes.scatter(*centres.T, s=size, c=own, edgecolors="#333333", linewidths=0.3, zorder=3)
