@@ -59,9 +59,12 @@ def _limit_of_wrong(scene: RawScene, index: int) -> float | None:
 
 def _behind(scene: RawScene, images: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Which images have most of their points behind them."""
+    asked = set(images.tolist())
     behind = {
         r.image
         for r in scene.reprojections or ()
-        if len(r.depth) and np.count_nonzero(~(r.depth > 0)) > MOST_WRONG * len(r.depth)
+        if r.image in asked
+        and len(r.depth)
+        and np.count_nonzero(~(r.depth > 0)) > MOST_WRONG * len(r.depth)
     }
     return np.isin(images, sorted(behind))

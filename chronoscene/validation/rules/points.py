@@ -157,8 +157,7 @@ def points_of_one_period(scene: RawScene) -> Iterator[Hit]:
     assert seen is not None
     if not len(seen) or seen.shape[1] < 2:
         return
-    number = seen.sum(axis=1)
-    alone = [int(np.count_nonzero(seen[:, i] & (number == 1))) for i in range(seen.shape[1])]
+    alone = seen[seen.sum(axis=1) == 1].sum(axis=0).tolist()
     each = ", ".join(f"period {p} {n}" for p, n in zip(scene.period_ids, alone, strict=True))
     share = 100 * sum(alone) / len(seen)
     found = f"{sum(alone)} of {len(seen)} in one only ({share:.1f} %): {each}"
@@ -178,8 +177,10 @@ def points_of_one_period(scene: RawScene) -> Iterator[Hit]:
 def period_unconnected(scene: RawScene) -> Iterator[Hit]:
     seen = scene.point_periods
     assert seen is not None
+    points = seen.sum(axis=0)
     groups = connected(common_points(seen), FEWEST_SHARED)
-    groups = [group for group in groups if seen[:, group].any()]  # else another rule's
+    groups = [group for group in groups if points[group].any()]  # else another rule's
+    groups.sort(key=lambda group: -int(points[group].sum()))
     for group in groups[1:]:
         own = seen[:, group].any(axis=1)
         shared = np.count_nonzero(own & np.delete(seen, group, axis=1).any(axis=1))
@@ -190,27 +191,24 @@ def period_unconnected(scene: RawScene) -> Iterator[Hit]:
 
 
 def common_points(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Points that two periods see, for each two. [P, T] -> [T, T]"""
+    """Points that two periods see, for each two; nothing on the diagonal. [P, T] -> [T, T]"""
+    seen = seen[seen.sum(axis=1) > 1]
     rows = max(1, BLOCK // max(1, seen.shape[1]))
     common = np.zeros((seen.shape[1],) * 2, np.int64)
     for first in range(0, len(seen), rows):
         block = seen[first : first + rows].astype(np.float32)
         common += (block.T @ block).astype(np.int64)
+    np.fill_diagonal(common, 0)
     return common
 
 
 def connected(common: NDArray[np.int64], fewest: int) -> list[NDArray[np.int64]]:
-    """Groups of periods that a chain of periods with so many common points links.
-
-    Returns:
-        Indices of the periods of each group, the group with the most points first.
-    """
+    """Indices of the periods of each group that chains of so many common points link."""
     reach = (common >= fewest) | np.eye(len(common), dtype=bool)
     for _ in range(len(common).bit_length()):  # each time twice as many steps
         reach = (reach.astype(np.float32) @ reach.astype(np.float32)) > 0
     first = [int(np.flatnonzero(row)[0]) for row in reach]  # period of the group
-    groups = [np.flatnonzero(reach[period]) for period in sorted(set(first))]
-    return sorted(groups, key=lambda group: -int(np.diag(common)[group].sum()))
+    return [np.flatnonzero(reach[period]) for period in sorted(set(first))]
 
 
 @rule(
