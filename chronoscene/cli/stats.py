@@ -34,6 +34,9 @@ from chronoscene.validation.finding import printable
 Layout = Literal["full", "paper"]
 FIGURE_FORMATS = ("png", "pdf", "svg")
 
+SCENE_PARTS = ("sparse", "images")
+"""Folders that only scenes have."""
+
 SOME_FAILED, ALL_FAILED = 1, 2
 """Exit status when scenes cannot be read."""
 
@@ -131,9 +134,7 @@ def command(
     were read, 1 some, 2 none, or wrong usage.
     """
     request = Request(**options)  # type: ignore[arg-type]
-    paths = [
-        p for f in folders for p in in_paper_order(find_scenes(f, format=request.dataset_format))
-    ]
+    paths = [p for f in folders for p in in_paper_order(_scenes(f, request.dataset_format))]
     _check_places(request, out, paths)
     items = list(zip(paths, _file_names(paths), strict=True))
     work = map_parallel(partial(examine, request), items)
@@ -188,6 +189,15 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
     if request.layout == "paper":
         return count_scene(scene, count=request.count)
     return measure_scene(scene, count=request.count)
+
+
+def _scenes(folder: Path, dataset_format: str | None) -> list[Path]:
+    """The scenes of a folder, and beside them what looks like one, so that nothing is lost."""
+    found = find_scenes(folder, format=dataset_format)
+    if found == [folder]:
+        return found
+    beside = {p for name in SCENE_PARTS for p in folder.glob(f"*/{name}") if p.is_dir()}
+    return sorted({*found, *(p.parent for p in beside)})
 
 
 def _width(out: Path | None) -> int | None:

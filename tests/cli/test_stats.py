@@ -165,6 +165,19 @@ def test_a_scene_that_cannot_be_read_does_not_cost_the_others(make_scene_folder,
     assert len(done.stderr.splitlines()) == 3
 
 
+def test_a_scene_that_is_not_known_as_one_is_not_left_out_in_silence(make_scene_folder, tmp_path):
+    for name in "abc":
+        make_scene_folder({"1.png": 0, "2.png": 1}, name=f"set/{name}")
+    (tmp_path / "set/b/sparse/split.txt").unlink()
+    (tmp_path / "set/notes").mkdir()
+    result = run(tmp_path / "set", "--format", "json")
+    assert result.exit_code == 1
+    data = json.loads(result.stdout)
+    assert [s["name"] for s in data["scenes"]] == ["a", "c"]
+    assert [u["path"] for u in data["unreadable"]] == [str(tmp_path / "set/b")]
+    assert "split.txt" in result.stderr and len(result.stderr.splitlines()) == 1
+
+
 def test_out_is_looked_at_before_the_work(make_scene_folder, tmp_path, monkeypatch):
     folder = make_scene_folder()
     monkeypatch.setattr("chronoscene.cli.stats.read_scene", lambda *_, **__: pytest.fail("work"))
