@@ -17,7 +17,7 @@ from chronoscene.colmap import MODEL_FILES
 from chronoscene.colmap_writer import write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.files import write_text_atomic
-from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST
+from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD
 from chronoscene.splits import parse_split_text, parse_test_text
 from chronoscene.validation.finding import counted, shown
 from chronoscene.validation.origin import other_format
@@ -25,7 +25,7 @@ from chronoscene.validation.raw_model import FORMS, RawModel
 from chronoscene.validation.raw_scene import RawScene, TextFile, read_text_file
 from chronoscene.validation.repair_images import set_upright
 from chronoscene.validation.repair_model import Repair, repair_model
-from chronoscene.validation.repair_texts import repair_split, repair_test
+from chronoscene.validation.repair_texts import plain_table, repair_split, repair_test
 from chronoscene.validation.rules import split as split_rules
 from chronoscene.validation.rules import testlist as test_rules
 from chronoscene.validation.rules.images import images_of_other_shape
@@ -155,8 +155,12 @@ class _Fix:
         text = self._find_text(SPLIT, split_rules.ELSEWHERE, "CS301")
         if text is None or names is None:
             return
-        entries, _ = parse_split_text(text.text)
-        better, new_ids, repairs = repair_split(text.data, text.text, names, entries)
+        plain, repairs = plain_table(text.text, names)
+        entries, _ = parse_split_text(plain)
+        assert self._scene.images is not None
+        others = sorted(set(self._scene.images.names) - set(names))
+        better, new_ids, more = repair_split(text.data, plain, names, entries, others)
+        repairs += more
         if not self._write(SPLIT, better):
             return
         self._repairs += repairs
@@ -246,9 +250,36 @@ class _Fix:
                 left_out.append(place)
             elif path.is_file():
                 _link(path, self._out / place)
+        kept = self._behind_links(top)
+        left_out = [p for p in left_out if not any(k == p or k.startswith(f"{p}/") for k in kept)]
         if left_out:
             what = f"{counted(len(left_out), 'link')} out of the scene left out: {shown(left_out)}"
             self._repairs.append(Repair("", what))
+
+    def _behind_links(self, top: Path) -> list[str]:
+        """What makes up the scene and is still missing: it is in folders or files that are links.
+
+        Images elsewhere are linked again, so that nothing is copied from there but the model.
+        """
+        names = [f"images/{name}" for name in self._scene.present]
+        below = f"{self._scene.model_place}/" if self._scene.model_place else ""
+        stems = (*MODEL_FILES, "rigs", "frames")
+        model = [f"{below}{stem}{form}" for stem in stems for form in FORMS]
+        kept, linked = [], 0
+        for place in (*names, *model, SPLIT, TEST, PERIODS, WORLD):
+            source, target = self._scene.root / place, self._out / place
+            if place in self._written or os.path.lexists(target) or not source.is_file():
+                continue
+            kept.append(place)
+            if source.resolve().is_relative_to(top) or not place.startswith("images/"):
+                _link(source, target)
+            else:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.symlink_to(source.resolve())
+                linked += 1
+        if linked:
+            self._repairs.append(Repair("", f"{counted(linked, 'image')} linked from elsewhere"))
+        return kept
 
     def _write(self, place: str, text: str) -> bool:
         """Write a text file, unless it has names that are no text, which have their own rule."""

@@ -12,10 +12,15 @@ from collections.abc import Mapping, Sequence
 from chronoscene.splits import NameEntry, NameIndex, SplitEntry
 from chronoscene.validation.finding import counted
 from chronoscene.validation.repair_model import Repair
+from chronoscene.validation.spelling import PUNCTUATION, Spellings, spelling
 
 
 def repair_split(
-    data: bytes, text: str, names: Sequence[str], entries: Sequence[SplitEntry]
+    data: bytes,
+    text: str,
+    names: Sequence[str],
+    entries: Sequence[SplitEntry],
+    others: Sequence[str] = (),
 ) -> tuple[str, dict[int, int], list[Repair]]:
     """A better ``split.txt``.
 
@@ -24,6 +29,7 @@ def repair_split(
         text: The same, decoded.
         names: Full names of the registered images.
         entries: Its readable lines.
+        others: Names in the model that no image can have. Lines on them stay.
 
     Returns:
         The new text; new ids by the old ones; what was done.
@@ -34,7 +40,13 @@ def repair_split(
     if ids != list(range(len(ids))):
         listed = ", ".join(f"{old} is now {new}" for old, new in list(new_ids.items())[:10])
         repairs.append(Repair("CS401", f"periods numbered from 0: {listed}"))
-    lines, unknown, twice = _split_lines(text, names, entries, new_ids)
+    lines, unknown, twice, misspelt = _split_lines(text, names, entries, new_ids, others)
+    index = NameIndex(names)
+    known = set(names)
+    if short := sum(len(index.find(e.name)) == 1 and e.name not in known for e in entries):
+        repairs.append(Repair("", f"{counted(short, 'name')} written in full"))
+    if misspelt:
+        repairs.append(Repair("CS305", f"{counted(misspelt, 'name')} corrected as in the model"))
     if unknown:
         gone = counted(unknown, "line")
         repairs.append(Repair("CS309", f"{gone} on images that are not in the model removed"))
@@ -44,14 +56,23 @@ def repair_split(
 
 
 def _split_lines(
-    text: str, names: Sequence[str], entries: Sequence[SplitEntry], new_ids: Mapping[int, int]
-) -> tuple[list[str], int, int]:
-    """New lines, and how many old ones are left out: of unknown images, and repeated ones."""
+    text: str,
+    names: Sequence[str],
+    entries: Sequence[SplitEntry],
+    new_ids: Mapping[int, int],
+    others: Sequence[str],
+) -> tuple[list[str], int, int, int]:
+    """New lines; how many are left out, of unknown images and repeated ones; misspelt names."""
     index = NameIndex(names)
     by_line = {entry.line: (entry, index.find(entry.name)) for entry in entries}
+    listed = {fits[0] for _, fits in by_line.values() if len(fits) == 1}
+    spellings, impossible = Spellings(set(names) - listed), Spellings(others)
+    for number, (entry, fits) in by_line.items():
+        if not fits and (name := _meant(spellings, entry.name)) is not None:
+            by_line[number] = (entry, [name])
     used = {entry.period for entry, fits in by_line.values() if len(fits) == 1}
     lines: list[str] = []
-    unknown = twice = 0
+    unknown = twice = misspelt = 0
     done: set[tuple[str, int]] = set()
     for number, line in enumerate(re.split("\r\n|\r|\n", text), start=1):
         if number not in by_line:
@@ -59,14 +80,15 @@ def _split_lines(
             continue
         entry, fits = by_line[number]
         name = _one_name(fits, entry.name)
-        if not fits and entry.period in used:
+        if not fits and entry.period in used and impossible.find(entry.name) is None:
             unknown += 1
         elif (name, entry.period) in done:
             twice += 1
         else:
             done.add((name, entry.period))
+            misspelt += not index.find(entry.name) and bool(fits)
             lines.append(f"{name} {new_ids[entry.period]}")
-    return lines, unknown, twice
+    return lines, unknown, twice, misspelt
 
 
 def _line_repairs(data: bytes, text: str) -> list[Repair]:
@@ -83,15 +105,42 @@ def _line_repairs(data: bytes, text: str) -> list[Repair]:
     return repairs
 
 
+def plain_table(text: str, names: Sequence[str]) -> tuple[str, list[Repair]]:
+    """A table with commas, semicolons or quotes as one with blanks, where its names are images."""
+    index, spellings = NameIndex(names), Spellings(names)
+    lines, changed, code = re.split("(\r\n|\r|\n)", text), 0, ""
+    for i in range(0, len(lines), 2):
+        found = re.fullmatch(r"\s*[\"']?(.+?)[\"']?\s*[,;]\s*[\"']?([0-9]{1,9})[\"']?\s*", lines[i])
+        if found and (index.find(found[1]) or _meant(spellings, found[1])):
+            code = "CS305" if len(lines[i].split()) > 1 else "CS303"  # what it was reported as
+            lines[i] = f"{found[1]} {found[2]}"
+            changed += 1
+    what = f"blanks instead of commas in {counted(changed, 'line')}"
+    return "".join(lines), [Repair(code, what)] if changed else []
+
+
+def _meant(spellings: Spellings, text: str) -> str | None:
+    """The image that a name means but for case, Unicode form, quotes or folders above it."""
+    name, full = spellings.find(text), spelling(text.strip(PUNCTUATION))
+    if name is None:
+        return None
+    known = spelling(name)
+    same = full in (known, known.rpartition("/")[2]) or full.endswith(f"/{known}")
+    return name if same else None
+
+
 def repair_test(
     names: Sequence[str], entries: Sequence[NameEntry]
 ) -> tuple[list[str], list[Repair]]:
     """Better lines of ``test.txt``; the same lines if no one names an image of the model."""
-    index = NameIndex(names)
+    index, spellings = NameIndex(names), Spellings(names)
     lines: dict[str, None] = {}
-    unknown = 0
+    unknown = renamed = 0
     for entry in entries:
         fits = index.find(entry.name)
+        for text in (entry.name, entry.name.rsplit(maxsplit=1)[0]):  # some add the period
+            if not fits and (name := _meant(spellings, text)) is not None:
+                fits, renamed = [name], renamed + 1
         if fits:
             lines[_one_name(fits, entry.name)] = None
         else:
@@ -99,6 +148,8 @@ def repair_test(
     if not lines:
         return [entry.name for entry in entries], []
     repairs = []
+    if renamed:
+        repairs.append(Repair("CS324", f"{counted(renamed, 'name')} corrected as in the model"))
     if unknown:
         gone = counted(unknown, "line")
         repairs.append(Repair("CS324", f"{gone} on images that are not in the model removed"))

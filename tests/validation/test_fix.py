@@ -317,3 +317,68 @@ def test_nothing_is_left_behind_by_a_failure(scene, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="No space left"):
         fix_scene(scene.root, tmp_path / "fixed")
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+
+
+@pytest.mark.parametrize("name", ["A001.PNG", '"a001.png"', "images\\a001.png", "C:\\x\\a001.png"])
+def test_misspelt_names_are_corrected_not_removed(scene, fix, name):
+    scene.replace(SPLIT, "a001.png 0", f"{name} 0")
+    fixed, after, out = fix()
+    assert (fixed, after) == ({"CS305"}, {"CS507"})
+    assert "a001.png 0" in (out / SPLIT).read_text().splitlines()
+
+
+@pytest.mark.parametrize(("separator", "code"), [(",", "CS303"), (", ", "CS305"), (";", "CS303")])
+def test_tables_with_commas(scene, fix, separator, code):
+    scene.write(SPLIT, [line.replace(" ", separator) for line in scene.lines(SPLIT)])
+    fixed, after, _ = fix()
+    assert (fixed, after) == ({code}, {"CS507"})
+
+
+def test_test_image_with_its_period_stays_a_test_image(scene, fix):
+    scene.write(TEST, ["a003.png 0", "B003.PNG"])
+    fixed, after, out = fix()
+    assert (fixed, after) == ({"CS324"}, {"CS507"})
+    assert (out / TEST).read_text() == "a003.png\nb003.png\n"
+
+
+def test_lines_on_images_with_impossible_names_stay(scene, fix):
+    scene.edit_fields(IMAGES, 0, {9: "/home/me/a000.png"})
+    _, after, out = fix()
+    assert "a000.png 0" in (out / SPLIT).read_text().splitlines()
+    assert {"CS111", "CS309"} <= after
+
+
+def test_an_image_of_that_name_in_another_folder_is_another_one(scene, fix):
+    """Its line must not give the period of the one to the other."""
+    for place in (IMAGES, SPLIT):
+        scene.replace(place, "b001.png", "2023/a001.png")
+    scene.path("images/2023").mkdir()
+    scene.path("images/b001.png").rename(scene.path("images/2023/a001.png"))
+    scene.replace(SPLIT, "2023/a001.png 1", "2019/a001.png 1")
+    _, after, out = fix()
+    assert "2023/a001.png 1" not in (out / SPLIT).read_text()
+    assert "CS305" in after
+
+
+def test_images_that_are_links_are_linked_again(scene, fix, tmp_path):
+    """A scene that was made with links is good, and so must its copy be."""
+    scene.path("images").rename(tmp_path / "photos")
+    scene.path("images").mkdir()
+    for path in (tmp_path / "photos").iterdir():
+        scene.path(f"images/{path.name}").symlink_to(path)
+    fixed, after, out = fix()
+    assert (fixed, after) == (set(), {"CS507"})
+    assert (out / "images/a000.png").resolve() == tmp_path / "photos/a000.png"
+
+
+@pytest.mark.parametrize("folder", ["images", "sparse", "sparse/0"])
+def test_folders_that_are_links(scene, fix, tmp_path, folder):
+    scene.path(folder).rename(tmp_path / "elsewhere")
+    scene.path(folder).symlink_to(tmp_path / "elsewhere")
+    assert fix()[:2] == (set(), {"CS507"})
+
+
+def test_a_model_that_is_a_link_inside_of_the_scene(scene, fix):
+    scene.path("sparse/0").rename(scene.path("model"))
+    scene.path("sparse/0").symlink_to("../model")
+    assert fix()[:2] == (set(), {"CS507"})

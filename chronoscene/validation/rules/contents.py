@@ -21,9 +21,9 @@ and more in the median; 0.5 and less for a wrong one, 0.1 in the median."""
 TRIED = 12
 """Images whose photo is looked for among all photos where hardly any photo is right."""
 
-OF_USUAL = 0.5
+OF_USUAL = 0.4
 """And it must be below this share of the median of its period: where all is rebuilt and registered
-by little, points have the colours of another period. Measured: a median of 0.45, the least 0.23."""
+by little, points have the colours of another period. Measured: a median of 0.51, the least 0.23."""
 
 MOST_WRONG = 0.5
 """Share of the photos of a period beyond which all of them are at fault."""
