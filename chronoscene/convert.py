@@ -11,10 +11,8 @@ import numpy as np
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.formats import load_format, read_scene, writable_formats
-from chronoscene.formats.colmap_folders import names_in_folders, period_folders
-from chronoscene.formats.grouping import label_date
 from chronoscene.formats.writing import ImageSource, Progress
-from chronoscene.scene import Scene, WorldFrame
+from chronoscene.scene import Scene
 from chronoscene.splits import IMAGE_SUFFIXES
 
 
@@ -103,19 +101,8 @@ def _unused_images(scene: Scene) -> int:
 
 def losses(scene: Scene, target: str) -> list[str]:
     """What a scene has that a format cannot hold."""
-    lost = []
-    if target == "nerfstudio" and len(scene.points.track_frame):
-        lost.append("the observations of points, their ids and errors")
-    if target == "colmap-folders":
-        folders = period_folders(scene.periods)
-        if folders != [period.label for period in scene.periods]:
-            lost.append(f"the labels of the periods as they are (folders: {', '.join(folders)})")
-        if any(p.date != label_date(f) for p, f in zip(scene.periods, folders, strict=True)):
-            lost.append("the dates of the periods")
-        if any(new != old for old, new in names_in_folders(scene).items()):
-            lost.append("these image names, which get the folder of their period")
-        if scene.world != WorldFrame():
-            lost.append("unit and reference system of the world")
+    module = load_format(target)
+    lost = module.losses(scene) if hasattr(module, "losses") else []
     return [f"{target} has no place for {item}" for item in lost]
 
 

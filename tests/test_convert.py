@@ -139,8 +139,8 @@ def test_progress_counts_images(make_scene_folder, tmp_path):
 
 def test_unknown_target_and_grouping(make_scene_folder, tmp_path):
     folder = make_scene_folder()
-    with pytest.raises(ConfigError, match="chronoscene, colmap-folders, nerfstudio, found 'wat'"):
-        convert(folder, tmp_path / "out", target="wat")
+    with pytest.raises(ConfigError, match="nerfstudio, wat, found 'neusc'"):
+        convert(folder, tmp_path / "out", target="neusc")
     with pytest.raises(ConfigError, match="no such option for chronoscene, which says its periods"):
         convert(folder, tmp_path / "out", period_by="year")
 
@@ -149,7 +149,7 @@ def test_losses(make_scene_folder):
     scene = read_scene(make_scene_folder())
     assert losses(scene, "chronoscene") == []
     (names,) = losses(scene, "colmap-folders")
-    assert names.endswith("these image names, which get the folder of their period")
+    assert names.endswith("these image names, which get the mark of their period")
     assert losses(scene, "nerfstudio") == [
         "nerfstudio has no place for the observations of points, their ids and errors"
     ]
@@ -159,10 +159,10 @@ def test_losses(make_scene_folder):
         world=WorldFrame("metre"),
     )
     assert [text.split(" for ")[1] for text in losses(dated, "colmap-folders")] == [
-        "the labels of the periods as they are (folders: 0_a, 1_2023)",
+        "the labels of the periods as they are (but: 0_a, 1_2023)",
         "the dates of the periods",
-        "these image names, which get the folder of their period",
         "unit and reference system of the world",
+        "these image names, which get the mark of their period",
     ]
 
 

@@ -2,7 +2,8 @@
 
 A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and where it makes sense
 
-- ``write(scene, out, image_source=..., progress=...)``;
+- ``write(scene, out, image_source=..., progress=...)``, and with it ``losses(scene)``, what of the
+  scene has no place in the format;
 - ``PERIOD_BY``, the values that ``read(path, period_by=...)`` knows, where periods can be chosen;
 - ``remarks(path)``, what a folder has that does not become part of the scene.
 """

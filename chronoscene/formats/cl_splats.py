@@ -14,9 +14,18 @@ Source: Ackermann et al., CL-Splats, ICCV 2025; layout as in ``jan-ackermann/cl-
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
+from chronoscene.errors import SceneError
 from chronoscene.formats.colmap_layout import find_model, make_scene, read_images, scan
+from chronoscene.formats.colmap_writing import (
+    as_pinhole,
+    lost_labels,
+    lost_names,
+    lost_split,
+    write_renamed,
+)
 from chronoscene.formats.grouping import group_labels, natural_key, rule_error
 from chronoscene.formats.intrinsics import CameraTable
 from chronoscene.formats.json_values import read_json
@@ -30,7 +39,8 @@ from chronoscene.formats.transforms import (
     read_frames,
 )
 from chronoscene.formats.transforms import make_scene as scene_from_shots
-from chronoscene.scene import Points, Scene
+from chronoscene.formats.writing import ImageSource, Progress
+from chronoscene.scene import PINHOLE_MODELS, Camera, Points, Scene
 from chronoscene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
 
 NAME = "cl-splats"
@@ -143,3 +153,73 @@ def remarks(path: Path) -> list[str]:
     if _is_level(path) and not (path / POINTS).exists():
         return [f"the level has no {POINTS}: the scene has no points"]
     return []
+
+
+def write(
+    scene: Scene,
+    out: Path,
+    *,
+    image_source: ImageSource = "copy",
+    progress: Progress | None = None,
+) -> Path:
+    """Write a real scene for the loader of CL-Splats; it appears complete or not at all.
+
+    Images are directly in ``images/``, and their names begin with ``day_<period>_``.
+
+    Raises:
+        SceneError: If ``out`` is in use, an image is missing or of another camera than a pinhole,
+            or names without their folders are equal.
+    """
+    names = _written_names(scene)
+    if len(set(names.values())) < len(names):
+        raise SceneError(
+            out,
+            expected="image names that differ when / becomes _",
+            found="equal ones",
+            todo="rename images",
+        )
+    return write_renamed(
+        scene.with_frames([replace(f, camera=_readable(f.camera)) for f in scene.frames]),
+        Path(out),
+        names,
+        test_list=False,
+        image_source=image_source,
+        progress=progress,
+    )
+
+
+def _readable(camera: Camera) -> Camera:
+    """The same camera in a model that the loader reads."""
+    if camera.model in PINHOLE_MODELS:
+        return camera
+    if camera.is_pinhole:
+        return as_pinhole(camera)
+    raise SceneError(
+        f"camera {camera.camera_id}",
+        expected=f"a camera that CL-Splats reads: {', '.join(PINHOLE_MODELS)}",
+        found=camera.model,
+        todo="run chronoscene undistort first",
+    )
+
+
+def losses(scene: Scene) -> list[str]:
+    """What a scene has that this format, or the loader that it is for, cannot hold."""
+    names = _written_names(scene)
+    old = {new: name for name, new in names.items()}
+    order = sorted({_step(name) for name in old}, key=natural_key)
+    rule = f"every {TEST_EVERY}th image of all"
+    return [
+        *lost_labels(scene, order),
+        *lost_names(names),
+        *lost_split(scene, {old[name] for name in sorted(old)[::TEST_EVERY]}, rule),
+    ]
+
+
+def _written_names(scene: Scene) -> dict[str, str]:
+    """Name of each image; names that say the periods already stay."""
+    steps = {(f.period, _step(f.name)) for f in scene.frames if "/" not in f.name}
+    ordered = [step for _, step in sorted(steps)]
+    said = all(_DAY.match(f.name) and "/" not in f.name for f in scene.frames)
+    if said and len(steps) == scene.num_periods and ordered == sorted(ordered, key=natural_key):
+        return {f.name: f.name for f in scene.frames}
+    return {f.name: f"day_{f.period}_" + f.name.replace("/", "_") for f in scene.frames}

@@ -7,19 +7,19 @@ where it exists, as in the ChronoScene format.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
-from chronoscene.colmap import write_model
 from chronoscene.errors import SceneError
 from chronoscene.formats import wat
-from chronoscene.formats.chronoscene import (
-    MODEL,
-    TEST,
-    check_writable_name,
-    raise_first,
-)
+from chronoscene.formats.chronoscene import TEST, raise_first
 from chronoscene.formats.colmap_layout import find_model, layout, make_scene, read_images, scan
+from chronoscene.formats.colmap_writing import (
+    lost_labels,
+    lost_names,
+    new_names,
+    period_folders,
+    write_renamed,
+)
 from chronoscene.formats.grouping import (
     TABLE,
     group_by_table,
@@ -27,14 +27,8 @@ from chronoscene.formats.grouping import (
     natural_key,
     rule_error,
 )
-from chronoscene.formats.writing import (
-    ImageSource,
-    Progress,
-    place_image,
-    renamed,
-    staged_folder,
-)
-from chronoscene.scene import Period, Scene
+from chronoscene.formats.writing import ImageSource, Progress
+from chronoscene.scene import Scene
 from chronoscene.splits import (
     DEFAULT_RULE,
     assign_tests,
@@ -117,39 +111,20 @@ def write(
     Raises:
         SceneError: If ``out`` is in use, or an image is missing.
     """
-    out = Path(out)
-    names = names_in_folders(scene)
-    new = renamed(scene, names)
-    for frame in new.frames:
-        check_writable_name(out, frame)
-    with staged_folder(out) as staged:
-        (staged / MODEL).mkdir(parents=True)
-        write_model(staged / MODEL, new.frames, new.points)
-        tests = "".join(f"{f.name}\n" for f in new.frames if f.split == "test")
-        (staged / TEST).write_text(tests, encoding="utf-8", newline="\n")
-        (staged / "images").mkdir()
-        for done, frame in enumerate(scene.frames, start=1):
-            if image_source != "none":
-                target = staged / "images" / names[frame.name]
-                place_image(scene.image_path(frame), target, image_source)
-            if progress is not None:
-                progress(done, len(scene.frames))
-    return out
+    return write_renamed(
+        scene,
+        Path(out),
+        _names(scene),
+        test_list=True,
+        image_source=image_source,
+        progress=progress,
+    )
 
 
-def period_folders(periods: tuple[Period, ...]) -> list[str]:
-    """A folder for each period, whose natural order is the order of the periods."""
-    labels = [period.label for period in periods]
-    plain = all(re.fullmatch(r"\w[\w.+ -]*(?<! )", label) for label in labels)
-    if plain and labels == sorted(set(labels), key=natural_key):
-        return labels
-    return [f"{p.id}_" + re.sub(r"[^\w.+-]+", "-", p.label) for p in periods]
+def losses(scene: Scene) -> list[str]:
+    """What a scene has that this format cannot hold."""
+    return lost_labels(scene, period_folders(scene.periods)) + lost_names(_names(scene))
 
 
-def names_in_folders(scene: Scene) -> dict[str, str]:
-    """New name of each image. Names that are all in the folders of their periods stay."""
-    folders = period_folders(scene.periods)
-    old = {f.name: folders[f.period] for f in scene.frames}
-    if all(name.startswith(f"{folder}/") for name, folder in old.items()):
-        return {name: name for name in old}
-    return {name: f"{folder}/{name}" for name, folder in old.items()}
+def _names(scene: Scene) -> dict[str, str]:
+    return new_names(scene, period_folders(scene.periods), deep=True)

@@ -38,7 +38,8 @@ from chronoscene.formats.intrinsics import CameraTable
 from chronoscene.formats.json_values import json_error, number, read_json
 from chronoscene.formats.labels import parse_periods, parse_world
 from chronoscene.formats.nerfstudio_writing import FILE
-from chronoscene.formats.nerfstudio_writing import write as write  # part of the format
+from chronoscene.formats.nerfstudio_writing import losses as losses  # part of the format
+from chronoscene.formats.nerfstudio_writing import write as write
 from chronoscene.formats.ply import read_points
 from chronoscene.formats.transforms import (
     Shot,

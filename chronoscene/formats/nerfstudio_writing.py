@@ -48,6 +48,13 @@ def write(
     return out
 
 
+def losses(scene: Scene) -> list[str]:
+    """What a scene has that this format cannot hold."""
+    if not len(scene.points.track_frame):
+        return []
+    return ["the observations of points, their ids and errors"]
+
+
 def _document(scene: Scene) -> dict[str, Any]:
     tests = [f"images/{f.name}" for f in scene.frames if f.split == "test"]
     return {

@@ -17,17 +17,31 @@ Source: Cai and Mueller, CLNeRF, ICCV 2023; layout as in ``IntelLabs/CLNeRF`` at
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from chronoscene.errors import SceneError
 from chronoscene.formats.colmap_layout import find_model, layout, make_scene, read_images
+from chronoscene.formats.colmap_writing import (
+    as_pinhole,
+    lost_labels,
+    lost_names,
+    lost_split,
+    new_names,
+    period_folders,
+    write_renamed,
+)
 from chronoscene.formats.grouping import group_labels
-from chronoscene.scene import Scene
+from chronoscene.formats.writing import ImageSource, Progress
+from chronoscene.scene import Camera, Scene
 from chronoscene.splits import DEFAULT_RULE, default_tests
 
 NAME = "wat"
 MARKS = "images/<task>/ and sparse/0/ in a folder named as a scene of WAT"
 """What `matches` looks for."""
+
+READ_MODELS = ("SIMPLE_RADIAL", "PINHOLE", "OPENCV")
+"""Camera models that the loader of CLNeRF reads; it ignores distortion."""
 
 SCENES = (
     "breville", "car", "community", "grill", "kitchen", "living_room", "mac", "ninja", "spa",
@@ -73,3 +87,71 @@ def _task(path: Path, name: str) -> str:
             todo="give the folder of one scene of WAT, or name its --format",
         )
     return folder
+
+
+def write(
+    scene: Scene,
+    out: Path,
+    *,
+    image_source: ImageSource = "copy",
+    progress: Progress | None = None,
+) -> Path:
+    """Write a scene for the loader of CLNeRF; the folder appears complete or not at all.
+
+    Each period becomes a task: a folder directly in ``images/``, named after the label where the
+    alphabetical order of the labels is that of the periods, else after id and label. The loader
+    takes the size and intrinsics of camera 1 for all images, so there must be no other.
+
+    Raises:
+        SceneError: If ``out`` is in use, an image is missing, or cameras differ.
+    """
+    camera = _one_camera(scene, out)
+    return write_renamed(
+        scene.with_frames([replace(frame, camera=camera) for frame in scene.frames]),
+        Path(out),
+        _names(scene),
+        test_list=False,
+        image_source=image_source,
+        progress=progress,
+    )
+
+
+def _one_camera(scene: Scene, out: Path) -> Camera:
+    """The camera that all images have, as number 1 and in a model that the loader reads."""
+    cameras = {replace(frame.camera, camera_id=1) for frame in scene.frames}
+    camera = cameras.pop()
+    if camera.is_pinhole and camera.model not in READ_MODELS:
+        camera = as_pinhole(camera)
+    if cameras or camera.model not in READ_MODELS:
+        raise SceneError(
+            out,
+            expected=f"one camera for all images, and of {', '.join(READ_MODELS)}, as the loader "
+            "of CLNeRF takes camera 1 for all",
+            found=f"{len(cameras) + 1} cameras" if cameras else camera.model,
+            todo="write another format, or bring the images to one camera",
+        )
+    return camera
+
+
+def losses(scene: Scene) -> list[str]:
+    """What a scene has that this format, or the loader that it is for, cannot hold."""
+    names = _names(scene)
+    old = {new: name for name, new in names.items()}
+    taken = default_tests({names[f.name]: f.period for f in scene.frames})
+    lost = lost_labels(scene, _folders(scene)) + lost_names(names)
+    lost += lost_split(scene, {old[name] for name in taken}, "images 0, 8, 16, ... of each task")
+    if any(not frame.camera.is_pinhole for frame in scene.frames):
+        lost.append("distortion, which its loader ignores: undistort first")
+    files = [name.rpartition("/")[2] for name in old]
+    if len(set(files)) < len(files):
+        lost.append("equal file names in several tasks, of which its replay keeps one")
+    return lost
+
+
+def _folders(scene: Scene) -> list[str]:
+    """Folders of the tasks; the loader sorts full paths, so the slash takes part."""
+    return period_folders(scene.periods, order=lambda folder: f"{folder}/")
+
+
+def _names(scene: Scene) -> dict[str, str]:
+    return new_names(scene, _folders(scene), deep=False)

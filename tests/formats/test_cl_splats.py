@@ -2,13 +2,15 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from chronoscene.errors import ConfigError, ImageError, SceneError
-from chronoscene.formats import read_scene
+from chronoscene.formats import cl_splats, detect_format, read_scene
 from chronoscene.formats.ply import write_points
+from chronoscene.scene import Camera
 
 REAL = [f"day_{day}_{i:02d}.png" for day in (2, 10) for i in range(4)] + ["frame_1.png"]
 
@@ -82,3 +84,37 @@ def test_a_missing_image_whose_size_is_needed(level):
     (folder / "images/r_1.png").unlink()
     with pytest.raises(ImageError, match=r"images/r_1\.png: expected an image, found nothing"):
         read_scene(folder)
+
+
+@pytest.mark.parametrize("names", [["a/0.png", "b/0.png", "b/1.png"], ["x 1.png", "y.1.png"]])
+def test_what_is_written_says_the_time_step_in_the_name(make_scene_folder, tmp_path, names):
+    scene = read_scene(make_scene_folder({name: min(i, 1) for i, name in enumerate(names)}))
+    out = cl_splats.write(scene, tmp_path / "out", image_source="symlink")
+    assert detect_format(out) == "cl-splats"
+    again = read_scene(out)
+    sources = {again.image_path(f).resolve(): f for f in again.frames}
+    for frame in scene.frames:
+        new = sources[scene.image_path(frame).resolve()]
+        assert new.name == f"day_{frame.period}_{frame.name.replace('/', '_')}"
+        assert new.period == frame.period
+    assert "this split, as its loader takes every 8th image of all" in " ".join(
+        cl_splats.losses(scene.with_frames([replace(f, split="train") for f in scene.frames]))
+    )
+
+
+def test_names_that_would_become_one_are_refused(make_scene_folder, tmp_path):
+    scene = read_scene(make_scene_folder({"a/0.png": 0, "a_0.png": 0, "b/0.png": 1}))
+    with pytest.raises(SceneError, match="image names that differ when / becomes _"):
+        cl_splats.write(scene, tmp_path / "out")
+
+
+def test_cameras_that_cl_splats_lacks_are_refused(make_scene_folder, tmp_path):
+    scene = read_scene(make_scene_folder())
+    straight = Camera(1, "OPENCV", 64, 48, (50, 52, 30, 25.5, 0, 0, 0, 0))
+    same = scene.with_frames([replace(f, camera=straight) for f in scene.frames])
+    again = read_scene(cl_splats.write(same, tmp_path / "same"))
+    assert again.frames[0].camera == Camera(1, "PINHOLE", 64, 48, (50, 52, 30, 25.5))
+    camera = Camera(1, "OPENCV", 64, 48, (50, 52, 30, 25.5, 0, 0.1, 0, 0))
+    bent = scene.with_frames([replace(f, camera=camera) for f in scene.frames])
+    with pytest.raises(SceneError, match="camera 1: expected a camera that CL-Splats reads"):
+        cl_splats.write(bent, tmp_path / "out")

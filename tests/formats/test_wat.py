@@ -1,9 +1,14 @@
 """WAT, and how it is told apart from plain COLMAP in the same layout."""
 
+import dataclasses
+from pathlib import Path
+
 import pytest
 
+from chronoscene.colmap_records import read_cameras
 from chronoscene.errors import SceneError
-from chronoscene.formats import detect_format, read_scene
+from chronoscene.formats import detect_format, read_scene, wat
+from chronoscene.scene import Camera, Period
 
 
 def names(tasks, count=9):
@@ -55,3 +60,68 @@ def test_where_the_readings_differ_the_format_must_be_named(colmap_folder):
 def test_images_outside_of_tasks_are_refused(colmap_folder):
     with pytest.raises(SceneError, match=r"every image in the folder of its task, found 'a.png'"):
         read_scene(colmap_folder(["a.png", "b/c.png"], name="mac"), format="wat")
+
+
+def as_clnerf_reads(folder):
+    """Task and split of each image, and the record of camera 1, as its loader is described."""
+    cameras = {c.camera_id: c for c in read_cameras(folder / "sparse/0/cameras.bin")}
+    paths = sorted(str(p) for p in (folder / "images").rglob("*") if not p.is_dir())
+    tasks = list(dict.fromkeys(path.rsplit("/", 2)[1] for path in paths))
+    of_task = {task: [p for p in paths if p.rsplit("/", 2)[1] == task] for task in tasks}
+    found = {
+        Path(path): (tasks.index(task), "train" if i % 8 else "test")
+        for task, members in of_task.items()
+        for i, path in enumerate(members)
+    }
+    return found, cameras[1]
+
+
+@pytest.mark.parametrize(
+    "labels", [("t2", "t10"), ("a", "b"), ("new", "after 9/2016"), ("t", "t-x"), ("1", "1")]
+)
+def test_what_is_written_is_read_by_clnerf_as_meant(make_scene_folder, tmp_path, labels):
+    names = {f"{'ab'[p]}/{'cd'[i % 2]}/{i:02d}.png": p for p in (0, 1) for i in range(10)}
+    scene = read_scene(make_scene_folder(names))
+    periods = tuple(Period(i, label) for i, label in enumerate(labels))
+    camera = dataclasses.replace(scene.frames[0].camera, camera_id=7)
+    frames = [dataclasses.replace(f, camera=camera) for f in scene.frames]
+    scene = dataclasses.replace(scene.with_frames(frames), periods=periods)
+    out = wat.write(scene, tmp_path / "out", image_source="symlink")
+    found, read = as_clnerf_reads(out)
+    sources = {path.resolve(): path for path in found}
+    for frame in scene.frames:
+        task, _ = found[sources[scene.image_path(frame).resolve()]]
+        assert task == frame.period
+    assert (read.width, read.height, read.params) == (64, 48, camera.params)
+    ours = read_scene(out, format="wat")
+    for frame in ours.frames:
+        assert found[ours.image_path(frame)] == (frame.period, frame.split)
+
+
+def test_cameras_that_clnerf_would_mix_up_are_refused(make_scene_folder, tmp_path):
+    scene = read_scene(make_scene_folder())
+    first, *others = scene.frames
+    other = Camera(2, "PINHOLE", 64, 48, (51, 52, 30, 25.5))
+    two = scene.with_frames([dataclasses.replace(first, camera=other), *others])
+    with pytest.raises(SceneError, match=r"one camera for all images.*found 2 cameras"):
+        wat.write(two, tmp_path / "out")
+    odd = Camera(1, "OPENCV_FISHEYE", 64, 48, (50, 52, 30, 25.5, 0.1, 0, 0, 0))
+    one = scene.with_frames([dataclasses.replace(f, camera=odd) for f in scene.frames])
+    with pytest.raises(SceneError, match="found OPENCV_FISHEYE"):
+        wat.write(one, tmp_path / "out")
+    simple = Camera(3, "SIMPLE_PINHOLE", 64, 48, (50, 30, 25.5))
+    one = scene.with_frames([dataclasses.replace(f, camera=simple) for f in scene.frames])
+    again = read_scene(wat.write(one, tmp_path / "out"), format="wat")
+    assert again.frames[0].camera == Camera(1, "PINHOLE", 64, 48, (50, 50, 30, 25.5))
+
+
+def test_what_clnerf_does_otherwise_is_said(make_scene_folder):
+    scene = read_scene(make_scene_folder({"a/0.png": 0, "a/1.png": 0, "b/0.png": 1}, tests=["a/1"]))
+    bent = Camera(1, "OPENCV", 64, 48, (50, 52, 30, 25.5, 0.1, 0, 0, 0))
+    scene = scene.with_frames([dataclasses.replace(f, camera=bent) for f in scene.frames])
+    lost = " ".join(wat.losses(scene))
+    assert "this split, as its loader takes images 0, 8, 16" in lost
+    assert "distortion, which its loader ignores" in lost
+    periods = (Period(0, "a"), Period(1, "b"))
+    named = dataclasses.replace(scene, periods=periods)
+    assert "equal file names in several tasks" in " ".join(wat.losses(named))
