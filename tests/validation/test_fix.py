@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import os
+import signal
 
 import numpy as np
 import pytest
@@ -382,3 +383,17 @@ def test_a_model_that_is_a_link_inside_of_the_scene(scene, fix):
     scene.path("sparse/0").rename(scene.path("model"))
     scene.path("sparse/0").symlink_to("../model")
     assert fix()[:2] == (set(), {"CS507"})
+
+
+@pytest.mark.parametrize(
+    ("number", "error"), [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)]
+)
+def test_interrupted(scene, tmp_path, monkeypatch, number, error):
+    def interrupt(*_):
+        signal.raise_signal(number)
+
+    monkeypatch.setattr("chronoscene.validation.fix._link", interrupt)
+    before = state(tmp_path)
+    with pytest.raises(error):
+        fix_scene(scene.root, tmp_path / "fixed")
+    assert state(tmp_path) == before
