@@ -9,7 +9,7 @@ import pytest
 
 from chronoscene.convert import convert, losses, obstacles
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats import read_scene
+from chronoscene.formats import load_format, read_scene
 from chronoscene.scene import Camera, Period, Points, WorldFrame
 from chronoscene.splits import split_hash
 
@@ -203,3 +203,14 @@ def test_obstacles(make_scene_folder):
         Points.empty(), ids=np.array([1]), xyz=np.zeros((1, 3)), track_start=np.zeros(2, np.int64)
     )
     assert "observed" in obstacles(dataclasses.replace(scene, points=cloud))[0]
+
+
+@pytest.mark.parametrize("source", ["copy", "link", "symlink"])
+def test_two_names_of_one_file_are_refused(make_scene_folder, tmp_path, source):
+    scene = read_scene(make_scene_folder({"a/0.png": 0, "b/0.png": 1}))
+    first, second = scene.frames
+    twice = dataclasses.replace(scene, frames=(first, dataclasses.replace(second, name="a//0.png")))
+    for name in ("chronoscene", "nerfstudio"):
+        with pytest.raises(SceneError, match="expected a file of its own for each image"):
+            load_format(name).write(twice, tmp_path / "out", image_source=source)
+    assert not (tmp_path / "out").exists()

@@ -87,7 +87,10 @@ def _advice(path: Path) -> str:
             "say which image is of which period: write sparse/split.txt, or convert it with "
             "--format colmap-folders --period-by table:FILE"
         )
-    return "give the folder of one scene; DATASET.md describes its files"
+    advice = "give the folder of one scene; DATASET.md describes its files"
+    if (path / "images").is_dir() and not (path / "sparse").exists():
+        return f"register these photos (chronoscene register), or {advice}"
+    return advice
 
 
 def find_scenes(path: Path, *, format: str | None = None) -> list[Path]:

@@ -84,10 +84,17 @@ def place_image(source: Path, target: Path, image_source: ImageSource) -> None:
     """Copy or link one image.
 
     Raises:
-        SceneError: If it is missing.
+        SceneError: If it is missing, or its place is taken.
     """
     if not source.is_file():
         raise SceneError(source, expected="an image", found="nothing", todo="copy it there")
+    if os.path.lexists(target):  # a/b and a//b; or a and A on a disk that takes them for one
+        raise SceneError(
+            target,
+            expected="a file of its own for each image",
+            found="one that another image has",
+            todo="rename the image",
+        )
     target.parent.mkdir(parents=True, exist_ok=True)
     if image_source == "symlink":
         target.symlink_to(source.resolve())

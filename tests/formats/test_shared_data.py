@@ -67,7 +67,7 @@ def test_images_without_poses_are_refused(shared_data, name):
     message = str(error.value)
     assert message.startswith(f"{shared_data / name}: expected a scene of a known format (")
     assert "found SOURCE.md, " in message and "images/" in message
-    assert message.endswith("give the folder of one scene; DATASET.md describes its files")
+    assert "; register these photos (chronoscene register), or give the folder of one" in message
 
 
 @pytest.mark.parametrize("name", BARE_MODELS)
