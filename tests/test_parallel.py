@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 
 import pytest
 
-from chronoscene.errors import SceneError
+from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.parallel import map_parallel
 
 
@@ -35,3 +36,19 @@ def test_an_error_keeps_its_kind_and_words_on_its_way():
     with pytest.raises(SceneError, match="place: expected one, found two; count again") as caught:
         list(map_parallel(fail_on_two, [1, 2, 3], workers=2))
     assert (caught.value.place, caught.value.todo) == ("place", "count again")
+
+
+def die_on_two(item: int) -> int:
+    if item == 2:
+        os.kill(os.getpid(), signal.SIGKILL)  # as a system does that is out of memory
+    return 10 * item
+
+
+def test_a_process_that_dies_loses_its_item_only():
+    found = list(map_parallel(die_on_two, [1, 2, 3, 4], workers=2, lost=lambda item: -item))
+    assert found == [10, -2, 30, 40]
+
+
+def test_a_process_that_dies_is_an_error_in_one_line():
+    with pytest.raises(ChronoSceneError, match="2: expected work that ends, found a process that"):
+        list(map_parallel(die_on_two, [1, 2, 3], workers=2))

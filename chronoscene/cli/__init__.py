@@ -9,6 +9,7 @@ import click
 
 from chronoscene import __version__
 from chronoscene.errors import ChronoSceneError
+from chronoscene.files import stoppable
 
 COMMANDS = {
     "bench": "chronoscene.cli.bench:command",
@@ -50,9 +51,13 @@ def cli() -> None:
 
 
 def main() -> None:
-    """Run the command line; turns our errors into one line and exit status 2."""
+    """Run the command line; turns our errors into one line and exit status 2.
+
+    A command that is asked to end by SIGTERM cleans up, as one that is interrupted does.
+    """
     try:
-        cli.main(prog_name="chronoscene")
+        with stoppable():
+            cli.main(prog_name="chronoscene")
     except ChronoSceneError as error:
         _end(str(error))
     except OSError as error:  # a full disk, a place that went away

@@ -137,7 +137,7 @@ def command(
     paths = [p for f in folders for p in in_paper_order(_scenes(f, request.dataset_format))]
     _check_places(request, out, paths)
     items = list(zip(paths, _file_names(paths), strict=True))
-    work = map_parallel(partial(examine, request), items)
+    work = map_parallel(partial(examine, request), items, lost=_lost)
     results = list(tracked(work, "scenes", total=len(items)))
     unreadable = [r for r in results if isinstance(r, Unreadable)]
     full = [r for r in results if isinstance(r, SceneStatistics)]
@@ -198,6 +198,11 @@ def _scenes(folder: Path, dataset_format: str | None) -> list[Path]:
         return found
     beside = {p for name in SCENE_PARTS for p in folder.glob(f"*/{name}") if p.is_dir()}
     return sorted({*found, *(p.parent for p in beside)})
+
+
+def _lost(item: tuple[Path, str]) -> Unreadable:
+    path = str(item[0])
+    return Unreadable(path, f"{path}: the process died; if memory ran out, read this one alone")
 
 
 def _width(out: Path | None) -> int | None:

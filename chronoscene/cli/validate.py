@@ -20,7 +20,7 @@ from chronoscene.validation.report_json import write_json
 from chronoscene.validation.report_sarif import write_sarif
 from chronoscene.validation.report_text import describe_rule, write_text
 from chronoscene.validation.rule import choose_rules
-from chronoscene.validation.run import find_folders, validate_scene
+from chronoscene.validation.run import find_folders, lost_report, validate_scene
 
 WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
 
@@ -105,7 +105,7 @@ def command(
     if len(folders) == 1:
         reports = [check(folders[0], track=tracked)]
     else:
-        done = map_parallel(check, folders)
+        done = map_parallel(check, folders, lost=lost_report)
         reports = list(tracked(done, "validate scenes", total=len(folders)))
     emit(WRITERS[output_format](reports, strict=strict), out)
     for option, file, write in (("--sarif", sarif, write_sarif), ("--html", html, write_html)):

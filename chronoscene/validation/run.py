@@ -23,6 +23,9 @@ RULE_FAILED = "CS000"
 """Code of the finding that a rule itself failed: our mistake, reported as such."""
 
 
+NOTHING_KNOWN = Summary(None, None, None, None, 0, ())
+
+
 def find_folders(path: Path) -> list[Path]:
     """The folder itself if it looks like a scene, else the folders in it that do, sorted.
 
@@ -140,7 +143,23 @@ def _summary(scene: RawScene) -> Summary:
     try:
         return summarise(scene)
     except Exception:  # the rules that need the same part have said so
-        return Summary(None, None, None, None, 0, ())
+        return NOTHING_KNOWN
+
+
+def lost_report(path: Path) -> SceneReport:
+    """The report on a scene whose check ended with its process."""
+    finding = Finding(
+        code=RULE_FAILED,
+        name="rule-failed",
+        severity="error",
+        place=".",
+        expected="a scene that can be checked",
+        found="one whose check died with its process",
+        remedy="if memory ran out, check this scene by itself; else report this",
+        count=1,
+    )
+    name = printable(path.resolve().name)
+    return SceneReport(name, path, NOTHING_KNOWN, findings=(finding,), skipped=())
 
 
 def _finding(rule: Rule, hit: Hit) -> Finding:

@@ -1,6 +1,8 @@
 """chronoscene validate: exit status, options, where the report goes."""
 
 import json
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -8,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from chronoscene.cli import cli, main
+from chronoscene.cli.validate import _check
 from chronoscene.errors import ConfigError
 
 PERIODS = {f"{'ab'[p]}{i}.png": p for p in (0, 1) for i in range(7)}
@@ -206,3 +209,20 @@ def test_places_of_reports_are_tried_first(broken, option, tmp_path, monkeypatch
         run(broken, option, tmp_path)
     with pytest.raises(ConfigError, match=f"{option} .*found No such file"):
         run(broken, option, tmp_path / "absent/report")
+
+
+def die_on_b(select, ignore, decode, path, **_):
+    if path.name == "b":
+        os.kill(os.getpid(), signal.SIGKILL)  # as a system does that is out of memory
+    return _check(select, ignore, decode, path)
+
+
+def test_a_check_that_dies_leaves_the_others(make_scene_folder, tmp_path, monkeypatch):
+    for name in "abc":
+        make_scene_folder(PERIODS, name=f"all/{name}", tests=["a3", "b3"])
+    monkeypatch.setattr("chronoscene.cli.validate._check", die_on_b)
+    status, text = run(tmp_path / "all", "--format", "json")
+    scenes = {s["name"]: s for s in json.loads(text)["scenes"]}
+    assert status == 1 and scenes.keys() == {"a", "b", "c"}
+    assert [f["code"] for f in scenes["b"]["findings"]] == ["CS000"]
+    assert scenes["c"]["summary"]["images"] == 14
