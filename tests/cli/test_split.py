@@ -102,3 +102,17 @@ def test_a_list_that_its_record_would_replace_is_refused(scene, tmp_path, capsys
     assert end.value.code == 2
     assert "expected a name for the list that does not end in .json" in capsys.readouterr().err
     assert not (tmp_path / "a.json").exists()
+
+
+@pytest.mark.parametrize("strategy", [[], ["--seed", 3], ["--strategy", "blocked", "--seed", 3]])
+def test_the_order_in_files_does_not_matter(make_scene_folder, tmp_path, strategy):
+    scene = make_scene_folder(PERIODS, form="text")
+    assert run(scene, tmp_path / "one.txt", *strategy).exit_code == 0
+    images, split = scene / "sparse/0/images.txt", scene / "sparse/split.txt"
+    lines = [line for line in images.read_text().splitlines() if not line.startswith("#")]
+    pairs = list(zip(lines[0::2], lines[1::2], strict=True))
+    images.write_text("".join(f"{a}\n{b}\n" for a, b in reversed(pairs)))
+    split.write_text("\n".join(reversed(split.read_text().splitlines())))
+    assert run(scene, tmp_path / "two.txt", *strategy).exit_code == 0
+    assert (tmp_path / "one.txt").read_text() == (tmp_path / "two.txt").read_text()
+    assert (tmp_path / "one.json").read_text() == (tmp_path / "two.json").read_text()

@@ -68,3 +68,12 @@ def test_errors_are_one_line(distorted, tmp_path, monkeypatch, capsys, arguments
     assert stopped.value.code == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(("link", "is_symlink"), [("hard", False), ("sym", True)])
+def test_links(make_scene_folder, tmp_path, link, is_symlink):
+    folder, out = make_scene_folder(), tmp_path / "out"
+    assert run(folder, out, "--link", link).exit_code == 0
+    for frame in read_scene(out).frames:
+        path = out / "images" / frame.name
+        assert path.samefile(folder / "images" / frame.name) and path.is_symlink() == is_symlink
