@@ -41,8 +41,8 @@ def map_parallel(
 ) -> Iterator[Result]:
     """Results in the order of the items, each as soon as it and those before it are there.
 
-    A process that dies (killed for its memory, or by a fault in a library) takes the others with
-    it; then each item that is left gets a process of its own, so that only the one at fault is lost.
+    A process that dies (killed for its memory, or by a fault in a library) ends the others, too;
+    then each item that is left gets a process of its own, and only the one at fault is lost.
 
     Args:
         function: At the top level of a module, or a ``partial`` of such a function.
