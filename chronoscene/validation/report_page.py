@@ -53,7 +53,8 @@ footer { margin: 2rem 0 1rem; font-size: .9rem; }
 {% endif %}</h1>
 <div class="counts">
 {% for severity in severities %}
-<span class="{{ severity }}"><b>{{ total[severity] }}</b> {{ titles[severity]|lower }}</span>
+<span class="{{ severity }}"><b>{{ total[severity] }}</b>
+{{ titles[severity]|lower if total[severity] != 1 else titles[severity][:-1]|lower }}</span>
 {% endfor %}
 </div>
 {% if scenes|length > 1 %}
@@ -94,7 +95,7 @@ footer { margin: 2rem 0 1rem; font-size: .9rem; }
 {% for severity, blocks in sections %}
 <h3 class="{{ severity }}">{{ titles[severity] }}</h3>
 {% for block in blocks %}
-<details{% if severity != "info" %} open{% endif %}>
+<details{% if severity != "info" and block.total <= 10 %} open{% endif %}>
 <summary><b class="{{ severity }}">{{ block.code }}</b> <code>{{ block.name }}</code>
 {% if block.total > 1 %}<span class="dim">({{ block.total }})</span> {% endif %}
 {{ block.what|replace("`", "") }}</summary>

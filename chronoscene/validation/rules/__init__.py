@@ -3,6 +3,7 @@
 from chronoscene.validation.rules import (
     cameras,
     contents,
+    conventions,
     dates,
     duplicates,
     exif,
@@ -27,6 +28,7 @@ from chronoscene.validation.rules import (
 __all__ = [
     "cameras",
     "contents",
+    "conventions",
     "dates",
     "duplicates",
     "exif",

@@ -39,6 +39,9 @@ def period_error(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
     medians = scene.period_errors
     limit = period_limit(scene)
+    judged = np.flatnonzero(~np.isnan(scene.image_errors)).tolist()
+    if not judged or limit > WORSE * np.median([pose_limit(scene, i) for i in judged]):
+        return  # no period fits: nothing to compare with
     for period, median in medians.items():
         if median > limit and scene.period_ids.index(period) not in own_frames(scene):
             mine = np.flatnonzero(scene.image_periods == scene.period_ids.index(period))
