@@ -19,6 +19,8 @@ FILE = "transforms.json"
 
 POINTS = "sparse_points.ply"
 
+FISHEYE = "OPENCV_FISHEYE"
+
 
 def write(
     scene: Scene,
@@ -50,14 +52,19 @@ def write(
 
 def losses(scene: Scene) -> list[str]:
     """What a scene has that this format cannot hold."""
-    if not len(scene.points.track_frame):
-        return []
-    return ["the observations of points, their ids and errors"]
+    lost = []
+    if len(scene.points.track_frame):
+        lost.append("the observations of points, their ids and errors")
+    if len({frame.camera.model == FISHEYE for frame in scene.frames}) > 1:
+        lost.append(f"{FISHEYE} beside other cameras, as its loader takes one kind for all frames")
+    return lost
 
 
 def _document(scene: Scene) -> dict[str, Any]:
     tests = [f"images/{f.name}" for f in scene.frames if f.split == "test"]
+    models = sorted({_camera_keys(frame.camera)["camera_model"] for frame in scene.frames})
     return {
+        "camera_model": models[0],  # all that the loader asks is whether they are fisheyes
         **({"ply_file_path": POINTS} if len(scene.points) else {}),
         "train_filenames": [f"images/{f.name}" for f in scene.frames if f.split == "train"],
         "val_filenames": tests,

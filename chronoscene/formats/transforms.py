@@ -53,6 +53,8 @@ def read_frames(place: Path, data: Mapping[str, Any]) -> list[dict[str, Any]]:
 def head_has(path: Path, text: str, *, length: int = 65536) -> bool:
     """Whether the first bytes of a file have a text."""
     try:
+        if not path.is_file():  # a pipe would never end
+            return False
         with path.open("rb") as file:
             return text.encode() in file.read(length)
     except OSError:

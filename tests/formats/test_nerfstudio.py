@@ -373,6 +373,22 @@ def test_a_third_radial_parameter_is_written(nerfstudio_folder, tmp_path):
     assert again.frames[0].camera == scene.frames[0].camera
 
 
+def test_the_kind_of_camera_stands_where_nerfstudio_looks_for_it(make_scene_folder, tmp_path):
+    """Once for the whole file; frames of two kinds cannot be told apart there."""
+    scene = read_scene(make_scene_folder())
+    first, *others = scene.frames
+    fisheye = Camera(1, "OPENCV_FISHEYE", 64, 48, (50, 52, 30, 25.5, 0.1, 0, 0, 0))
+    all_of_them = scene.with_frames([dataclasses.replace(f, camera=fisheye) for f in scene.frames])
+    for case, model in ((scene, "PINHOLE"), (all_of_them, "OPENCV_FISHEYE")):
+        out = nerfstudio.write(case, tmp_path / model)
+        assert json.loads((out / "transforms.json").read_text())["camera_model"] == model
+        assert len(nerfstudio.losses(case)) == 1
+    mixed = scene.with_frames([dataclasses.replace(first, camera=fisheye), *others])
+    assert "OPENCV_FISHEYE beside other cameras" in nerfstudio.losses(mixed)[1]
+    again = read_scene(nerfstudio.write(mixed, tmp_path / "mixed"))
+    assert [f.camera.model for f in again.frames] == [f.camera.model for f in mixed.frames]
+
+
 def test_models_that_the_format_lacks_are_refused(make_scene_folder, tmp_path):
     scene = read_scene(make_scene_folder())
     odd = Camera(1, "FOV", 64, 48, (50, 50, 32, 24, 0.1))
