@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-LONGEST = 600
-"""Characters of a finding that a message shows."""
+LONGEST = 1000
+"""Characters of an expectation or a finding; what quotes a damaged file may have millions."""
 
 
 class ChronoSceneError(Exception):
@@ -14,19 +14,24 @@ class ChronoSceneError(Exception):
 
     Args:
         place: File, file and line, option or argument where the problem sits.
-        expected: What would have been right there.
-        found: What is there instead; of more than `LONGEST` characters, beginning and end.
+        expected: What would have been right there. Shown up to `LONGEST` characters.
+        found: What is there instead; likewise.
         todo: What the user can do about it.
     """
 
     def __init__(self, place: object, *, expected: str, found: str, todo: str) -> None:
-        if len(found) > LONGEST:  # it may quote a damaged file
-            found = f"{found[: LONGEST // 2]} ... {found[-LONGEST // 2 :]}"
+        expected, found = _shortened(expected), _shortened(found)
         self.place = str(place)
         self.expected = expected
         self.found = found
         self.todo = todo
         super().__init__(f"{place}: expected {expected}, found {found}; {todo}")
+
+
+def _shortened(text: str) -> str:
+    """Beginning and end of a long text."""
+    half = LONGEST // 2
+    return text if len(text) <= LONGEST else f"{text[:half]} ... {text[-half:]}"
 
 
 class ConfigError(ChronoSceneError):

@@ -4,12 +4,20 @@ import numpy as np
 import pytest
 
 from chronoscene.checks import check_choice, check_shape
-from chronoscene.errors import ChronoSceneError, ConfigError, SceneError, ShapeError
+from chronoscene.errors import LONGEST, ChronoSceneError, ConfigError, SceneError, ShapeError
 
 
 def test_message_has_place_expectation_finding_and_remedy():
     error = ChronoSceneError("a.txt:3", expected="two fields", found="one", todo="see DATASET.md")
     assert str(error) == "a.txt:3: expected two fields, found one; see DATASET.md"
+
+
+def test_long_quotations_are_shortened():
+    error = ChronoSceneError(
+        "a.txt", expected="x" * 10**6, found="<" + "9" * 10**6 + ">", todo="no"
+    )
+    assert len(str(error)) < 2 * LONGEST + 100
+    assert error.found.startswith("<9") and error.found.endswith("9>")
 
 
 def test_check_shape_accepts_wildcards_and_refuses_the_rest():
