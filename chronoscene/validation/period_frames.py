@@ -66,6 +66,8 @@ class Rays:
         assert seen is not None and table is not None
         of_period = [r for r in scene.reprojections or () if scene.image_periods[r.image] == period]
         share = table.sum(axis=1) > 1
+        if not (share & table[:, period]).any():
+            share = table[:, period]  # with its own points it may at least agree
         rows = np.concatenate([np.zeros(0, np.int64), *(r.rows for r in of_period)])
         rows = rows[share[seen.point[rows]]]
         # Whole tracks, so that points keep several rays.

@@ -127,9 +127,9 @@ def period_apart(scene: RawScene) -> Iterator[Hit]:
     share = common_view(scene)
     share[~(np.diag(share) >= OWN)] = np.nan  # cameras that miss their own points tell nothing
     elsewhere = own_frames(scene).keys() | _other_depths(scene).keys()
+    for index in elsewhere:  # what is seen in a wrong frame says nothing of places
+        share[index], share[:, index] = np.nan, np.nan
     for index, period in enumerate(scene.period_ids):
-        if index in elsewhere:
-            continue  # what is seen in a wrong frame says nothing of places
         both = np.fmax(np.delete(share[index], index), np.delete(share[:, index], index))
         if np.isfinite(both).any() and np.nanmax(both) < APART:
             found = f"at most {100 * np.nanmax(both):.1f} % of the points in common view"

@@ -19,6 +19,9 @@ from chronoscene.validation.rules.own_frames import (
 )
 from chronoscene.validation.rules.reprojection import pose_limit
 
+MOST_STORED = 0.9
+"""Share of the points that must have an error stored with them."""
+
 MOST_DUPLICATES = 0.05
 """Share of points on top of another one. COLMAP's models were seen with one percent."""
 
@@ -37,20 +40,25 @@ FAR = 100.0
 )
 def period_error(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
-    medians = scene.period_errors
+    for period, limit in _worse_periods(scene).items():
+        mine = np.flatnonzero(scene.image_periods == scene.period_ids.index(period))
+        known = mine[~np.isnan(scene.image_errors[mine])]
+        worst = known[np.argsort(-scene.image_errors[known])]
+        named = shown([scene.images.names[i] for i in worst])
+        found = f"{scene.period_errors[period]:.3g} px; worst are {named}"
+        found += _other_focal(scene, scene.period_ids.index(period), limit)
+        yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
+
+
+def _worse_periods(scene: RawScene) -> dict[int, float]:
+    """Periods that stand out, with what their median error should be below in pixels."""
     limit = period_limit(scene)
     judged = np.flatnonzero(~np.isnan(scene.image_errors)).tolist()
     if not judged or limit > WORSE * np.median([pose_limit(scene, i) for i in judged]):
-        return  # no period fits: nothing to compare with
-    for period, median in medians.items():
-        if median > limit and scene.period_ids.index(period) not in own_frames(scene):
-            mine = np.flatnonzero(scene.image_periods == scene.period_ids.index(period))
-            known = mine[~np.isnan(scene.image_errors[mine])]
-            worst = known[np.argsort(-scene.image_errors[known])]
-            named = shown([scene.images.names[i] for i in worst])
-            found = f"{median:.3g} px; worst are {named}"
-            found += _other_focal(scene, scene.period_ids.index(period), limit)
-            yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
+        return {}  # no period fits: nothing to compare with
+    explained = {scene.period_ids[index] for index in own_frames(scene)}
+    worse = (period for period, median in scene.period_errors.items() if median > limit)
+    return {period: limit for period in worse if period not in explained}
 
 
 def _other_focal(scene: RawScene, index: int, limit: float) -> str:
@@ -59,6 +67,32 @@ def _other_focal(scene: RawScene, index: int, limit: float) -> str:
         return ""
     factor = focal_factor(Rays(scene, index), limit)
     return "" if factor is None else f"; it fits with focal lengths times {factor:.4g}"
+
+
+@rule(
+    "CS524",
+    "error-outdated",
+    "warning",
+    what="Points are reprojected far worse than the errors stored with them say: cameras, poses or "
+    "points were changed after the model was made.",
+    remedy="use cameras, images and points of one model; or refine them together (colmap "
+    "bundle_adjuster)",
+    bad="a focal length replaced by that of the data sheet; stored 0.5 px, found 3.2 px",
+    needs=("points", "reprojections"),
+)
+def error_outdated(scene: RawScene) -> Iterator[Hit]:
+    assert scene.points is not None
+    stored = scene.points.error[(scene.points.error > 0) & np.isfinite(scene.points.error)]
+    if len(stored) < MOST_STORED * len(scene.points) or not len(stored):
+        return  # not every program writes them
+    errors = [r.error[r.depth > 0] for r in scene.reprojections or ()]
+    found = float(np.nanmedian(np.concatenate([np.zeros(0), *errors])))
+    expected = float(np.median(stored))
+    judged = np.flatnonzero(~np.isnan(scene.image_errors)).tolist()
+    fits = all(scene.image_errors[i] <= pose_limit(scene, i) for i in judged)
+    if fits and found > max(LEAST_ERROR, WORSE * expected) and not _worse_periods(scene):
+        text = f"{found:.3g} px (median)"
+        yield Hit(scene.model_file("points3D"), f"errors about {expected:.3g} px", text)
 
 
 @rule(

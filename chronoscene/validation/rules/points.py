@@ -120,6 +120,9 @@ def track_disagrees(scene: RawScene) -> Iterator[Hit]:
         yield Hit(scene.model_file("points3D"), "keypoints that agree", found, count=wrong)
     claimed = images.keypoint_point >= 0
     claimed[keypoints[agree]] = False
+    # What is left of a track that is broken elsewhere has its own error.
+    broken = points.ids[np.unique(seen.point[~seen.valid])]
+    claimed &= ~np.isin(images.keypoint_point, broken)
     if lost := int(np.count_nonzero(claimed)):
         found = f"{counted(lost, 'keypoint')} of points whose track does not have them"
         yield Hit(scene.model_file("images"), "tracks that agree", found, count=lost)

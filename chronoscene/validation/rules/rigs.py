@@ -114,6 +114,8 @@ def rig_pose_differs(scene: RawScene) -> Iterator[Hit]:
     raw, images = _read(scene), scene.images
     if raw is None or images is None or not len(images):
         return
+    if scene.cameras is not None and any(rigs_inconsistent(scene)):
+        return  # of another model altogether
     row = {image_id: i for i, image_id in enumerate(images.ids.tolist())}
     good = good_poses(images)
     triples = [

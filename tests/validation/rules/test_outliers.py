@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 IMAGES, POINTS = "sparse/0/images.txt", "sparse/0/points3D.txt"
 
@@ -63,3 +64,17 @@ def test_far_points(scene):
 def test_far_points_of_absurd_size(scene):
     scene.edit_fields(POINTS, 5, {2: "1e300"})
     scene.expect("CS518", place=POINTS, found="(ids 6)")
+
+
+def test_error_outdated(scene):
+    """A camera replaced by that of the data sheet: all periods are worse, none stands out."""
+    scene.write("sparse/0/cameras.txt", ["1 PINHOLE 64 48 62.5 62.5 32 24"])
+    scene.expect("CS524", place=POINTS, found="px (median)")
+
+
+@pytest.mark.parametrize("stored", ["0", "-1"])
+def test_errors_that_are_not_stored_say_nothing(scene, stored):
+    scene.write("sparse/0/cameras.txt", ["1 PINHOLE 64 48 62.5 62.5 32 24"])
+    for row in range(40):
+        scene.edit_fields(POINTS, row, {7: stored})
+    assert {f.code for f in scene.validate().findings} == {"CS507"}

@@ -54,13 +54,13 @@ def test_short_track(scene, track, found):
 
 def test_track_over_a_missing_image(scene):
     scene.edit_fields(POINTS, 4, {8: "77"})
-    scene.expect("CS504", place=POINTS, found="1 observation in image ids 77", also={"CS505"})
+    scene.expect("CS504", place=POINTS, found="1 observation in image ids 77")
 
 
 @pytest.mark.parametrize("keypoint", ["40", "-1", "999999999"])
 def test_track_over_a_missing_keypoint(scene, keypoint):
     scene.edit_fields(POINTS, 4, {9: keypoint})
-    scene.expect("CS504", place=POINTS, found="beyond the keypoints", also={"CS505"})
+    scene.expect("CS504", place=POINTS, found="beyond the keypoints")
 
 
 def test_keypoint_names_another_point(scene):
