@@ -12,6 +12,7 @@ import numpy as np
 from chronoscene.errors import ChronoSceneError
 from chronoscene.exif import ExifData
 from chronoscene.formats.chronoscene import PERIODS, read_periods
+from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.validation.finding import Hit, counted
 from chronoscene.validation.positions import GpsFit, fit_gps
 from chronoscene.validation.raw_scene import RawScene
@@ -40,6 +41,9 @@ GPS_SIGMAS = 6.0
 
 GPS_LOOSE = 0.5
 """Standard deviation of the fit, as a share of the spread, beyond which nothing fits at all."""
+
+MOST_UP = 0.9
+"""Share of the cameras that look up where the model was turned over."""
 
 FILM_DIAGONAL, FILM_WIDTH = 43.2666, 36.0
 """Millimetres; makers go by one or the other."""
@@ -127,6 +131,10 @@ def exif_position(scene: RawScene) -> Iterator[Hit]:
         found = f"{np.median(fit.distance):.3g} m between them (median)"
         yield Hit(scene.model_file("images"), "cameras where the photos' GPS has them", found)
         return
+    if upside_down(scene, fit):
+        found = "positions that only a mirrored or overturned model reaches: its cameras look up"
+        todo = "check the signs of longitudes (east, west), and whether the model is mirrored"
+        yield Hit(scene.model_file("images"), "cameras the right way up over GPS", found, todo)
     far = fit.distance > max(GPS_FAR, GPS_SIGMAS * fit.sigma)
     whole = _mostly_far(scene, fit, far)
     yield from whole.values()
@@ -135,6 +143,19 @@ def exif_position(scene: RawScene) -> Iterator[Hit]:
         if int(scene.image_periods[image]) not in whole:
             place = scene.image_place(scene.images.names[image])
             yield Hit(place, "a camera where its GPS has it", f"one {metres:.3g} m away")
+
+
+def upside_down(scene: RawScene, fit: GpsFit) -> bool:
+    """Whether the fit turned the model over, which it does where one of both is mirrored.
+
+    Cameras look down, or to the horizon with their lower side down. In a mirrored plan that holds
+    for a model on its head only.
+    """
+    assert scene.images is not None
+    rotations = rotation_from_quaternion(scene.images.quaternions[fit.images])
+    middle = rotations[:, 1] + rotations[:, 2]  # between forwards and down, in the world
+    up = middle @ fit.metres_from_world.matrix[2]
+    return bool(np.mean(up > 0) > MOST_UP)
 
 
 def _mostly_far(scene: RawScene, fit: GpsFit, far: np.ndarray) -> dict[int, Hit]:

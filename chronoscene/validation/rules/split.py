@@ -13,6 +13,8 @@ from chronoscene.validation.raw_scene import RawScene, TextFile
 from chronoscene.validation.rule import rule
 from chronoscene.validation.spelling import Spellings
 
+_SIMILAR = re.compile(r"(splits?|periods?)(\.(txt|csv|tsv))*", re.IGNORECASE)
+
 ELSEWHERE = ("split.txt", "sparse/0/split.txt", "images/split.txt")
 
 
@@ -95,7 +97,23 @@ def split_absent(scene: RawScene) -> Iterator[Hit]:
         if elsewhere:
             yield Hit(SPLIT, "the periods of the images", f"{elsewhere[0]} instead", "move it")
         else:
-            yield Hit(SPLIT, "the periods of the images", "no such file", _by_folders(scene))
+            found, similar = "no such file", _similar_files(scene)
+            if similar:
+                found += f"; there is {shown(similar)}"
+            yield Hit(SPLIT, "the periods of the images", found, _by_folders(scene))
+
+
+def _similar_files(scene: RawScene) -> list[str]:
+    """Files that are called nearly like the right one."""
+    found = []
+    for folder in ("", "sparse", "sparse/0"):
+        try:
+            names = sorted(os.listdir(scene.root / folder))
+        except OSError:
+            continue
+        similar = (name for name in names if _SIMILAR.fullmatch(name))
+        found += [f"{folder}/{name}".removeprefix("/") for name in similar]
+    return found
 
 
 def _by_folders(scene: RawScene) -> str | None:

@@ -49,8 +49,8 @@ def tag_places(scene, metres=METRES, moved=(), by=(0.0, 0.0)):
     """Positions of the cameras on the globe, some of them moved by metres east and north."""
     raw = RawScene(scene.root)
     for name, (x, y, z) in zip(raw.images.names, raw.centres * metres, strict=True):
-        # The cameras stand on a circle in x and z; y is up.
-        east, north = (x + by[0], z + by[1]) if name in moved else (x, z)
+        # The cameras stand on a circle in x and z; y is up, so -z is north.
+        east, north = (x + by[0], by[1] - z) if name in moved else (x, -z)
         longitude = LONGITUDE + east / (DEGREE * np.cos(np.radians(LATITUDE)))
         tag(scene, name, place=(LATITUDE + north / DEGREE, longitude, 500 + y))
 
@@ -108,7 +108,7 @@ def test_whole_period_far_from_its_positions(scene):
             scene.path(f"images/b{i:03d}.png")
         )
     tag_places_of(scene, [n for n in NAMES if n[0] == "a"] + moved, moved)
-    scene.expect("CS223", place="period 1", found="2 cameras of 2 142 m away")
+    scene.expect("CS223", place="period 1", found="2 cameras of 2 141 m away")
 
 
 def tag_places_of(scene, names, moved):
@@ -143,3 +143,16 @@ def test_scale_by_positions(scene):
     tag_places(scene, metres=METRES)
     scene.write(WORLD, '{"unit": "unknown"}')
     assert {f.code for f in scene.validate().findings} == {"CS507"}
+
+
+def test_longitudes_without_their_sign(scene):
+    """West read as east: the plan is mirrored, and heights do not count."""
+    tag_places(scene)
+    for name in NAMES:
+        path = scene.path(f"images/{name}")
+        with Image.open(path) as image:
+            image.load()
+            exif = image.getexif()
+        exif.get_ifd(0x8825)[3] = "W"
+        image.save(path, exif=exif)
+    scene.expect("CS223", place=IMAGES, found="a mirrored or overturned model")

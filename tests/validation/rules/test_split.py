@@ -27,6 +27,12 @@ def test_split_absent_where_folders_may_be_periods(make_scene):
     assert "if the folders 'a', 'b' are the periods, chronoscene convert" in finding.remedy
 
 
+@pytest.mark.parametrize("file", ["Split.txt", "splits.txt", "split.txt.txt", "0/split.csv"])
+def test_split_under_another_name(scene, file):
+    scene.path(SPLIT).rename(scene.path(f"sparse/{file}"))
+    scene.expect("CS301", place=SPLIT, found=f"no such file; there is 'sparse/{file}'")
+
+
 def test_split_misplaced(scene):
     scene.path(SPLIT).rename(scene.path("sparse/0/split.txt"))
     report = scene.expect("CS301", place=SPLIT, found="sparse/0/split.txt instead")
