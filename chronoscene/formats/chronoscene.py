@@ -48,6 +48,9 @@ WORLD = "sparse/world.json"
 LARGEST_COORDINATE = 1e100
 """Beyond any world; squares and sums of such numbers are still finite."""
 
+NOT_RIGID = 1e-6
+"""Deviation from a rotation beyond which a pose is refused; COLMAP's are exact to rounding."""
+
 MOST_PERIODS = 100_000
 """Far beyond any real scene: more come from a mistaken id, and would fill the memory."""
 
@@ -103,12 +106,19 @@ def raise_first(path: Path, problems: Iterable[Problem]) -> None:
 def check_image(place: Path, image: PosedImage) -> None:
     """Refuse an image that no method could use: its name, its pose, its camera."""
     check_name(place, image.name)
-    camera = image.camera
-    if not (np.abs(image.cam_from_world) < LARGEST_COORDINATE).all():
+    camera, pose = image.camera, image.cam_from_world
+    if not (np.abs(pose) < LARGEST_COORDINATE).all():
         raise SceneError(
             place,
             expected=f"a finite pose of {image.name!r}",
             found="NaN, infinity, or more than any place can have",
+            todo="remove the image from the model, or register it again",
+        )
+    if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > NOT_RIGID:
+        raise SceneError(
+            place,
+            expected=f"a rotation in the pose of {image.name!r}",
+            found="another matrix, from a quaternion that is too large or too small",
             todo="remove the image from the model, or register it again",
         )
     if not is_usable(camera):

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import check_name
@@ -13,7 +17,7 @@ from chronoscene.formats.labels import period_items, world_item
 from chronoscene.formats.ply import write_points
 from chronoscene.formats.transforms import opengl_from_pose
 from chronoscene.formats.writing import ImageSource, Progress, place_images, staged_folder
-from chronoscene.scene import Camera, Scene
+from chronoscene.scene import Camera, Points, Scene
 
 FILE = "transforms.json"
 
@@ -41,6 +45,9 @@ def write(
     out = Path(out)
     for frame in scene.frames:
         check_name(out, frame.name)
+    finite = _finite(scene.points)
+    if not finite.all():
+        scene = replace(scene, points=scene.points.select(finite))
     text = json.dumps(_document(scene), indent=1, ensure_ascii=False) + "\n"
     with staged_folder(out) as staged:
         (staged / FILE).write_text(text, encoding="utf-8", newline="\n")
@@ -55,9 +62,16 @@ def losses(scene: Scene) -> list[str]:
     lost = []
     if len(scene.points.track_frame):
         lost.append("the observations of points, their ids and errors")
+    if count := int((~_finite(scene.points)).sum()):
+        lost.append(f"{count} points that are not finite")
     if len({frame.camera.model == FISHEYE for frame in scene.frames}) > 1:
         lost.append(f"{FISHEYE} beside other cameras, as its loader takes one kind for all frames")
     return lost
+
+
+def _finite(points: Points) -> NDArray[np.bool_]:
+    """Which points a cloud can hold. [P]"""
+    return np.asarray(np.isfinite(points.xyz).all(axis=1))
 
 
 def _document(scene: Scene) -> dict[str, Any]:

@@ -162,9 +162,12 @@ def test_cameras_of_no_use_are_refused(camera):
 def test_poses_of_no_use_are_refused(value):
     pose = np.eye(4)
     pose[1, 3] = value
-    image = PosedImage(1, "a.png", Camera(1, "PINHOLE", 64, 48, (50, 50, 32, 24)), pose)
+    camera = Camera(1, "PINHOLE", 64, 48, (50, 50, 32, 24))
     with pytest.raises(SceneError, match=r"expected a finite pose of 'a\.png'"):
-        check_image(Path("place"), image)
+        check_image(Path("place"), PosedImage(1, "a.png", camera, pose))
+    skewed = np.diag([1, 1, 1.001, 1])
+    with pytest.raises(SceneError, match=r"expected a rotation in the pose of 'a\.png'"):
+        check_image(Path("place"), PosedImage(1, "a.png", camera, skewed))
 
 
 def test_panoramas_are_read(make_scene_folder):

@@ -364,6 +364,16 @@ def test_written_points_project_to_where_they_were_seen(make_scene_folder, tmp_p
         np.testing.assert_allclose(pixel, scene.points.track_xy[j], atol=1e-6)
 
 
+def test_points_that_are_not_finite_are_left_out(make_scene_folder, tmp_path):
+    scene = read_scene(make_scene_folder())
+    xyz = scene.points.xyz.copy()
+    xyz[3, 1] = np.nan
+    scene = dataclasses.replace(scene, points=dataclasses.replace(scene.points, xyz=xyz))
+    assert "1 points that are not finite" in nerfstudio.losses(scene)
+    again = read_scene(nerfstudio.write(scene, tmp_path / "out"))
+    np.testing.assert_array_equal(again.points.xyz, np.delete(xyz, 3, axis=0))
+
+
 def test_a_third_radial_parameter_is_written(nerfstudio_folder, tmp_path):
     folder = nerfstudio_folder(NAMES)
     edit(folder, k1=0.1, p2=0.02, k3=0.03)
