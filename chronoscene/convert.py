@@ -63,18 +63,28 @@ def convert(
 
 
 def check_outside(source: Path, out: Path) -> None:
-    """Refuse to write into the folder of a scene.
+    """Refuse to write into the folder of a scene, also where parts of it are links to folders.
 
     Raises:
-        ConfigError: If ``out`` is ``source`` or below it.
+        ConfigError: If ``out`` is ``source`` or below it, or below what a folder in it links to.
     """
-    if out.resolve().is_relative_to(source.resolve()):
-        raise ConfigError(
-            out,
-            expected="a place outside of the source",
-            found=f"one in {source}",
-            todo="choose another; scenes are never written into",
-        )
+    linked = [path for path in _entries(source) if path.is_symlink() and path.is_dir()]
+    for folder in (source, *linked):
+        if out.resolve().is_relative_to(folder.resolve()):
+            raise ConfigError(
+                out,
+                expected="a place outside of the source",
+                found=f"one in {folder}",
+                todo="choose another; scenes are never written into",
+            )
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What is in a folder; nothing where it cannot be looked into."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
 
 
 def remarks_on(scene: Scene) -> list[str]:

@@ -82,6 +82,15 @@ def test_never_into_the_source_through_a_link(make_scene_folder, tmp_path):
         convert(folder, tmp_path / "link" / "new")
 
 
+def test_never_into_what_the_source_links_to(make_scene_folder, tmp_path):
+    folder = make_scene_folder()
+    (folder / "images").rename(tmp_path / "photos")
+    (folder / "images").symlink_to(tmp_path / "photos")
+    with pytest.raises(ConfigError, match=r"found one in .*/scene/images; choose another"):
+        convert(folder, tmp_path / "photos/new")
+    assert len(convert(folder, tmp_path / "new").scene.frames) == 4
+
+
 @pytest.mark.parametrize("target", ["chronoscene", "nerfstudio", "colmap-folders"])
 def test_a_folder_in_use_is_left_alone(make_scene_folder, tmp_path, target):
     out = tmp_path / "out"
