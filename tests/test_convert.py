@@ -9,7 +9,7 @@ import pytest
 
 from chronoscene.convert import convert, losses, obstacles
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats import load_format, read_scene
+from chronoscene.formats import load_format, read_scene, writable_formats
 from chronoscene.scene import Camera, Period, Points, WorldFrame
 from chronoscene.splits import split_hash
 
@@ -91,7 +91,7 @@ def test_never_into_what_the_source_links_to(make_scene_folder, tmp_path):
     assert len(convert(folder, tmp_path / "new").scene.frames) == 4
 
 
-@pytest.mark.parametrize("target", ["chronoscene", "nerfstudio", "colmap-folders"])
+@pytest.mark.parametrize("target", writable_formats())
 def test_a_folder_in_use_is_left_alone(make_scene_folder, tmp_path, target):
     out = tmp_path / "out"
     out.mkdir()
@@ -101,7 +101,7 @@ def test_a_folder_in_use_is_left_alone(make_scene_folder, tmp_path, target):
     assert snapshot(out) == {"thesis.txt": hashlib.sha256(b"all of it").hexdigest()}
 
 
-@pytest.mark.parametrize("target", ["chronoscene", "nerfstudio", "colmap-folders"])
+@pytest.mark.parametrize("target", writable_formats())
 def test_nothing_is_left_of_a_failure(make_scene_folder, tmp_path, target):
     folder = make_scene_folder()
     (folder / "images/b/0003.png").unlink()
@@ -123,19 +123,20 @@ def test_below_a_file(make_scene_folder, tmp_path):
         convert(make_scene_folder(), tmp_path / "file/out")
 
 
-@pytest.mark.parametrize("target", ["chronoscene", "nerfstudio", "colmap-folders"])
+@pytest.mark.parametrize("target", writable_formats())
 def test_links(make_scene_folder, tmp_path, target):
     folder = make_scene_folder({"0/a.png": 0, "1/a.png": 1})
     for kind in ("link", "symlink", "copy"):
         convert(folder, tmp_path / kind, target=target, image_source=kind)
-        image, source = tmp_path / kind / "images/0/a.png", folder / "images/0/a.png"
+        again = read_scene(tmp_path / kind, format=target)
+        image, source = again.image_path(again.frames[0]), folder / "images/0/a.png"
         assert image.read_bytes() == source.read_bytes()
         assert image.is_symlink() == (kind == "symlink")
         assert os.path.samefile(image, source) == (kind != "copy")
 
 
 def test_progress_counts_images(make_scene_folder, tmp_path):
-    for target in ("chronoscene", "nerfstudio", "colmap-folders"):
+    for target in writable_formats():
         seen = []
         convert(
             make_scene_folder(name=f"s-{target}"),
