@@ -29,6 +29,10 @@ BLOCK = 10_000_000
 """Points times periods that are counted at a time."""
 
 
+FEW = 0.01
+"""Share of the points up to which short tracks do not matter."""
+
+
 @rule(
     "CS501",
     "no-points",
@@ -70,9 +74,32 @@ def point_not_finite(scene: RawScene) -> Iterator[Hit]:
     needs=("points",),
 )
 def short_track(scene: RawScene) -> Iterator[Hit]:
+    return _short_tracks(scene, few=False)
+
+
+@rule(
+    "CS525",
+    "few-short-tracks",
+    "info",
+    what=f"Of every hundred points at most {100 * FEW:g} are seen by no image or by one; their "
+    "positions are not measurements.",
+    remedy="nothing to do; validate --fix leaves them out",
+    bad="a point that lost an observation when its image was cropped",
+    needs=("points",),
+)
+def few_short_tracks(scene: RawScene) -> Iterator[Hit]:
+    return _short_tracks(scene, few=True)
+
+
+def _short_tracks(scene: RawScene, *, few: bool) -> Iterator[Hit]:
     points = scene.points
     assert points is not None
     lengths = np.diff(points.track_start)
+    short = int(np.count_nonzero(lengths < 2))
+    if few != (short <= FEW * len(points)):
+        return
+    if short and not lengths.any() and scene.tests is not None:
+        return  # no tracks at all: an error of its own
     for number, found in ((0, "no observation"), (1, "one observation")):
         yield from _some_points(scene, points, lengths == number, "two or more", found)
 
@@ -120,9 +147,6 @@ def track_disagrees(scene: RawScene) -> Iterator[Hit]:
         yield Hit(scene.model_file("points3D"), "keypoints that agree", found, count=wrong)
     claimed = images.keypoint_point >= 0
     claimed[keypoints[agree]] = False
-    # What is left of a track that is broken elsewhere has its own error.
-    broken = points.ids[np.unique(seen.point[~seen.valid])]
-    claimed &= ~np.isin(images.keypoint_point, broken)
     if lost := int(np.count_nonzero(claimed)):
         found = f"{counted(lost, 'keypoint')} of points whose track does not have them"
         yield Hit(scene.model_file("images"), "tracks that agree", found, count=lost)
@@ -141,6 +165,8 @@ def period_without_points(scene: RawScene) -> Iterator[Hit]:
     seen = scene.point_periods
     assert seen is not None
     total = len(seen)
+    if not seen.any():
+        return  # no tracks at all: an error of its own
     for column, period in enumerate(scene.period_ids):
         if total and not seen[:, column].any():
             yield Hit(f"period {period}", "points that its images see", f"0 of {total}")

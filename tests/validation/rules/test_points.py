@@ -54,13 +54,13 @@ def test_short_track(scene, track, found):
 
 def test_track_over_a_missing_image(scene):
     scene.edit_fields(POINTS, 4, {8: "77"})
-    scene.expect("CS504", place=POINTS, found="1 observation in image ids 77")
+    scene.expect("CS504", place=POINTS, found="1 observation in image ids 77", also={"CS505"})
 
 
 @pytest.mark.parametrize("keypoint", ["40", "-1", "999999999"])
 def test_track_over_a_missing_keypoint(scene, keypoint):
     scene.edit_fields(POINTS, 4, {9: keypoint})
-    scene.expect("CS504", place=POINTS, found="beyond the keypoints")
+    scene.expect("CS504", place=POINTS, found="beyond the keypoints", also={"CS505"})
 
 
 def test_keypoint_names_another_point(scene):
@@ -173,3 +173,20 @@ def test_points_without_colours(make_scene):
 def test_points_with_colours(make_scene):
     scene = make_scene(points=200, form="text")
     assert "CS522" not in {f.code for f in scene.validate().findings}
+
+
+def test_a_few_short_tracks_are_a_remark(scene, monkeypatch):
+    monkeypatch.setattr("chronoscene.validation.rules.points.FEW", 1 / 40)
+    words = scene.lines(POINTS)[4].split()
+    lines = scene.lines(POINTS)
+    lines[4] = " ".join(words[:10])
+    scene.write(POINTS, lines)
+    assert "CS525" in {f.code for f in scene.validate().findings}
+    assert "CS503" not in {f.code for f in scene.validate().findings}
+
+
+def test_points_without_any_track_are_one_finding(scene):
+    """Not one for the points, one for each period, and one for the scene."""
+    scene.write(POINTS, [" ".join(line.split()[:8]) for line in scene.lines(POINTS)])
+    found = {f.code for f in scene.validate().findings}
+    assert "CS514" in found and not found & {"CS503", "CS506", "CS525"}
