@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -224,3 +225,20 @@ def test_two_names_of_one_file_are_refused(make_scene_folder, tmp_path, source):
         with pytest.raises(SceneError, match="expected a file of its own for each image"):
             load_format(name).write(twice, tmp_path / "out", image_source=source)
     assert not (tmp_path / "out").exists()
+
+
+def test_the_working_folder_is_refused(make_scene_folder, tmp_path, monkeypatch):
+    folder, empty = make_scene_folder(), tmp_path / "empty"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    with pytest.raises(SceneError, match="expected another folder than the one you are in"):
+        convert(folder, Path())
+    assert list(empty.iterdir()) == []
+
+
+def test_a_link_to_an_empty_folder_may_be_written_to(make_scene_folder, tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "disk")
+    convert(make_scene_folder(), tmp_path / "link")
+    assert (tmp_path / "link").is_symlink()
+    assert len(read_scene(tmp_path / "disk").frames) == 4

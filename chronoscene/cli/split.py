@@ -128,6 +128,8 @@ def _check_targets(source: Path, out: Path | None, scene_out: Path | None) -> No
             check_outside(source, target)
     if scene_out is not None:
         check_place("--scene-out", scene_out)
+    if out is not None and not out.name:
+        raise click.BadParameter("the name of a file is needed", param_hint="OUT")
     if out is not None and _json_beside(out) == out:
         raise ConfigError(
             out,

@@ -34,6 +34,14 @@ def staged_folder(out: Path) -> Iterator[Path]:
         SceneError: If ``out`` is a file or has content, or the disk refuses.
     """
     try:
+        if out.resolve() == Path.cwd():  # a shell would stay in the folder that is replaced
+            raise SceneError(
+                out,
+                expected="another folder than the one you are in",
+                found="that one",
+                todo="go up and name it, or name a new folder",
+            )
+        out = out.resolve()
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise SceneError(
                 out,

@@ -72,6 +72,7 @@ def test_whole_periods_are_remarked_upon(scene, tmp_path):
         (["{scene}", "{tmp}/o", "--every", "4", "--fraction", "0.1"], "not both"),
         (["{scene}", "{tmp}/o", "--every", "1"], "2 or more is needed"),
         (["{scene}", "{scene}/sparse/0/test.txt"], "a place outside of the source"),
+        (["{scene}", ""], "the name of a file is needed"),
         (["{scene}", "--scene-out", "{scene}/new"], "a place outside of the source"),
         (["{scene}", "{tmp}/there.txt"], "expected a new file, found an existing one"),
         (["{scene}", "{tmp}/other.txt"], "other.json: expected a new file"),
