@@ -170,18 +170,10 @@ def write(
         SceneError: If ``out`` is in use, an image is missing or of another camera than a pinhole,
             or names without their folders are equal.
     """
-    names = _written_names(scene)
-    if len(set(names.values())) < len(names):
-        raise SceneError(
-            out,
-            expected="image names that differ when / becomes _",
-            found="equal ones",
-            todo="rename images",
-        )
     return write_renamed(
         scene.with_frames([replace(f, camera=_readable(f.camera)) for f in scene.frames]),
         Path(out),
-        names,
+        _written_names(scene),
         test_list=False,
         image_source=image_source,
         progress=progress,

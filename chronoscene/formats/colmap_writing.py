@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.colmap import write_model
+from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import MODEL, TEST, check_writable_name
 from chronoscene.formats.grouping import label_date, natural_key
 from chronoscene.formats.writing import (
@@ -44,8 +45,15 @@ def write_renamed(
         progress: Called after each image.
 
     Raises:
-        SceneError: If ``out`` is in use, or an image is missing.
+        SceneError: If ``out`` is in use, an image is missing, or two new names are equal.
     """
+    if len(set(names.values())) < len(names):
+        raise SceneError(
+            out,
+            expected="image names that differ when / becomes _",
+            found="equal ones",
+            todo="rename images",
+        )
     new = renamed(scene, names)
     for frame in new.frames:
         check_writable_name(out, frame)
