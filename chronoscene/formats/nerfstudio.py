@@ -17,7 +17,7 @@ Source: the data parser of ``nerfstudio-project/nerfstudio``.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,7 +43,6 @@ from chronoscene.formats.nerfstudio_writing import write as write
 from chronoscene.formats.ply import read_points
 from chronoscene.formats.transforms import (
     Shot,
-    check_distinct,
     file_name,
     head_has,
     image_name,
@@ -93,10 +92,9 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     place = path / FILE
     data = read_json(place, dict)
     frames = read_frames(place, data)
-    shots = _read_shots(path, data, frames)
-    extras = {shot.name: frame for shot, frame in zip(shots, frames, strict=True)}
-    shots, tests, rule = _apply_lists(path, data, shots)
-    grouped = _group(place, data, {shot.name: extras[shot.name] for shot in shots}, period_by)
+    named = _by_name(path, frames)
+    shots, tests, rule = _apply_lists(path, data, _read_shots(path, data, named), named)
+    grouped = _group(place, data, {shot.name: named[shot.name][1] for shot in shots}, period_by)
     scene = make_scene(
         path,
         shots,
@@ -131,36 +129,41 @@ def remarks(path: Path) -> list[str]:
                 "versions of nerfstudio made is undone"
             )
         found.append(f"{COLMAP} is not read, which has observations of points")
-    shots = _read_shots(path, data, frames)
-    there = _with_image(path, shots)
-    if len(there) < len(frames):
-        found.append(f"{len(frames) - len(there)} frames are left out, as their image is missing")
-    kept, _, _ = _apply_lists(path, data, shots)
-    if len(kept) < len(there):
-        found.append(f"{len(there) - len(kept)} frames are left out, as no list names them")
+    named = _by_name(path, frames)
+    shots = _read_shots(path, data, named)
+    if len(shots) < len(frames):
+        found.append(f"{len(frames) - len(shots)} frames are left out, as their image is missing")
+    kept, _, _ = _apply_lists(path, data, shots, named)
+    if len(kept) < len(shots):
+        found.append(f"{len(shots) - len(kept)} frames are left out, as no list names them")
     return found
 
 
-def _with_image(path: Path, shots: list[Shot]) -> list[Shot]:
-    """The frames whose image is there.
-
-    Raises:
-        SceneError: If none is.
-    """
-    there = [shot for shot in shots if os.path.isfile(path / shot.name)]
-    if not there:
-        raise SceneError(
-            path / shots[0].name, expected="an image", found="nothing", todo="copy the images there"
-        )
-    return there
-
-
-def _read_shots(path: Path, data: Mapping[str, Any], frames: list[dict[str, Any]]) -> list[Shot]:
-    cameras, shots = CameraTable(), []
-    shared = {key: value for key, value in data.items() if key != "frames"}
+def _by_name(path: Path, frames: list[dict[str, Any]]) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Place, for messages, and keys of each frame, by the path of its image."""
+    named: dict[str, tuple[str, dict[str, Any]]] = {}
     for i, frame in enumerate(frames):
         place = f"{path / FILE}: frames[{i}]"
         name = image_name(place, path, "", frame.get("file_path"))
+        if name in named:
+            raise json_error(path / FILE, "each image once", f"{name!r} twice")
+        named[name] = place, frame
+    return named
+
+
+def _read_shots(
+    path: Path, data: Mapping[str, Any], named: Mapping[str, tuple[str, dict[str, Any]]]
+) -> list[Shot]:
+    """The frames whose image is there.
+
+    Raises:
+        SceneError: If none is, or one is damaged.
+    """
+    cameras, shots = CameraTable(), []
+    shared = {key: value for key, value in data.items() if key != "frames"}
+    for name, (place, frame) in named.items():
+        if not os.path.isfile(path / name):
+            continue
         world_from_cam = matrix(place, frame.get("transform_matrix"), (3, 4))
         image_id = frame.get("colmap_im_id")
         shots.append(
@@ -171,17 +174,20 @@ def _read_shots(path: Path, data: Mapping[str, Any], frames: list[dict[str, Any]
                 image_id=image_id if type(image_id) is int else 0,
             )
         )
-    check_distinct(path / FILE, shots)
+    if not shots:
+        missing = path / next(iter(named))
+        raise SceneError(
+            missing, expected="an image", found="nothing", todo="copy the images there"
+        )
     return shots
 
 
 def _apply_lists(
-    path: Path, data: Mapping[str, Any], shots: list[Shot]
+    path: Path, data: Mapping[str, Any], shots: list[Shot], known: Collection[str]
 ) -> tuple[list[Shot], set[str] | None, str]:
     """Frames that are used, and the test images with the rule in words; None for the default."""
-    place, known = path / FILE, {shot.name for shot in shots}
+    place = path / FILE
     lists = {key: _names(path, data, f"{key}_filenames", known) for key in ("train", "val", "test")}
-    shots = _with_image(path, shots)
     if all(names is None for names in lists.values()):
         return shots, None, DEFAULT_RULE
     tests = (lists["val"] or set()) | (lists["test"] or set())
@@ -195,14 +201,16 @@ def _apply_lists(
     return shots, tests, "the lists of file names in transforms.json"
 
 
-def _names(path: Path, data: Mapping[str, Any], key: str, known: set[str]) -> set[str] | None:
+def _names(
+    path: Path, data: Mapping[str, Any], key: str, known: Collection[str]
+) -> set[str] | None:
     names, place = data.get(key), f"{path / FILE}: {key}"
     if names is None:
         return None
     if not isinstance(names, list):
         raise json_error(place, "a list", type(names).__name__)
     found = {image_name(place, path, "", name) for name in names}
-    if lost := sorted(found - known):
+    if lost := sorted(found.difference(known)):
         raise json_error(place, "names of frames", repr(lost[0]), "correct the list")
     return found
 

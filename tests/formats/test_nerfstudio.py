@@ -207,6 +207,21 @@ def test_left_out_extensions_are_found_out(nerfstudio_folder, suffix):
     assert [f.name for f in scene.select(split="test")] == [f"2{suffix}"]
 
 
+def test_frames_without_image_are_left_out_where_images_say_the_size(nerfstudio_folder):
+    folder = nerfstudio_folder(NAMES)
+    edit(folder, w=None, h=None, cx=None, cy=None)
+    (folder / "images/1.png").unlink()
+    edit(folder, test_filenames=["images/1.png", "images/2.png"])
+    scene = read_scene(folder)
+    assert [(f.name, f.split) for f in scene.frames] == [
+        ("0.png", "train"),
+        ("2.png", "test"),
+        ("3.png", "train"),
+    ]
+    assert (scene.frames[0].camera.width, scene.frames[0].camera.height) == (64, 48)
+    assert "1 frames are left out, as their image is missing" in nerfstudio.remarks(folder)
+
+
 def test_names_that_no_disk_can_hold_count_as_missing(nerfstudio_folder):
     folder = nerfstudio_folder(NAMES)
     long = "x" * 300
