@@ -57,6 +57,8 @@ def _unit_quaternions(images: RawImages, repairs: list[Repair]) -> RawImages:
 def _without_broken_observations(
     images: RawImages, points: RawPoints, repairs: list[Repair]
 ) -> RawPoints:
+    if len(np.unique(images.ids)) < len(images):
+        return points  # of two images with one id, one has lost its observations to the other
     seen = observe(images, points)
     finite = np.asarray(np.isfinite(images.keypoint_xy).all(axis=1))
     exists = seen.valid
