@@ -42,6 +42,7 @@ ul { list-style: none; margin: .5rem 0; padding: 0; }
 li { display: flex; gap: .75rem; margin: .35rem 0; padding: .35rem 0 .35rem .75rem;
   border-left: 3px solid var(--line); }
 li div { min-width: 0; overflow-wrap: anywhere; }
+@media (max-width: 40rem) { li { flex-wrap: wrap; } li div { flex-basis: 100%; } }
 img { width: 7.5rem; height: 6rem; object-fit: cover; border-radius: .3rem; flex: none; }
 .todo { margin: .25rem 0 .25rem .75rem; }
 footer { margin: 2rem 0 1rem; font-size: .9rem; }

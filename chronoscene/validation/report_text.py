@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
+import textwrap
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 
@@ -17,6 +20,9 @@ FIRST = 3
 LINES = 5
 """Different lines of one rule that are shown."""
 
+NARROWEST = 40
+"""Columns below which lines are not broken further."""
+
 COLOURS: dict[Severity, str] = {"error": "red", "warning": "yellow", "info": "cyan"}
 
 
@@ -26,7 +32,27 @@ def write_text(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
     if len(reports) > 1:
         bad = sum(bool(r.count("error") or (strict and r.count("warning"))) for r in reports)
         blocks.append([f"{counted(len(reports), 'scene')}, {bad} not valid: {_total(reports)}"])
-    return "\n\n".join("\n".join(block) for block in blocks) + "\n"
+    width = _width()
+    return "\n\n".join("\n".join(_fit(line, width) for line in block) for block in blocks) + "\n"
+
+
+def _width() -> int | None:
+    """Columns of the terminal; None without one: lines stay whole for other programs."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+
+
+def _fit(line: str, width: int | None) -> str:
+    """A line with what does not fit below it, further in."""
+    if width is None or len(click.unstyle(line)) <= width:
+        return line
+    indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
+    return textwrap.fill(
+        line,
+        max(width, NARROWEST),
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def describe_rule(rule: Rule) -> str:

@@ -120,3 +120,14 @@ def test_words():
     assert len(quote("x" * 10_000)) < 150
     assert printable("grün ok") == "grün ok"
     assert printable("a\tb\u202e") == "a\\tb\\u202e"
+
+
+def test_lines_are_broken_for_a_terminal_only(scene, monkeypatch):
+    scene.path("images/a000.png").unlink()
+    report = scene.validate()
+    whole = write_text([report])
+    assert max(map(len, whole.splitlines())) > 100
+    monkeypatch.setattr("chronoscene.validation.report_text._width", lambda: 80)
+    broken = write_text([report])
+    assert max(len(click.unstyle(line)) for line in broken.splitlines()) <= 80
+    assert broken.split() == whole.split()
