@@ -40,6 +40,9 @@ JPEG = ("JPEG", "MPO")
 TAIL = 4096
 """Bytes at the end of a file in which its mark is looked for."""
 
+_SUBFILE, _REDUCED, _MASK = 254, 1, 4
+"""Tag of TIFF that says what an image in the file is, and two of its bits (TIFF 6.0, page 36)."""
+
 _HEADER_THREADS = 4
 _FEW = 32
 """Headers that are read before threads would have begun."""
@@ -120,8 +123,8 @@ def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
         kind=kind,
         deep=_is_deep(image),
         transparent=image.mode in ALPHA_MODES or "transparency" in image.info,
-        moving=kind not in ("MPO", "TIFF") and bool(getattr(image, "is_animated", False)),
         cut_off=_is_cut_off(path, file, image),
+        moving=_has_frames(image),
         exif=exif,
     )
 
@@ -132,6 +135,21 @@ def _is_deep(image: Image.Image) -> bool:
         return True
     tiles = getattr(image, "tile", None) or ((),)
     return any(";16" in str(argument) for argument in tiles[0][3:])
+
+
+def _has_frames(image: Image.Image) -> bool:
+    """Whether there are several images of equal rank; previews and masks do not count."""
+    if image.format == "MPO" or not getattr(image, "is_animated", False):
+        return False
+    if image.format != "TIFF":
+        return True
+    size = image.size
+    try:
+        image.seek(1)
+    except (EOFError, OSError, SyntaxError):
+        return False
+    kind = getattr(image, "tag_v2", {}).get(_SUBFILE, 0)
+    return image.size == size and not kind & (_REDUCED | _MASK)
 
 
 def _is_cut_off(path: Path, file: BinaryIO, image: Image.Image) -> bool:
