@@ -138,7 +138,8 @@ def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.flo
     fx, fy, cx, cy = change.target.params
     if change.source.is_pinhole:  # exact, whatever the model
         K = change.source.K
-        rays = (xy - K[:2, 2]) / K[[0, 1], [0, 1]]
+        with np.errstate(over="ignore"):  # as in `sampling_map`
+            rays = (xy - K[:2, 2]) / K[[0, 1], [0, 1]]
     else:
         rays = _rays(change.source, xy)
     return rays * [fx, fy] + [cx, cy]
