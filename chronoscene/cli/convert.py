@@ -10,7 +10,6 @@ import click
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import convert
-from chronoscene.files import stoppable
 from chronoscene.formats import format_names, load_format, writable_formats
 from chronoscene.formats.writing import ImageSource
 from chronoscene.scene import Scene
@@ -61,7 +60,7 @@ def command(
     SRC is left alone; OUT appears complete or not at all. What gets lost on the way is said.
     DATASET.md describes the formats.
     """
-    with stoppable(), progress_bar() as bar:
+    with progress_bar() as bar:
         done = convert(
             source,
             out,

@@ -13,7 +13,7 @@ from chronoscene.cli.output import check_place, emit, writing_to
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.errors import ConfigError
-from chronoscene.files import stoppable, write_text_atomic
+from chronoscene.files import write_text_atomic
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import format_names, read_scene
 from chronoscene.split_making import (
@@ -85,30 +85,29 @@ def command(
     left alone: --scene-out writes a copy that has the split.
     """
     _check_targets(source, out, scene_out)
-    with stoppable():
-        scene = read_scene(source, format=scene_format)
-        split = make_split(
-            scene,
-            SplitSettings(
-                strategy=strategy,
-                fraction=_fraction(fraction, every),
-                offset=offset,
-                seed=seed,
-                blocks=blocks,
-                periods=periods,
-            ),
-        )
-        for frame in split.scene.frames:
-            our_format.check_writable_name(source, frame)
-        if scene_out is not None:
-            with progress_bar() as bar:
-                our_format.write(
-                    split.scene, scene_out, image_source="link", progress=partial(bar, "images")
-                )
-            _write(split, scene_out / our_format.TEST, "--scene-out")
-        if out is not None:
-            _write(split, out, "OUT")
-        emit(report(split), None)
+    scene = read_scene(source, format=scene_format)
+    split = make_split(
+        scene,
+        SplitSettings(
+            strategy=strategy,
+            fraction=_fraction(fraction, every),
+            offset=offset,
+            seed=seed,
+            blocks=blocks,
+            periods=periods,
+        ),
+    )
+    for frame in split.scene.frames:
+        our_format.check_writable_name(source, frame)
+    if scene_out is not None:
+        with progress_bar() as bar:
+            our_format.write(
+                split.scene, scene_out, image_source="link", progress=partial(bar, "images")
+            )
+        _write(split, scene_out / our_format.TEST, "--scene-out")
+    if out is not None:
+        _write(split, out, "OUT")
+    emit(report(split), None)
 
 
 def _fraction(fraction: float | None, every: int | None) -> float:

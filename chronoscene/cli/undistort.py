@@ -11,7 +11,6 @@ from chronoscene.cli.convert import LINKS, describe
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
-from chronoscene.files import stoppable
 from chronoscene.formats import format_names, read_scene
 from chronoscene.splits import split_hash
 from chronoscene.undistort import Undistortion, undistort
@@ -55,7 +54,7 @@ def command(
     alone. OUT is in the ChronoScene format.
     """
     check_outside(source, out)
-    with stoppable(), progress_bar() as bar:
+    with progress_bar() as bar:
         done = undistort(
             read_scene(source, format=scene_format),
             out,

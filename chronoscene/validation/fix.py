@@ -16,7 +16,7 @@ from pathlib import Path
 from chronoscene.colmap import MODEL_FILES
 from chronoscene.colmap_writer import write_raw_model
 from chronoscene.errors import ConfigError
-from chronoscene.files import stoppable, write_text_atomic
+from chronoscene.files import write_text_atomic
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD
 from chronoscene.splits import parse_split_text, parse_test_text
 from chronoscene.validation.finding import counted, shown
@@ -51,10 +51,7 @@ def fix_scene(root: Path, out: Path) -> list[Repair]:
     _check_format(root)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        with (
-            stoppable(),
-            tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary,
-        ):
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
             staged = Path(temporary) / "scene"
             staged.mkdir()
             with quiet_numbers():

@@ -15,7 +15,6 @@ from pathlib import Path
 
 from chronoscene.colmap_writer import write_without_observations
 from chronoscene.errors import ChronoSceneError
-from chronoscene.files import stoppable
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.validation.raw_model import RawModel
 
@@ -27,7 +26,7 @@ def reader_complaint(root: Path, model: RawModel) -> ChronoSceneError | None:
     if set(model.files.values()) != {"cameras.bin", "images.bin", "points3D.bin"}:
         return _complaint(root)  # text is small
     assert model.images is not None
-    with stoppable(), tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
+    with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
         skeleton = Path(temporary)
         folder = skeleton / our_format.MODEL
         folder.mkdir(parents=True)
