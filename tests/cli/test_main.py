@@ -2,8 +2,10 @@
 
 import errno
 import os
+import signal
 import subprocess
 import sys
+import time
 
 import click
 import pytest
@@ -53,6 +55,24 @@ def test_a_full_disk_is_one_line_too(monkeypatch, capsys):
     told = capsys.readouterr().err
     assert told.startswith("error: runs/results.json: No space left on device")
     assert told.count("\n") == 1
+
+
+def test_a_command_that_is_asked_to_end_leaves_nothing_behind(tmp_path):
+    code = "from chronoscene.cli import main; main()"
+    arguments = ["synth", str(tmp_path / "out"), "--preset", "skeleton", "--scene", "Aerial3"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while process.poll() is None and not any(tmp_path.rglob("*.*")):
+        time.sleep(0.01)
+    process.terminate()
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGTERM, told
+    assert "Traceback" not in told
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
 
 
 def test_help_imports_nothing_heavy():

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from chronoscene.errors import ConfigError
+from chronoscene.files import stoppable
 from chronoscene.formats import read_scene
 from chronoscene.validation.fix import fix_scene
 from chronoscene.validation.raw_model import read_raw_model
@@ -394,7 +395,7 @@ def test_interrupted(scene, tmp_path, monkeypatch, number, error):
 
     monkeypatch.setattr("chronoscene.validation.fix._link", interrupt)
     before = state(tmp_path)
-    with pytest.raises(error):
+    with pytest.raises(error), stoppable():
         fix_scene(scene.root, tmp_path / "fixed")
     assert state(tmp_path) == before
 
