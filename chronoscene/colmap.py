@@ -30,11 +30,14 @@ from chronoscene.colmap_records import (
 )
 from chronoscene.colmap_writer import posed_images, write_raw_model, write_without_observations
 from chronoscene.errors import SceneError
-from chronoscene.geometry import pose_from_rotation_translation
+from chronoscene.geometry import pose_from_rotation_translation, rotation_from_quaternion
 from chronoscene.scene import Camera, Frame, Points
 
 MODEL_FILES = ("cameras", "images", "points3D")
 """Stems of the files that every model has."""
+
+UNIT = 1e-9
+"""Deviation of the length of a quaternion from 1 that is rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,12 +278,29 @@ def _posed_images(folder: Path, model: pycolmap.Reconstruction) -> tuple[PosedIm
             name = str(image.name)
         except UnicodeDecodeError as error:
             raise _model_error(folder, "image names in UTF-8", f"image {image_id}") from error
-        matrix = image.cam_from_world().matrix()
-        pose = pose_from_rotation_translation(matrix[:, :3], matrix[:, 3])
+        pose = _pose(image.cam_from_world())
         if name in images:
             raise _model_error(folder, "one image of each name", f"{name!r} twice")
         images[name] = PosedImage(int(image_id), name, cameras[image.camera_id], pose)
     return tuple(images[name] for name in sorted(images))
+
+
+def _pose(rigid: pycolmap.Rigid3d) -> NDArray[np.float64]:
+    """The same pose as a matrix, NaN for quaternions without a direction. [4, 4]
+
+    Text with few digits has quaternions that are not quite unit, of which pycolmap makes matrices
+    that are no rotations.
+    """
+    x, y, z, w = rigid.rotation.quat
+    with np.errstate(all="ignore"):
+        length = np.linalg.norm([w, x, y, z])
+        if abs(length - 1) <= UNIT:
+            matrix = rigid.matrix()[:, :3]
+        elif 0 < length < np.inf:
+            matrix = rotation_from_quaternion([w, x, y, z])
+        else:
+            matrix = np.full((3, 3), np.nan)
+    return pose_from_rotation_translation(matrix, rigid.translation)
 
 
 def _model_error(folder: Path, expected: str, found: str) -> SceneError:

@@ -67,6 +67,23 @@ def test_camera_round_trip():
     assert from_pycolmap(to_pycolmap(camera)) == camera
 
 
+def test_quaternions_of_few_digits_are_rotations(make_scene_folder):
+    folder = make_scene_folder(form="text") / "sparse" / "0"
+    exact = read_model(folder)
+    lines = (folder / "images.txt").read_text().splitlines()
+    for row, line in enumerate(lines):
+        words = line.split()
+        if not line.startswith("#") and len(words) == 10 and words[9].endswith(".png"):
+            words[1:5] = [f"{float(w):.4f}" for w in words[1:5]]
+            lines[row] = " ".join(words)
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    for image, old in zip(read_model(folder).images, exact.images, strict=True):
+        rotation = image.cam_from_world[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+        np.testing.assert_allclose(rotation, old.cam_from_world[:3, :3], atol=3e-4)
+        assert not np.array_equal(rotation, old.cam_from_world[:3, :3])
+
+
 @pytest.mark.parametrize("form", ["binary", "old", "text"])
 def test_records_agree_with_pycolmap(make_scene_folder, form):
     folder = make_scene_folder(form=form) / "sparse" / "0"

@@ -56,6 +56,10 @@ MODEL_PLACES = (MODEL, "sparse", "colmap/sparse/0", "dense/sparse", "dense/0/spa
 FEWEST = 10
 """Observations of an image from which the median of its errors means something."""
 
+ERROR_SHARE, LEAST_ERROR = 0.01, 4.0
+"""Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
+pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
+
 FEWEST_IMAGES = 3
 """Images with an error from which the median of a period means something."""
 
@@ -205,6 +209,19 @@ class RawScene:
             if len(front) >= FEWEST:
                 errors[seen.image] = np.median(np.where(np.isnan(front), np.inf, front))
         return errors
+
+    def pose_limit(self, image: int) -> float:
+        """Reprojection error in pixels beyond which the pose of an image does not fit."""
+        assert self.images is not None
+        camera = self.usable_cameras[int(self.images.camera_ids[image])]
+        return max(LEAST_ERROR, ERROR_SHARE * float(np.hypot(camera.width, camera.height)))
+
+    @cached_property
+    def own_frames(self) -> dict[int, str]:
+        """Periods in a frame of their own, see `chronoscene.validation.own_frames`."""
+        from chronoscene.validation.own_frames import explain_periods  # it asks for much of this
+
+        return explain_periods(self)
 
     @cached_property
     def period_errors(self) -> dict[int, float]:

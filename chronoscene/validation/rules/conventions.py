@@ -13,7 +13,6 @@ from chronoscene.validation.finding import Hit
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.reprojection import good_poses
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.reprojection import pose_limit
 
 Array = NDArray[np.float64]
 
@@ -50,7 +49,7 @@ def pose_convention(scene: RawScene) -> Iterator[Hit]:
     errors, images = scene.image_errors, scene.images
     assert images is not None
     looked_at = [r for r in scene.reprojections or () if len(r.rows)]
-    limits = {r.image: pose_limit(scene, r.image) for r in looked_at}
+    limits = {r.image: scene.pose_limit(r.image) for r in looked_at}
     wrong = [r for r in looked_at if not errors[r.image] <= limits[r.image]]
     if not wrong or len(wrong) <= MOST_WRONG * len(looked_at):
         return

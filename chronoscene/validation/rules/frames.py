@@ -15,7 +15,6 @@ from chronoscene.validation.positions import fit_gps
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.reprojection import project
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.own_frames import own_frames
 
 DEPTH_RATIO = 10.0
 """Between the median depths of two periods without shared points: nothing else tells scales."""
@@ -52,7 +51,7 @@ REACH = 3.0
     needs=("images", "periods", "reprojections", "point_periods"),
 )
 def period_frame(scene: RawScene) -> Iterator[Hit]:
-    for index, explained in own_frames(scene).items():
+    for index, explained in scene.own_frames.items():
         place = f"period {scene.period_ids[index]}"
         yield Hit(place, "the frame of the other periods", explained)
     yield from _other_depths(scene).values()
@@ -126,7 +125,7 @@ def period_apart(scene: RawScene) -> Iterator[Hit]:
         return
     share = common_view(scene)
     share[~(np.diag(share) >= OWN)] = np.nan  # cameras that miss their own points tell nothing
-    elsewhere = own_frames(scene).keys() | _other_depths(scene).keys()
+    elsewhere = scene.own_frames.keys() | _other_depths(scene).keys()
     for index in elsewhere:  # what is seen in a wrong frame says nothing of places
         share[index], share[:, index] = np.nan, np.nan
     for index, period in enumerate(scene.period_ids):

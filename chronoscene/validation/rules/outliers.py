@@ -8,16 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.validation.finding import Hit, counted, shown
+from chronoscene.validation.own_frames import LEAST_ERROR, WORSE, period_limit
 from chronoscene.validation.period_frames import Rays, focal_factor
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.own_frames import (
-    LEAST_ERROR,
-    WORSE,
-    own_frames,
-    period_limit,
-)
-from chronoscene.validation.rules.reprojection import pose_limit
 
 MOST_STORED = 0.9
 """Share of the points that must have an error stored with them."""
@@ -54,9 +48,9 @@ def _worse_periods(scene: RawScene) -> dict[int, float]:
     """Periods that stand out, with what their median error should be below in pixels."""
     limit = period_limit(scene)
     judged = np.flatnonzero(~np.isnan(scene.image_errors)).tolist()
-    if not judged or limit > WORSE * np.median([pose_limit(scene, i) for i in judged]):
+    if not judged or limit > WORSE * np.median([scene.pose_limit(i) for i in judged]):
         return {}  # no period fits: nothing to compare with
-    explained = {scene.period_ids[index] for index in own_frames(scene)}
+    explained = {scene.period_ids[index] for index in scene.own_frames}
     worse = (period for period, median in scene.period_errors.items() if median > limit)
     return {period: limit for period in worse if period not in explained}
 
@@ -89,7 +83,7 @@ def error_outdated(scene: RawScene) -> Iterator[Hit]:
     found = float(np.nanmedian(np.concatenate([np.zeros(0), *errors])))
     expected = float(np.median(stored))
     judged = np.flatnonzero(~np.isnan(scene.image_errors)).tolist()
-    fits = all(scene.image_errors[i] <= pose_limit(scene, i) for i in judged)
+    fits = all(scene.image_errors[i] <= scene.pose_limit(i) for i in judged)
     if fits and found > max(LEAST_ERROR, WORSE * expected) and not _worse_periods(scene):
         text = f"{found:.3g} px (median)"
         yield Hit(scene.model_file("points3D"), f"errors about {expected:.3g} px", text)
@@ -111,7 +105,7 @@ def image_error(scene: RawScene) -> Iterator[Hit]:
         index, error = int(scene.image_periods[image]), float(scene.image_errors[image])
         period = scene.period_ids[index] if index >= 0 else -1
         limit = max(LEAST_ERROR, WORSE * medians.get(period, np.inf))
-        if limit < error <= pose_limit(scene, image):  # beyond, it is another rule's
+        if limit < error <= scene.pose_limit(image):  # beyond, it is another rule's
             place = scene.image_place(scene.images.names[image])
             yield Hit(place, f"a median error below {limit:.3g} px", f"{error:.3g} px")
 

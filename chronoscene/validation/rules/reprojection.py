@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.finding import Hit, shown
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
 
@@ -17,9 +17,8 @@ MOST_OUTSIDE = 0.05
 MOST_BEHIND = 0.5
 """Share of observations behind their camera. In a model that belongs together there are none."""
 
-ERROR_SHARE, LEAST_ERROR = 0.01, 4.0
-"""Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
-pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
+MOST_WRONG = 0.5
+"""Share of the images of a period that disagree, beyond which one finding is on all of them."""
 
 
 @rule(
@@ -78,16 +77,30 @@ def points_behind_cameras(scene: RawScene) -> Iterator[Hit]:
 )
 def pose_disagrees(scene: RawScene) -> Iterator[Hit]:
     assert scene.images is not None
-    for image in np.flatnonzero(~np.isnan(scene.image_errors)).tolist():
-        limit, median = pose_limit(scene, image), scene.image_errors[image]
-        if not median <= limit:
+    errors = scene.image_errors
+    judged = np.flatnonzero(~np.isnan(errors)).tolist()
+    limits = {image: scene.pose_limit(image) for image in judged}
+    wrong = [image for image in judged if not errors[image] <= limits[image]]
+    for index in sorted({int(scene.image_periods[image]) for image in wrong}):
+        if index in scene.own_frames:
+            continue  # says why
+        mine = [image for image in wrong if scene.image_periods[image] == index]
+        of_period = sum(int(scene.image_periods[image]) == index for image in judged)
+        if index >= 0 and len(mine) > max(1, MOST_WRONG * of_period):
+            yield _most_of(scene, index, mine, of_period)
+            continue
+        for image in mine:
             place = scene.image_place(scene.images.names[image])
-            expected = f"a median reprojection error below {limit:.3g} px"
-            yield Hit(place, expected, f"{median:.3g} px")
+            expected = f"a median reprojection error below {limits[image]:.3g} px"
+            yield Hit(place, expected, f"{errors[image]:.3g} px")
 
 
-def pose_limit(scene: RawScene, image: int) -> float:
-    """Reprojection error in pixels beyond which the pose of an image does not fit."""
+def _most_of(scene: RawScene, index: int, wrong: list[int], judged: int) -> Hit:
+    """One hit for the images of a period that disagree."""
     assert scene.images is not None
-    camera = scene.usable_cameras[int(scene.images.camera_ids[image])]
-    return max(LEAST_ERROR, ERROR_SHARE * float(np.hypot(camera.width, camera.height)))
+    limit = float(np.median([scene.pose_limit(image) for image in wrong]))
+    worst = sorted(wrong, key=lambda image: -scene.image_errors[image])
+    named = shown([scene.images.names[image] for image in worst])
+    found = f"{np.median(scene.image_errors[wrong]):.3g} px in {len(wrong)} of {judged}: {named}"
+    expected = f"images with a median reprojection error below {limit:.3g} px"
+    return Hit(f"period {scene.period_ids[index]}", expected, found, count=len(wrong))

@@ -1,15 +1,12 @@
-"""Which periods disagree with the others, and what explains it: asked by several rules."""
+"""Which periods disagree with the others, and what explains it."""
 
 from __future__ import annotations
-
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.validation.period_frames import explain
 from chronoscene.validation.raw_scene import RawScene
-from chronoscene.validation.rules.reprojection import pose_limit
 
 WORSE = 3.0
 """Ratio of median reprojection errors, of a period to the best one or of an image to its period."""
@@ -20,22 +17,14 @@ LEAST_ERROR = 1.0
 MOST_WRONG = 0.5
 """Share of the images of a period with a pose that does not fit: beyond, the period is at fault."""
 
-_EXPLAINED: WeakKeyDictionary[RawScene, dict[int, str]] = WeakKeyDictionary()
-
 
 def period_limit(scene: RawScene) -> float:
     """Median reprojection error in pixels beyond which a period stands out among the others."""
     return max(LEAST_ERROR, WORSE * min(scene.period_errors.values(), default=0.0))
 
 
-def own_frames(scene: RawScene) -> dict[int, str]:
+def explain_periods(scene: RawScene) -> dict[int, str]:
     """Periods in a frame of their own by index, with what brings them into that of the others."""
-    if scene not in _EXPLAINED:
-        _EXPLAINED[scene] = _explain_all(scene)
-    return _EXPLAINED[scene]
-
-
-def _explain_all(scene: RawScene) -> dict[int, str]:
     if scene.point_periods is None:
         return {}
     limits = {i: _limit_of_wrong(scene, i) for i in range(len(scene.period_ids))}
@@ -52,7 +41,7 @@ def _limit_of_wrong(scene: RawScene, index: int) -> float | None:
     if not len(mine):
         return None
     usual = period_limit(scene) if len(scene.period_errors) > 1 else np.inf
-    limit = min(usual, float(np.median([pose_limit(scene, i) for i in mine.tolist()])))
+    limit = min(usual, float(np.median([scene.pose_limit(i) for i in mine.tolist()])))
     wrong = np.count_nonzero(~(scene.image_errors[mine] <= limit))
     return limit if wrong > MOST_WRONG * len(mine) else None
 
