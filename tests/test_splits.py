@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import replace
+from pathlib import PurePosixPath
 
 import pytest
 from hypothesis import given
@@ -13,6 +14,7 @@ from chronoscene.splits import (
     NameEntry,
     NameIndex,
     SplitEntry,
+    _image_keys,
     assign_periods,
     assign_tests,
     decode_text,
@@ -167,3 +169,16 @@ def test_split_hash(make_scene_folder):
     assert split_hash(scene) == expected
     other = scene.with_frames([replace(f, split="train") for f in scene.frames])
     assert split_hash(other) != expected
+
+
+PART = st.text("ab.é 1", min_size=1, max_size=6).filter(lambda part: part.strip("."))
+
+
+@given(st.lists(PART, min_size=1, max_size=3).map("/".join))
+def test_forms_of_a_name_are_those_of_pathlib(name):
+    path = PurePosixPath(name)
+    first = path.name.split(".")[0]
+    full, file, bare, cut = _image_keys(name)
+    assert (full, file) == ({name}, {path.name})
+    assert bare == {str(path.with_suffix("")), path.stem}
+    assert cut == ({f"{path.parent}/{first}", first} if "/" in name else {first})

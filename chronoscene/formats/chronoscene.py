@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
@@ -142,8 +142,9 @@ def is_usable(camera: Camera) -> bool:
 
 def check_name(place: Path, name: str) -> None:
     """Refuse an image name that leads out of ``images/``."""
-    parts = PurePosixPath(name).parts
-    if not parts or ".." in parts or name.startswith("/") or PureWindowsPath(name).drive:
+    parts = set(name.split("/"))
+    drive = (":" in name or "\\" in name) and PureWindowsPath(name).drive
+    if not parts - {"", "."} or ".." in parts or name.startswith("/") or drive:
         raise SceneError(
             place,
             expected="image names below images/",

@@ -60,6 +60,9 @@ ERROR_SHARE, LEAST_ERROR = 0.01, 4.0
 """Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
 pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
 
+MOST_DEPTHS = 500
+"""Depths of an image that are looked at: enough for a percentile over a period."""
+
 FEWEST_IMAGES = 3
 """Images with an error from which the median of a period means something."""
 
@@ -236,10 +239,11 @@ class RawScene:
 
     @cached_property
     def _front(self) -> dict[int, NDArray[np.float64]]:
-        """Depths of the observations in front of their cameras by index of the period."""
+        """Depths in front of the cameras by index of the period, some of each image."""
         by_period: dict[int, list[NDArray[np.float64]]] = {}
         for seen in self.reprojections or ():
-            front = seen.depth[(seen.depth > 0) & np.isfinite(seen.depth)]
+            depth = seen.depth[:: len(seen.depth) // MOST_DEPTHS + 1]
+            front = depth[(depth > 0) & np.isfinite(depth)]
             if len(front):
                 by_period.setdefault(int(self.image_periods[seen.image]), []).append(front)
         return {period: np.concatenate(depths) for period, depths in by_period.items()}

@@ -79,10 +79,10 @@ def error_outdated(scene: RawScene) -> Iterator[Hit]:
     stored = scene.points.error[(scene.points.error > 0) & np.isfinite(scene.points.error)]
     if len(stored) < MOST_STORED * len(scene.points) or not len(stored):
         return  # not every program writes them
-    errors = [r.error[r.depth > 0] for r in scene.reprojections or ()]
-    found = float(np.nanmedian(np.concatenate([np.zeros(0), *errors])))
-    expected = float(np.median(stored))
     judged = np.flatnonzero(~np.isnan(scene.image_errors)).tolist()
+    if not judged:
+        return
+    found, expected = float(np.median(scene.image_errors[judged])), float(np.median(stored))
     fits = all(scene.image_errors[i] <= scene.pose_limit(i) for i in judged)
     if fits and found > max(LEAST_ERROR, WORSE * expected) and not _worse_periods(scene):
         text = f"{found:.3g} px (median)"

@@ -38,10 +38,11 @@ def meant(scene: RawScene, problems: Iterable[Problem], lines: dict[int, str]) -
         problems: Of one file.
         lines: The names in this file, by line.
     """
+    unknown = [p.line for p in problems if p.kind == "unknown" and p.line]
+    if not unknown:
+        return {}
     spellings = Spellings(scene.names)
-    found = {
-        p.line: spellings.find(lines[p.line]) for p in problems if p.kind == "unknown" and p.line
-    }
+    found = {line: spellings.find(lines[line]) for line in unknown}
     return {line: name for line, name in found.items() if name is not None}
 
 
@@ -63,13 +64,15 @@ def in_other_words(scene: RawScene) -> set[str]:
     """Images without a period because of a line that has a finding of its own."""
     if scene.split_text is None:
         return set()
+    kinds = ("fields", "period", "ambiguous")
+    wrong = [p.line for p in scene.split_problems if p.line and p.kind in kinds]
+    if not wrong:
+        return set()
     lines = re.split("\r\n|\r|\n", scene.split_text.text)
     index = NameIndex(scene.names)
     found: set[str] = set()
-    for problem in scene.split_problems:
-        if problem.line is None or problem.kind not in ("fields", "period", "ambiguous"):
-            continue
-        line = lines[problem.line - 1]
+    for number in wrong:
+        line = lines[number - 1]
         # Some have the period in front; with commas instead of blanks the name ends there.
         names = (line.rsplit(maxsplit=1)[0], line.split()[-1], re.split("[,;]", line)[0].strip())
         found.update(*(index.find(name) for name in names))
