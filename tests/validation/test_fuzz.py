@@ -25,7 +25,10 @@ from chronoscene.validation.raw_model import read_raw_model
 from chronoscene.validation.raw_rigs import read_rigs
 from chronoscene.validation.run import validate_scene
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, on damaged files
+pytestmark = [  # Pillow's, on damaged files
+    pytest.mark.filterwarnings("ignore::UserWarning"),
+    pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning"),
+]
 
 SECONDS = float(os.environ.get("CHRONOSCENE_FUZZ_SECONDS", "16"))
 SEED = int(os.environ.get("CHRONOSCENE_FUZZ_SEED", "0"))
