@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from collections.abc import Iterator
 
 from chronoscene.formats.chronoscene import TEST
-from chronoscene.splits import DEFAULT_RULE
-from chronoscene.validation.finding import Hit, counted, quote
+from chronoscene.splits import DEFAULT_RULE, NameIndex
+from chronoscene.validation.finding import Hit, counted, quote, shown
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.split import meant, not_text, problem_hits, unknown_hits
@@ -94,15 +93,21 @@ def list_ambiguous(scene: RawScene) -> Iterator[Hit]:
     "CS326",
     "test-duplicate",
     "info",
-    what="`test.txt` has the same line twice.",
+    what="`test.txt` names an image twice.",
     remedy="delete one of the lines",
-    bad="`a.jpg` twice",
+    bad="`a.jpg` twice; `a.jpg` and `a`",
     needs=("test",),
 )
 def list_duplicate(scene: RawScene) -> Iterator[Hit]:
-    for name, times in Counter(entry.name for entry in scene.test or ()).items():
-        if times > 1:
-            yield Hit(TEST, "each name once", f"{quote(name)} {times} times")
+    index = NameIndex(scene.names)
+    written: dict[str, list[str]] = {}
+    for entry in scene.test or ():
+        images = index.find(entry.name)
+        written.setdefault(images[0] if len(images) == 1 else entry.name, []).append(entry.name)
+    for name, forms in written.items():
+        if len(forms) > 1:
+            also = f", as {shown(sorted(set(forms)))}" if len(set(forms)) > 1 else ""
+            yield Hit(TEST, "each name once", f"{quote(name)} {len(forms)} times{also}")
 
 
 def _elsewhere(scene: RawScene) -> list[str]:

@@ -44,6 +44,15 @@ def test_duplicate_points(scene):
     scene.expect("CS517", place=POINTS, found="3 of 40")
 
 
+def test_points_that_were_rounded_are_the_same_points(scene):
+    """Copies that went through single precision."""
+    shared = [f"{np.float32(x):.9g}" for x in scene.lines(POINTS)[0].split()[1:4]]
+    for row in range(1, 4):
+        scene.edit_fields(POINTS, row, dict(enumerate(shared, start=1)))
+    found = [f.found for f in scene.validate().findings if f.code == "CS517"]
+    assert found in (["2 of 40 on another one"], ["3 of 40 on another one"])
+
+
 def test_two_points_in_one_place_are_silent(scene):
     x, y, z = scene.lines(POINTS)[0].split()[1:4]
     scene.edit_fields(POINTS, 1, {1: x, 2: y, 3: z})
