@@ -229,18 +229,20 @@ def _gather_points(
 ) -> PointRecords:
     """Copy the records at ``offsets`` out of the file, in the order of the point ids."""
     heads = _at_every_byte(data, POINT_HEAD)[offsets]
-    order = np.argsort(heads["id"], kind="stable")
-    ids = heads["id"][order]
+    if (heads["id"][1:] < heads["id"][:-1]).any():
+        order = np.argsort(heads["id"], kind="stable")
+        heads, offsets, lengths = heads[order], offsets[order], lengths[order]
+    ids = heads["id"]
     if (ids[1:] == ids[:-1]).any():
         raise RecordError(f"point id {ids[:-1][ids[1:] == ids[:-1]][0]} twice")
     if len(ids) and ids[-1] > np.iinfo(np.int64).max:
         raise RecordError(f"point id {ids[-1]}, more than 63 bits")
-    start = np.concatenate([[0], np.cumsum(lengths[order])])
+    start = np.concatenate([[0], np.cumsum(lengths)])
     # Observation j of point i begins start[i] pairs after the first one of the point.
-    first = (offsets + POINT_HEAD.itemsize)[order] - _TRACK_BYTES * start[:-1]
-    at = np.repeat(first, lengths[order]) + _TRACK_BYTES * np.arange(start[-1])
+    first = offsets + POINT_HEAD.itemsize - _TRACK_BYTES * start[:-1]
+    at = np.repeat(first, lengths) + _TRACK_BYTES * np.arange(start[-1])
     tracks = _at_every_byte(data, np.dtype("<i8"))[at].view("<i4").reshape(-1, 2)
-    return PointRecords(heads[order], start, tracks)
+    return PointRecords(heads, start, tracks)
 
 
 def _at_every_byte(data: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:

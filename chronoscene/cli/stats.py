@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import click
 
+from chronoscene.allocator import keep_freed_memory
 from chronoscene.cli.output import check_file, check_outside, check_place, emit, writing_to
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
@@ -168,6 +169,7 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
         item: Folder of the scene, and the name of its figure and page.
     """
     path, name = item
+    keep_freed_memory()  # arrays as large as the model come and go
     try:
         scene = read_scene(path, format=request.dataset_format)
     except ChronoSceneError as error:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from chronoscene.allocator import keep_freed_memory
 from chronoscene.cli.output import check_file, check_outside, emit
 from chronoscene.cli.progress import tracked
 from chronoscene.parallel import map_parallel
@@ -125,6 +126,7 @@ def _check(
     track: Track = no_progress,
 ) -> SceneReport:
     """One scene, perhaps in a process of its own, which is given names of rules, not rules."""
+    keep_freed_memory()  # arrays as large as the model come and go
     rules = choose_rules(select, ignore)
     return validate_scene(path, rules=rules, decode=decode, track=track)
 
