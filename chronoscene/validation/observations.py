@@ -54,20 +54,22 @@ def observe(images: RawImages, points: RawPoints) -> Observations:
         nothing = np.full(len(point), -1, np.int64)
         return Observations(point, nothing, nothing)
     image = _look_up(images.ids, points.track_image)
-    first = images.keypoint_start[:-1][image]
-    length = np.diff(images.keypoint_start)[image]
-    inside = (image >= 0) & (points.track_keypoint >= 0) & (points.track_keypoint < length)
-    return Observations(point, image, np.where(inside, first + points.track_keypoint, -1))
+    # `take` that clips is twice as quick as brackets; what is no image is marked afterwards.
+    first = images.keypoint_start.take(image, mode="clip")
+    length = np.diff(images.keypoint_start).take(image, mode="clip")
+    keypoint = first + points.track_keypoint
+    outside = (points.track_keypoint < 0) | (points.track_keypoint >= length) | (image < 0)
+    keypoint[outside] = -1
+    return Observations(point, image, keypoint)
 
 
 def _look_up(ids: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
     """Index of each wanted id, -1 for none. Of equal ids the first counts."""
     low, high = int(ids.min()), int(ids.max())
     if high - low < 2 * DENSE + 4 * len(ids):  # a table is ten times quicker than a search
-        table = np.full(high - low + 2, -1, np.int64)
-        table[ids[::-1] - low] = np.arange(len(ids))[::-1]
-        inside = (wanted >= low) & (wanted <= high)
-        return table[np.where(inside, wanted - low, high - low + 1)]
+        table = np.full(high - low + 3, -1, np.int64)  # both ends stand for what is beyond
+        table[ids[::-1] - (low - 1)] = np.arange(len(ids))[::-1]
+        return table.take(wanted - (low - 1), mode="clip")
     order = np.argsort(ids, kind="stable")
     slot = np.minimum(np.searchsorted(ids[order], wanted), len(ids) - 1)
     return np.where(ids[order[slot]] == wanted, order[slot], -1)
