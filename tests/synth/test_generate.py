@@ -14,6 +14,7 @@ import pytest
 
 from chronoscene.errors import SceneError
 from chronoscene.synth import generate, preset
+from chronoscene.validation.run import validate_scene
 
 SMALL: dict[str, Any] = {
     "width": 32,
@@ -122,3 +123,15 @@ def test_progress_counts_to_the_end(tmp_path: Path) -> None:
     settings = preset("tiny", **SMALL, kind="street", periods=1)
     generate(tmp_path / "scene", settings, lambda *x: seen.append(x))
     assert [done for done, _, _ in seen] == list(range(1, seen[-1][1] + 1))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"off_centre": True}, {"kind": "street"}, {"rebuilt": 1.0}, {"noise": 0.5}, {"periods": 1}],
+    ids=str,
+)
+def test_the_validator_has_nothing_to_say(tmp_path: Path, change: dict[str, Any]) -> None:
+    generate(tmp_path / "scene", preset("tiny", **change))
+    report = validate_scene(tmp_path / "scene", decode=True)
+    assert [str(f) for f in report.findings if f.severity != "info"] == []
+    assert not report.skipped
