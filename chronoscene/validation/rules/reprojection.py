@@ -10,6 +10,7 @@ import numpy as np
 from chronoscene.validation.finding import Hit, shown
 from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
+from chronoscene.validation.rules.conventions import pose_convention
 
 MOST_OUTSIDE = 0.05
 """Share of observations outside of the image; undistortion leaves a few there."""
@@ -81,6 +82,8 @@ def pose_disagrees(scene: RawScene) -> Iterator[Hit]:
     judged = np.flatnonzero(~np.isnan(errors)).tolist()
     limits = {image: scene.pose_limit(image) for image in judged}
     wrong = [image for image in judged if not errors[image] <= limits[image]]
+    if wrong and any(pose_convention(scene)):
+        return  # says why, for all of them
     for index in sorted({int(scene.image_periods[image]) for image in wrong}):
         if index in scene.own_frames:
             continue  # says why
