@@ -17,6 +17,9 @@ from chronoscene.validation.rule import RULES, Rule
 FIRST = 3
 """Places that are named of equal findings."""
 
+CODES = 8
+"""Rules that are named of those that were not run for one reason."""
+
 LINES = 5
 """Different lines of one rule that are shown."""
 
@@ -67,8 +70,9 @@ def _scene(report: SceneReport) -> list[str]:
     for code, group in groupby(report.findings, key=lambda f: f.code):
         lines += _rule(code, list(group))
     for reason in sorted({s.reason for s in report.skipped}):
-        codes = (s.code for s in report.skipped if s.reason == reason)
-        lines.append(f"  not checked ({reason}): {', '.join(codes)}")
+        codes = [s.code for s in report.skipped if s.reason == reason]
+        rest = f" and {len(codes) - CODES} more" if len(codes) > CODES else ""
+        lines.append(f"  not checked ({reason}): {', '.join(codes[:CODES])}{rest}")
     return [*lines, f"  {_total([report])}"]
 
 

@@ -65,6 +65,14 @@ def test_several_scenes_end_in_a_total():
     assert "2 scenes, 2 not valid" in text_of(warned, warned, strict=True)
 
 
+def test_rules_that_were_not_run_are_folded():
+    skipped = tuple(Skipped(f"CS4{i:02d}", "no model") for i in range(11))
+    report = SceneReport("a", Path("a"), Summary(0, 0, 0, 0, 0, ()), (), skipped)
+    line = write_text([report]).splitlines()[1]
+    assert line.startswith("  not checked (no model): CS400, ")
+    assert line.endswith("CS407 and 3 more")
+
+
 def test_json_has_every_finding():
     document = json.loads(write_json([report(*map(finding, range(12)), name="scène")]))
     assert document["schema_version"] == SCHEMA_VERSION
