@@ -395,8 +395,13 @@ def test_interrupted(scene, tmp_path, monkeypatch, number, error):
 
     monkeypatch.setattr("chronoscene.validation.fix._link", interrupt)
     before = state(tmp_path)
-    with pytest.raises(error), stoppable():
-        fix_scene(scene.root, tmp_path / "fixed")
+    # What a shell starts in the background ignores interruptions.
+    usual = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(error), stoppable():
+            fix_scene(scene.root, tmp_path / "fixed")
+    finally:
+        signal.signal(signal.SIGINT, usual)
     assert state(tmp_path) == before
 
 
