@@ -15,6 +15,7 @@ from chronoscene import formats
 from chronoscene.convert import remarks_on
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
+from chronoscene.formats.writing import place_image
 from chronoscene.validation.raw_model import model_files
 
 
@@ -66,8 +67,7 @@ def _write(path: Path, name: str, ours: Path) -> tuple[str, ...]:
     our_format.write(scene, ours, image_source="none")
     (ours / "images").mkdir(exist_ok=True)
     for frame in scene.frames:
-        source, target = scene.image_path(frame), ours / "images" / frame.name
+        source = scene.image_path(frame)
         if source.is_file():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.symlink_to(source.resolve())
+            place_image(source, ours / "images" / frame.name, "symlink")
     return tuple(remarks_on(scene))

@@ -27,17 +27,24 @@ def explain_periods(scene: RawScene) -> dict[int, str]:
     """Periods in a frame of their own by index, with what brings them into that of the others."""
     if scene.point_periods is None:
         return {}
-    limits = {i: _limit_of_wrong(scene, i) for i in range(len(scene.period_ids))}
+    judged = ~np.isnan(scene.image_errors) | _behind(scene)
+    limits = {
+        i: _limit_of_wrong(scene, np.flatnonzero(judged & (scene.image_periods == i)))
+        for i in range(len(scene.period_ids))
+    }
     if all(limit is not None for limit in limits.values()):
         return {}  # there is no frame to be in
     found = {i: explain(scene, i, limit) for i, limit in limits.items() if limit is not None}
     return {i: words for i, words in found.items() if words is not None}
 
 
-def _limit_of_wrong(scene: RawScene, index: int) -> float | None:
-    """Error in pixels that most images of a period exceed, if they do."""
-    mine = np.flatnonzero(scene.image_periods == index)
-    mine = mine[~np.isnan(scene.image_errors[mine]) | _behind(scene, mine)]
+def _limit_of_wrong(scene: RawScene, mine: NDArray[np.int64]) -> float | None:
+    """Error in pixels that most images of a period exceed, if they do.
+
+    Args:
+        scene: The scene.
+        mine: Indices of those images of the period that can be judged.
+    """
     if not len(mine):
         return None
     usual = period_limit(scene) if len(scene.period_errors) > 1 else np.inf
@@ -46,14 +53,10 @@ def _limit_of_wrong(scene: RawScene, index: int) -> float | None:
     return limit if wrong > MOST_WRONG * len(mine) else None
 
 
-def _behind(scene: RawScene, images: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which images have most of their points behind them."""
-    asked = set(images.tolist())
-    behind = {
-        r.image
-        for r in scene.reprojections or ()
-        if r.image in asked
-        and len(r.depth)
-        and np.count_nonzero(~(r.depth > 0)) > MOST_WRONG * len(r.depth)
-    }
-    return np.isin(images, sorted(behind))
+def _behind(scene: RawScene) -> NDArray[np.bool_]:
+    """Which images have most of their points behind them. [I]"""
+    behind = np.zeros(len(scene.images or ()), bool)
+    for seen in scene.reprojections or ():
+        wrong = np.count_nonzero(~(seen.depth > 0))
+        behind[seen.image] = wrong > MOST_WRONG * len(seen.depth)
+    return behind

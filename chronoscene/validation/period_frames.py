@@ -92,18 +92,23 @@ class Rays:
         """Median error in pixels, without distortion, with some axes of both negated."""
         local = np.einsum("nij,nj->ni", self.rotation, self.xyz * world) + self.translation
         local = local * camera
-        shift = (local[:, :2] / local[:, 2:] - self.plane) * self.focal
-        distance = np.linalg.norm(shift, axis=1)
-        distance[~(local[:, 2] > 0) | np.isnan(distance)] = np.inf
+        distance = self._distances(local)
+        distance[~(local[:, 2] > 0)] = np.inf
         return float(np.median(distance)) if len(distance) else np.inf
 
     def error_in(self, similarity: Similarity) -> float:
         """Median error in pixels with the points in the frame that a similarity leads from."""
         own = np.linalg.solve(similarity.matrix, (self.xyz - similarity.translation).T).T
         local = np.einsum("nij,nj->ni", self.rotation, own) + self.translation
+        return float(np.median(self._distances(local)))
+
+    def _distances(self, local: Array) -> Array:
+        """Pixels, without distortion, between points in the frames of the cameras and their
+        observations; infinite where there is no such number. [M, 3] -> [M]
+        """
         shift = (local[:, :2] / local[:, 2:] - self.plane) * self.focal
         distance = np.linalg.norm(shift, axis=1)
-        return float(np.median(np.where(np.isnan(distance), np.inf, distance)))
+        return np.where(np.isnan(distance), np.inf, distance)
 
     def focal_factor(self) -> tuple[float, float]:
         """Factor of the focal lengths that fits best, and the median error in pixels with it."""

@@ -56,7 +56,7 @@ MODEL_PLACES = (MODEL, "sparse", "colmap/sparse/0", "dense/sparse", "dense/0/spa
 FEWEST = 10
 """Observations of an image from which the median of its errors means something."""
 
-ERROR_SHARE, LEAST_ERROR = 0.01, 4.0
+LIMIT_SHARE, LEAST_LIMIT = 0.01, 4.0
 """Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
 pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
 
@@ -217,7 +217,7 @@ class RawScene:
         """Reprojection error in pixels beyond which the pose of an image does not fit."""
         assert self.images is not None
         camera = self.usable_cameras[int(self.images.camera_ids[image])]
-        return max(LEAST_ERROR, ERROR_SHARE * float(np.hypot(camera.width, camera.height)))
+        return max(LEAST_LIMIT, LIMIT_SHARE * float(np.hypot(camera.width, camera.height)))
 
     @cached_property
     def own_frames(self) -> dict[int, str]:
