@@ -31,15 +31,15 @@ from numpy.typing import NDArray
 
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
+from chronoscene.anchors.decode.heads import HeadWeights
+from chronoscene.anchors.model import HEADS
 from chronoscene.bench.identity import code_version, processor_name
 from chronoscene.bench.protocol import make_parts
-from chronoscene.bench.training import render_bytes
+from chronoscene.bench.training_loop import render_bytes
 from chronoscene.formats import read_scene
-from chronoscene.images import ImageStore
-from chronoscene.metrics.image import psnr
-from chronoscene.training._matmul import product
-from chronoscene.training.anchor_model import HEADS
-from chronoscene.training.decode import HeadWeights
+from chronoscene.images.store import ImageStore
+from chronoscene.kernels.matmul import product
+from chronoscene.metrics.psnr_ssim import psnr
 
 ROWS, LAYERS = 64, ((48, 96), (32, 16), (32, 96), (32, 32))
 """Anchors of a block; inputs (padded) and outputs of the first layers, and of the second layers of

@@ -28,10 +28,10 @@ import torch
 from peers import UnavailableError, cpu, cuda, gsplat_torch, scalar, torch_tiles
 from scenes import SIZES, Scene, surfaces
 
-from chronoscene.allocator import keep_freed_memory
 from chronoscene.bench.identity import code_version, processor_name
-from chronoscene.files import write_text_atomic
-from chronoscene.threads import available_threads, set_threads
+from chronoscene.io.files import write_text_atomic
+from chronoscene.kernels.allocator import keep_freed_memory
+from chronoscene.kernels.threads import available_threads, set_threads
 
 SLOW_LIMIT = 60.0
 """Seconds: a peer whose one run at a size takes longer than its share of this is not run at the
@@ -177,7 +177,7 @@ def draw(panels: tuple[list[Row], list[Row]], path: Path) -> None:
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
 
-    from chronoscene.files import replacing
+    from chronoscene.io.files import replacing
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
     titles = ("Gaussians (400x300 pixels)", "pixels (100,000 Gaussians)")

@@ -29,11 +29,11 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene.bench.identity import processor_name
-from chronoscene.geometry import camera_centre
-from chronoscene.registration.certificate import certify
 from chronoscene.registration.generated import CaseSettings, generate_case, pose_errors
-from chronoscene.registration.model import Registered
-from chronoscene.registration.verdict import LEVELS, Verdict, judge
+from chronoscene.registration.quality.certificate import certify
+from chronoscene.registration.quality.verdict import LEVELS, Verdict, judge
+from chronoscene.registration.result import Registered
+from chronoscene.scene.geometry import camera_centre
 
 REFUSED = "refused"
 

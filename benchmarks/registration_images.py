@@ -21,12 +21,12 @@ from PIL import Image, ImageEnhance
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.geodesy import Georeference
-from chronoscene.geometry import camera_centre
-from chronoscene.registration.captures import read_captures
 from chronoscene.registration.inspection import Inspection
-from chronoscene.registration.model import Registered
+from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import Options, run, run_into
+from chronoscene.registration.result import Registered
 from chronoscene.scene import Scene
+from chronoscene.scene.geometry import camera_centre
 from chronoscene.synth import SynthSettings, generate
 
 if TYPE_CHECKING:

@@ -21,13 +21,13 @@ from registration_images import ROUTES, cpu_seconds, options_for, print_outcome,
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
-from chronoscene.geometry import camera_centre
-from chronoscene.registration.captures import read_captures
 from chronoscene.registration.generated import pose_errors
 from chronoscene.registration.inspection import Inspection
-from chronoscene.registration.model import Registered
+from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import run, run_into
-from chronoscene.splits import IMAGE_SUFFIXES
+from chronoscene.registration.result import Registered
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 if TYPE_CHECKING:
     from registration import Outcome

@@ -32,18 +32,19 @@ import torch
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronogs.presets import PRESETS
-from chronoscene.allocator import keep_freed_memory
+from chronoscene.anchors import volume_loss
+from chronoscene.anchors.decode.function import Decode
+from chronoscene.anchors.density import DensityStatistics
+from chronoscene.anchors.model import AnchorModel
+from chronoscene.anchors.trainer import AnchorTrainer
 from chronoscene.bench.identity import code_version, processor_name
 from chronoscene.bench.protocol import Part, make_parts
 from chronoscene.formats import read_scene
-from chronoscene.images import ImageStore
+from chronoscene.images.store import ImageStore
+from chronoscene.kernels.allocator import keep_freed_memory
+from chronoscene.kernels.threads import available_threads, set_threads
 from chronoscene.rasterizer.cpu.function import Render
-from chronoscene.threads import available_threads, set_threads
-from chronoscene.training import losses, volume_loss
-from chronoscene.training._decode_function import Decode
-from chronoscene.training.anchor_model import AnchorModel
-from chronoscene.training.anchor_training import AnchorTrainer
-from chronoscene.training.density import DensityStatistics
+from chronoscene.training import losses
 from chronoscene.training.row_adam import DenseTable, RowAdam
 
 PARTS: tuple[tuple[str, Any, str], ...] = (

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
-from chronoscene.training.anchor_config import HEADS, AnchorConfig
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from torch import Tensor
 from chronogs.config import ChronoGSConfig
 from chronogs.periods import period_weights
 from chronogs.sharing import pack_features, share_periods, unpack_features
+from chronoscene.anchors.method import AnchorMethod
+from chronoscene.anchors.model import AnchorLayout
+from chronoscene.anchors.trainer import AfterUpdate
 from chronoscene.methods import Prediction, View
-from chronoscene.training.anchor_method import AnchorMethod
-from chronoscene.training.anchor_model import AnchorLayout
-from chronoscene.training.anchor_training import AfterUpdate
 
 
 class ChronoGS(AnchorMethod):

@@ -13,7 +13,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.training.anchor_model import AnchorLayout, AnchorModel
+from chronoscene.anchors.model import AnchorLayout, AnchorModel
 
 
 @torch.no_grad()

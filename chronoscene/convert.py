@@ -11,9 +11,9 @@ import numpy as np
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.formats import load_format, read_scene, writable_formats
-from chronoscene.formats.writing import ImageSource, Progress
+from chronoscene.formats.shared.writing import ImageSource, Progress
 from chronoscene.scene import Scene
-from chronoscene.splits import IMAGE_SUFFIXES
+from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 
 @dataclass(frozen=True, slots=True, eq=False)

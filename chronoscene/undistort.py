@@ -18,17 +18,17 @@ from PIL import Image
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats.writing import ImageSource, Progress, place_image, staged_folder
-from chronoscene.images import load_rgb
-from chronoscene.scene import Scene
-from chronoscene.threads import available_threads
-from chronoscene.undistort_cameras import (
+from chronoscene.formats.shared.writing import ImageSource, Progress, place_image, staged_folder
+from chronoscene.images.resampling import warp
+from chronoscene.images.store import load_rgb
+from chronoscene.images.undistortion import (
     CameraChange,
     move_observations,
     plan_cameras,
     sampling_map,
 )
-from chronoscene.warp import warp
+from chronoscene.kernels.threads import available_threads
+from chronoscene.scene import Scene
 
 JPEG_QUALITY = 95
 

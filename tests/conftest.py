@@ -10,7 +10,7 @@ from hypothesis import settings
 from PIL import Image
 
 import chronoscene  # noqa: F401  (loads zlib before pycolmap)
-from chronoscene._pycolmap import pycolmap
+from chronoscene.io.pycolmap import pycolmap
 
 # How long an example takes is not a property of the code on a machine that others use too.
 settings.register_profile("untimed", parent=settings.default, deadline=None)

@@ -12,7 +12,7 @@ from chronoscene.convert import convert, losses, obstacles
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import load_format, read_scene, writable_formats
 from chronoscene.scene import Camera, Period, Points, WorldFrame
-from chronoscene.splits import split_hash
+from chronoscene.scene.splits import split_hash
 
 
 def snapshot(folder):

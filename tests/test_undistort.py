@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene._pycolmap import pycolmap
-from chronoscene.colmap import from_pycolmap, to_pycolmap
+from chronoscene.colmap.model import from_pycolmap, to_pycolmap
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
-from chronoscene.images import load_rgb
+from chronoscene.images.store import load_rgb
+from chronoscene.images.undistortion import CameraChange, move_pixels, pinhole_camera, sampling_map
+from chronoscene.io.pycolmap import pycolmap
 from chronoscene.scene import Camera, Period, WorldFrame
-from chronoscene.splits import split_hash
+from chronoscene.scene.splits import split_hash
 from chronoscene.undistort import undistort, undistort_pixels
-from chronoscene.undistort_cameras import CameraChange, move_pixels, pinhole_camera, sampling_map
 
 SIZE = (256, 192)
 F, CX, CY = 210.0, 120.5, 101.25

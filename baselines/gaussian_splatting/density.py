@@ -15,8 +15,8 @@ from torch import Tensor
 
 from baselines.gaussian_splatting.config import GaussianSplattingConfig
 from baselines.gaussian_splatting.gaussians import logit, opacities_of, scales_of
-from chronoscene.geometry import rotation_from_quaternion
 from chronoscene.rasterizer.types import RasterInfo
+from chronoscene.scene.geometry import rotation_from_quaternion
 
 PARTS = 2
 """Gaussians that a split one becomes."""

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from chronoscene.errors import SceneError
+from chronoscene.gaussians.spherical_harmonics import NUM_BASES, dc_from_rgb
 from chronoscene.methods import TrainingSet
-from chronoscene.training.spherical_harmonics import NUM_BASES, dc_from_rgb
 
 SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),

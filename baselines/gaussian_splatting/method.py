@@ -14,15 +14,15 @@ from baselines.gaussian_splatting.density import GradientStatistics, densify, re
 from baselines.gaussian_splatting.gaussians import SHAPES, initialise, opacities_of, scales_of
 from baselines.gaussian_splatting.timeline import Due, Timeline
 from chronoscene.errors import CheckpointError
-from chronoscene.geometry import Sim3
+from chronoscene.gaussians.spherical_harmonics import evaluate
 from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
 from chronoscene.rasterizer import Rasterization, rasterize
+from chronoscene.scene.geometry import Sim3
+from chronoscene.training.camera_tensors import camera_centre_tensor, camera_tensors
 from chronoscene.training.checkpoint import META_FILE, build_meta, load_tensors, save_tensors
 from chronoscene.training.losses import photometric_loss
 from chronoscene.training.optimizer import Adam
 from chronoscene.training.sampler import ViewSampler
-from chronoscene.training.spherical_harmonics import evaluate
-from chronoscene.training.view import camera_centre_tensor, camera_tensors
 
 NAME = "3dgs"
 VERSION = "1"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from chronoscene.training.anchor_config import AnchorConfig
+from chronoscene.anchors.config import AnchorConfig
 
 
 @dataclass(frozen=True)

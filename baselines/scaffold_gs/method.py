@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.scaffold_gs.config import ScaffoldGSConfig
-from chronoscene.training.anchor_method import AnchorMethod
-from chronoscene.training.anchor_model import AnchorLayout
+from chronoscene.anchors.method import AnchorMethod
+from chronoscene.anchors.model import AnchorLayout
 
 
 class ScaffoldGS(AnchorMethod):

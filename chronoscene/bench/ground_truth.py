@@ -6,10 +6,10 @@ import os
 import shutil
 from pathlib import Path
 
-from chronoscene.bench.images import ImageWriter, Manifest, read_manifest, safe_name
+from chronoscene.bench.image_store import ImageWriter, Manifest, read_manifest, safe_name
 from chronoscene.bench.results import GROUND_TRUTH
 from chronoscene.errors import ConfigError
-from chronoscene.images import ImageStore
+from chronoscene.images.store import ImageStore
 from chronoscene.scene import Scene
 
 

@@ -10,7 +10,7 @@ from textwrap import shorten
 from typing import Any
 
 from chronoscene.bench.identity import config_hash
-from chronoscene.bench.images import safe_name
+from chronoscene.bench.image_store import safe_name
 from chronoscene.bench.results import Failure
 from chronoscene.bench.stopping import StopRule
 from chronoscene.checks import check_choice

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import SceneError
-from chronoscene.geometry import Sim3, camera_centre
-from chronoscene.images import ImageStore
+from chronoscene.images.store import ImageStore
 from chronoscene.methods import MethodSpec, TrainingSet, TrainingView, View
 from chronoscene.scene import Frame, Scene
+from chronoscene.scene.geometry import Sim3, camera_centre
 
 STRATEGIES = ("joint", "pooled", "separate")
 """``joint``: one model, told the period. ``pooled``: one model, the period hidden from it.

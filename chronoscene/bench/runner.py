@@ -15,19 +15,19 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.bench import results
-from chronoscene.bench.files import replace_folder
 from chronoscene.bench.ground_truth import freeze_ground_truth
 from chronoscene.bench.identity import code_version, scene_hash
 from chronoscene.bench.jobs import Job, check_job, write_job
 from chronoscene.bench.protocol import check_scene, effective_strategy
+from chronoscene.bench.run_folders import replace_folder
 from chronoscene.errors import CheckpointError, ConfigError
-from chronoscene.files import stoppable
 from chronoscene.formats import read_scene
-from chronoscene.images import MAX_WIDTH, ImageStore
+from chronoscene.images.store import MAX_WIDTH, ImageStore
+from chronoscene.io.files import stoppable
 from chronoscene.methods import MethodSpec, load_spec
 from chronoscene.metrics.lpips_weights import check_available
 from chronoscene.scene import Scene
-from chronoscene.splits import split_hash
+from chronoscene.scene.splits import split_hash
 
 Say = Callable[[str], None]
 """Takes one line for the user."""

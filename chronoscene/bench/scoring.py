@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench.images import ImageEntry, Manifest, load_image, read_manifest
+from chronoscene.bench.image_store import ImageEntry, Manifest, load_image, read_manifest
 from chronoscene.bench.results import Row, Values
 from chronoscene.errors import CheckpointError, ShapeError
+from chronoscene.metrics.names import METRICS
 from chronoscene.metrics.scorers import Scorers
-from chronoscene.metrics.table import METRICS
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
-from chronoscene.bench.files import csv_text
 from chronoscene.bench.results import Failure, RunRecord
+from chronoscene.bench.run_folders import csv_text
 from chronoscene.bench.tables import Cell, Entry, Grid, entries, footnotes, grids
 
 FORMATS = ("table", "csv", "markdown", "latex", "json")

@@ -10,7 +10,7 @@ from statistics import mean, stdev
 
 from chronoscene.bench.results import Failure, RunRecord, read_failures, read_run, run_folders
 from chronoscene.errors import CheckpointError
-from chronoscene.metrics.table import METRICS, metric_info
+from chronoscene.metrics.names import METRICS, metric_info
 
 AGGREGATES = ("macro", "micro", "worst")
 

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.bench.training import seed_everything
-from chronoscene.geometry import Sim3, camera_centre
+from chronoscene.bench.training_loop import seed_everything
 from chronoscene.methods import (
     Method,
     MethodSpec,
@@ -21,6 +20,7 @@ from chronoscene.methods import (
     TrainingView,
     import_object,
 )
+from chronoscene.scene.geometry import Sim3, camera_centre
 
 SIZE = 32
 """Pixels per axis of the made-up images."""

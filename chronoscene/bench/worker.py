@@ -16,10 +16,8 @@ from json import dumps
 from pathlib import Path
 from typing import Any
 
-from chronoscene.allocator import keep_freed_memory
 from chronoscene.bench import results
 from chronoscene.bench.display import ProgressDisplay
-from chronoscene.bench.files import csv_text, folder_bytes
 from chronoscene.bench.ground_truth import ground_truth_folder
 from chronoscene.bench.identity import (
     describe_device,
@@ -27,12 +25,13 @@ from chronoscene.bench.identity import (
     method_version,
     peak_memory_bytes,
 )
-from chronoscene.bench.images import ImageWriter, load_image, read_manifest
+from chronoscene.bench.image_store import ImageWriter, load_image, read_manifest
 from chronoscene.bench.jobs import Job, read_job
 from chronoscene.bench.protocol import Part, make_parts
+from chronoscene.bench.run_folders import csv_text, folder_bytes
 from chronoscene.bench.scoring import aggregate, score_folder
 from chronoscene.bench.stopping import StopRule
-from chronoscene.bench.training import (
+from chronoscene.bench.training_loop import (
     CurvePoint,
     Trained,
     probe_frames,
@@ -42,13 +41,14 @@ from chronoscene.bench.training import (
 )
 from chronoscene.bench.warmup import forget_peak_memory, warm_up
 from chronoscene.errors import BackendError, ChronoSceneError
-from chronoscene.files import write_text_atomic
 from chronoscene.formats import read_scene
-from chronoscene.images import ImageStore
+from chronoscene.images.store import ImageStore
+from chronoscene.io.files import write_text_atomic
+from chronoscene.kernels.allocator import keep_freed_memory
+from chronoscene.kernels.threads import set_threads
 from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
 from chronoscene.metrics.scorers import make_scorers
 from chronoscene.scene import Scene
-from chronoscene.threads import set_threads
 
 FAILED = 1
 """Exit status after a failure that is written down in ``failed.json``."""

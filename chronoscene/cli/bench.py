@@ -14,7 +14,7 @@ from chronoscene.checks import check_choice
 from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.table import split_list
 from chronoscene.errors import ConfigError
-from chronoscene.images import MAX_WIDTH
+from chronoscene.images.store import MAX_WIDTH
 
 SOME_FAILED = 1
 """Exit status when a run failed; the others have their results."""
@@ -130,7 +130,7 @@ def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
 
 def report(outcome: BenchOutcome, out: Path) -> None:
     """Print the tables of all runs in the folder and the files that were written."""
-    from chronoscene.bench.figures import draw_figures
+    from chronoscene.bench.comparison_figure import draw_figures
     from chronoscene.bench.results import RESULTS_FILE, ROWS_FILE, read_failures
     from chronoscene.bench.table_formats import format_runs
     from chronoscene.bench.tables import read_runs

@@ -11,9 +11,9 @@ from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import convert
 from chronoscene.formats import format_names, load_format, writable_formats
-from chronoscene.formats.writing import ImageSource
+from chronoscene.formats.shared.writing import ImageSource
 from chronoscene.scene import Scene
-from chronoscene.splits import split_hash
+from chronoscene.scene.splits import split_hash
 
 LINKS: dict[str | None, ImageSource] = {None: "copy", "hard": "link", "sym": "symlink"}
 

@@ -13,7 +13,7 @@ from tempfile import TemporaryFile
 import click
 
 from chronoscene.errors import ConfigError
-from chronoscene.files import write_text_atomic
+from chronoscene.io.files import write_text_atomic
 
 FILE = "a file that can be written"
 

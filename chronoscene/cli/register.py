@@ -10,11 +10,15 @@ from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.formats import read_scene
-from chronoscene.registration.cameras import CALIBRATIONS, LEAST_OF_ITS_OWN, Calibration
-from chronoscene.registration.captures import read_captures
 from chronoscene.registration.inspection import Inspection
-from chronoscene.registration.model import ROUTES, Registered, Route
+from chronoscene.registration.photos.camera_sharing import (
+    CALIBRATIONS,
+    LEAST_OF_ITS_OWN,
+    Calibration,
+)
+from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import Options, run, run_into
+from chronoscene.registration.result import ROUTES, Registered, Route
 
 DEFAULTS = Options()
 

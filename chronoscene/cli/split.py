@@ -13,10 +13,10 @@ from chronoscene.cli.output import check_place, emit, writing_to
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.errors import ConfigError
-from chronoscene.files import write_text_atomic
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import format_names, read_scene
-from chronoscene.split_making import (
+from chronoscene.io.files import write_text_atomic
+from chronoscene.scene.split_making import (
     FRACTION,
     STRATEGIES,
     NewSplit,

@@ -12,12 +12,12 @@ from typing import Any, Literal
 
 import click
 
-from chronoscene.allocator import keep_freed_memory
 from chronoscene.cli.output import check_file, check_outside, check_place, emit, writing_to
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import find_scenes, format_names, read_scene
-from chronoscene.parallel import map_parallel
+from chronoscene.io.parallel import map_parallel
+from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.stats import (
     COUNT_RULES,
     DETAIL_WRITERS,
@@ -183,7 +183,7 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
         with writing_to("--figures", target):
             draw_projections(scene, target, cameras=request.cameras)
     if request.pages is not None:
-        from chronoscene.figures.page import write_page
+        from chronoscene.figures.viewer import write_page
 
         page = request.pages / f"{name}.html"
         with writing_to("--pages", page):

@@ -15,7 +15,7 @@ from chronoscene.synth import PRESETS, generate, preset
 from chronoscene.synth.settings import KINDS
 
 SKELETON = "skeleton"
-"""The preset that is a dataset of the paper's size; see `chronoscene.synth.skeleton`."""
+"""The preset that is a dataset of the paper's size; see `chronoscene.synth.scene.skeleton`."""
 
 
 @click.command("synth")
@@ -62,7 +62,7 @@ def command(
 
 
 def _write_skeletons(out: Path, scenes: tuple[str, ...], given: dict[str, Any]) -> None:
-    from chronoscene.synth.skeleton import write_dataset
+    from chronoscene.synth.scene.skeleton import write_dataset
 
     if unused := sorted(given.keys() - {"seed", "width", "height"}):
         raise _not_together(f"--preset {SKELETON}", f"--{unused[0].replace('_', '-')}")

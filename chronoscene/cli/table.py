@@ -10,7 +10,7 @@ from chronoscene.bench.table_formats import FORMATS, format_runs
 from chronoscene.bench.tables import read_runs
 from chronoscene.cli.output import emit
 from chronoscene.errors import ConfigError
-from chronoscene.metrics.table import metric_info
+from chronoscene.metrics.names import metric_info
 
 
 @click.command("table")

@@ -12,9 +12,9 @@ from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import check_outside
 from chronoscene.formats import format_names, read_scene
-from chronoscene.splits import split_hash
+from chronoscene.images.undistortion import CameraChange
+from chronoscene.scene.splits import split_hash
 from chronoscene.undistort import Undistortion, undistort
-from chronoscene.undistort_cameras import CameraChange
 
 
 @click.command("undistort")

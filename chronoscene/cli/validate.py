@@ -8,20 +8,20 @@ from pathlib import Path
 
 import click
 
-from chronoscene.allocator import keep_freed_memory
 from chronoscene.cli.output import check_file, check_outside, emit
 from chronoscene.cli.progress import tracked
-from chronoscene.parallel import map_parallel
+from chronoscene.io.parallel import map_parallel
+from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.validation.finding import counted, printable
-from chronoscene.validation.fix import fix_scene
-from chronoscene.validation.raw_scene import Track, no_progress
-from chronoscene.validation.report import SceneReport, counts
-from chronoscene.validation.report_html import write_html
-from chronoscene.validation.report_json import write_json
-from chronoscene.validation.report_sarif import write_sarif
-from chronoscene.validation.report_text import describe_rule, write_text
+from chronoscene.validation.repair.fix import fix_scene
+from chronoscene.validation.report.html import write_html
+from chronoscene.validation.report.json import write_json
+from chronoscene.validation.report.report import SceneReport, counts
+from chronoscene.validation.report.sarif import write_sarif
+from chronoscene.validation.report.text import describe_rule, write_text
 from chronoscene.validation.rule import choose_rules
 from chronoscene.validation.run import find_folders, lost_report, validate_scene
+from chronoscene.validation.scene_folder import Track, no_progress
 
 WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
 

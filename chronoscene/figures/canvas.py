@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 from warnings import catch_warnings, filterwarnings
 
-from chronoscene.files import replacing
+from chronoscene.io.files import replacing
 from chronoscene.validation.finding import printable
 
 DPI = 200

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.geometry import camera_centre
 from chronoscene.scene import Scene
+from chronoscene.scene.geometry import camera_centre
 from chronoscene.stats.counts import assign_points
 from chronoscene.stats.extent import robust_range
 from chronoscene.stats.titles import period_name

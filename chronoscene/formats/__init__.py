@@ -77,8 +77,8 @@ def detect_format(path: Path) -> str:
 
 def _advice(path: Path) -> str:
     """What to do about a folder that no format matches."""
-    from chronoscene.colmap import model_kind  # pycolmap, loaded by the formats by now
-    from chronoscene.formats.colmap_layout import find_model
+    from chronoscene.colmap.model import model_kind  # pycolmap, loaded by the formats by now
+    from chronoscene.formats.shared.colmap_layout import find_model
 
     if model_kind(path):
         return "move this COLMAP model to sparse/0 in a folder with images/"

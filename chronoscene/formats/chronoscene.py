@@ -8,20 +8,20 @@ from pathlib import Path, PureWindowsPath
 
 import numpy as np
 
-from chronoscene.colmap import Model, PosedImage, read_model, write_model
+from chronoscene.colmap.model import Model, PosedImage, read_model, write_model
 from chronoscene.errors import SceneError
-from chronoscene.formats.intrinsics import LARGEST_SIDE
-from chronoscene.formats.json_values import read_json
-from chronoscene.formats.labels import is_iso_date as is_iso_date  # it was here first
-from chronoscene.formats.labels import (
+from chronoscene.formats.shared.json_values import read_json
+from chronoscene.formats.shared.labels import is_iso_date as is_iso_date  # it was here first
+from chronoscene.formats.shared.labels import (
     parse_periods,
     parse_world,
     period_items,
     world_item,
 )
-from chronoscene.formats.writing import ImageSource, Progress, place_images, staged_folder
+from chronoscene.formats.shared.transforms_cameras import LARGEST_SIDE
+from chronoscene.formats.shared.writing import ImageSource, Progress, place_images, staged_folder
 from chronoscene.scene import Camera, Frame, Period, Scene, WorldFrame
-from chronoscene.splits import (
+from chronoscene.scene.splits import (
     DEFAULT_RULE,
     FATAL,
     Problem,

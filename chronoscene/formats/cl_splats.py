@@ -18,19 +18,18 @@ from dataclasses import replace
 from pathlib import Path
 
 from chronoscene.errors import SceneError
-from chronoscene.formats.colmap_layout import find_model, make_scene, read_images, scan
-from chronoscene.formats.colmap_writing import (
+from chronoscene.formats.shared.colmap_layout import find_model, make_scene, read_images, scan
+from chronoscene.formats.shared.colmap_writing import (
     as_pinhole,
     lost_labels,
     lost_names,
     lost_split,
     write_renamed,
 )
-from chronoscene.formats.grouping import group_labels, natural_key, rule_error
-from chronoscene.formats.intrinsics import CameraTable
-from chronoscene.formats.json_values import read_json
-from chronoscene.formats.ply import read_points
-from chronoscene.formats.transforms import (
+from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
+from chronoscene.formats.shared.json_values import read_json
+from chronoscene.formats.shared.ply import read_points
+from chronoscene.formats.shared.transforms import (
     Shot,
     check_distinct,
     image_name,
@@ -38,10 +37,11 @@ from chronoscene.formats.transforms import (
     pose_from_opengl,
     read_frames,
 )
-from chronoscene.formats.transforms import make_scene as scene_from_shots
-from chronoscene.formats.writing import ImageSource, Progress
+from chronoscene.formats.shared.transforms import make_scene as scene_from_shots
+from chronoscene.formats.shared.transforms_cameras import CameraTable
+from chronoscene.formats.shared.writing import ImageSource, Progress
 from chronoscene.scene import PINHOLE_MODELS, Camera, Points, Scene
-from chronoscene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
+from chronoscene.scene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
 
 NAME = "cl-splats"
 MARKS = "images/day_<n>_* and sparse/0/, or transforms_train.json here and in add/, move/, ..."

@@ -12,24 +12,30 @@ from pathlib import Path
 from chronoscene.errors import SceneError
 from chronoscene.formats import wat
 from chronoscene.formats.chronoscene import TEST, raise_first
-from chronoscene.formats.colmap_layout import find_model, layout, make_scene, read_images, scan
-from chronoscene.formats.colmap_writing import (
+from chronoscene.formats.shared.colmap_layout import (
+    find_model,
+    layout,
+    make_scene,
+    read_images,
+    scan,
+)
+from chronoscene.formats.shared.colmap_writing import (
     lost_labels,
     lost_names,
     new_names,
     period_folders,
     write_renamed,
 )
-from chronoscene.formats.grouping import (
+from chronoscene.formats.shared.grouping import (
     TABLE,
     group_by_table,
     group_labels,
     natural_key,
     rule_error,
 )
-from chronoscene.formats.writing import ImageSource, Progress
+from chronoscene.formats.shared.writing import ImageSource, Progress
 from chronoscene.scene import Scene
-from chronoscene.splits import (
+from chronoscene.scene.splits import (
     DEFAULT_RULE,
     assign_tests,
     default_tests,

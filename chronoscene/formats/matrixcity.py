@@ -26,11 +26,10 @@ from typing import Any
 import numpy as np
 
 from chronoscene.errors import SceneError
-from chronoscene.formats.colmap_layout import scan
-from chronoscene.formats.grouping import Grouped, group_labels, natural_key, rule_error
-from chronoscene.formats.intrinsics import CameraTable
-from chronoscene.formats.json_values import json_error, read_json
-from chronoscene.formats.transforms import (
+from chronoscene.formats.shared.colmap_layout import scan
+from chronoscene.formats.shared.grouping import Grouped, group_labels, natural_key, rule_error
+from chronoscene.formats.shared.json_values import json_error, read_json
+from chronoscene.formats.shared.transforms import (
     Shot,
     check_distinct,
     head_has,
@@ -40,9 +39,10 @@ from chronoscene.formats.transforms import (
     pose_from_opengl,
     read_frames,
 )
-from chronoscene.images import image_size
+from chronoscene.formats.shared.transforms_cameras import CameraTable
+from chronoscene.images.store import image_size
 from chronoscene.scene import Period, Points, Scene, WorldFrame
-from chronoscene.splits import DEFAULT_RULE, default_tests
+from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "matrixcity"
 MARKS = "transforms.json with rot_mat, or pose/<block>/transforms_train.json"

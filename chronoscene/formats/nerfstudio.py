@@ -26,7 +26,10 @@ import numpy as np
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.chronoscene import LARGEST_COORDINATE, MOST_PERIODS
-from chronoscene.formats.grouping import (
+from chronoscene.formats.nerfstudio_writing import FILE
+from chronoscene.formats.nerfstudio_writing import losses as losses  # part of the format
+from chronoscene.formats.nerfstudio_writing import write as write
+from chronoscene.formats.shared.grouping import (
     OPTION,
     TABLE,
     Grouped,
@@ -34,14 +37,10 @@ from chronoscene.formats.grouping import (
     group_times,
     rule_error,
 )
-from chronoscene.formats.intrinsics import CameraTable
-from chronoscene.formats.json_values import json_error, number, read_json
-from chronoscene.formats.labels import parse_periods, parse_world
-from chronoscene.formats.nerfstudio_writing import FILE
-from chronoscene.formats.nerfstudio_writing import losses as losses  # part of the format
-from chronoscene.formats.nerfstudio_writing import write as write
-from chronoscene.formats.ply import read_points
-from chronoscene.formats.transforms import (
+from chronoscene.formats.shared.json_values import json_error, number, read_json
+from chronoscene.formats.shared.labels import parse_periods, parse_world
+from chronoscene.formats.shared.ply import read_points
+from chronoscene.formats.shared.transforms import (
     Shot,
     file_name,
     head_has,
@@ -52,9 +51,10 @@ from chronoscene.formats.transforms import (
     pose_from_opengl,
     read_frames,
 )
-from chronoscene.geometry import Sim3
+from chronoscene.formats.shared.transforms_cameras import CameraTable
 from chronoscene.scene import Period, Points, Scene, WorldFrame
-from chronoscene.splits import DEFAULT_RULE, default_tests
+from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "nerfstudio"
 MARKS = FILE

@@ -22,12 +22,17 @@ import re
 from datetime import date
 from pathlib import Path, PurePosixPath
 
-from chronoscene.colmap import Model
+from chronoscene.colmap.model import Model
 from chronoscene.errors import SceneError
-from chronoscene.formats.colmap_layout import find_model, keep_images, make_scene, read_images
-from chronoscene.formats.grouping import group_dates
+from chronoscene.formats.shared.colmap_layout import (
+    find_model,
+    keep_images,
+    make_scene,
+    read_images,
+)
+from chronoscene.formats.shared.grouping import group_dates
 from chronoscene.scene import Scene
-from chronoscene.splits import NameIndex, parse_test_text, read_text
+from chronoscene.scene.splits import NameIndex, parse_test_text, read_text
 
 NAME = "neusc"
 MARKS = "dense/images/ and dense/sparse/"

@@ -21,8 +21,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from chronoscene.errors import SceneError
-from chronoscene.formats.colmap_layout import find_model, layout, make_scene, read_images
-from chronoscene.formats.colmap_writing import (
+from chronoscene.formats.shared.colmap_layout import find_model, layout, make_scene, read_images
+from chronoscene.formats.shared.colmap_writing import (
     as_pinhole,
     lost_labels,
     lost_names,
@@ -31,10 +31,10 @@ from chronoscene.formats.colmap_writing import (
     period_folders,
     write_renamed,
 )
-from chronoscene.formats.grouping import group_labels
-from chronoscene.formats.writing import ImageSource, Progress
+from chronoscene.formats.shared.grouping import group_labels
+from chronoscene.formats.shared.writing import ImageSource, Progress
 from chronoscene.scene import Camera, Scene
-from chronoscene.splits import DEFAULT_RULE, default_tests
+from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "wat"
 MARKS = "images/<task>/ and sparse/0/ in a folder named as a scene of WAT"

@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from chronoscene.errors import ShapeError
-from chronoscene.metrics.image import unit_float
 from chronoscene.metrics.lpips_weights import CONVOLUTIONS, LpipsWeights, load_weights
+from chronoscene.metrics.psnr_ssim import unit_float
 
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)

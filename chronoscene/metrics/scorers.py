@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from chronoscene.errors import MetricUnavailableError
-from chronoscene.metrics.image import IMAGE_METRICS
 from chronoscene.metrics.lpips_weights import check_available
-from chronoscene.metrics.table import METRICS, metric_info
+from chronoscene.metrics.names import METRICS, metric_info
+from chronoscene.metrics.psnr_ssim import IMAGE_METRICS
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,7 +79,7 @@ def rasterize(
             camera is outside the limits of `constants`.
         BackendError: If the backend is unknown or cannot be used on this machine.
     """
-    from chronoscene.rasterizer.validate import (
+    from chronoscene.rasterizer.input_checks import (
         check_cameras,
         check_finite_inputs,
         check_inputs,

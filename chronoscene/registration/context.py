@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from chronoscene.registration.cameras import Calibration
-from chronoscene.registration.model import Route
+from chronoscene.kernels.threads import available_threads
+from chronoscene.registration.photos.camera_sharing import Calibration
+from chronoscene.registration.result import Route
 from chronoscene.registration.stages import Stages
 from chronoscene.registration.worker import Report, run_step
-from chronoscene.threads import available_threads
 
 EXHAUSTIVE_LIMIT = 60
 """Images; at most 1,770 pairs."""

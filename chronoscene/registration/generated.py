@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.geodesy import Georeference
-from chronoscene.geometry import Sim3, camera_centre, pose_from_rotation_translation
-from chronoscene.registration.misalignment import measure, transfers
-from chronoscene.registration.model import CrossMatches, HeldOutTracks, Registered
-from chronoscene.registration.rays import Rays, place, rays_of
+from chronoscene.registration.quality.misalignment import measure, transfers
+from chronoscene.registration.quality.rays import Rays, place, rays_of
+from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered
 from chronoscene.scene import Camera
-from chronoscene.validation.alignment import fit_robustly
+from chronoscene.scene.geometry import Sim3, camera_centre, pose_from_rotation_translation
+from chronoscene.scene.similarity import fit_robustly
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -6,14 +6,14 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from chronoscene.files import write_text_atomic
-from chronoscene.registration.certificate import Certificate, certify
-from chronoscene.registration.certificate_json import to_json
-from chronoscene.registration.model import Registered
-from chronoscene.registration.report import write_report
-from chronoscene.registration.tie_alignment import TieAlignment, with_tie_tracks
-from chronoscene.registration.tie_points import TiePoints
-from chronoscene.registration.verdict import Verdict, judge
+from chronoscene.io.files import write_text_atomic
+from chronoscene.registration.quality.certificate import Certificate, certify
+from chronoscene.registration.quality.certificate_json import to_json
+from chronoscene.registration.quality.verdict import Verdict, judge
+from chronoscene.registration.report.page import write_report
+from chronoscene.registration.result import Registered
+from chronoscene.registration.ties.tie_alignment import TieAlignment, with_tie_tracks
+from chronoscene.registration.ties.tie_points import TiePoints
 
 JSON_NAME = "registration.json"
 PAGE_NAME = "registration.html"

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from chronoscene.errors import SceneError
-from chronoscene.files import write_text_atomic
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats.writing import Progress
-from chronoscene.registration.model import Registered
+from chronoscene.formats.shared.writing import Progress
+from chronoscene.io.files import write_text_atomic
+from chronoscene.registration.result import Registered
 from chronoscene.scene import Frame, Period, Points, Scene, WorldFrame
-from chronoscene.splits import default_tests, split_of
+from chronoscene.scene.splits import default_tests, split_of
 from chronoscene.undistort import undistort
 
 LOG = "registration_log.json"
@@ -82,7 +82,7 @@ def point_errors(registered: Registered) -> np.ndarray:
 
 def observation_errors(registered: Registered) -> np.ndarray:
     """Reprojection error of each observation, pixels; NaN behind a camera. [O]"""
-    from chronoscene.colmap import project_points
+    from chronoscene.colmap.model import project_points
 
     lengths = np.diff(registered.track_start)
     point = np.repeat(np.arange(len(lengths)), lengths)
@@ -154,7 +154,7 @@ def add_period(scene: Scene, registered: Registered, name: str) -> Scene:
     is an observation of a point of the scene at the same pixel, its new observations join that
     point instead.
     """
-    from chronoscene.registration.growing import grow_points
+    from chronoscene.registration.reconstruct.extend_tracks import grow_points
 
     new = as_scene(registered, name)
     old_names = {f.name for f in scene.frames}

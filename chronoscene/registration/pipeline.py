@@ -8,18 +8,18 @@ from typing import Any
 
 from chronoscene.errors import ConfigError
 from chronoscene.registration import output
-from chronoscene.registration.captures import Captures
 from chronoscene.registration.context import Context, Options
-from chronoscene.registration.estimation import estimate, refined
-from chronoscene.registration.inputs import Inputs, gather
+from chronoscene.registration.features.matching import find_matches
 from chronoscene.registration.inspection import Inspection, inspect_registration
-from chronoscene.registration.kept_bits import copy_poses, pose_bytes
-from chronoscene.registration.matching import find_matches
-from chronoscene.registration.model import Registered
+from chronoscene.registration.photos.captures import Captures
+from chronoscene.registration.photos.inputs import Inputs, gather
+from chronoscene.registration.reconstruct.estimation import estimate, refined
+from chronoscene.registration.reconstruct.kept_bits import copy_poses, pose_bytes
+from chronoscene.registration.result import Registered
 from chronoscene.registration.stages import Stages, work_folder
-from chronoscene.registration.tie_alignment import TieAlignment
-from chronoscene.registration.tie_points import TiePoints, read_tie_points
-from chronoscene.registration.tying import tie
+from chronoscene.registration.ties.apply import tie
+from chronoscene.registration.ties.tie_alignment import TieAlignment
+from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
 from chronoscene.registration.worker import Report
 from chronoscene.scene import Scene
 
@@ -43,7 +43,7 @@ def run(
     """Register all periods and write a scene.
 
     Args:
-        captures: From `chronoscene.registration.captures.read_captures`.
+        captures: From `chronoscene.registration.photos.captures.read_captures`.
         out: Folder that does not exist yet, or is empty.
         options: How.
         report: Called with the progress of what takes long.

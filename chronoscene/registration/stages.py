@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from chronoscene.files import write_text_atomic
+from chronoscene.io.files import write_text_atomic
 from chronoscene.registration.errors import RegistrationError
 
 VERSION = 1

@@ -27,14 +27,14 @@ Report = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and its total."""
 
 STEPS = {
-    "features": "chronoscene.registration.sfm:extract",
-    "pairs": "chronoscene.registration.pairs:choose_pairs",
-    "matches": "chronoscene.registration.sfm:match",
-    "holdout": "chronoscene.registration.holdout:hold_out",
-    "joint": "chronoscene.registration.joint:run",
-    "separate": "chronoscene.registration.separate:run",
-    "frozen": "chronoscene.registration.frozen:run",
-    "refine": "chronoscene.registration.refine:run",
+    "features": "chronoscene.registration.features.database:extract",
+    "pairs": "chronoscene.registration.features.pairs:choose_pairs",
+    "matches": "chronoscene.registration.features.database:match",
+    "holdout": "chronoscene.registration.features.holdout:hold_out",
+    "joint": "chronoscene.registration.reconstruct.joint:run",
+    "separate": "chronoscene.registration.reconstruct.separate:run",
+    "frozen": "chronoscene.registration.reconstruct.add_period:run",
+    "refine": "chronoscene.registration.reconstruct.refine:run",
 }
 """Name of a step to ``module:function``, which takes a dictionary and a `Report` and returns what
 JSON can hold."""

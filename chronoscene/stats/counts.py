@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from chronoscene import __version__
 from chronoscene.scene import Scene
-from chronoscene.splits import split_hash
+from chronoscene.scene.splits import split_hash
 from chronoscene.stats.published import published
 from chronoscene.stats.text import latex_row, markdown_table, text_table
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.geometry import camera_centre
-from chronoscene.projection import pixels_of
 from chronoscene.scene import Scene
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.projection import pixels_of
 from chronoscene.stats.counts import CountRule, SceneCount, count_scene, observation_counts
 from chronoscene.stats.extent import robust_range
-from chronoscene.stats.views import common_view
+from chronoscene.stats.view_overlap import common_view
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -55,7 +55,7 @@ class SceneStatistics:
     """Row a, column b: share of the points that period a sees which period b sees, too. [T, T]"""
     in_view: tuple[tuple[float | None, ...], ...]
     """Row a, column b: share of the points that period a sees which cameras of period b have in
-    view, whether b sees them or not; see `chronoscene.stats.views`. [T, T]"""
+    view, whether b sees them or not; see `chronoscene.stats.view_overlap`. [T, T]"""
     unit: str
     """Of the world: ``metre`` or ``unknown``."""
 

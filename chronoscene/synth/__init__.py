@@ -26,6 +26,6 @@ def generate(out: Path | str, settings: SynthSettings, progress: Any = None) -> 
     Raises:
         ChronoSceneError: If ``out`` holds files already.
     """
-    from chronoscene.synth.pipeline import run
+    from chronoscene.synth.generation import run
 
     run(Path(out), settings, progress)

@@ -18,8 +18,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from chronoscene.errors import CheckpointError
-from chronoscene.files import replacing, write_text_atomic
-from chronoscene.geometry import Sim3
+from chronoscene.io.files import replacing, write_text_atomic
+from chronoscene.scene.geometry import Sim3
 
 TENSOR_FILE = "model.safetensors"
 META_FILE = "model.json"

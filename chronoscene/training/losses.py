@@ -10,7 +10,7 @@ from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
-from chronoscene.training._ssim_kernel import CHANNELS, RADIUS, SIGMA, l1_ssim
+from chronoscene.training.ssim_kernel import CHANNELS, RADIUS, SIGMA, l1_ssim
 
 
 def photometric_loss(image: Tensor, target: Tensor, *, ssim_weight: float = 0.2) -> Tensor:

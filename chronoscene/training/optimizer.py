@@ -12,7 +12,7 @@ from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
-from chronoscene.training._adam_kernel import BETA1, BETA2, BLOCK, adam_block, adam_blocks
+from chronoscene.training.adam_kernel import BETA1, BETA2, BLOCK, adam_block, adam_blocks
 
 
 @dataclass(slots=True, eq=False)

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.training import _row_adam_kernel as kernel
-from chronoscene.training._adam_kernel import BETA1, BETA2
+from chronoscene.training import row_adam_kernel as kernel
+from chronoscene.training.adam_kernel import BETA1, BETA2
 from chronoscene.training.optimizer import Adam
 
 _HORIZON = 256

@@ -16,7 +16,7 @@ the scene as it lies on disk and yields a `Hit` for each problem::
         ...
 
 Codes are stable: a code is never given to another rule. DATASET.md has the table
-(`python -m chronoscene.validation.document` prints it).
+(`python -m chronoscene.validation.report.rule_list` prints it).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from difflib import get_close_matches
 
 from chronoscene.errors import ConfigError
 from chronoscene.validation.finding import SEVERITIES, Hit, Severity
-from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.scene_folder import RawScene
 
 Check = Callable[[RawScene], Iterable[Hit]]
 

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from chronoscene.colmap.raw_model import model_files
 from chronoscene.errors import SceneError
 from chronoscene.validation.finding import SEVERITIES, Finding, Hit, printable
-from chronoscene.validation.origin import in_our_format, other_format
-from chronoscene.validation.raw_model import model_files
-from chronoscene.validation.raw_scene import RawScene, Track, no_progress
-from chronoscene.validation.report import SceneReport, Skipped, Summary, summarise
+from chronoscene.validation.other_formats import in_our_format, other_format
+from chronoscene.validation.report.report import SceneReport, Skipped, Summary, summarise
 from chronoscene.validation.rule import Rule, all_rules
-from chronoscene.validation.rules.other_formats import OF_ORIGINS
+from chronoscene.validation.rules.foreign_folder import OF_ORIGINS
+from chronoscene.validation.scene_folder import RawScene, Track, no_progress
 
 RULE_FAILED = "CS000"
 """Code of the finding that a rule itself failed: our mistake, reported as such."""

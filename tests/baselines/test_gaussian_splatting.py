@@ -20,11 +20,11 @@ from baselines.gaussian_splatting.gaussians import (
 from baselines.gaussian_splatting.method import GaussianSplatting
 from baselines.gaussian_splatting.timeline import Timeline
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
-from chronoscene.geometry import Sim3
+from chronoscene.kernels.threads import set_threads
 from chronoscene.methods import TrainingSet, TrainingView, build_config, import_object
 from chronoscene.rasterizer import rasterize
-from chronoscene.threads import set_threads
-from chronoscene.training.view import camera_tensors
+from chronoscene.scene.geometry import Sim3
+from chronoscene.training.camera_tensors import camera_tensors
 
 WIDTH, HEIGHT = 48, 36
 EXTENT = 1.1
@@ -266,7 +266,7 @@ def test_a_large_gaussian_becomes_two_samples_of_itself():
 
 
 def test_parts_are_distributed_as_their_gaussian():
-    from chronoscene.geometry import rotation_from_quaternion
+    from chronoscene.scene.geometry import rotation_from_quaternion
 
     count = 20_000
     parameters = {name: values[:1].repeat(count, *(1,) * (values.dim() - 1)) for name, values in

@@ -14,8 +14,8 @@ from baselines.scaffold_gs.config import ScaffoldGSConfig
 from baselines.scaffold_gs.method import ScaffoldGS
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
-from chronoscene.geometry import Sim3
 from chronoscene.methods import TrainingSet, TrainingView, build_config
+from chronoscene.scene.geometry import Sim3
 
 GROWING: dict[str, Any] = {
     "iterations": 20,

@@ -12,10 +12,10 @@ from chronoscene.bench.protocol import (
     training_frame,
 )
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.geometry import camera_centre
-from chronoscene.images import ImageStore
+from chronoscene.images.store import ImageStore
 from chronoscene.methods import load_spec
 from chronoscene.scene import Points
+from chronoscene.scene.geometry import camera_centre
 
 TRAIN = ["a/0.png", "a/1.png", "a/3.png", "b/0.png", "b/3.png"]
 

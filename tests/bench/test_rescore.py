@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from chronoscene.bench.images import encode_png
+from chronoscene.bench.image_store import encode_png
 from chronoscene.bench.rescore import rescore
 from chronoscene.bench.results import Row, read_rows, read_run, run_folders, write_run
 from chronoscene.errors import CheckpointError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from chronoscene.bench import results
-from chronoscene.bench.images import read_manifest
+from chronoscene.bench.image_store import read_manifest
 from chronoscene.bench.results import read_rows, read_run, run_folders
 from chronoscene.bench.runner import BenchSettings, first_difference, split_overrides
 from chronoscene.errors import ConfigError, MetricUnavailableError, SceneError

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from chronoscene.bench.images import ImageWriter
+from chronoscene.bench.image_store import ImageWriter
 from chronoscene.bench.results import Row
 from chronoscene.bench.scoring import aggregate, changes, score_folder
 from chronoscene.errors import CheckpointError

@@ -5,8 +5,8 @@ import pytest
 
 from chronoscene.bench.protocol import EXTENT_MARGIN
 from chronoscene.bench.warmup import STEPS, made_up_set, warm_up
-from chronoscene.geometry import camera_centre
 from chronoscene.methods import import_object, load_spec
+from chronoscene.scene.geometry import camera_centre
 
 
 def test_a_method_is_set_up_stepped_and_rendered(monkeypatch):

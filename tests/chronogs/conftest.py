@@ -10,8 +10,8 @@ import torch
 
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
-from chronoscene.geometry import Sim3, rotation_from_quaternion
 from chronoscene.methods import TrainingSet, TrainingView
+from chronoscene.scene.geometry import Sim3, rotation_from_quaternion
 
 WIDTH, HEIGHT = 40, 30
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from chronogs.method import ChronoGS
+from chronoscene.anchors.config import HEADS
+from chronoscene.anchors.decode.heads import Decoded
+from chronoscene.anchors.model import PER_ANCHOR, AnchorModel, draw
+from chronoscene.anchors.volume_loss import mean_volume
 from chronoscene.errors import ConfigError
-from chronoscene.training.anchor_config import HEADS
-from chronoscene.training.anchor_model import PER_ANCHOR, AnchorModel, draw
-from chronoscene.training.decode import Decoded
-from chronoscene.training.volume_loss import mean_volume
 
 Make = Callable[..., ChronoGS]
 CENTRE = torch.tensor([0.3, -0.2, 2.0])

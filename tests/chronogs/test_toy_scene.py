@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
-from chronoscene.geometry import Sim3
 from chronoscene.methods import TrainingSet, TrainingView
+from chronoscene.scene.geometry import Sim3
 
 pytestmark = pytest.mark.slow
 

@@ -12,11 +12,11 @@ import torch
 
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
+from chronoscene.anchors import trainer as anchor_training
+from chronoscene.anchors.density import DensityStatistics
 from chronoscene.errors import CheckpointError
+from chronoscene.kernels.threads import set_threads
 from chronoscene.methods import TrainingSet
-from chronoscene.threads import set_threads
-from chronoscene.training import anchor_training
-from chronoscene.training.density import DensityStatistics
 from chronoscene.training.schedule import log_linear
 
 Make = Callable[..., ChronoGS]

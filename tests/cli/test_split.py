@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from chronoscene.cli import cli, main
 from chronoscene.formats import read_scene
-from chronoscene.splits import split_hash
+from chronoscene.scene.splits import split_hash
 
 PERIODS = {f"{'ab'[p]}/{i:02d}.png": p for p in (0, 1) for i in range(16)}
 

@@ -18,7 +18,7 @@ from chronoscene.cli.stats import against_paper
 from chronoscene.errors import ConfigError
 from chronoscene.stats import WRITERS, PeriodCount, SceneCount
 from chronoscene.stats.published import PAPER_COUNTS
-from chronoscene.synth.skeleton import write_skeleton
+from chronoscene.synth.scene.skeleton import write_skeleton
 
 
 def run(*args: object):

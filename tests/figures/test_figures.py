@@ -13,7 +13,7 @@ from chronoscene.figures import projections
 from chronoscene.figures.bars import _period_names, draw_bars
 from chronoscene.figures.cloud import Cloud, shown_box
 from chronoscene.figures.colors import EIGHT, FOUR, period_colors, rgb_of
-from chronoscene.figures.density import (
+from chronoscene.figures.density_map import (
     FAINTEST,
     Window,
     count_points,

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chronoscene.colmap import PosedImage
+from chronoscene.colmap.model import PosedImage
 from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 from chronoscene.formats import detect_format, find_scenes, read_scene
 from chronoscene.formats.chronoscene import check_image, is_iso_date, read_periods, write
 from chronoscene.scene import Camera, Period, WorldFrame
-from chronoscene.splits import DEFAULT_RULE
+from chronoscene.scene.splits import DEFAULT_RULE
 
 
 def split_of(scene) -> dict[str, str]:

@@ -9,7 +9,7 @@ import pytest
 
 from chronoscene.errors import ConfigError, ImageError, SceneError
 from chronoscene.formats import cl_splats, detect_format, read_scene
-from chronoscene.formats.ply import write_points
+from chronoscene.formats.shared.ply import write_points
 from chronoscene.scene import Camera
 
 REAL = [f"day_{day}_{i:02d}.png" for day in (2, 10) for i in range(4)] + ["frame_1.png"]

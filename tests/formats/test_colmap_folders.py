@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import colmap_folders, detect_format, read_scene
-from chronoscene.formats.grouping import natural_key
+from chronoscene.formats.shared.grouping import natural_key
 from chronoscene.scene import Period
 
 DATED = ["2016/a.png", "2016/b.png", "2023-04/a.png", "2023-04/c/d.png"]

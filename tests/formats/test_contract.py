@@ -11,7 +11,7 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import FORMATS, detect_format, load_format, read_scene, writable_formats
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.scene import Scene
-from chronoscene.splits import split_hash
+from chronoscene.scene.splits import split_hash
 
 
 @pytest.fixture(params=sorted(FORMATS))

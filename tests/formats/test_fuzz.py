@@ -20,23 +20,23 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.colmap import PosedImage
-from chronoscene.colmap_arrays import CAMERA_MODELS
-from chronoscene.colmap_records import CAMERA_PARAMETERS
+from chronoscene.colmap.arrays import CAMERA_MODELS
+from chronoscene.colmap.binary import CAMERA_PARAMETERS
+from chronoscene.colmap.model import PosedImage
 from chronoscene.convert import convert
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import FORMATS, detect_format, read_scene, writable_formats
 from chronoscene.formats.chronoscene import check_image
-from chronoscene.formats.ply import read_points
-from chronoscene.scene import Camera
-from chronoscene.split_making import SplitSettings, make_split
-from chronoscene.undistort import undistort
-from chronoscene.undistort_cameras import (
+from chronoscene.formats.shared.ply import read_points
+from chronoscene.images.undistortion import (
     CameraChange,
     move_pixels,
     pinhole_camera,
     sampling_map,
 )
+from chronoscene.scene import Camera
+from chronoscene.scene.split_making import SplitSettings, make_split
+from chronoscene.undistort import undistort
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, on damaged files
 

@@ -8,7 +8,7 @@ import pytest
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import detect_format, matrixcity, read_scene
-from chronoscene.geometry import camera_centre
+from chronoscene.scene.geometry import camera_centre
 
 EYE_FROM_NADIR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 

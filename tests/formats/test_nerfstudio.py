@@ -10,10 +10,14 @@ from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import nerfstudio, read_scene
-from chronoscene.formats.intrinsics import CameraTable
-from chronoscene.formats.transforms import opengl_from_pose, pose_from_opengl
-from chronoscene.geometry import Sim3, pose_from_rotation_translation, rotation_from_quaternion
+from chronoscene.formats.shared.transforms import opengl_from_pose, pose_from_opengl
+from chronoscene.formats.shared.transforms_cameras import CameraTable
 from chronoscene.scene import Camera, Period
+from chronoscene.scene.geometry import (
+    Sim3,
+    pose_from_rotation_translation,
+    rotation_from_quaternion,
+)
 
 NAMES = [f"{i}.png" for i in range(4)]
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.formats import load_format, read_scene, writable_formats
-from chronoscene.geometry import pose_from_rotation_translation, rotation_from_quaternion
 from chronoscene.scene import Camera, Frame, Period, Points, Scene, WorldFrame
-from chronoscene.splits import split_hash
+from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
+from chronoscene.scene.splits import split_hash
 
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: sum(x * x for x in q) > 1e-3)
 positions = st.tuples(*[st.floats(-1e4, 1e4)] * 3)

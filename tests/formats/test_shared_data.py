@@ -96,7 +96,7 @@ def test_bare_models_with_a_table_of_periods(shared_data, tmp_path, name, images
 
 
 def read_names(folder):
-    from chronoscene.colmap import read_model
+    from chronoscene.colmap.model import read_model
 
     return [image.name for image in read_model(folder / "sparse/0").images]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from chronoscene.colmap_records import read_cameras
+from chronoscene.colmap.binary import read_cameras
 from chronoscene.errors import SceneError
 from chronoscene.formats import detect_format, read_scene, wat
 from chronoscene.scene import Camera, Period

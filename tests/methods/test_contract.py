@@ -17,6 +17,7 @@ import tiny_training
 from safetensors import safe_open
 
 from chronoscene.errors import CheckpointError
+from chronoscene.kernels.threads import set_threads
 from chronoscene.methods import (
     Method,
     MethodSpec,
@@ -28,7 +29,6 @@ from chronoscene.methods import (
     load_spec,
     method_names,
 )
-from chronoscene.threads import set_threads
 
 
 @dataclass

@@ -22,7 +22,10 @@ from hypothesis.extra import numpy as hnp
 from rasterizer_cases.comparison import everything
 
 from chronoscene.rasterizer import rasterize
-from chronoscene.rasterizer.cpu import layout, pipeline, team, workspace
+from chronoscene.rasterizer.cpu import passes as pipeline
+from chronoscene.rasterizer.cpu import sizes as layout
+from chronoscene.rasterizer.cpu import thread_pool as team
+from chronoscene.rasterizer.cpu import workspace
 from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, SORT_PHASES, sort_phases
 
 MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
@@ -220,7 +223,7 @@ def test_a_forked_child_can_render(tools: SimpleNamespace) -> None:
     """The child has none of the threads that the parent's team counts on."""
     code = """
 import os, numpy as np
-from chronoscene.rasterizer.cpu import team
+from chronoscene.rasterizer.cpu import thread_pool as team
 def kernel(worker, control, seen): seen[worker] += 1
 team.launch(kernel, 2, np.zeros(2))
 child = os.fork()

@@ -192,7 +192,7 @@ def test_moving_world_and_camera_together_changes_nothing(tools: SimpleNamespace
 
 def _compose(rotation: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
     """Quaternions of rotation times each rotation of ``quats``."""
-    from chronoscene.geometry import quaternion_from_rotation, rotation_from_quaternion
+    from chronoscene.scene.geometry import quaternion_from_rotation, rotation_from_quaternion
 
     matrices = rotation.numpy() @ rotation_from_quaternion(quats.numpy())
     return torch.tensor(np.stack([quaternion_from_rotation(m) for m in matrices]))

@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 import chronoscene  # noqa: F401  (loads zlib before pycolmap)
-from chronoscene._pycolmap import pycolmap
-from chronoscene.colmap import read_model
+from chronoscene.colmap.model import read_model
 from chronoscene.formats import read_scene
-from chronoscene.geometry import camera_centre, pose_from_rotation_translation
+from chronoscene.io.pycolmap import pycolmap
 from chronoscene.scene import Scene
+from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
+from chronoscene.scene.similarity import fit
 from chronoscene.synth import SynthSettings, generate
-from chronoscene.validation.alignment import fit
 
 Array = NDArray[np.float64]
 

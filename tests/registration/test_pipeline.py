@@ -12,13 +12,13 @@ from PIL import Image
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
-from chronoscene.geometry import camera_centre
-from chronoscene.registration.captures import read_captures
 from chronoscene.registration.errors import RegistrationError
-from chronoscene.registration.model import Registered
+from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import Options, run, run_into
+from chronoscene.registration.result import Registered
 from chronoscene.scene import Scene
-from chronoscene.validation.alignment import fit
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.similarity import fit
 from chronoscene.validation.run import validate_scene
 
 OPTIONS = Options(threads=1, max_features=3000)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
-from chronoscene.splits import split_hash
+from chronoscene.scene.splits import split_hash
 from chronoscene.stats import (
     PeriodCount,
     SceneCount,

@@ -31,13 +31,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 @pytest.fixture(scope="session")
 def world(made: Made):  # type: ignore[no-untyped-def]
-    from chronoscene.synth.city import make_world
+    from chronoscene.synth.city.plan import make_world
 
     return make_world(made.settings)
 
 
 @pytest.fixture(scope="session")
 def renderers(made: Made, world):  # type: ignore[no-untyped-def]
-    from chronoscene.synth.pipeline import make_renderers
+    from chronoscene.synth.generation import make_renderers
 
     return make_renderers(made.settings, world)

@@ -5,7 +5,7 @@ import pytest
 from chronoscene.bench.protocol import make_parts
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
-from chronoscene.images import ImageStore
+from chronoscene.images.store import ImageStore
 
 CAMERAS, IMAGES, POINTS = (f"sparse/0/{stem}.txt" for stem in ("cameras", "images", "points3D"))
 TEST = "sparse/0/test.txt"

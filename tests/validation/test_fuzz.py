@@ -17,12 +17,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from chronoscene.colmap.raw_model import read_raw_model
+from chronoscene.colmap.rigs import read_rigs
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
-from chronoscene.validation.fix import fix_scene
-from chronoscene.validation.pixels import read_header, read_pixels_of
-from chronoscene.validation.raw_model import read_raw_model
-from chronoscene.validation.raw_rigs import read_rigs
+from chronoscene.validation.checks.pixels import read_header, read_pixels_of
+from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.run import validate_scene
 
 pytestmark = [  # Pillow's, on damaged files

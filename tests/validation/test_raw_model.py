@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.colmap import read_model
-from chronoscene.geometry import rotation_from_quaternion
-from chronoscene.validation.observations import observe
-from chronoscene.validation.raw_model import model_files, read_raw_model
-from chronoscene.validation.raw_text import read_points
+from chronoscene.colmap.model import read_model
+from chronoscene.colmap.raw_model import model_files, read_raw_model
+from chronoscene.colmap.text import read_points
+from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.validation.checks.observations import observe
 
 
 @pytest.mark.parametrize("form", ["text", "classic", "rigs"])

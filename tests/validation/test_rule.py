@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from chronoscene.errors import ConfigError
-from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import RULES, all_rules, choose_rules, rule
+from chronoscene.validation.scene_folder import RawScene
 
 
 def codes(rules):

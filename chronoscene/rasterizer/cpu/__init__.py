@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 
 from chronoscene.errors import BackendError
 from chronoscene.rasterizer.constants import VALUE_MAX
-from chronoscene.rasterizer.cpu import pipeline
+from chronoscene.rasterizer.cpu import passes as pipeline
 from chronoscene.rasterizer.cpu.function import Render, Request
 from chronoscene.rasterizer.cpu.simd import LANES
 from chronoscene.rasterizer.recentring import recentred

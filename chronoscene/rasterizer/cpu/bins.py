@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.rasterizer.cpu import layout as lay
+from chronoscene.rasterizer.cpu import sizes as lay
 from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
 from chronoscene.rasterizer.cpu.phases import draw, finish, wait_for
 from chronoscene.rasterizer.cpu.project import chunk_of, project_chunk

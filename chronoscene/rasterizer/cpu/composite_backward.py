@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from chronoscene.rasterizer.constants import ALPHA_MAX
-from chronoscene.rasterizer.cpu import layout as lay
+from chronoscene.rasterizer.cpu import sizes as lay
 from chronoscene.rasterizer.cpu.kernel import helper, kernel
 from chronoscene.rasterizer.cpu.phases import draw
 from chronoscene.rasterizer.cpu.simd import (

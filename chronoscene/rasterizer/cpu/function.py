@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
-from chronoscene.rasterizer.cpu import pipeline, workspace
+from chronoscene.rasterizer.cpu import passes as pipeline
+from chronoscene.rasterizer.cpu import workspace
 from chronoscene.rasterizer.cpu.project import set_colors
 
 

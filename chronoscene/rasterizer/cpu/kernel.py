@@ -8,8 +8,8 @@ from typing import Any
 
 from numba import njit
 
-from chronoscene import simd
-from chronoscene.compiled import kept_on_disk
+from chronoscene.kernels import simd
+from chronoscene.kernels.compilation import kept_on_disk
 
 _OPTIONS: dict[str, Any] = {
     "nogil": True,

@@ -16,8 +16,8 @@ from chronoscene.rasterizer.constants import (
     RADIUS_MAX,
     VALUE_MAX,
 )
-from chronoscene.rasterizer.cpu import layout as lay
-from chronoscene.rasterizer.cpu.geometry import (
+from chronoscene.rasterizer.cpu import sizes as lay
+from chronoscene.rasterizer.cpu.ellipses import (
     by,
     dot,
     ellipse,

@@ -1,6 +1,6 @@
 """What the kernels do with vectors of 8 or 16 numbers: memory, functions, and lanes that move.
 
-The vectors themselves and their operators are in `chronoscene.simd`.
+The vectors themselves and their operators are in `chronoscene.kernels.simd`.
 
 All arrays must be one-dimensional and contiguous; offsets count elements and are not checked.
 """
@@ -13,7 +13,7 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 
-from chronoscene.simd import (
+from chronoscene.kernels.simd import (
     ELEMENTS,
     FLAGS,
     I32,

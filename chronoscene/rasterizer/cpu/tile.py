@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.rasterizer.cpu import layout as lay
+from chronoscene.rasterizer.cpu import sizes as lay
 from chronoscene.rasterizer.cpu.kernel import inlined
 from chronoscene.rasterizer.cpu.simd import LANES, make_constant, splat, store
 

@@ -8,11 +8,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.geometry import rotation_from_quaternion
+from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.validation.checks.reprojection import good_poses
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.raw_scene import RawScene
-from chronoscene.validation.reprojection import good_poses
 from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
 
 Array = NDArray[np.float64]
 

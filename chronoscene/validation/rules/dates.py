@@ -10,9 +10,14 @@ from itertools import pairwise
 
 from chronoscene.formats.chronoscene import PERIODS, SPLIT
 from chronoscene.validation.finding import Hit, counted, shown
-from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.exif import dates_of, median_dates, of_other_period, stated_dates
+from chronoscene.validation.rules.photo_metadata import (
+    dates_of,
+    median_dates,
+    of_other_period,
+    stated_dates,
+)
+from chronoscene.validation.scene_folder import RawScene
 
 FEWEST_DATES = 5
 """Photos with a date from which one can be alone among them."""

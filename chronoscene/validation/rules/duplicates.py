@@ -10,12 +10,12 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.geometry import rotation_from_quaternion
+from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.validation.checks.near_duplicates import relit_pairs
+from chronoscene.validation.checks.pixels import THUMBNAIL, Pixels
 from chronoscene.validation.finding import Hit, shown
-from chronoscene.validation.likeness import relit_pairs
-from chronoscene.validation.pixels import THUMBNAIL, Pixels
-from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
 
 NEAR = 3.0
 """Root mean square difference of two thumbnails in grey levels 0..255. Measured: photos saved again

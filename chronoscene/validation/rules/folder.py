@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 
+from chronoscene.colmap.raw_model import numbered_models
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
+from chronoscene.validation.checks.reader import reader_complaint
 from chronoscene.validation.finding import Hit, shown
-from chronoscene.validation.raw_model import numbered_models
-from chronoscene.validation.raw_scene import RawScene
-from chronoscene.validation.reader_check import reader_complaint
 from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
 
 
 @rule(

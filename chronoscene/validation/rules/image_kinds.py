@@ -7,10 +7,10 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
+from chronoscene.validation.checks.pixels import Header
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.pixels import Header
-from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
 
 KINDS = {
     ".jpg": ("JPEG", "MPO"),

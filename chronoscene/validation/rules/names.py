@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 
+from chronoscene.validation.checks.spelling import spelling
 from chronoscene.validation.finding import Hit, counted, quote, shown
-from chronoscene.validation.raw_scene import RawScene, is_safe
 from chronoscene.validation.rule import rule
-from chronoscene.validation.spelling import spelling
+from chronoscene.validation.scene_folder import RawScene, is_safe
 
 FORBIDDEN = re.compile(r'[<>:"|?*\\]|[ .]$')
 """What a file or folder name cannot have, or end in, on Windows (Microsoft, *Naming Files, Paths,

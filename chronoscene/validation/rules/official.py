@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.formats.chronoscene import SPLIT, TEST
-from chronoscene.splits import TEST_EVERY
+from chronoscene.scene.splits import TEST_EVERY
 from chronoscene.validation.finding import Hit, counted, quote, shown
-from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
-from chronoscene.validation.rules.images import GREY_MODES
-from chronoscene.validation.rules.testlist import ELSEWHERE
+from chronoscene.validation.rules.image_files import GREY_MODES
+from chronoscene.validation.rules.test_list import ELSEWHERE
+from chronoscene.validation.scene_folder import RawScene
 
 VOXEL, NEAR = 0.001, 0.2
 """World units; constants of the released code, and of 3D Gaussian splatting."""

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.validation.checks.own_frames import LEAST_ERROR, WORSE, period_limit
+from chronoscene.validation.checks.period_frames import Rays, focal_factor
 from chronoscene.validation.finding import Hit, counted, shown
-from chronoscene.validation.own_frames import LEAST_ERROR, WORSE, period_limit
-from chronoscene.validation.period_frames import Rays, focal_factor
-from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
 
 MOST_STORED = 0.9
 """Share of the points that must have an error stored with them."""

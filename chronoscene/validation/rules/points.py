@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap_arrays import RawPoints
+from chronoscene.colmap.arrays import RawPoints
 from chronoscene.validation.finding import NOTHING, Hit, counted, shown
-from chronoscene.validation.raw_scene import RawScene
 from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
 
 FEWEST_SHARED = 10
 """Points from which a similarity between two periods can be told from chance."""

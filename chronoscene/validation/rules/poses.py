@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from chronoscene.validation.checks.reprojection import good_poses
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.raw_scene import RawScene
-from chronoscene.validation.reprojection import good_poses
 from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
 
 UNIT_TOLERANCE = 1e-3
 """Deviation of a quaternion's length from 1 that rounding in a text file cannot explain."""

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.geometry import camera_centre
+from chronoscene.colmap.rigs import CAMERA, RawFrame, RawRigs, pose_matrices, read_rigs
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.validation.checks.reprojection import good_poses
 from chronoscene.validation.finding import Hit, counted, shown
-from chronoscene.validation.raw_rigs import CAMERA, RawFrame, RawRigs, pose_matrices, read_rigs
-from chronoscene.validation.raw_scene import RawScene
-from chronoscene.validation.reprojection import good_poses
 from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
 
 Array = NDArray[np.float64]
 

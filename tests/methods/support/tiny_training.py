@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.bench.training import seed_everything
-from chronoscene.geometry import Sim3
+from chronoscene.bench.training_loop import seed_everything
+from chronoscene.kernels.threads import set_threads
 from chronoscene.methods import (
     Method,
     MethodSpec,
@@ -23,7 +23,7 @@ from chronoscene.methods import (
     import_object,
     load_spec,
 )
-from chronoscene.threads import set_threads
+from chronoscene.scene.geometry import Sim3
 
 WIDTH, HEIGHT = 40, 30
 STEPS = 120

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.bench.protocol import training_frame
-from chronoscene.geometry import quaternion_from_rotation, rotation_from_quaternion
+from chronoscene.scene.geometry import quaternion_from_rotation, rotation_from_quaternion
 
 from .scenes import SmallScene, random_scene
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.validation.likeness import relit_pairs
-from chronoscene.validation.pixels import Pixels
+from chronoscene.validation.checks.near_duplicates import relit_pairs
+from chronoscene.validation.checks.pixels import Pixels
 from chronoscene.validation.rules.duplicates import near_pairs, twins
 
 TEST = "sparse/0/test.txt"

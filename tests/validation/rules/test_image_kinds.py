@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.validation.pixels import TAIL, read_header
+from chronoscene.validation.checks.pixels import TAIL, read_header
 
 
 def noise(mode="RGB", size=(64, 48), seed=99):

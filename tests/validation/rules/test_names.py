@@ -2,9 +2,9 @@ import os
 
 import pytest
 
-from chronoscene.validation import pixels
-from chronoscene.validation.raw_scene import RawScene
+from chronoscene.validation.checks import pixels
 from chronoscene.validation.rules.names import is_portable
+from chronoscene.validation.scene_folder import RawScene
 
 IMAGES = "sparse/0/images.txt"
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from chronoscene.geometry import rotation_from_quaternion
+from chronoscene.scene.geometry import rotation_from_quaternion
 
 IMAGES = "sparse/0/images.txt"
 

@@ -2,7 +2,7 @@ import struct
 
 import pytest
 
-from chronoscene.validation.raw_rigs import read_rigs
+from chronoscene.colmap.rigs import read_rigs
 
 FRAMES, RIGS, IMAGES = (f"sparse/0/{stem}.bin" for stem in ("frames", "rigs", "images"))
 FRAME = struct.Struct("<II7dIiIQ")
@@ -31,7 +31,7 @@ def test_good_model_with_rigs(rigs):
 
 @pytest.mark.parametrize("form", [".bin", ".txt"])
 def test_both_forms_say_the_same(rigs, form, tmp_path):
-    from chronoscene.colmap import read_reconstruction
+    from chronoscene.colmap.model import read_reconstruction
 
     folder = rigs.path("sparse/0")
     expected = read_rigs(folder, ".bin")

@@ -1,0 +1,1 @@
+"""Scenes as anchors whose features are decoded into Gaussians; Scaffold-GS and ChronoGS use it."""

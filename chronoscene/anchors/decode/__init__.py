@@ -1,0 +1,1 @@
+"""From the features of anchors to Gaussians: small MLPs, in torch and compiled."""

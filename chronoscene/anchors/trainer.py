@@ -1,0 +1,294 @@
+"""One training step of a model with anchors; shared by ChronoGS and Scaffold-GS.
+
+Every schedule follows the progress of the training. Gradients come from kernels that reduce in a
+fixed order or from elementwise torch, and random numbers only from the seed, so a seed gives the
+same bytes for any number of threads.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from chronoscene.anchors.config import AnchorConfig
+from chronoscene.anchors.density import (
+    AnchorArrays,
+    DensityRules,
+    DensityStatistics,
+    grow,
+    prune_mask,
+)
+from chronoscene.anchors.model import PER_ANCHOR, AnchorModel, draw
+from chronoscene.anchors.volume_loss import mean_volume
+from chronoscene.methods import StepReport, TrainingSet, TrainingView
+from chronoscene.rasterizer.types import RasterInfo
+from chronoscene.training.camera_tensors import camera_centre_tensor
+from chronoscene.training.downscale import coarser_image, coarser_view
+from chronoscene.training.losses import photometric_loss
+from chronoscene.training.optimizer import Adam
+from chronoscene.training.row_adam import make_table
+from chronoscene.training.sampler import ViewSampler
+from chronoscene.training.schedule import log_linear
+
+Rates = Mapping[str, tuple[float, float]]
+AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]
+
+_ADAM_EPS = 1e-15
+_MARGIN = 1e-9
+"""Shares of the training this close are equal: progress is a quotient of rounded numbers."""
+
+
+def learning_rates(config: AnchorConfig, camera_extent: float) -> dict[str, tuple[float, float]]:
+    """Start and end of the learning rate of every tensor, by its name in the model."""
+    start, end = config.offset_lr
+    rates = {
+        "offsets": (start * camera_extent, end * camera_extent),
+        "features": config.feature_lr,
+        "log_scales": config.scaling_lr,
+    }
+    by_head = {
+        "opacity": config.opacity_lr,
+        "covariance": config.covariance_lr,
+        "color": config.color_lr,
+    }
+    for head, rate in by_head.items():
+        rates |= {f"{head}.{layer}": rate for layer in ("w1", "b1", "w2", "b2")}
+    return rates
+
+
+def density_rules(config: AnchorConfig, voxel_size: float) -> DensityRules:
+    """Thresholds of growth and pruning: counts are shares of the steps between two rounds."""
+    visits = config.density_interval * config.success_threshold
+    return DensityRules(
+        voxel_size=voxel_size,
+        grad_threshold=config.grad_threshold,
+        min_hits=0.5 * visits,
+        min_visits=visits,
+        min_opacity=config.min_opacity,
+        prune_by=config.prune_by,
+        prune_gradient=config.prune_gradient,
+        levels=config.growth_levels,
+        coarsest=config.coarsest_cell,
+        refinement=config.cell_refinement,
+        chained=config.chained_levels,
+        random_mask=config.random_growth,
+        max_anchors=config.max_anchors,
+    )
+
+
+class AnchorTrainer:
+    """Trains a model on the views of a training set.
+
+    Args:
+        config: Options.
+        model: Trained in place; `snapshot` has the present state.
+        train: Views, images, background.
+        voxel_size: Smallest growth cell in training units.
+        seed: All random choices follow from it.
+        rates: Learning rates by tensor name.
+        after_update: Called with the model and the learning rates after each step that changed
+            the features; makes every step update the features of all anchors.
+    """
+
+    def __init__(
+        self,
+        config: AnchorConfig,
+        model: AnchorModel,
+        train: TrainingSet,
+        *,
+        voxel_size: float,
+        seed: int,
+        rates: Rates,
+        after_update: AfterUpdate | None = None,
+    ) -> None:
+        self.config = config
+        self.after_update = after_update
+        self.model = model.requires_grad()
+        self.train = train
+        self.rules = density_rules(config, voxel_size)
+        trained = {n: t for n, t in model.tensors().items() if n in rates and t.numel() > 0}
+        self.rates = {name: rates[name] for name in trained}
+        layout = model.layout
+        blocks = [layout.base_dim, *[layout.period_dim] * layout.num_periods]
+        self.tables = {
+            "offsets": make_table(model.offsets, None, _ADAM_EPS, lazy=True),
+            "features": make_table(model.features, blocks, _ADAM_EPS, lazy=True),
+            # Culling reads the scales of all anchors in every step.
+            "log_scales": make_table(model.log_scales, None, _ADAM_EPS, lazy=False),
+        }
+        self.optimizer = Adam(
+            {n: t for n, t in trained.items() if n not in PER_ANCHOR}, eps=_ADAM_EPS
+        )
+        self._seen_layout = dataclasses.replace(layout, num_periods=1)
+        self._one_period = torch.ones(1, device=model.device)
+        self.background = torch.from_numpy(train.background).to(model.device)
+        self.sampler = ViewSampler(len(train.views), seed)
+        self._middle = train.points.astype(np.float64).mean(axis=0)
+        self.growth_generator = np.random.default_rng((seed, 1))
+        self.noise_generator = np.random.default_rng((seed, 2))
+        self.statistics: DensityStatistics | None = None
+
+    def step(self, index: int, progress: float) -> StepReport:
+        """Render one training view, learn from it, and grow and prune where a round is due."""
+        done = self._progress_after(index, progress)
+        position = self.sampler.next()
+        view = self.train.views[position]
+        photo = self.train.load_image(position)
+        if done <= self.config.coarse_until:
+            factor = self.config.coarse_factor
+            view, photo = coarser_view(view, factor), coarser_image(photo, factor)
+        visible = self.model.visible(view)
+        if len(visible) == 0:  # nothing to learn from; the image is the background
+            return StepReport(loss=float("nan"), primitives=len(self.model))
+        loss = self._learn(view, photo, visible, done)
+        resized = self._densify_if_due(index, done)
+        self._update(done, resized=resized)
+        return StepReport(loss=loss, primitives=len(self.model))
+
+    def _progress_after(self, index: int, progress: float) -> float:
+        """Share of the training that is over once this step is done."""
+        return progress * (index + 1) / index if index > 0 else 1.0 / self.config.iterations
+
+    def _learn(
+        self, view: TrainingView, photo: NDArray[np.uint8], visible: np.ndarray, done: float
+    ) -> float:
+        everything = torch.arange(len(visible), device=self.model.device)
+        decoded, positions = self._seen(visible, view.period).decode_living(
+            self._one_period, self._seen_from(view), everything
+        )
+        raster = draw(decoded, view, self.background, check_finite=False)
+        target = torch.from_numpy(photo).to(self.model.device)
+        loss = photometric_loss(raster.image[0], target, ssim_weight=self.config.ssim_weight)
+        if self.config.scale_weight:
+            volume = mean_volume(decoded.scales, decoded.opacities)
+            loss = loss + self.config.scale_weight * volume
+        loss.backward()
+        if self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN:
+            self._count(view, visible, positions, decoded.opacities, raster.info)
+        return float(loss.detach())
+
+    def _seen(self, visible: np.ndarray, period: int) -> AnchorModel:
+        """The visible anchors with the features of one period: a model of a single period."""
+        tables, model = self.tables, self.model
+        return AnchorModel(
+            self._seen_layout,
+            anchors=model.anchors[torch.from_numpy(visible).to(model.device)],
+            offsets=tables["offsets"].fetch(visible),
+            features=tables["features"].fetch(visible, (0, 1 + period)),
+            log_scales=tables["log_scales"].fetch(visible),
+            global_features=model.global_features[period : period + 1],
+            heads=model.heads,
+        )
+
+    def snapshot(self) -> AnchorModel:
+        """The model up to date: in `model`, anchors that no view saw lately lag behind."""
+        tensors = self.model.tensors()
+        tensors |= {name: table.snapshot() for name, table in self.tables.items()}
+        return AnchorModel.from_tensors(self.model.layout, tensors)
+
+    def _seen_from(self, view: TrainingView) -> Tensor:
+        """Camera centre for the viewing directions, shifted by chance if so configured. [3]"""
+        centre = camera_centre_tensor(view, self.model.device)
+        if self.config.direction_noise:
+            distance = float(np.linalg.norm(centre.cpu().numpy() - self._middle))
+            shift = self.noise_generator.normal(0.0, self.config.direction_noise * distance, 3)
+            centre = centre + torch.from_numpy(shift.astype(np.float32)).to(centre.device)
+        return centre
+
+    def _count(
+        self,
+        view: TrainingView,
+        visible: np.ndarray,
+        positions: Tensor,
+        opacities: Tensor,
+        info: RasterInfo,
+    ) -> None:
+        assert info.means2d.grad is not None
+        if self.statistics is None:
+            self.statistics = DensityStatistics(len(self.model), self.model.layout.offsets)
+        self.statistics.update(
+            visible,
+            positions.cpu().numpy(),
+            opacities.detach().cpu().numpy(),
+            info.radii[0].cpu().numpy(),
+            info.means2d.grad[0].cpu().numpy(),
+            view.width,
+            view.height,
+        )
+
+    def _densify_if_due(self, index: int, done: float) -> bool:
+        """Grow and prune; whether the rows of the anchors changed."""
+        config = self.config
+        if done >= config.density_until - _MARGIN:
+            self.statistics = None
+            return False
+        sign = 1.0 if config.first_round == "after" else -1.0
+        started = done > config.density_from + sign * _MARGIN
+        if not started or (index + 1) % config.density_interval or self.statistics is None:
+            return False
+        for table in self.tables.values():
+            table.flush()
+        self._grow(self.statistics)
+        self._prune(self.statistics)
+        return True
+
+    def _grow(self, statistics: DensityStatistics) -> None:
+        model = self.model
+        names = ("anchors", "offsets", "log_scales", "features")
+        arrays = AnchorArrays(*(getattr(model, n).detach().cpu().numpy() for n in names))
+        new = grow(arrays, statistics, self.rules, self.growth_generator)
+        rows = {
+            "offsets": np.zeros((len(new), *model.offsets.shape[1:]), np.float32),
+            "features": new.features,
+            "log_scales": new.log_scales,
+        }
+        for name, array in rows.items():
+            table = self.tables[name].extend(torch.from_numpy(array).to(model.device))
+            setattr(model, name, table)
+        positions = torch.from_numpy(new.positions).to(model.device)
+        model.anchors = torch.cat([model.anchors, positions])
+        statistics.extend(len(new))
+
+    def _prune(self, statistics: DensityStatistics) -> None:
+        """Drop anchors; bound the scales. A model is never left without any anchor."""
+        keep = prune_mask(statistics, self.rules)
+        if not keep.all() and keep.any():
+            mask = torch.from_numpy(keep).to(self.model.device)
+            for name, table in self.tables.items():
+                setattr(self.model, name, table.keep(mask))
+            self.model.anchors = self.model.anchors[mask]
+            statistics.keep(keep)
+        with torch.no_grad():
+            self.model.log_scales[:, 3:].clamp_(max=self.config.max_log_scale)
+
+    def _update(self, done: float, *, resized: bool) -> None:
+        """Adam. After a round only MLPs and global features move, as in the official code, where
+        the anchors then have new tensors without gradients."""
+        rates = {name: log_linear(done, *rate) for name, rate in self.rates.items()}
+        self.optimizer.step(rates)
+        self.optimizer.zero_grad()
+        if not resized:
+            for name, table in self.tables.items():
+                if name in rates:
+                    table.step(rates[name])
+        self._decay(rates, resized)
+        if self.after_update is not None and "features" in rates and not resized:
+            self.tables["features"].flush()
+            self.after_update(self.model, rates)
+
+    @torch.no_grad()
+    def _decay(self, rates: Mapping[str, float], resized: bool) -> None:
+        """Decoupled weight decay; off unless configured."""
+        config = self.config
+        if config.feature_decay and "features" in rates and not resized:
+            factor = 1.0 - rates["features"] * config.feature_decay
+            self.tables["features"].flush().mul_(factor)
+        if config.head_decay:
+            for name, value in self.optimizer.params.items():
+                if name.endswith(".w1"):
+                    value.mul_(1.0 - rates[name] * config.head_decay)

@@ -1,0 +1,155 @@
+"""Figures of runs: predictions side by side with the photos, one row per period."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import shorten
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.bench.ground_truth import ground_truth_folder
+from chronoscene.bench.image_store import ImageEntry, load_image, read_manifest, safe_name
+from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord, read_run, run_folders
+from chronoscene.io.files import replacing
+from chronoscene.metrics.psnr_ssim import psnr
+
+CELL_WIDTH = 2.6
+"""Inches per image."""
+ERROR_RANGE = 0.25
+"""Mean absolute error over channels that saturates the error map, as a share of full scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One method in a figure."""
+
+    title: str
+    folder: Path
+    """Its predictions."""
+    entries: dict[str, ImageEntry]
+
+
+def draw_figures(runs: Path, *, views_per_period: int = 1) -> list[Path]:
+    """Draw the comparison and the error maps of every scene; returns the files."""
+    by_scene: dict[str, list[tuple[Path, RunRecord]]] = {}
+    for folder in run_folders(runs):
+        record = read_run(folder)
+        by_scene.setdefault(record.scene, []).append((folder, record))
+    written = []
+    for scene, found in by_scene.items():
+        columns = [_column(folder, record) for folder, record in first_seeds(found)]
+        truth = ground_truth_folder(runs, scene)
+        labels = found[0][1].period_labels
+        rows = chosen_views(truth, views_per_period)
+        for errors, name in ((False, "comparison"), (True, "errors")):
+            path = runs / FIGURES / f"{safe_name(scene)}_{name}.png"
+            _draw(path, scene, truth, rows, columns, labels, errors=errors)
+            written.append(path)
+    return written
+
+
+def first_seeds(found: Sequence[tuple[Path, RunRecord]]) -> list[tuple[Path, RunRecord]]:
+    """The lowest seed of each method, strategy and preset."""
+    chosen: dict[tuple[str, str, str], tuple[Path, RunRecord]] = {}
+    for folder, record in sorted(found, key=lambda item: item[1].seed):
+        chosen.setdefault((record.method, record.strategy, record.preset), (folder, record))
+    return sorted(chosen.values(), key=lambda item: str(item[0]))
+
+
+def chosen_views(truth: Path, per_period: int) -> list[ImageEntry]:
+    """Views spread evenly over the test views of each period, in name order."""
+    by_period: dict[int, list[ImageEntry]] = {}
+    for entry in read_manifest(truth).images:
+        by_period.setdefault(entry.camera_period, []).append(entry)
+    chosen = []
+    for _, entries in sorted(by_period.items()):
+        count = min(per_period, len(entries))
+        chosen += [entries[(2 * i + 1) * len(entries) // (2 * count)] for i in range(count)]
+    return chosen
+
+
+def _column(folder: Path, record: RunRecord) -> Column:
+    predictions = folder / PREDICTIONS
+    entries = {e.view: e for e in read_manifest(predictions).images}
+    title = f"{record.title}\n{record.strategy}, {record.preset}"
+    return Column(title, predictions, entries)
+
+
+def _draw(
+    path: Path,
+    scene: str,
+    truth: Path,
+    rows: Sequence[ImageEntry],
+    columns: Sequence[Column],
+    labels: dict[str, str],
+    *,
+    errors: bool,
+) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    aspect = float(np.mean([entry.height / entry.width for entry in rows]))
+    # Room for a caption under each image, the titles above and the colour bar below; what is left
+    # over is cut off when the figure is saved.
+    size = (CELL_WIDTH * (1 + len(columns)), (CELL_WIDTH * aspect + 0.3) * len(rows) + 1.2)
+    figure = Figure(figsize=size, layout="compressed", dpi=150)
+    FigureCanvasAgg(figure)
+    axes: Any = figure.subplots(len(rows), 1 + len(columns), squeeze=False)
+    image = None
+    for row, entry in zip(axes, rows, strict=True):
+        image = _draw_row(row, truth, entry, columns, labels, errors=errors)
+    for axis, title in zip(axes[0], ["ground truth", *(c.title for c in columns)], strict=True):
+        axis.set_title(title, fontsize=10)
+    if errors and image is not None:
+        bar = figure.colorbar(image, ax=axes, location="bottom", shrink=0.4, aspect=40, pad=0.01)
+        bar.set_label("mean absolute error, share of full scale", fontsize=9)
+    what = "error of the test views" if errors else "test views"
+    figure.suptitle(f"{scene}: {what}", fontsize=12)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as partial:
+        figure.savefig(partial, format="png", bbox_inches="tight", pad_inches=0.1)
+
+
+def _draw_row(
+    axes: Any,
+    truth: Path,
+    entry: ImageEntry,
+    columns: Sequence[Column],
+    labels: dict[str, str],
+    *,
+    errors: bool,
+) -> Any:
+    """One view: the photo, then each method with its PSNR. Returns the last error map."""
+    photo = load_image(truth, entry)
+    axes[0].imshow(photo)
+    axes[0].set_ylabel(shorten(period_title(entry.camera_period, labels), 26), fontsize=10)
+    axes[0].set_xlabel(entry.view, fontsize=8)
+    shown = None
+    for axis, column in zip(axes[1:], columns, strict=True):
+        image = load_image(column.folder, column.entries[entry.view])
+        if errors:
+            error = mean_error(image, photo)
+            shown = axis.imshow(error, vmin=0, vmax=ERROR_RANGE, cmap="magma")
+        else:
+            axis.imshow(image)
+        axis.set_xlabel(f"{psnr(image, photo):.2f} dB", fontsize=9)
+    for axis in axes:
+        axis.set_xticks([])
+        axis.set_yticks([])
+    return shown
+
+
+def period_title(period: int, labels: dict[str, str]) -> str:
+    """The label of a period, or its number where it has none."""
+    label = labels.get(str(period), str(period))
+    return f"period {label}" if label == str(period) else label
+
+
+def mean_error(image: NDArray[np.uint8], photo: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Mean absolute error over the channels, 0..1. [H, W]"""
+    difference = image.astype(np.float64) - photo.astype(np.float64)
+    return np.asarray(np.abs(difference).mean(axis=2) / 255.0)

@@ -1,0 +1,204 @@
+"""Folders of 8-bit PNG images with a manifest: predictions, and the frozen ground truth.
+
+A view's file is ``<view name>.png`` below the folder. The manifest lists every file with its
+SHA-256; a file that does not agree is refused, and no path in a manifest leads out of its folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from chronoscene.errors import CheckpointError
+from chronoscene.io.files import write_text_atomic
+
+MANIFEST = "manifest.json"
+
+_UNSAFE = re.compile(r'[%<>:"|?*\\\x00-\x1f\x7f]')
+
+
+class ImageEntry(BaseModel):
+    """One image of a folder."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    view: str
+    """Full name of the frame."""
+    camera_period: int
+    """Period in which the photo was taken."""
+    rendered_period: int
+    """Period that the image shows."""
+    file: str
+    """Path below the folder."""
+    sha256: str
+    width: int
+    height: int
+
+
+class Manifest(BaseModel):
+    """What a folder of images holds and what it belongs to."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format_version: Literal[1]
+    kind: Literal["predictions", "ground truth"]
+    scene: str
+    scene_hash: str
+    details: Mapping[str, Any]
+    """Evaluation size and the like."""
+    images: tuple[ImageEntry, ...]
+
+
+def safe_name(name: str) -> str:
+    """A name as a path that every file system takes: odd characters become ``%XX``."""
+    return _UNSAFE.sub(lambda match: f"%{ord(match.group()):02X}", name)
+
+
+def image_file(view: str) -> str:
+    """Path of a view's image below its folder.
+
+    Raises:
+        CheckpointError: If the name would lead out of the folder.
+    """
+    return f"{_inside(safe_name(view))}.png"
+
+
+def _inside(path: str) -> PurePosixPath:
+    pure = PurePosixPath(path)
+    if not pure.parts or pure.is_absolute() or ".." in pure.parts or "\\" in path or "\0" in path:
+        raise CheckpointError(
+            repr(path),
+            expected="a path below its folder",
+            found="one that leads elsewhere",
+            todo="do not use these files",
+        )
+    return pure
+
+
+def to_bytes(rgb: ArrayLike) -> NDArray[np.uint8]:
+    """Quantise 0..1 to 0..255 by rounding; values outside are clipped. [H, W, 3]"""
+    image = np.asarray(rgb)
+    if image.dtype == np.uint8:
+        return image
+    return np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def encode_png(image: NDArray[np.uint8]) -> bytes:
+    """PNG bytes of an RGB image. [H, W, 3]"""
+    import cv2
+
+    done, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+    assert done
+    return data.tobytes()
+
+
+class ImageWriter:
+    """Writes images one by one; `close` makes the folder complete."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._entries: list[ImageEntry] = []
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def add(self, view: str, image: ArrayLike, *, camera_period: int, rendered_period: int) -> None:
+        """Write one image: uint8, or floats 0..1. [H, W, 3]"""
+        pixels = to_bytes(image)
+        data = encode_png(pixels)
+        file = image_file(view)
+        target = self.folder / file
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(data)
+        self._entries.append(
+            ImageEntry(
+                view=view,
+                camera_period=camera_period,
+                rendered_period=rendered_period,
+                file=file,
+                sha256=hashlib.sha256(data).hexdigest(),
+                width=pixels.shape[1],
+                height=pixels.shape[0],
+            )
+        )
+
+    def close(
+        self,
+        *,
+        kind: Literal["predictions", "ground truth"],
+        scene: str,
+        scene_hash: str,
+        details: Mapping[str, Any],
+    ) -> Manifest:
+        """Write the manifest, last of all."""
+        manifest = Manifest(
+            format_version=1,
+            kind=kind,
+            scene=scene,
+            scene_hash=scene_hash,
+            details=dict(details),
+            images=tuple(sorted(self._entries, key=lambda e: e.view)),
+        )
+        write_text_atomic(self.folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
+        return manifest
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read and check a manifest.
+
+    Raises:
+        CheckpointError: If it is missing, damaged, or names a path outside the folder.
+    """
+    path = folder / MANIFEST
+    try:
+        manifest = Manifest.model_validate_json(path.read_bytes())
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            path, expected="a manifest of images", found="no such file", todo="run bench again"
+        ) from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the file"
+        raise _untrusted(path, f"{first['msg']} ({where})") from error
+    views = [(e.view, e.rendered_period) for e in manifest.images]
+    if len(set(views)) != len(views):
+        raise _untrusted(path, "a view twice")
+    for entry in manifest.images:
+        _inside(entry.file)
+    return manifest
+
+
+def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
+    """Read one image. [H, W, 3]
+
+    Raises:
+        CheckpointError: If the file is missing or not the one that the manifest lists.
+    """
+    import cv2
+
+    path = folder / _inside(entry.file)
+    if not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
+        raise CheckpointError(path, expected="an image", found="no such file", todo="run again")
+    data = path.read_bytes()
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise CheckpointError(
+            path,
+            expected=f"the file with SHA-256 {entry.sha256[:12]}... that {MANIFEST} lists",
+            found="another one",
+            todo="the image was changed after it was rendered: delete the run and bench again",
+        )
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None or image.shape[:2] != (entry.height, entry.width):
+        raise _untrusted(path, "an image of another size" if image is not None else "no image")
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def _untrusted(path: Path, found: str) -> CheckpointError:
+    return CheckpointError(
+        path, expected="what bench wrote", found=found, todo="delete the folder and bench again"
+    )

@@ -1,0 +1,216 @@
+"""Text models, line by line, so that a finding can name the line.
+
+Fields are separated by blanks. Cameras: ``id model width height params...``. Images take two lines:
+``id qw qx qy qz tx ty tz camera_id name``, then ``x y point_id`` for each keypoint (an empty line
+for none). Points: ``id x y z r g b error``, then ``image_id keypoint_index`` for each observation.
+Empty lines and lines that begin with ``#`` are skipped where a new record may begin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.colmap.arrays import CAMERA_MODELS, RawImages, RawPoints
+from chronoscene.colmap.binary import CAMERA_PARAMETERS
+from chronoscene.colmap.raw_model import Damage, DamagedError
+from chronoscene.scene import Camera
+from chronoscene.validation.finding import quote
+
+BLOCK = 20_000
+"""Lines whose fields are in memory as text at one time."""
+
+MOST_DAMAGES = 100
+"""Damaged lines of one file that are listed."""
+
+_IMAGE_LINE = '"<id> <qw> <qx> <qy> <qz> <tx> <ty> <tz> <camera id> <name>" with blanks between'
+_KEYPOINT_LINE = '"<x> <y> <point id>" for each keypoint'
+_POINT_LINE = '"<id> <x> <y> <z> <r> <g> <b> <error>" and pairs "<image id> <keypoint>"'
+
+Line = tuple[int, str]
+"""Number from 1, and the text without surrounding blanks."""
+
+
+def read_cameras(path: Path) -> tuple[Camera, ...]:
+    """Cameras in the order of the file.
+
+    Raises:
+        DamagedError: With every line that is not a camera.
+    """
+    cameras, damages = [], []
+    for number, line in _records(_lines(path)):
+        camera = _camera(line.split())
+        if isinstance(camera, Camera):
+            cameras.append(camera)
+        else:
+            damages.append(Damage(f"{path.name}:{number}", camera, quote(line)))
+    _raise_any(damages)
+    return tuple(cameras)
+
+
+def _camera(fields: list[str]) -> Camera | str:
+    """The camera of a line, or what was expected."""
+    if len(fields) < 4 or fields[1] not in CAMERA_MODELS:
+        return '"<id> <model> <width> <height> <parameters>" with a model of COLMAP'
+    count = CAMERA_PARAMETERS[CAMERA_MODELS.index(fields[1])]
+    try:
+        camera_id, width, height = (int(fields[i]) for i in (0, 2, 3))
+        params = tuple(float(text) for text in fields[4:])
+    except ValueError:
+        return "numbers after the name of the camera model"
+    if len(params) != count:
+        return f"{count} parameters for {fields[1]}"
+    if not 0 <= camera_id < 2**32:
+        return "a camera id of 32 bits"
+    return Camera(camera_id, fields[1], width, height, params)
+
+
+def read_images(path: Path) -> RawImages:
+    """Images in the order of the file.
+
+    Raises:
+        DamagedError: With every line that is not right.
+    """
+    heads, names, keypoint_lines, damages = [], [], [], []
+    lines = _lines(path)
+    for number, line in _records(lines):
+        keypoint_lines.append(next(lines, (number + 1, "")))
+        fields = line.split(maxsplit=9)
+        try:
+            ids = float(int(fields[0])), float(int(fields[8]))
+            heads.append([ids[0], *map(float, fields[1:8]), ids[1]])
+            names.append(fields[9])
+        except (ValueError, IndexError, OverflowError):
+            damages.append(Damage(f"{path.name}:{number}", _IMAGE_LINE, quote(line)))
+    values, lengths = _numbers(path, keypoint_lines, _KEYPOINT_LINE, _triples, damages)
+    _raise_any(damages)
+    infinite = np.flatnonzero(~np.isfinite(values))
+    for row in np.unique(np.searchsorted(np.cumsum(lengths), infinite, "right")):
+        number, line = keypoint_lines[row]  # COLMAP stops reading there
+        damages.append(
+            Damage(f"{path.name}:{number}", "finite positions of keypoints", quote(line))
+        )
+    _raise_any(damages)
+    table = np.array(heads, np.float64).reshape(-1, 9)
+    keypoints = values.reshape(-1, 3)
+    return RawImages(
+        ids=_integers(table[:, 0]),
+        names=tuple(names),
+        quaternions=table[:, 1:5],
+        translations=table[:, 5:8],
+        camera_ids=_integers(table[:, 8]),
+        keypoint_start=np.concatenate([[0], np.cumsum(lengths // 3)]),
+        keypoint_xy=np.ascontiguousarray(keypoints[:, :2]),
+        keypoint_point=_integers(keypoints[:, 2]),
+    )
+
+
+def read_points(path: Path) -> RawPoints:
+    """Points sorted by id.
+
+    Raises:
+        DamagedError: With every line that is not a point, or with the ids that come twice.
+    """
+    damages: list[Damage] = []
+    lines = list(_records(_lines(path)))
+    values, lengths = _numbers(path, lines, _POINT_LINE, _point, damages)
+    _raise_any(damages)
+    start = np.concatenate([[0], np.cumsum(lengths)])
+    heads = values[start[:-1, None] + np.arange(8)]
+    rgb = heads[:, 4:7]
+    for row in np.flatnonzero(~((rgb >= 0) & (rgb <= 255) & (rgb == np.floor(rgb))).all(axis=1)):
+        number, line = lines[row]
+        damages.append(Damage(f"{path.name}:{number}", "a colour of three 0..255", quote(line)))
+    _raise_any(damages)
+    order = np.argsort(heads[:, 0], kind="stable")
+    ids = _integers(heads[order, 0])
+    if len(twice := ids[1:][ids[1:] == ids[:-1]]):
+        raise DamagedError(Damage(path.name, "each point once", f"point id {twice[0]} twice"))
+    pairs = (lengths[order] - 8) // 2
+    track_start = np.concatenate([[0], np.cumsum(pairs)])
+    at = np.repeat(start[:-1][order] + 8 - 2 * track_start[:-1], pairs)
+    at += 2 * np.arange(track_start[-1])
+    return RawPoints(
+        ids=ids,
+        xyz=np.ascontiguousarray(heads[order, 1:4]),
+        rgb=rgb[order].astype(np.uint8),
+        error=heads[order, 7].copy(),
+        track_start=track_start,
+        track_image=_integers(values[at]),
+        track_keypoint=_integers(values[at + 1]),
+    )
+
+
+def _triples(count: int) -> bool:
+    return count % 3 == 0
+
+
+def _point(count: int) -> bool:
+    return count >= 8 and count % 2 == 0
+
+
+def _lines(path: Path) -> Iterator[Line]:
+    text = path.read_bytes().decode("utf-8", "surrogateescape")
+    yield from ((i, line.strip()) for i, line in enumerate(text.split("\n"), start=1))
+
+
+def _records(lines: Iterator[Line]) -> Iterator[Line]:
+    """Lines where a record begins; the caller may take more lines from the same iterator."""
+    for number, line in lines:
+        if line and not line.startswith("#"):
+            yield number, line
+
+
+def _numbers(
+    path: Path,
+    lines: Sequence[Line],
+    expected: str,
+    fits: Callable[[int], bool],
+    damages: list[Damage],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """All numbers of some lines, one after the other, and how many each line has.
+
+    Lines that are not numbers, or of a number that does not fit, are added to ``damages``.
+    """
+    blocks, lengths = [np.zeros(0)], [np.zeros(0, np.int64)]
+    for first in range(0, len(lines), BLOCK):
+        block = lines[first : first + BLOCK]
+        fields = [line.split() for _, line in block]
+        counts = list(map(len, fields))
+        try:
+            blocks.append(np.array(list(chain.from_iterable(fields)), np.float64))
+            bad = [i for i, count in enumerate(counts) if not fits(count)]
+        except ValueError:
+            bad = [i for i, row in enumerate(fields) if not (fits(len(row)) and _all_numbers(row))]
+        for i in bad:
+            number, line = block[i]
+            damages.append(Damage(f"{path.name}:{number}", expected, quote(line)))
+        lengths.append(np.array(counts, np.int64))
+    return np.concatenate(blocks), np.concatenate(lengths)
+
+
+def _integers(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Cast; what is not finite becomes some number that no id has, without a warning."""
+    with np.errstate(invalid="ignore"):
+        return values.astype(np.int64)
+
+
+def _all_numbers(fields: Sequence[str]) -> bool:
+    try:
+        np.array(fields, np.float64)
+    except ValueError:
+        return False
+    return True
+
+
+def _raise_any(damages: list[Damage]) -> None:
+    if len(damages) > MOST_DAMAGES:
+        file = damages[0].file.split(":")[0]
+        more = Damage(file, "records", f"{len(damages) - MOST_DAMAGES} more damaged lines")
+        raise DamagedError(*damages[:MOST_DAMAGES], more)
+    if damages:
+        raise DamagedError(*damages)

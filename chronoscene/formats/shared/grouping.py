@@ -1,0 +1,166 @@
+"""Periods from dates, times, folders or a table: the answers to ``--period-by``.
+
+A value of the option is ``year``, ``month``, ``day`` (dates only), ``gap:X`` (a new period where
+two neighbours are more than X apart: days, or the unit of the times), ``count:N`` (N periods, cut
+at the N - 1 widest gaps) or ``table:FILE`` (a CSV file with the columns ``file`` and ``period``).
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import date
+from itertools import pairwise
+from pathlib import Path
+
+from chronoscene.errors import ConfigError, SceneError
+from chronoscene.formats.shared.labels import is_iso_date
+from chronoscene.scene import Period
+from chronoscene.scene.splits import NameIndex, read_text
+
+Grouped = tuple[dict[str, int], tuple[Period, ...]]
+"""Period of each image, and the periods."""
+
+OPTION = "--period-by"
+
+TABLE = "table:"
+
+_CALENDAR = {"year": 4, "month": 7, "day": 10}
+"""Characters of an ISO date that images of one period share."""
+
+
+def natural_key(text: str) -> tuple[tuple[tuple[int, int | str], ...], str]:
+    """Sorts ``t2`` before ``t10``; texts that differ in leading zeros alone by the text."""
+    parts = re.findall(r"[0-9]{1,18}|[^0-9]+", text)
+    numbers = tuple((0, int(part)) if part[0] in "0123456789" else (1, part) for part in parts)
+    return numbers, text
+
+
+def group_dates(dates: Mapping[str, date], by: str) -> Grouped:
+    """Group images by the dates on which they were taken.
+
+    Raises:
+        ConfigError: If ``by`` is not one of the rules, or asks for more periods than there are
+            dates.
+    """
+    if by in _CALENDAR:
+        length = _CALENDAR[by]
+        keys = {name: when.isoformat()[:length] for name, when in dates.items()}
+        order = sorted(set(keys.values()))
+        periods = tuple(Period(i, key, key) for i, key in enumerate(order))
+        return {name: order.index(key) for name, key in keys.items()}, periods
+    days = {name: float(when.toordinal()) for name, when in dates.items()}
+
+    def describe(first: float, last: float) -> tuple[str, str | None]:
+        a, b = (date.fromordinal(int(x)).isoformat() for x in (first, last))
+        shared = next((a[:n] for n in (10, 7, 4) if a[:n] == b[:n]), None)
+        return (a if a == b else f"{a} to {b}"), shared
+
+    return _group_numbers(days, by, describe, rules=(*_CALENDAR, "gap:DAYS", "count:N"))
+
+
+def group_times(times: Mapping[str, float], by: str) -> Grouped:
+    """Group images by times of an unknown unit; labels are times.
+
+    Raises:
+        ConfigError: As `group_dates`.
+    """
+
+    def describe(first: float, last: float) -> tuple[str, str | None]:
+        return (f"{first:g}" if first == last else f"{first:g} to {last:g}"), None
+
+    return _group_numbers(times, by, describe, rules=("gap:X", "count:N"))
+
+
+def group_labels(labels: Mapping[str, str], order: Sequence[str]) -> Grouped:
+    """One period for each label, in the given order; a label that is a date is the date too."""
+    index = {label: i for i, label in enumerate(order)}
+    periods = tuple(Period(i, label, label_date(label)) for i, label in enumerate(order))
+    return {name: index[label] for name, label in labels.items()}, periods
+
+
+def label_date(label: str) -> str | None:
+    """The label itself where it is an ISO date: year-month-day, year-month or a year."""
+    return label if label[:2] in ("19", "20") and is_iso_date(label) else None
+
+
+def group_by_table(names: Sequence[str], path: Path) -> Grouped:
+    """Periods from a CSV file; labels are sorted naturally, so numbers and dates are in order.
+
+    Raises:
+        SceneError: If the file is damaged, an image is missing or ambiguous in it.
+    """
+    index = NameIndex(names)
+    labels: dict[str, str] = {}
+    try:
+        rows = list(csv.DictReader(read_text(path).splitlines()))
+    except csv.Error as error:
+        raise _table_error(path, "a CSV file", str(error)) from error
+    if not rows or not {"file", "period"} <= rows[0].keys():
+        raise _table_error(path, "the columns file and period, and at least one row", "others")
+    for number, row in enumerate(rows, start=2):
+        name, label = (row["file"] or "").strip(), (row["period"] or "").strip()
+        found = index.find(name)
+        if len(found) > 1:
+            raise _table_error(f"{path}:{number}", "a name that fits one image", repr(name))
+        if found and label and labels.setdefault(found[0], label) != label:
+            raise _table_error(f"{path}:{number}", f"one period of {name!r}", "two")
+    if lost := [name for name in names if name not in labels]:
+        raise _table_error(path, f"a period of every image, {lost[0]!r} too", "none")
+    return group_labels(labels, sorted(set(labels.values()), key=natural_key))
+
+
+def _table_error(place: object, expected: str, found: str) -> SceneError:
+    return SceneError(place, expected=expected, found=found, todo="correct the table")
+
+
+def rule_error(by: str, rules: Iterable[str]) -> ConfigError:
+    """A value of the option that a format does not know."""
+    return ConfigError(
+        OPTION, expected=f"one of {', '.join(rules)}", found=repr(by), todo="choose one of them"
+    )
+
+
+def _group_numbers(
+    values: Mapping[str, float],
+    by: str,
+    describe: Callable[[float, float], tuple[str, str | None]],
+    *,
+    rules: tuple[str, ...],
+) -> Grouped:
+    """Cut the sorted distinct values where the rule says, and number the pieces."""
+    distinct = sorted(set(values.values()))
+    pieces = _pieces(distinct, by, rules)
+    index = {value: i for i, piece in enumerate(pieces) for value in piece}
+    periods = tuple(Period(i, *describe(piece[0], piece[-1])) for i, piece in enumerate(pieces))
+    return {name: index[value] for name, value in values.items()}, periods
+
+
+def _pieces(distinct: list[float], by: str, rules: tuple[str, ...]) -> list[list[float]]:
+    gaps = [b - a for a, b in pairwise(distinct)]
+    kind, _, number = by.partition(":")
+    if kind == "gap" and _positive(number):
+        cuts = [i for i, gap in enumerate(gaps) if gap > float(number)]
+    elif kind == "count" and re.fullmatch("[1-9][0-9]{0,5}", number):
+        if int(number) > len(distinct):
+            raise ConfigError(
+                f"{OPTION} {by}",
+                expected=f"at most {len(distinct)} periods",
+                found=number,
+                todo="ask for no more periods than there are different dates or times",
+            )
+        widest = sorted(range(len(gaps)), key=lambda i: (-gaps[i], i))
+        cuts = sorted(widest[: int(number) - 1])
+    else:
+        raise rule_error(by, rules)
+    ends = [0, *(i + 1 for i in cuts), len(distinct)]
+    return [distinct[a:b] for a, b in pairwise(ends)]
+
+
+def _positive(text: str) -> bool:
+    try:
+        return math.isfinite(float(text)) and float(text) > 0
+    except ValueError:
+        return False

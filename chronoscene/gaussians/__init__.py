@@ -1,0 +1,1 @@
+"""Scenes as explicit Gaussians: parameters, colours, density control."""

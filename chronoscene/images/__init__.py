@@ -1,0 +1,1 @@
+"""Image files: decoding and the cache, metadata, resampling, undistorted cameras."""

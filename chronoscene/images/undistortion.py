@@ -1,0 +1,175 @@
+"""Cameras without distortion, and where pixels are in their images."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.colmap.model import project_points, undistorted_camera, unproject_pixels
+from chronoscene.errors import SceneError
+from chronoscene.formats.shared.colmap_layout import filter_observations
+from chronoscene.images.store import image_size, resize_camera
+from chronoscene.scene import Camera, Frame, Scene
+
+ROWS = 128
+"""Rows of a map that are computed at once, to bound the memory."""
+
+LARGEST_SIDE = 65535
+"""Pixels; what a JPEG file can hold. A camera that needs more is a mistake."""
+
+LARGEST_DISAGREEMENT = 0.01
+"""Pixels between an observation and the projection of its ray."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraChange:
+    """A camera before and after, for images of one size."""
+
+    source: Camera
+    """At the size of the image files."""
+    target: Camera
+
+    @property
+    def is_copy(self) -> bool:
+        """Whether pixels stay as they are."""
+        same_size = (self.source.width, self.source.height) == (
+            self.target.width,
+            self.target.height,
+        )
+        same_K = np.array_equal(self.source.K, self.target.K)
+        return self.source.is_pinhole and same_size and same_K
+
+
+def plan_cameras(scene: Scene, *, center: bool = False) -> list[CameraChange]:
+    """New camera of each frame; images of one camera and one size share it."""
+    targets: dict[tuple[Camera, int, int], CameraChange] = {}
+    used: set[int] = set()
+    spare = 1 + max((f.camera.camera_id for f in scene.frames), default=0)
+    changes = []
+    for frame in scene.frames:
+        size = image_size(scene.image_path(frame))
+        key = (frame.camera, *size)
+        if key not in targets:
+            camera_id = frame.camera.camera_id
+            if camera_id in used:
+                camera_id, spare = spare, spare + 1
+            used.add(camera_id)
+            source = resize_camera(frame.camera, *size)
+            target = replace(pinhole_camera(source, center=center), camera_id=camera_id)
+            targets[key] = CameraChange(source, target)
+        changes.append(targets[key])
+    return changes
+
+
+def pinhole_camera(camera: Camera, *, center: bool = False) -> Camera:
+    """The PINHOLE camera for the images of a camera.
+
+    Raises:
+        SceneError: If there is none: not perspective, or no principal point inside to centre.
+    """
+    if camera.is_pinhole:
+        K = camera.K
+        params = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item())
+        camera = replace(camera, model="PINHOLE", params=params)
+    else:
+        camera = undistorted_camera(camera)
+    if not np.isfinite(camera.params).all():
+        raise _camera_error(camera, "a camera that can be undistorted")
+    if center:
+        camera = _centred(camera)
+    if max(camera.width, camera.height) > LARGEST_SIDE:
+        raise _camera_error(camera, f"at most {LARGEST_SIDE} pixels a side")
+    return camera
+
+
+def _centred(camera: Camera) -> Camera:
+    """The largest image inside of the camera's that has the principal point in its centre."""
+    fx, fy, cx, cy = camera.params
+    width = 2 * math.floor(min(cx, camera.width - cx))
+    height = 2 * math.floor(min(cy, camera.height - cy))
+    if min(width, height) < 2:
+        raise _camera_error(camera, "a principal point inside the image")
+    return replace(camera, width=width, height=height, params=(fx, fy, width / 2, height / 2))
+
+
+def _camera_error(camera: Camera, expected: str) -> SceneError:
+    found = f"{camera.width} x {camera.height}, {tuple(round(p, 3) for p in camera.params)}"
+    return SceneError(
+        f"camera {camera.camera_id}", expected=expected, found=found, todo="correct the camera"
+    )
+
+
+def move_observations(scene: Scene, changes: list[CameraChange]) -> tuple[Scene, int, int]:
+    """The scene with its new cameras and observations.
+
+    Returns:
+        The scene, the number of observations that are outside of the new images and were dropped,
+        and the number of points that lost all of theirs and were dropped too.
+    """
+    points = scene.points
+    xy, inside = np.empty_like(points.track_xy), np.zeros(len(points.track_xy), bool)
+    order = np.argsort(points.track_frame, kind="stable")
+    ends = np.searchsorted(points.track_frame[order], np.arange(len(scene.frames) + 1))
+    frames: list[Frame] = []
+    for i, (frame, change) in enumerate(zip(scene.frames, changes, strict=True)):
+        mine = order[ends[i] : ends[i + 1]]
+        size = np.array([frame.camera.width, frame.camera.height])
+        file_size = np.array([change.source.width, change.source.height])
+        xy[mine] = move_pixels(change, points.track_xy[mine] * (file_size / size))
+        limits = np.array([change.target.width, change.target.height])
+        inside[mine] = ((xy[mine] >= 0) & (xy[mine] <= limits)).all(axis=1)
+        frames.append(replace(frame, camera=change.target))
+    moved = filter_observations(
+        replace(points, track_xy=xy), inside, np.arange(len(frames), dtype=np.int32)
+    )
+    lost = (np.diff(points.track_start) > 0) & (np.diff(moved.track_start) == 0)
+    new = replace(scene.with_frames(frames), points=moved.select(~lost))
+    return new, int((~inside).sum()), int(lost.sum())
+
+
+def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where pixels of the old image are in the new one; NaN where nowhere. [N, 2] -> [N, 2]"""
+    if change.is_copy or not len(xy):
+        return xy
+    fx, fy, cx, cy = change.target.params
+    if change.source.is_pinhole:  # exact, whatever the model
+        K = change.source.K
+        with np.errstate(over="ignore"):  # as in `sampling_map`
+            rays = (xy - K[:2, 2]) / K[[0, 1], [0, 1]]
+    else:
+        rays = _rays(change.source, xy)
+    return rays * [fx, fy] + [cx, cy]
+
+
+def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points at depth 1 that a camera sees at pixels. [N, 2] -> [N, 2]
+
+    COLMAP finds them step by step, and returns something even where there is no such ray: beyond
+    the field of view of the model. So they are projected again, and NaN where that disagrees.
+    """
+    rays = unproject_pixels(camera, xy)
+    again = project_points(camera, np.column_stack([rays, np.ones(len(rays))]))
+    wrong = ~(np.abs(again - xy).max(axis=1) < LARGEST_DISAGREEMENT)
+    rays[wrong] = np.nan
+    return rays
+
+
+@lru_cache(maxsize=4)
+def sampling_map(change: CameraChange) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pixel of the old image under each centre of the new one, x and y. [H, W] each"""
+    source, target = change.source, change.target
+    fx, fy, cx, cy = target.params
+    maps = np.empty((2, target.height, target.width), np.float32)
+    with np.errstate(over="ignore"):  # absurd cameras: what has no place becomes infinite
+        x = (np.arange(target.width) + 0.5 - cx) / fx
+        for first in range(0, target.height, ROWS):
+            rows = np.arange(first, min(first + ROWS, target.height))
+            rays = np.ones((len(rows), len(x), 3))
+            rays[..., 0], rays[..., 1] = x, ((rows + 0.5 - cy) / fy)[:, None]
+            pixels = project_points(source, rays.reshape(-1, 3)).reshape(len(rows), len(x), 2)
+            maps[:, rows] = np.moveaxis(pixels, -1, 0)
+    return maps[0], maps[1]

@@ -1,0 +1,1 @@
+"""Outside of this process: files that appear complete or not at all, processes, pycolmap."""

@@ -1,0 +1,130 @@
+"""Small matrix products inside compiled kernels, at a good part of the processor's peak.
+
+A matrix is ``(memory, start, row)``, memory as in `_simd`, with the distance between rows; a left
+factor is ``(memory, start, row, step)`` with the distance between columns too, so that it can be
+read transposed. Lengths are padded to `PADDING`, so there are no remainders.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import types
+from numba.core import cgutils
+
+from chronoscene.kernels.registers import (
+    LANES,
+    MANY_REGISTERS,
+    emit_address,
+    emit_constant,
+    emit_load,
+    emit_multiply_add,
+    emit_splat,
+    emit_store,
+    intrinsic,
+)
+from chronoscene.kernels.training_compilation import inner
+
+ROW_TILE = 8 if MANY_REGISTERS else 4
+"""Rows of the result held in registers, by one or two vectors of columns."""
+PADDING = max(ROW_TILE, LANES)
+
+_INDEX = types.intp
+
+
+class _Matrix:
+    """Addresses in a matrix while code is generated."""
+
+    def __init__(self, context: Any, builder: Any, kind: Any, value: Any) -> None:
+        self.context, self.builder, self.kind = context, builder, kind[0]
+        self.memory, self.start, *self.strides = cgutils.unpack_tuple(builder, value, len(kind))
+
+    def at(self, row: Any, column: Any) -> Any:
+        b = self.builder
+        across = b.mul(column, self.strides[1]) if len(self.strides) > 1 else column
+        index = b.add(b.add(self.start, b.mul(row, self.strides[0])), across)
+        return emit_address(self.context, b, self.kind, self.memory, index)
+
+
+def _make_tile(vectors: int, relu: bool) -> Any:
+    """Make the inner loop of `product` for ROW_TILE rows and some vectors of columns."""
+
+    def tile(
+        typing: Any, left: Any, right: Any, first: Any, out: Any, row: Any, column: Any, depth: Any
+    ) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            a, b, first, c = (
+                _Matrix(context, builder, kind, value)
+                for kind, value in zip(signature.args[:4], args[:4], strict=True)
+            )
+            top, left_column, depth = args[4:]
+            index = top.type
+            rows = [builder.add(top, index(i)) for i in range(ROW_TILE)]
+            columns = [builder.add(left_column, index(i * LANES)) for i in range(vectors)]
+            # LLVM turns these variables into registers.
+            sums = [
+                [
+                    cgutils.alloca_once_value(builder, emit_load(builder, first.at(m, n)))
+                    for n in columns
+                ]
+                for m in rows
+            ]
+            with cgutils.for_range(builder, depth) as loop:
+                vectors_b = [emit_load(builder, b.at(loop.index, n)) for n in columns]
+                for m, row_sums in zip(rows, sums, strict=True):
+                    factor = emit_splat(builder, builder.load(a.at(m, loop.index)))
+                    for total, vector in zip(row_sums, vectors_b, strict=True):
+                        new = emit_multiply_add(builder, factor, vector, builder.load(total))
+                        builder.store(new, total)
+            zero = emit_constant(0.0)
+            for m, row_sums in zip(rows, sums, strict=True):
+                for total, n in zip(row_sums, columns, strict=True):
+                    value = builder.load(total)
+                    if relu:
+                        # Not a maximum: that would turn what is not a number into 0.
+                        negative = builder.fcmp_ordered("<", value, zero)
+                        value = builder.select(negative, zero, value)
+                    emit_store(builder, value, c.at(m, n))
+            return context.get_dummy_value()
+
+        return types.void(left, right, first, out, _INDEX, _INDEX, _INDEX), generate
+
+    return intrinsic(tile)
+
+
+_TILE_1 = _make_tile(1, relu=False)
+_TILE_2 = _make_tile(2, relu=False)
+_TILE_1_RELU = _make_tile(1, relu=True)
+_TILE_2_RELU = _make_tile(2, relu=True)
+
+
+@inner
+def product(left, right, first, out, rows, columns, depth):  # type: ignore[no-untyped-def]
+    """out = first + left @ right.
+
+    Args:
+        left: [rows, depth], with a step.
+        right: [depth, columns]
+        first: [rows, columns]; may be ``out``, or one row if its row distance is 0.
+        out: [rows, columns]
+        rows: Multiple of ROW_TILE.
+        columns: Multiple of LANES.
+        depth: Any.
+    """
+    for column in range(0, columns - LANES, 2 * LANES):
+        for row in range(0, rows, ROW_TILE):
+            _TILE_2(left, right, first, out, row, column, depth)
+    if columns % (2 * LANES):
+        for row in range(0, rows, ROW_TILE):
+            _TILE_1(left, right, first, out, row, columns - LANES, depth)
+
+
+@inner
+def relu_product(left, right, first, out, rows, columns, depth):  # type: ignore[no-untyped-def]
+    """out = max(0, first + left @ right); see `product`."""
+    for column in range(0, columns - LANES, 2 * LANES):
+        for row in range(0, rows, ROW_TILE):
+            _TILE_2_RELU(left, right, first, out, row, column, depth)
+    if columns % (2 * LANES):
+        for row in range(0, rows, ROW_TILE):
+            _TILE_1_RELU(left, right, first, out, row, columns - LANES, depth)

@@ -1,0 +1,1 @@
+"""From images to features, matches between them, and tracks held out for testing."""

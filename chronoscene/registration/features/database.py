@@ -1,0 +1,196 @@
+"""Features and matches in a COLMAP database. Runs in the worker process only.
+
+Images enter the database in the order of the photos, so ids are the same in every run. Both steps
+go in small batches: what a batch has stored is not done again. What an earlier database has of the
+same photos is copied from there; see `chronoscene.registration.features.feature_reuse`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from chronoscene.io.files import write_text_atomic
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.features import feature_reuse as carrying
+from chronoscene.registration.worker import Report
+
+FEATURE_BATCH = 8
+MATCH_BATCH = 64
+
+SEED = 0
+
+
+def quiet() -> None:
+    """Keep COLMAP's progress out of the log, and make its random numbers the same every time."""
+    pycolmap.logging.minloglevel = 2
+    pycolmap.set_random_seed(SEED)
+
+
+def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Import images and extract SIFT features.
+
+    Arguments: ``database``, ``photos`` (folder), ``groups`` (lists of names that share a camera,
+    each with ``names``, ``model`` and ``params`` or null), ``max_image_size``, ``max_features``,
+    ``threads``.
+
+    Returns:
+        ``keypoints``: number by name; ``focal_known``: whether the focal length of a group is known
+        beforehand; ``carried``: number of photos whose features an earlier database had.
+    """
+    quiet()
+    database, photos = arguments["database"], arguments["photos"]
+    carrying.renew(Path(database), carrying.record_of(arguments))
+    _import(database, photos, arguments["groups"])
+    carried = carrying.carry_features(Path(database))
+    names = sorted(name for group in arguments["groups"] for name in group["names"])
+    left = [name for name, count in keypoint_counts(database).items() if count == 0]
+    left = sorted(set(left) & set(names))
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu = False
+    options.num_threads = arguments["threads"]
+    options.max_image_size = arguments["max_image_size"]
+    options.sift.max_num_features = arguments["max_features"]
+    for first in range(0, len(left), FEATURE_BATCH):
+        report("features", len(names) - len(left) + first, len(names))
+        batch = left[first : first + FEATURE_BATCH]
+        pycolmap.extract_features(database, photos, batch, extraction_options=options)
+    report("features", len(names), len(names))
+    with pycolmap.Database.open(database) as opened:
+        known = {c.camera_id: bool(c.has_prior_focal_length) for c in opened.read_all_cameras()}
+    counts = keypoint_counts(database)
+    return {
+        "keypoints": {name: counts[name] for name in names},
+        "focal_known": known,
+        "carried": carried,
+    }
+
+
+def keypoint_counts(database: str | Path) -> dict[str, int]:
+    """Number of keypoints of each image."""
+    with pycolmap.Database.open(str(database)) as opened:
+        return {
+            str(image.name): int(opened.num_keypoints_for_image(image.image_id))
+            for image in opened.read_all_images()
+        }
+
+
+def _import(database: str, photos: str, groups: Sequence[Mapping[str, Any]]) -> None:
+    """Add the images of each group, with one camera for all of them, unless they are there."""
+    with pycolmap.Database.open(database) as opened:
+        present = {str(image.name) for image in opened.read_all_images()}
+    for group in groups:
+        if present.issuperset(group["names"]):
+            continue
+        options = pycolmap.ImageReaderOptions(camera_model=group["model"])
+        if group["params"] is not None:
+            options.camera_params = ",".join(repr(float(p)) for p in group["params"])
+        pycolmap.import_images(
+            database, photos, pycolmap.CameraMode.SINGLE, group["names"], options
+        )
+    with pycolmap.Database.open(database) as opened:
+        opened.clear_pose_priors()  # positions are judged first; see georeference
+
+
+def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Match and verify pairs of images that are not in the database yet.
+
+    Arguments: ``database``, ``pairs`` (text file with two names a line), ``threads``,
+    ``scratch`` (folder).
+
+    Returns:
+        Number of ``pairs``, of those ``verified``, of their ``inliers``, and of the pairs
+        ``carried`` over from an earlier database.
+    """
+    quiet()
+    database = arguments["database"]
+    pairs = read_pairs(Path(arguments["pairs"]))
+    _drop_others(database, pairs)
+    carried = carrying.carry_matches(Path(database), pairs)
+    left = _unmatched(database, pairs)
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = arguments["threads"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    listed = Path(arguments["scratch"]) / "batch.txt"
+    for first in range(0, len(left), MATCH_BATCH):
+        report("pairs", len(pairs) - len(left) + first, len(pairs))
+        write_pairs(listed, left[first : first + MATCH_BATCH])
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
+        pycolmap.match_image_pairs(database, options, pairing, verification)
+    listed.unlink(missing_ok=True)
+    report("pairs", len(pairs), len(pairs))
+    with pycolmap.Database.open(database) as opened:
+        counts = [int(n) for n in opened.read_two_view_geometry_num_inliers()[1]]
+    carrying.forget(Path(database))
+    return {
+        "pairs": len(pairs),
+        "verified": sum(n > 0 for n in counts),
+        "inliers": sum(counts),
+        "carried": carried,
+    }
+
+
+def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:
+    """Drop pairs that are not listed: an earlier list can have had others."""
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): image.image_id for image in opened.read_all_images()}
+        listed = {pycolmap.image_pair_to_pair_id(ids[a], ids[b]) for a, b in pairs}
+        for pair_id in set(opened.read_num_matches()[0]) - listed:
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            opened.delete_matches(a, b)
+            opened.delete_two_view_geometry(a, b)
+
+
+def _unmatched(database: str, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Pairs without a geometry. Matches of such a pair are what a killed run left: COLMAP would
+    verify them and then fail to store them a second time, so they are dropped."""
+    left = []
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): image.image_id for image in opened.read_all_images()}
+        for a, b in pairs:
+            if not opened.exists_two_view_geometry(ids[a], ids[b]):
+                if opened.exists_matches(ids[a], ids[b]):
+                    opened.delete_matches(ids[a], ids[b])
+                left.append((a, b))
+    return left
+
+
+def read_pairs(path: Path) -> list[tuple[str, str]]:
+    """Pairs of names from a file that `write_pairs` wrote."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [(a, b) for a, b in (line.split(" ") for line in lines)]
+
+
+def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
+    """Write pairs of names, one a line; COLMAP cuts at blanks, so names must have none."""
+    write_text_atomic(path, "".join(f"{a} {b}\n" for a, b in pairs))
+
+
+def verified_matches(
+    database: str | Path,
+) -> tuple[dict[int, str], dict[tuple[int, int], np.ndarray]]:
+    """Names by image id, and the inliers of each verified pair as keypoint indices. [M, 2]"""
+    with pycolmap.Database.open(str(database)) as opened:
+        names = {int(i.image_id): str(i.name) for i in opened.read_all_images()}
+        pair_ids, geometries = opened.read_two_view_geometries()
+    matches = {}
+    for pair_id, geometry in zip(pair_ids, geometries, strict=True):
+        inliers = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
+        if len(inliers):
+            first, second = pycolmap.pair_id_to_image_pair(pair_id)
+            matches[int(first), int(second)] = inliers
+    return names, matches
+
+
+def keypoints_of(database: str | Path) -> dict[int, np.ndarray]:
+    """Pixel positions of the keypoints of each image. [K, 2]"""
+    with pycolmap.Database.open(str(database)) as opened:
+        return {
+            int(i.image_id): np.asarray(opened.read_keypoints(i.image_id), np.float64)[:, :2]
+            for i in opened.read_all_images()
+        }

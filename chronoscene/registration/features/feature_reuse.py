@@ -1,0 +1,235 @@
+"""What of an earlier database still holds when photos change. Runs in the worker process only.
+
+Features depend on the content of a photo and a few settings, matches on the features and cameras
+of two photos. A record beside the database says from which contents and settings it was made. When
+these change, the database is set aside, a new one is made in the order of the photos, and what
+still holds is copied to it. The database set aside stays until all pairs are matched, so each of
+these functions can be killed and called again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from chronoscene.io.files import write_text_atomic
+from chronoscene.io.pycolmap import pycolmap
+
+METHOD = 1
+"""Of extraction and matching, as far as settings do not say it; raise it when that changes."""
+
+Record = dict[str, Any]
+"""``settings`` that all features depend on, ``groups`` of photos with one camera, and ``photos``:
+SHA-256 by name."""
+
+
+def record_of(arguments: Mapping[str, Any]) -> Record:
+    """What features are made from, by the arguments of `database.extract`."""
+    folder, groups = Path(arguments["photos"]), arguments["groups"]
+    names = sorted(name for group in groups for name in group["names"])
+    with ThreadPoolExecutor(arguments["threads"]) as pool:
+        digests = list(pool.map(_digest, (folder / name for name in names)))
+    settings = {key: arguments[key] for key in ("max_image_size", "max_features")}
+    return {
+        "settings": settings | {"method": METHOD, "pycolmap": pycolmap.__version__},
+        "groups": groups,
+        "photos": dict(zip(names, digests, strict=True)),
+    }
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def renew(database: Path, wanted: Record) -> None:
+    """Make way for a database of these photos, unless the one there is; it may be begun only.
+
+    Of the database there and one that was set aside before, the one stays aside of which more can
+    be carried over. Records are right at every moment: a database goes before its record.
+    """
+    if _read_record(database) == wanted:
+        return
+    aside = set_aside(database)
+    worth = {path: _worth(path, wanted) for path in (aside, database)}
+    if worth[database] > worth[aside]:
+        _remove(aside)
+        write_text_atomic(_record_path(aside), json.dumps(_read_record(database)))
+        database.replace(aside)
+    elif worth[aside] == (0, 0):
+        _remove(aside)
+    _remove(database)
+    write_text_atomic(_record_path(database), json.dumps(wanted))
+
+
+def set_aside(database: Path) -> Path:
+    """Where the database before this one is kept."""
+    return database.with_name(f"{database.stem}-old{database.suffix}")
+
+
+def forget(database: Path) -> None:
+    """Remove what was set aside: all that still holds was carried over."""
+    _remove(set_aside(database))
+    _record_path(set_aside(database)).unlink(missing_ok=True)
+
+
+def carry_features(database: Path) -> int:
+    """Copy features of photos whose content is in the database set aside.
+
+    Returns:
+        Number of photos that have their features from there.
+    """
+    carried = 0
+    with _both(database) as (old, new, sources):
+        for name, source in sources.items():
+            was, now = old.ids.get(source), new.ids[name]
+            if was is None or not old.database.num_keypoints_for_image(was):
+                continue
+            carried += 1
+            if not new.database.exists_descriptors(now):
+                new.database.write_descriptors(now, old.database.read_descriptors(was))
+            if not new.database.exists_keypoints(now):  # by which a photo counts as done
+                new.database.write_keypoints(now, old.database.read_keypoints(was))
+    return carried
+
+
+def carry_matches(database: Path, pairs: Sequence[tuple[str, str]]) -> int:
+    """Copy matches and geometries of pairs whose photos and cameras are what they were.
+
+    COLMAP matches in the order of the names and verifies in the order of the ids, and neither is
+    symmetric to the last bit. Where an order has turned, the pair is matched anew, so that the
+    database is the same as one from scratch.
+
+    Returns:
+        Number of pairs that have theirs from there.
+    """
+    carried = 0
+    with _both(database) as (old, new, sources):
+        known = {name: source for name, source in sources.items() if source in old.ids}
+        for first, second in pairs:
+            a, b = known.get(first), known.get(second)
+            if a is None or b is None or a >= b:
+                continue
+            alike = old.verification(a, b) == new.verification(first, second)
+            was = old.ordered(a, b)
+            if alike and old.database.exists_two_view_geometry(*was):
+                carried += 1
+                _copy_pair(old, was, new, new.ordered(first, second))
+    return carried
+
+
+class _Opened:
+    """A database with the ids and cameras of its images by name."""
+
+    def __init__(self, database: Any) -> None:
+        self.database = database
+        self.cameras = {int(c.camera_id): c for c in database.read_all_cameras()}
+        images = database.read_all_images()
+        self.ids = {str(image.name): int(image.image_id) for image in images}
+        self.camera_ids = {int(image.image_id): int(image.camera_id) for image in images}
+
+    def ordered(self, first: str, second: str) -> tuple[int, int]:
+        """Ids of two images as COLMAP stores them, so that nothing is turned and rounded."""
+        a, b = sorted((self.ids[first], self.ids[second]))
+        return a, b
+
+    def verification(self, first: str, second: str) -> tuple[Any, ...]:
+        """What the geometry of a pair depends on besides its features."""
+        pair = self.ids[first], self.ids[second]
+        a, b = (self.cameras[self.camera_ids[i]] for i in pair)
+        turned, shared = pair[0] > pair[1], a.camera_id == b.camera_id
+        return (
+            turned,
+            shared,
+            *(
+                (c.model, c.width, c.height, tuple(c.params), c.has_prior_focal_length)
+                for c in (a, b)
+            ),
+        )
+
+
+@contextmanager
+def _both(database: Path) -> Iterator[tuple[_Opened, _Opened, dict[str, str]]]:
+    """The database set aside, the new one, and the names in the former by those in the latter."""
+    aside = set_aside(database)
+    with pycolmap.Database.open(database) as new:
+        if not aside.exists():
+            yield _Opened(new), _Opened(new), {}
+            return
+        sources = _sources(_read_record(aside), _read_record(database))
+        with pycolmap.Database.open(aside) as old:
+            yield _Opened(old), _Opened(new), sources
+
+
+def _sources(was: Record | None, now: Record | None) -> dict[str, str]:
+    """Name of the same content in another record by name; the same name where it has it."""
+    if was is None or now is None or was["settings"] != now["settings"]:
+        return {}
+    names = {digest: name for name, digest in was["photos"].items()}
+    return {
+        name: name if was["photos"].get(name) == digest else names[digest]
+        for name, digest in now["photos"].items()
+        if digest in names
+    }
+
+
+def _copy_pair(old: _Opened, was: tuple[int, int], new: _Opened, now: tuple[int, int]) -> None:
+    """Copy one pair, unless it is there; the geometry last, by which a pair counts as done."""
+    if new.database.exists_two_view_geometry(*now):
+        return
+    if new.database.exists_matches(*now):
+        new.database.delete_matches(*now)
+    new.database.write_matches(*now, old.database.read_matches(*was))
+    geometry = old.database.read_two_view_geometry(*was)
+    for camera, image in zip((geometry.camera1, geometry.camera2), now, strict=True):
+        if camera is not None:  # with the focal length that the pair suggests
+            camera.camera_id = new.camera_ids[image]
+    new.database.write_two_view_geometry(*now, geometry)
+
+
+def _worth(database: Path, wanted: Record) -> tuple[int, int]:
+    """Verified pairs and photos with features that could be carried over, about."""
+    sources = set(_sources(_read_record(database), wanted).values())
+    if not sources or not database.exists():
+        return 0, 0
+    try:
+        with pycolmap.Database.open(database) as opened:
+            ids = {i for name, i in _Opened(opened).ids.items() if name in sources}
+            pairs = map(
+                pycolmap.pair_id_to_image_pair, opened.read_two_view_geometry_num_inliers()[0]
+            )
+            verified = sum(a in ids and b in ids for a, b in pairs)
+            photos = sum(opened.num_keypoints_for_image(i) > 0 for i in ids)
+    except RuntimeError:  # damaged
+        return 0, 0
+    # With the last connection its journal went into it, so that it is one file again.
+    return (0, 0) if _journals(database) else (verified, photos)
+
+
+def _journals(database: Path) -> list[Path]:
+    journals = [Path(f"{database}{suffix}") for suffix in ("-wal", "-shm")]
+    return [path for path in journals if path.exists()]
+
+
+def _remove(database: Path) -> None:
+    """Remove a database: SQLite ignores the journal of one that is gone."""
+    database.unlink(missing_ok=True)
+    for path in _journals(database):
+        path.unlink()
+
+
+def _record_path(database: Path) -> Path:
+    return database.with_suffix(".json")
+
+
+def _read_record(database: Path) -> Record | None:
+    try:
+        record = json.loads(_record_path(database).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) else None

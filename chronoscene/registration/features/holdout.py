@@ -1,0 +1,220 @@
+"""Tracks that take no part in estimation, so that the result can be tested on them.
+
+Matches are joined to tracks over all images. A share of the tracks that two periods see is drawn,
+and all their matches are taken out of the database that the mapper reads, within periods too: a
+held-out track cannot pull at any pose.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from chronoscene.io.files import replacing
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.features.database import keypoints_of, quiet, verified_matches
+from chronoscene.registration.worker import Report
+
+LEAST_LEFT = 16
+"""A pair of images keeps this many matches whatever the draw: sparse pairs are not made useless."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """Keypoints of all images joined by matches, flat."""
+
+    image: NDArray[np.int64]
+    """Image id of each keypoint that has a match. [K]"""
+    keypoint: NDArray[np.int64]
+    """Its index in the image. [K]"""
+    track: NDArray[np.int64]
+    """[K]"""
+    offset: Mapping[int, int]
+    """Index of keypoint 0 of an image in the numbering that `node_track` has."""
+    node_track: NDArray[np.int64]
+    """Track of every keypoint of every image; -1 without matches."""
+
+    def of(self, image: int, keypoints: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Track of keypoints of an image."""
+        return self.node_track[self.offset[image] + keypoints]
+
+
+def build_tracks(
+    matches: Mapping[tuple[int, int], NDArray[np.int64]],
+    keypoints: Mapping[int, NDArray[np.float64]],
+) -> Tracks:
+    """Connected components of matches.
+
+    SIFT gives a place several keypoints where it has several orientations. They count as one, or a
+    held-out place would be known to the mapper under its other names.
+
+    Args:
+        matches: Keypoint indices by pair of image ids. [M, 2]
+        keypoints: Pixels of the keypoints of each image. [K, 2]
+    """
+    ids = sorted(keypoints)
+    starts = np.concatenate([[0], np.cumsum([len(keypoints[i]) for i in ids])])
+    offset = {image: int(start) for image, start in zip(ids, starts, strict=False)}
+    total = int(starts[-1])
+    place = [offset[i] + first_at_place(keypoints[i]) for i in ids]
+    alias = np.concatenate([np.zeros(0, np.int64), *place])
+    a = [offset[i] + m[:, 0] for (i, _), m in matches.items()]
+    b = [offset[j] + m[:, 1] for (_, j), m in matches.items()]
+    first = alias[np.concatenate([np.zeros(0, np.int64), *a])]
+    second = alias[np.concatenate([np.zeros(0, np.int64), *b])]
+    graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), shape=(total, total))
+    _, labels = connected_components(graph, directed=False)
+    used = np.unique(np.concatenate([first, second]))
+    compact = np.unique(labels[used], return_inverse=True)[1]
+    node_track = np.full(total, -1, np.int64)
+    node_track[used] = compact
+    image = np.asarray(ids, np.int64)[np.searchsorted(starts, used, side="right") - 1]
+    keypoint = used - np.asarray([offset[i] for i in image.tolist()], np.int64)
+    return Tracks(image, keypoint, node_track[used], offset, node_track[alias])
+
+
+def first_at_place(xy: NDArray[np.float64]) -> NDArray[np.int64]:
+    """For each keypoint, the first one at the same pixel position. [K, 2] -> [K]"""
+    if not len(xy):
+        return np.zeros(0, np.int64)
+    _, first, inverse = np.unique(xy, axis=0, return_index=True, return_inverse=True)
+    return np.asarray(first[inverse.ravel()], np.int64)
+
+
+def eligible_tracks(tracks: Tracks, period_of: Mapping[int, int]) -> NDArray[np.int64]:
+    """Tracks of at least two periods that see no image twice, which wrong matches make."""
+    count = int(tracks.track.max()) + 1 if len(tracks.track) else 0
+    order = np.lexsort((tracks.image, tracks.track))
+    track, image = tracks.track[order], tracks.image[order]
+    twice = (track[1:] == track[:-1]) & (image[1:] == image[:-1])
+    consistent = np.ones(count, bool)
+    consistent[track[1:][twice]] = False
+    period = np.array([period_of[i] for i in image.tolist()], np.int64)
+    low, high = np.full(count, np.iinfo(np.int64).max), np.full(count, -1)
+    np.minimum.at(low, track, period)
+    np.maximum.at(high, track, period)
+    return np.flatnonzero(consistent & (high > low))
+
+
+def hold_out(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Write the database for mapping and the file of what was held out.
+
+    Arguments: ``database``, ``out`` (database), ``held_out`` (npz), ``periods`` (by name),
+    ``share``, ``seed``.
+    """
+    quiet()
+    report("hold out", 0, 1)
+    names, matches = verified_matches(arguments["database"])
+    points = keypoints_of(arguments["database"])
+    period_of = {i: arguments["periods"][name] for i, name in names.items()}
+    tracks = build_tracks(matches, points)
+    candidates = eligible_tracks(tracks, period_of)
+    rng = np.random.default_rng(arguments["seed"])
+    count = round(arguments["share"] * len(candidates))
+    chosen = np.sort(rng.choice(candidates, count, replace=False))
+    removed = _filtered_copy(Path(arguments["database"]), Path(arguments["out"]), tracks, chosen)
+    _write_held_out(Path(arguments["held_out"]), tracks, chosen, removed, points, names)
+    partners: dict[str, int] = dict.fromkeys(names.values(), 0)
+    for pair in matches:
+        for i in pair:
+            partners[names[i]] += 1
+    across = {f"{i}-{j}": n for (i, j), n in sorted(_cross_counts(matches, period_of).items())}
+    return {
+        "tracks_of_several_periods": len(candidates),
+        "held_out": int(removed.sum()),
+        "partners": partners,
+        "verified_pairs_across": {k: v[0] for k, v in across.items()},
+        "matches_across": {k: v[1] for k, v in across.items()},
+    }
+
+
+def _cross_counts(
+    matches: Mapping[tuple[int, int], NDArray[np.int64]], period_of: Mapping[int, int]
+) -> dict[tuple[int, int], tuple[int, int]]:
+    """Pairs of images and matches between every two periods."""
+    counts: dict[tuple[int, int], tuple[int, int]] = {}
+    for (i, j), pairs in matches.items():
+        a, b = sorted((period_of[i], period_of[j]))
+        if a != b:
+            n, m = counts.get((a, b), (0, 0))
+            counts[a, b] = (n + 1, m + len(pairs))
+    return counts
+
+
+def _filtered_copy(
+    source: Path, target: Path, tracks: Tracks, chosen: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Copy a database without the matches of some tracks.
+
+    Returns:
+        Whether a track is held out. A track whose removal would leave a pair with fewer than
+        `LEAST_LEFT` matches stays in. [tracks]
+    """
+    held = np.zeros(int(tracks.track.max()) + 1 if len(tracks.track) else 0, bool)
+    held[chosen] = True
+    with replacing(target) as partial:
+        _copy_database(source, partial)
+        with pycolmap.Database.open(str(partial)) as opened:
+            pair_ids, geometries = opened.read_two_view_geometries()
+            pairs = [pycolmap.pair_id_to_image_pair(i) for i in pair_ids]
+            for (i, _), geometry in zip(pairs, geometries, strict=True):
+                track = tracks.of(i, _first_column(geometry))
+                if (~held[track]).sum() < LEAST_LEFT:
+                    held[track] = False
+            for (i, j), geometry in zip(pairs, geometries, strict=True):
+                keep = ~held[tracks.of(i, _first_column(geometry))]
+                if not keep.all():
+                    geometry.inlier_matches = np.asarray(geometry.inlier_matches)[keep]
+                    opened.update_two_view_geometry(i, j, geometry)
+    return held
+
+
+def _first_column(geometry: pycolmap.TwoViewGeometry) -> NDArray[np.int64]:
+    return np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)[:, 0]
+
+
+def _copy_database(source: Path, target: Path) -> None:
+    """Copy a database with what its log still holds."""
+    import sqlite3
+
+    with sqlite3.connect(source) as a, sqlite3.connect(target) as b:
+        a.backup(b)
+    a.close()
+    b.close()
+    for suffix in ("-wal", "-shm"):
+        leftover = Path(f"{target}{suffix}")
+        leftover.unlink(missing_ok=True)
+
+
+def _write_held_out(
+    path: Path,
+    tracks: Tracks,
+    chosen: NDArray[np.int64],
+    held: NDArray[np.bool_],
+    points: Mapping[int, NDArray[np.float64]],
+    names: Mapping[int, str],
+) -> None:
+    """Observations of the held-out tracks: track, name of the image, pixels."""
+    mine = held[tracks.track] if len(held) else np.zeros(0, bool)
+    order = np.flatnonzero(mine)[np.argsort(tracks.track[mine], kind="stable")]
+    image, keypoint = tracks.image[order], tracks.keypoint[order]
+    xy = np.array([points[i][k] for i, k in zip(image.tolist(), keypoint.tolist(), strict=True)])
+    with replacing(path) as partial, partial.open("wb") as file:
+        np.savez(
+            file,
+            track=np.unique(tracks.track[order], return_inverse=True)[1],
+            image=image,
+            xy=xy.reshape(-1, 2),
+            names=np.frombuffer(json.dumps(dict(names)).encode(), np.uint8),
+        )
+        file.flush()
+        os.fsync(file.fileno())

@@ -1,0 +1,148 @@
+"""Second stage: features, matches, and what of them is held out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from chronoscene.registration.context import Context
+from chronoscene.registration.photos.camera_sharing import camera_groups
+from chronoscene.registration.photos.inputs import Inputs
+from chronoscene.scene import Frame, Scene
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """What is known of the photos before any pose."""
+
+    keypoints: Mapping[str, int]
+    """Number of features by name."""
+    partners: Mapping[str, int]
+    """Number of photos with verified matches by name."""
+    pairs_across: Mapping[str, int]
+    """Verified pairs of photos between two periods, by ``"0-1"``."""
+    matches_across: Mapping[str, int]
+
+
+def find_matches(inputs: Inputs, context: Context) -> Matched:
+    """Extract, match and hold out; each is done once."""
+    features = _features(inputs, context)
+    _matches(inputs, context)
+    held = _hold_out(inputs, context)
+    return Matched(
+        keypoints=features["keypoints"],
+        partners=held["partners"],
+        pairs_across=held["verified_pairs_across"],
+        matches_across=held["matches_across"],
+    )
+
+
+def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
+    options = context.options
+    groups = camera_groups(inputs.images, options.camera_model, options.calibration)
+    if inputs.scene is not None:
+        groups = scene_groups(inputs.scene) + groups
+    settings = {
+        "groups": groups,
+        "max_image_size": options.max_image_size,
+        "max_features": options.max_features,
+    }
+
+    def extract() -> tuple[Any, list[str]]:
+        places = {
+            "database": str(context.database),
+            "photos": str(context.photos),
+            "threads": context.threads,
+        }
+        # The database can become another one: pairs that an earlier one had may be missing in it.
+        (context.work / "stage-matches.json").unlink(missing_ok=True)
+        found = context.step("features", settings | places)
+        total = sum(found["keypoints"].values())
+        known = sum(found["focal_known"].values())
+        remark = (
+            f"{total} features in {len(found['keypoints'])} photos, {len(groups)} cameras, "
+            f"{known} with a focal length from EXIF or the scene"
+        )
+        return found, [remark, *_told(found["carried"], len(found["keypoints"]), "photos")]
+
+    return dict(context.stages.run("features", settings, extract))
+
+
+def _told(carried: int, total: int, what: str) -> list[str]:
+    return [f"{carried} of {total} {what} carried over from the run before"] if carried else []
+
+
+def _matches(inputs: Inputs, context: Context) -> None:
+    listing = context.work / "pairs.txt"
+    centres = inputs.centres()
+    taken = {c.name: c.taken.isoformat() for c in inputs.images if c.taken is not None}
+    images = [
+        {
+            "name": name,
+            "period": inputs.periods[name],
+            "enu": centres.get(name),
+            "taken": taken.get(name),
+        }
+        for name in sorted(inputs.periods)
+    ]
+    settings = {"images": images, "exhaustive_limit": context.options.exhaustive_limit}
+
+    def choose() -> tuple[Any, list[str]]:
+        places = {"database": str(context.database), "out": str(listing)}
+        found = context.step("pairs", settings | places)
+        kinds = ", ".join(f"{n} {kind}" for kind, n in found["kinds"].items())
+        told = f"{found['pairs']} pairs ({kinds}), {found['across_periods']} across periods"
+        return found, [told]
+
+    def match() -> tuple[Any, list[str]]:
+        arguments = {
+            "database": str(context.database),
+            "pairs": str(listing),
+            "scratch": str(context.work),
+            "threads": context.threads,
+        }
+        found = context.step("matches", arguments)
+        pairs, verified, inliers = (found[k] for k in ("pairs", "verified", "inliers"))
+        told = f"{verified} of {pairs} pairs verified, {inliers} matches"
+        return found, [told, *_told(found["carried"], pairs, "pairs")]
+
+    context.stages.run("pairs", settings, choose)
+    context.stages.run("matches", None, match)
+
+
+def _hold_out(inputs: Inputs, context: Context) -> dict[str, Any]:
+    options = context.options
+    settings = {"periods": inputs.periods, "share": options.held_out, "seed": options.seed}
+
+    def hold_out() -> tuple[Any, list[str]]:
+        places = {
+            "database": str(context.database),
+            "out": str(context.mapping_database),
+            "held_out": str(context.held_out),
+        }
+        found = context.step("holdout", settings | places)
+        tracks = found["tracks_of_several_periods"]
+        told = [f"{found['held_out']} of {tracks} tracks of several periods held out"]
+        told += [
+            f"periods {key}: {count} verified pairs, {found['matches_across'][key]} matches"
+            for key, count in found["verified_pairs_across"].items()
+        ]
+        return found, told
+
+    return dict(context.stages.run("holdout", settings, hold_out))
+
+
+def scene_groups(scene: Scene) -> list[dict[str, Any]]:
+    """The cameras of a scene with their images, as they are."""
+    by_camera: dict[int, list[Frame]] = {}
+    for frame in scene.frames:
+        by_camera.setdefault(frame.camera.camera_id, []).append(frame)
+    return [
+        {
+            "names": sorted(f.name for f in frames),
+            "model": frames[0].camera.model,
+            "params": list(frames[0].camera.params),
+        }
+        for frames in by_camera.values()
+    ]

@@ -1,0 +1,263 @@
+"""What there is to register: photographs by period, with what they say about themselves.
+
+Three forms are read: a folder with one folder for each period, one folder of photos (periods are
+proposed from their dates), and a CSV table of image and period.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import date, datetime
+from pathlib import Path, PurePosixPath
+
+from chronoscene.errors import SceneError
+from chronoscene.formats.chronoscene import is_iso_date
+from chronoscene.images.exif import read_exif
+from chronoscene.kernels.threads import available_threads
+from chronoscene.registration.photos.photo import Capture, open_photo, taken_at
+from chronoscene.scene.splits import IMAGE_SUFFIXES, read_text
+
+PERIOD_GAP_DAYS = 14
+"""Photos in one folder that were taken this many days after the previous one begin a new period."""
+
+
+@dataclass(frozen=True, slots=True)
+class CapturePeriod:
+    """A date group."""
+
+    label: str
+    date: str | None
+    """ISO date of most of its photos, where they say."""
+
+
+@dataclass(frozen=True, slots=True)
+class Captures:
+    """Everything that was found."""
+
+    root: Path
+    images: tuple[Capture, ...]
+    """Sorted by name."""
+    periods: tuple[CapturePeriod, ...]
+    refused: tuple[tuple[str, int, str], ...]
+    """Path below the root, period, and reason of each photo that cannot be used."""
+    remarks: tuple[str, ...]
+
+    def of_period(self, period: int) -> tuple[Capture, ...]:
+        return tuple(c for c in self.images if c.period == period)
+
+
+@dataclass(frozen=True, slots=True)
+class _Listed:
+    """A file and the period that it is said to be of."""
+
+    path: Path
+    name: str
+    label: str
+
+
+def read_captures(path: Path, *, table: Path | None = None) -> Captures:
+    """Find the photographs of all periods.
+
+    Args:
+        path: Folder with a folder for each period, or with photos; or a CSV table.
+        table: CSV with the columns ``image`` and ``period``; image paths are relative to ``path``.
+
+    Raises:
+        SceneError: If there are no photos, or the table is wrong.
+    """
+    path = Path(path)
+    if table is None and path.suffix.lower() == ".csv" and path.is_file():
+        path, table = path.parent, path
+    if not path.is_dir():
+        raise _nothing(path, "nothing")
+    remarks: list[str] = []
+    if table is not None:
+        listed = _from_table(path, table)
+    elif groups := _period_folders(path):
+        listed = groups
+    else:
+        listed, remarks = _by_date(path, _photos_in(path))
+    return _assemble(path, listed, remarks)
+
+
+def _photos_in(folder: Path) -> list[Path]:
+    """Image files below a folder, sorted; hidden files and folders are passed over."""
+    found = [
+        p
+        for p in folder.rglob("*")
+        if p.suffix.lower() in IMAGE_SUFFIXES
+        and not any(part.startswith(".") for part in p.relative_to(folder).parts)
+        and p.is_file()
+    ]
+    return sorted(found, key=lambda p: p.relative_to(folder).as_posix())
+
+
+def _period_folders(root: Path) -> list[_Listed]:
+    """Photos of the sub-folders; empty if photos lie in the root itself or in one folder only."""
+    photos = _photos_in(root)
+    tops = {p.relative_to(root).parts[0] for p in photos if len(p.relative_to(root).parts) > 1}
+    if len(tops) < 2 or any(p.parent == root for p in photos):
+        return []
+    return [
+        _Listed(p, p.relative_to(root).as_posix(), p.relative_to(root).parts[0]) for p in photos
+    ]
+
+
+def _from_table(root: Path, table: Path) -> list[_Listed]:
+    """Rows ``image, period`` of a CSV, in any order of columns."""
+    lines = [line for line in read_text(table).splitlines() if line.strip()]
+    rows = list(csv.DictReader(lines))
+    columns = rows[0].keys() if rows else ()
+    image_key = next((k for k in ("image", "file", "name") if k in columns), None)
+    if image_key is None or "period" not in columns:
+        raise SceneError(
+            table,
+            expected="a header line with the columns image and period",
+            found=lines[0][:80] if lines else "an empty file",
+            todo="write lines such as: 2016/IMG_0001.jpg,2016",
+        )
+    listed: dict[str, _Listed] = {}
+    for number, row in enumerate(rows, start=2):
+        name, label = (row[image_key] or "").strip(), (row["period"] or "").strip()
+        file = _in_root(root, name)
+        if not name or not label or file is None:
+            raise SceneError(
+                f"{table}:{number}",
+                expected="an image below the folder of the captures, and its period",
+                found=f"{name!r}, {label!r}",
+                todo="correct the line; paths are relative to the folder of the captures",
+            )
+        if name in listed and listed[name].label != label:
+            raise SceneError(
+                f"{table}:{number}",
+                expected=f"one period of {name!r}",
+                found=f"{listed[name].label!r} and {label!r}",
+                todo="keep one of the two lines",
+            )
+        listed[name] = _Listed(file, PurePosixPath(name).as_posix(), label)
+    return list(listed.values())
+
+
+def _in_root(root: Path, name: str) -> Path | None:
+    """The file of a table's entry, in the folder or in its ``images/``; None if it leaves it."""
+    pure = PurePosixPath(name)
+    if pure.is_absolute() or ".." in pure.parts or not pure.parts:
+        return None
+    inner = root / "images" / name
+    return inner if not (root / name).exists() and inner.exists() else root / name
+
+
+def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str]]:
+    """Photos of one folder, cut into periods where `PERIOD_GAP_DAYS` lie between two dates."""
+    times = {p: taken_at(p, read_exif(p)) for p in photos}
+    dated = sorted((t, p) for p, t in times.items() if t is not None)
+    if not dated or len(dated) < len(photos):
+        undated = len(photos) - len(dated)
+        remark = f"{undated} of {len(photos)} photos have no date: all are taken as one period"
+        return [_Listed(p, p.relative_to(root).as_posix(), root.name) for p in photos], [remark]
+    groups: list[list[tuple[datetime, Path]]] = []
+    for item in dated:
+        if not groups or (item[0] - groups[-1][-1][0]).days >= PERIOD_GAP_DAYS:
+            groups.append([])
+        groups[-1].append(item)
+    listed = []
+    for group in groups:
+        label = group[0][0].date().isoformat()
+        listed += [_Listed(p, p.relative_to(root).as_posix(), label) for _, p in group]
+    labels = ", ".join(f"{g[0][0].date()} ({len(g)} photos)" for g in groups)
+    return listed, [f"one folder: periods proposed from the dates of the photos: {labels}"]
+
+
+def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Captures:
+    if not listed:
+        raise _nothing(root, "no image files")
+    order = _ordered_labels(listed)
+    images, refused = [], []
+    with ThreadPoolExecutor(available_threads()) as pool:
+        opened = list(
+            pool.map(lambda item: open_photo(item.path, item.name, order.index(item.label)), listed)
+        )
+    for item, capture in zip(listed, opened, strict=True):
+        period = order.index(item.label)
+        if isinstance(capture, str):
+            refused.append((item.name, period, capture))
+        else:
+            images.append(capture)
+    if not images:
+        raise _nothing(root, f"{len(refused)} files, none of which can be used: {refused[0][2]}")
+    images.sort(key=lambda c: c.name)
+    periods = tuple(
+        CapturePeriod(label, _period_date(label, [c for c in images if c.period == i]))
+        for i, label in enumerate(order)
+    )
+    _check_names(root, images)
+    remarks = remarks + _date_remarks(periods)
+    return Captures(root, tuple(images), periods, tuple(refused), tuple(remarks))
+
+
+def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
+    """Labels by the dates of their photos where all have some, else in natural order."""
+    by_label: dict[str, list[Path]] = {}
+    for item in listed:
+        by_label.setdefault(item.label, []).append(item.path)
+    first: dict[str, datetime] = {}
+    for label, paths in by_label.items():
+        times = [t for p in paths if (t := taken_at(p, read_exif(p))) is not None]
+        if times:
+            first[label] = sorted(times)[len(times) // 2]
+    if len(first) == len(by_label):
+        return sorted(by_label, key=lambda label: (first[label], label))
+    return sorted(by_label, key=_natural)
+
+
+def _natural(label: str) -> tuple[list[tuple[int, int, str]], str]:
+    """Sorts t2 before t10."""
+    parts = re.findall(r"\d+|\D+", label)
+    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts], label
+
+
+def _period_date(label: str, captures: Sequence[Capture]) -> str | None:
+    """The day, month or year that all photos of a period share."""
+    days = sorted({c.taken.date() for c in captures if c.taken is not None})
+    if not days:
+        return label if is_iso_date(label) else None
+    first, last = days[0], days[-1]
+    if first == last:
+        return first.isoformat()
+    if (first.year, first.month) == (last.year, last.month):
+        return first.isoformat()[:7]
+    return str(first.year) if first.year == last.year else _middle(days).isoformat()[:4]
+
+
+def _middle(days: Sequence[date]) -> date:
+    return days[len(days) // 2]
+
+
+def _date_remarks(periods: Sequence[CapturePeriod]) -> list[str]:
+    shown = ", ".join(f"{i} = {p.label} ({p.date or 'no date'})" for i, p in enumerate(periods))
+    return [f"periods: {shown}"]
+
+
+def _check_names(root: Path, images: Sequence[Capture]) -> None:
+    """Refuse names that one line of split.txt cannot hold."""
+    for capture in images:
+        if capture.name != capture.name.strip() or re.search(r"[\r\n]", capture.name):
+            raise SceneError(
+                root,
+                expected="image names without line breaks, and without blanks at their ends",
+                found=repr(capture.name),
+                todo="rename the image",
+            )
+
+
+def _nothing(path: Path, found: str) -> SceneError:
+    return SceneError(
+        path,
+        expected="a folder with a folder of photos for each period, or a CSV of image and period",
+        found=found,
+        todo="copy the photos there",
+    )

@@ -1,0 +1,115 @@
+"""One photograph: whether it can be used, and what it says about itself."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from PIL import Image
+
+from chronoscene.images.exif import ExifData, read_exif
+
+GPS_SIGMA = (5.0, 5.0, 10.0)
+"""Metres east, north, up, where the photo states none: a consumer receiver under open sky."""
+
+LEAST_SIDE = 64
+"""Pixels; smaller pictures are icons and previews."""
+
+HEAD_BYTES = 200_000
+"""Of a file that are searched for metadata on panoramas."""
+
+LARGEST_ASPECT = 3.0
+"""Wider pictures are panoramas, which no perspective camera describes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gps:
+    """Where a photo says it was taken."""
+
+    latitude: float
+    """Degrees."""
+    longitude: float
+    altitude: float | None
+    """Metres, as the photo states it."""
+    relative_altitude: float | None
+    """Metres above take-off."""
+    sigma: tuple[float, float, float]
+    """Metres east, north, up."""
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """One photograph."""
+
+    name: str
+    """Unique over all periods: ``<period folder>/<path in it>`` in posix form."""
+    path: Path
+    period: int
+    width: int
+    """Pixels, as stored."""
+    height: int
+    exif: ExifData
+    taken: datetime | None
+    gps: Gps | None
+
+
+def open_photo(path: Path, name: str, period: int) -> Capture | str:
+    """The capture, or why it cannot be used. Every file is decoded once: half a file is common."""
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            # A JPEG is then read to its end, but not computed in full.
+            image.draft("RGB", (width // 8, height // 8))
+            image.load()
+    except Exception as error:  # Pillow raises almost anything for damaged files
+        return f"cannot be decoded: {str(error) or type(error).__name__}"
+    if min(width, height) < LEAST_SIDE:
+        return f"{width} x {height} pixels: too small"
+    if is_panorama(path) or max(width, height) > LARGEST_ASPECT * min(width, height):
+        return f"{width} x {height} pixels: a panorama, which no perspective camera describes"
+    exif = read_exif(path)
+    return Capture(
+        name=name,
+        path=path,
+        period=period,
+        width=width,
+        height=height,
+        exif=exif,
+        taken=taken_at(path, exif),
+        gps=_position(exif),
+    )
+
+
+def is_panorama(path: Path) -> bool:
+    """Whether a file says that it is a sphere or cylinder unrolled (Google's GPano metadata)."""
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    return re.search(rb"GPano:ProjectionType\W{1,4}(equirectangular|cylindrical)", head) is not None
+
+
+def _position(exif: ExifData) -> Gps | None:
+    if exif.latitude is None or exif.longitude is None:
+        return None
+    drone = exif.drone
+    sigma = GPS_SIGMA
+    relative = None
+    if drone is not None:
+        relative = drone.relative_altitude
+        if drone.rtk_std is not None and all(0 < s < 100 for s in drone.rtk_std):
+            east, north, up = drone.rtk_std
+            # Stated deviations are those of the antenna at the fix, not of the shutter: 2 cm least.
+            sigma = (max(east, 0.02), max(north, 0.02), max(up, 0.03))
+    return Gps(exif.latitude, exif.longitude, exif.altitude, relative, sigma)
+
+
+def taken_at(path: Path, exif: ExifData) -> datetime | None:
+    """When a photo was taken: by its EXIF block, else by a date that begins its file name."""
+    if exif.date is not None:
+        return exif.date
+    found = re.match(r"((?:19|20)\d{2})[-_]?(\d{2})[-_]?(\d{2})(?!\d)", path.name, re.ASCII)
+    try:
+        return datetime(*map(int, found.groups())) if found else None  # type: ignore[arg-type]
+    except ValueError:
+        return None

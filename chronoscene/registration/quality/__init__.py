@@ -1,0 +1,1 @@
+"""How well a registration fits: measurements, certificate, verdict."""

@@ -1,0 +1,241 @@
+"""A certificate as ``registration.json``, and as rows of a table.
+
+Every figure stands with its unit and the number of things it was taken over; one that could not be
+computed is ``null``, with the reason beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from chronoscene import __version__
+from chronoscene.registration.quality.certificate import (
+    Certificate,
+    HeldOut,
+    PairFigures,
+    PeriodFigures,
+)
+from chronoscene.registration.quality.gps_fit import GpsFit
+from chronoscene.registration.quality.localisation import Localisation
+from chronoscene.registration.quality.misalignment import Interval, Misalignment, rotation_angle
+from chronoscene.registration.quality.surface_distance import CloudDistance
+from chronoscene.registration.quality.verdict import THRESHOLDS, Verdict
+from chronoscene.registration.ties.tie_alignment import TieAlignment
+
+FORMAT = "chronoscene-registration-1"
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One line of a certificate."""
+
+    name: str
+    value: float | None
+    unit: str
+    over: str
+    """What it was taken over, with the number."""
+    absent: str | None = None
+    interval: tuple[float, float] | None = None
+    """95%."""
+
+    @property
+    def text(self) -> str:
+        """For people."""
+        if self.value is None:
+            return f"absent: {self.absent}"
+        number = f"{self.value:,.0f}" if abs(self.value) >= 1000 else f"{self.value:.3g}"
+        unit = f" {self.unit}" if self.unit else ""
+        if self.interval is None:
+            return number + unit
+        return f"{number}{unit} ({self.interval[0]:.2g} to {self.interval[1]:.2g})"
+
+
+def period_figures(certificate: Certificate, period: PeriodFigures) -> Iterator[Figure]:
+    """Lines of one period."""
+    photos = f"{period.photos} photos"
+    yield Figure("registered images", period.registered, "", photos)
+    if period.error is None:
+        yield Figure("reprojection error", None, "px", "", "no observations")
+    else:
+        over = f"{period.observations:,} observations"
+        yield Figure("reprojection error, median", period.error, "px", over)
+    gps = period.gps
+    if not isinstance(gps, GpsFit):
+        yield Figure("GPS residual", None, "m", "", gps)
+        return
+    over = f"{gps.positions} positions"
+    yield Figure("GPS residual after a similarity, median", gps.median, "m", over)
+    yield Figure("GPS residual after a similarity, largest", gps.largest, "m", over)
+    yield Figure("GPS outliers", gps.outliers, "", over)
+    offset, error = np.linalg.norm(gps.offset[:2]), np.linalg.norm(gps.offset_error[:2])
+    both = (max(0.0, float(offset - 2 * error)), float(offset + 2 * error))
+    yield Figure("GPS against cameras, horizontal", float(offset), "m", over, None, both)
+    yield Figure("GPS against cameras, vertical", float(gps.offset[2]), "m", over)
+    short = "the path is short against the noise of the GPS"
+    for name, unit, value, spread in (
+        ("scale against own GPS", "", gps.scale, gps.scale_error),
+        ("turn against own GPS", "degrees", gps.turn, gps.turn_error),
+    ):
+        if value is None or spread is None:
+            yield Figure(name, None, unit, over, short)
+        else:
+            span = (value - 1.96 * spread, value + 1.96 * spread)
+            yield Figure(name, value, unit, over, None, span)
+
+
+def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure]:
+    """Lines of two periods."""
+    names = certificate.labels[pair.a], certificate.labels[pair.b]
+    unit = "m" if certificate.unit == "metre" else "units"
+    ties = pair.ties
+    yield Figure("tie points of the model", ties.points, "", "points seen in both periods")
+    yield Figure("overlap with tie points", 100 * ties.occupied, "%", f"{ties.cells} cells")
+    yield Figure("hull of the tie points, of the overlap", 100 * ties.hull, "%", "ground plan")
+    yield Figure(f"images of {names[0]} that see ties", 100 * ties.tied_a, "%", "its images")
+    yield Figure(f"images of {names[1]} that see ties", 100 * ties.tied_b, "%", "its images")
+    yield from _held_out_figures(pair.held_out, unit)
+    for name, found in (
+        ("by held-out tracks", pair.misalignment),
+        ("by held-out tracks and ties", pair.by_all),
+    ):
+        yield from _misalignment_figures(certificate, name, found, unit)
+    for name, other, local in (
+        (names[1], names[0], pair.localised_b),
+        (names[0], names[1], pair.localised_a),
+    ):
+        what = f"images of {name} localised from {other}"
+        if not isinstance(local, Localisation):
+            yield Figure(what, None, "", "", local)
+            continue
+        over = f"{local.images} of {local.tried} images"
+        yield Figure(f"{what}: rotation, median", local.rotation, "degrees", over)
+        yield Figure(f"{what}: centre, median", local.centre, unit, over)
+    yield from _cloud_figures(pair.clouds, unit)
+
+
+def _held_out_figures(held: HeldOut | str, unit: str) -> Iterator[Figure]:
+    if not isinstance(held, HeldOut):
+        yield Figure("held-out reprojection error", None, "px", "", held)
+        return
+    over = f"{held.observations:,} observations of {held.tracks} tracks"
+    yield Figure("held-out reprojection error, median", held.median, "px", over)
+    yield Figure("held-out reprojection error, 90%", held.p90, "px", over)
+    yield Figure("held-out reprojection error, median", held.distance, unit, over)
+    yield Figure("held-out observations that agree", 100 * held.agreeing, "%", over)
+    tracks = f"{held.gap_tracks} tracks"
+    missing = None if held.gap is not None else "no track is placed by both periods"
+    yield Figure("gap between both periods' points", held.gap, unit, tracks, missing)
+    matches = f"{held.matches:,} matches"
+    missing = None if held.epipolar is not None else "no matches of images of both periods"
+    yield Figure("held-out epipolar error, median", held.epipolar, "px", matches, missing)
+
+
+def _misalignment_figures(
+    certificate: Certificate, name: str, found: Misalignment | str, unit: str
+) -> Iterator[Figure]:
+    if not isinstance(found, Misalignment):
+        yield Figure(f"misalignment {name}", None, "", "", found)
+        return
+    over = f"{found.tracks} agreeing tracks"
+    percent = 100 / certificate.extent
+    yield _interval(f"rotation {name}", found.rotation, "degrees", over)
+    yield _interval(f"displacement {name}", found.shift, unit, over)
+    yield _interval(f"displacement {name}", found.shift, "% of extent", over, percent)
+    yield Figure(f"scale ratio {name}", found.similarity.scale, "", over)
+
+
+def _cloud_figures(clouds: CloudDistance | str, unit: str) -> Iterator[Figure]:
+    if not isinstance(clouds, CloudDistance):
+        yield Figure("distance between surfaces", None, unit, "", clouds)
+        return
+    over = f"{clouds.stable:,} of {clouds.cores:,} core points on stable structure"
+    yield Figure("point-to-plane distance, median", clouds.median, unit, over)
+    yield Figure("level of detection, median", clouds.level, unit, over)
+    yield Figure("beyond the level of detection", 100 * clouds.beyond, "%", over)
+    yield _interval("shift between the surfaces", clouds.shift, unit, over)
+
+
+def _interval(name: str, size: Interval, unit: str, over: str, factor: float = 1.0) -> Figure:
+    span = (size.low * factor, size.high * factor)
+    return Figure(name, size.value * factor, unit, over, None, span)
+
+
+def to_json(
+    certificate: Certificate, verdict: Verdict, ties: TieAlignment | None = None
+) -> dict[str, Any]:
+    """What ``registration.json`` holds: plain data, finite numbers or null."""
+    return _plain(
+        {
+            "format": FORMAT,
+            "chronoscene": __version__,
+            "verdict": verdict.level,
+            "text": verdict.text,
+            "todo": list(verdict.todo),
+            "findings": [asdict(f) for f in verdict.findings],
+            "route": certificate.route,
+            "unit": certificate.unit,
+            "extent": certificate.extent,
+            "focal_px": certificate.focal,
+            "periods": [
+                {
+                    "period": p.period,
+                    "label": p.label,
+                    "registered": p.registered,
+                    "photos": p.photos,
+                    "reasons": dict(p.reasons),
+                    "figures": [asdict(f) for f in period_figures(certificate, p)],
+                }
+                for p in certificate.periods
+            ],
+            "pairs": [
+                {
+                    "periods": [p.a, p.b],
+                    "verdict": verdict.pairs.get((p.a, p.b)),
+                    "figures": [asdict(f) for f in pair_figures(certificate, p)],
+                    "similarity": _similarity(p),
+                }
+                for p in certificate.pairs
+            ],
+            "tie_points": None if ties is None else _ties(ties),
+            "thresholds": [asdict(t) for t in THRESHOLDS.values()],
+        }
+    )
+
+
+def _similarity(pair: PairFigures) -> dict[str, Any] | None:
+    """What would bring the first period to where the second one sees it."""
+    found = pair.by_all if isinstance(pair.by_all, Misalignment) else pair.misalignment
+    if not isinstance(found, Misalignment):
+        return None
+    return {
+        "scale": found.similarity.scale,
+        "rotation_degrees": rotation_angle(found.similarity.rotation),
+        "matrix": found.similarity.to_matrix().tolist(),
+    }
+
+
+def _ties(ties: TieAlignment) -> dict[str, Any]:
+    return {
+        "replaced": ties.replaced,
+        "controlled": ties.controlled,
+        "outliers": list(ties.outliers),
+        "remarks": list(ties.remarks),
+        "points": [asdict(r) for r in ties.residuals],
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Without numpy, tuples and numbers that JSON lacks."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,102 @@
+"""Each period against its own GPS: the only witness that sees no image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from chronoscene.registration.quality.rays import Array
+from chronoscene.scene.similarity import SIGMA, fit_robustly
+
+FEWEST = 4
+"""Positions that a period needs."""
+
+SPREAD_FACTOR = 3.0
+"""The positions of a period must spread this many times wider than the receiver errs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GpsFit:
+    """Cameras of a period against where their GPS says they were, in metres."""
+
+    positions: int
+    median: float
+    """Distance after the similarity that fits this period best."""
+    largest: float
+    outliers: int
+    """Positions farther off than three robust deviations."""
+    scale: float | None
+    """Of that similarity: the period's own GPS against the model. None where the path is short."""
+    scale_error: float | None
+    """Standard deviation."""
+    turn: float | None
+    """Degrees about the vertical, by the same fit; positive is counter-clockwise from above."""
+    turn_error: float | None
+    offset: Array
+    """Median of GPS minus camera as registered, east, north, up. [3]"""
+    offset_error: Array
+    """Standard deviation of that median, per axis. [3]"""
+
+
+def fit_gps(centres: Array, gps: Array) -> GpsFit | str:
+    """Compare cameras with positions, or say why not.
+
+    Args:
+        centres: In the frame of the model, which is east, north, up in metres. [N, 3]
+        gps: NaN where there is none, whether it was believed or not. [N, 3]
+    """
+    has = np.isfinite(gps).all(axis=1)
+    if has.sum() < FEWEST:
+        return f"{int(has.sum())} images have a GPS position"
+    source, target = centres[has], gps[has]
+    fitted = fit_robustly(source, target)
+    difference = target - source
+    offset = np.median(difference, axis=0)
+    width = SIGMA * np.median(np.abs(difference - offset), axis=0)
+    # The median of n normal numbers varies 1.2533 times as much as their mean.
+    error = 1.2533 * np.maximum(width, 0.01) / np.sqrt(has.sum())
+    if fitted is None:
+        return "the GPS positions lie in one place"
+    distance = fitted[1]
+    noise = max(float(np.median(distance)) / 1.5382, 0.01)
+    scale, scale_error, turn, turn_error = _scale_and_turn(source, target, noise)
+    return GpsFit(
+        positions=int(has.sum()),
+        median=float(np.median(distance)),
+        largest=float(distance.max()),
+        outliers=int((distance > 3 * SIGMA * np.median(distance)).sum()),
+        scale=scale,
+        scale_error=scale_error,
+        turn=turn,
+        turn_error=turn_error,
+        offset=offset,
+        offset_error=error,
+    )
+
+
+def _scale_and_turn(
+    source: Array, target: Array, noise: float
+) -> tuple[float | None, float | None, float | None, float | None]:
+    """Horizontal similarity by reweighted least squares on complex numbers: target = m source + c.
+
+    Heights are left out: those of consumer receivers are off by tens of metres between days.
+    """
+    z = source[:, 0] + 1j * source[:, 1]
+    w = target[:, 0] + 1j * target[:, 1]
+    weight = np.ones(len(z))
+    factor = 1.0 + 0j
+    for _ in range(10):
+        zc = z - np.average(z, weights=weight)
+        wc = w - np.average(w, weights=weight)
+        power = float((weight * np.abs(zc) ** 2).sum())
+        if power <= 0 or np.sqrt(power / weight.sum()) < SPREAD_FACTOR * noise:
+            return None, None, None, None
+        factor = (weight * zc.conj() * wc).sum() / power
+        residual = np.abs(wc - factor * zc)
+        width = max(float(np.median(residual)) / 1.1774, 0.01)
+        weight = 1.0 / (1.0 + (residual / (2 * width)) ** 2)
+    error = 1.1 * width / np.sqrt(power)
+    angle = float(np.degrees(np.angle(factor)))
+    size = abs(complex(factor))
+    return float(size), float(error), angle, float(np.degrees(error / max(size, 1e-9)))

@@ -1,0 +1,330 @@
+"""How far two periods lie apart, by tracks that took no part in the estimation.
+
+A track is placed by its images of one period alone and projected into its images of the other, in
+both directions. The similarity that would bring the periods together, and how surely it is known,
+follow from the residuals: a registration is as good as the largest motion that they leave open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.registration.quality.rays import Array, Ints, Placed, Rays, place, project
+from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import fit_robustly
+
+FEWEST_TRACKS = 12
+"""Tracks below which seven unknowns and their spread are not estimated."""
+
+STEPS = 12
+DRAWS = 400
+"""Random motions by which the spread of an angle or a distance is found."""
+
+GROSS_PIXELS = 20.0
+"""Median residual from which on the search begins with the positions of the points."""
+
+NOISE_FLOOR = 0.1
+"""Pixels: no feature is located better, whatever the residuals of a few say."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transfers:
+    """Points placed in one period at the rays of another (O observations)."""
+
+    rays: Rays
+    xyz: Array
+    """[O, 3]"""
+    covariance: Array
+    """Of the points, for observations of one pixel. [O, 3, 3]"""
+    backward: NDArray[np.bool_]
+    """Whether the point was placed by the later of the two periods. [O]"""
+
+    def __len__(self) -> int:
+        return len(self.rays)
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A size that is at least 0, and the 95% interval in which it lies."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Misalignment:
+    """The similarity between two periods that tracks ask for; identity where all is well."""
+
+    tracks: int
+    """Tracks that agree with it."""
+    similarity: Sim3
+    """Brings the points of the first period to where the second one sees them."""
+    rotation: Interval
+    """Degrees."""
+    shift: Interval
+    """Median displacement of the cameras of both periods, in world units."""
+    scale: Interval
+    """``abs(log(scale ratio))``."""
+
+
+def transfers(rays: Rays, period: Ints, a: int, b: int) -> tuple[Transfers, Placed, Placed]:
+    """Tracks of two periods in both directions, and the points as each of them places them.
+
+    Args:
+        rays: Observations of tracks.
+        period: Of each image. [N]
+        a: Earlier period.
+        b: Later period.
+    """
+    of_a, of_b = rays.where(period[rays.image] == a), rays.where(period[rays.image] == b)
+    placed_a, placed_b = place(of_a), place(of_b)
+    forward, backward = _seen(placed_a, of_b), _seen(placed_b, of_a)
+    both = Transfers(
+        rays=Rays(
+            *(
+                np.concatenate([getattr(forward[0], name), getattr(backward[0], name)])
+                for name in ("track", "image", "pose", "uv", "focal")
+            )
+        ),
+        xyz=np.concatenate([forward[1], backward[1]]),
+        covariance=np.concatenate([forward[2], backward[2]]),
+        backward=np.repeat([False, True], [len(forward[0]), len(backward[0])]),
+    )
+    return both, placed_a, placed_b
+
+
+def _seen(placed: Placed, rays: Rays) -> tuple[Rays, Array, Array]:
+    found, slot = placed.find(rays.track)
+    return rays.where(found), placed.xyz[slot], placed.covariance[slot]
+
+
+def transfer_errors(moved: Transfers) -> tuple[Array, Array, Array]:
+    """Residual in pixels, its expected standard deviation for noise of one pixel, and metres.
+
+    Returns:
+        error: Inf behind the camera. [O]
+        expected: Grows where a point is placed badly: of the projected point and the pixel. [O]
+        distance: The residual at the depth of the point, in world units. [O]
+    """
+    residual, jacobian, depth = project(moved.rays, moved.xyz)
+    error = np.linalg.norm(residual, axis=1)
+    distance = np.where(depth > 0, error * depth / moved.rays.focal.mean(axis=1), np.inf)
+    error = np.where(np.isfinite(error), error, np.inf)
+    return error, np.sqrt(transfer_variance(jacobian, moved.covariance)), distance
+
+
+def transfer_variance(jacobian: Array, covariance: Array) -> Array:
+    """Mean variance per axis of a transferred point and its observation, for unit noise. [O]"""
+    spread = np.einsum("nki,nij,nkj->n", jacobian, covariance, jacobian)
+    return np.asarray(1.0 + np.nan_to_num(spread, nan=1e12) / 2)
+
+
+def measure(
+    moved: Transfers, placed_a: Placed, placed_b: Placed, centres: Array
+) -> Misalignment | None:
+    """The similarity between two periods, with its spread.
+
+    Weights are those of a Cauchy distribution; the spread is that of a sandwich estimator whose
+    groups are tracks, so that ten images of one point do not count as ten points.
+
+    Args:
+        moved: From `transfers`.
+        placed_a: Points as the first period places them.
+        placed_b: Points as the second period places them.
+        centres: Cameras of the second period, whose motion is reported. [C, 3]
+
+    Returns:
+        None with fewer than `FEWEST_TRACKS` tracks, or where they leave the motion open.
+
+    Source: Huber 1967 (sandwich); Liang and Zeger 1986 (groups).
+    """
+    if len(np.unique(moved.rays.track)) < FEWEST_TRACKS:
+        return None
+    middle = np.median(moved.xyz, axis=0)
+    similarity = _begin(moved, placed_a, placed_b)
+    for _ in range(STEPS):
+        residual, jacobian = _residuals(moved, similarity, middle)
+        weight, _ = _weights(residual, jacobian[1])
+        normal, gradient = _sum(residual, jacobian[0], weight)
+        try:
+            step: Array = np.asarray(-np.linalg.solve(normal, gradient), np.float64)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(step).all():
+            return None
+        similarity = _compose(step, similarity, middle)
+        if np.abs(step).max() < 1e-10:
+            break
+    return _describe(moved, similarity, middle, centres)
+
+
+def _begin(moved: Transfers, placed_a: Placed, placed_b: Placed) -> Sim3:
+    """Identity, or, where the periods are far apart, the similarity between their points."""
+    error = transfer_errors(moved)[0]
+    if np.median(error) < GROSS_PIXELS:
+        return Sim3.identity()
+    found, slot = placed_b.find(placed_a.track)
+    if found.sum() < FEWEST_TRACKS:
+        return Sim3.identity()
+    fitted = fit_robustly(placed_a.xyz[found], placed_b.xyz[slot])
+    if fitted is None:
+        return Sim3.identity()
+    scale = fitted[0].scale
+    return Sim3(scale, fitted[0].matrix / scale, fitted[0].translation)
+
+
+def _residuals(
+    moved: Transfers, similarity: Sim3, middle: Array
+) -> tuple[Array, tuple[Array, Array]]:
+    """Residuals under a similarity; their derivatives by its seven parameters and variances."""
+    inverse = similarity.inverse()
+    back = moved.backward
+    xyz = np.where(back[:, None], inverse.apply(moved.xyz), similarity.apply(moved.xyz))
+    residual, by_point, _ = project(moved.rays, xyz)
+    # Left perturbation: S <- exp(d) S. The inverse changes as S^-1 exp(-d).
+    at = np.where(back[:, None], moved.xyz, xyz) - middle
+    by_motion = generators(at)
+    linear = -inverse.scale * inverse.rotation
+    by_motion = np.where(back[:, None, None], linear @ by_motion, by_motion)
+    variance = transfer_variance(by_point, moved.covariance)
+    return residual, (np.einsum("nki,nij->nkj", by_point, by_motion), variance)
+
+
+def generators(x: Array) -> Array:
+    """Derivative of ``t + w x p + s p`` by (t, w, s) at points. [O, 3] -> [O, 3, 7]"""
+    out = np.zeros((len(x), 3, 7))
+    out[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    out[:, 0, 4], out[:, 0, 5] = x[:, 2], -x[:, 1]
+    out[:, 1, 3], out[:, 1, 5] = -x[:, 2], x[:, 0]
+    out[:, 2, 3], out[:, 2, 4] = x[:, 1], -x[:, 0]
+    out[:, :, 6] = x
+    return out
+
+
+def _weights(residual: Array, variance: Array) -> tuple[Array, float]:
+    """Weights of observations, zero behind the camera, and the noise in pixels per axis."""
+    square = (residual**2).sum(axis=1) / variance
+    seen = np.isfinite(square)
+    # The median of a Rayleigh distribution is 1.1774 standard deviations per axis.
+    noise = np.sqrt(np.median(square[seen])) / 1.1774 if seen.any() else 1.0
+    noise = max(float(noise), NOISE_FLOOR)
+    weight = 1.0 / (variance * noise**2 * (1.0 + square / (2.0 * noise) ** 2))
+    return np.where(seen, np.nan_to_num(weight), 0.0), noise
+
+
+def _sum(residual: Array, jacobian: Array, weight: Array) -> tuple[Array, Array]:
+    residual, jacobian = np.nan_to_num(residual), np.nan_to_num(jacobian)
+    normal = np.einsum("nki,n,nkj->ij", jacobian, weight, jacobian)
+    return normal, np.einsum("nki,n,nk->i", jacobian, weight, residual)
+
+
+def _compose(step: Array, similarity: Sim3, middle: Array) -> Sim3:
+    """``exp(step)`` about a point, after a similarity."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec(step[3:6]).as_matrix()
+    grow = float(np.exp(np.clip(step[6], -1.0, 1.0)))
+    shift = middle + step[:3] - grow * turn @ middle
+    return Sim3(
+        grow * similarity.scale,
+        turn @ similarity.rotation,
+        grow * turn @ similarity.translation + shift,
+    )
+
+
+def _describe(
+    moved: Transfers, similarity: Sim3, middle: Array, centres: Array
+) -> Misalignment | None:
+    residual, (jacobian, variance) = _residuals(moved, similarity, middle)
+    weight, noise = _weights(residual, variance)
+    covariance = _sandwich(moved.rays.track, residual, jacobian, weight)
+    if covariance is None:
+        return None
+    rng = np.random.default_rng(0)
+    steps = rng.multivariate_normal(np.zeros(7), covariance, DRAWS, method="eigh")
+    drawn = [_compose(step, similarity, middle) for step in steps]
+    noise_only = [_compose(step, Sim3.identity(), middle) for step in steps]
+    agreeing = (residual**2).sum(axis=1) < 9 * noise**2 * variance
+    return Misalignment(
+        tracks=len(np.unique(moved.rays.track[agreeing])),
+        similarity=similarity,
+        rotation=_interval(lambda m: rotation_angle(m.rotation), similarity, drawn, noise_only),
+        shift=_interval(lambda m: _displacement(m, centres), similarity, drawn, noise_only),
+        scale=_interval(lambda m: abs(float(np.log(m.scale))), similarity, drawn, noise_only),
+    )
+
+
+def _sandwich(track: Ints, residual: Array, jacobian: Array, weight: Array) -> Array | None:
+    """Covariance of the seven parameters, grouped by track."""
+    residual, jacobian = np.nan_to_num(residual), np.nan_to_num(jacobian)
+    normal = np.einsum("nki,n,nkj->ij", jacobian, weight, jacobian)
+    _, slot = np.unique(track, return_inverse=True)
+    groups = int(slot.max()) + 1
+    score = np.einsum("nki,n,nk->ni", jacobian, weight, residual)
+    sums = np.stack([np.bincount(slot, score[:, i], groups) for i in range(7)], axis=1)
+    if groups <= 7 or np.linalg.cond(normal) > 1e16:
+        return None
+    bread = np.linalg.inv(normal)
+    # What the noise of the pixels alone would give is the least: few tracks can agree by chance.
+    covariance = bread @ (sums.T @ sums) @ bread * groups / (groups - 7)
+    return np.asarray(_ratio(bread, covariance) * covariance)
+
+
+def _ratio(least: Array, covariance: Array) -> float:
+    """Factor, at least 1, that brings a covariance up to the least that is believed."""
+    size = float(np.trace(covariance / np.maximum(np.diag(least), 1e-300)[:, None])) / 7
+    return 1.0 / size if 0 < size < 1 else 1.0
+
+
+def _interval(
+    size: Callable[[Sim3], float],
+    estimate: Sim3,
+    drawn: Sequence[Sim3],
+    noise: Sequence[Sim3],
+) -> Interval:
+    """A size cannot be negative: the low end is what noise alone would not explain."""
+    value = size(estimate)
+    high = float(np.percentile([size(m) for m in drawn], 97.5))
+    chance = float(np.percentile([size(m) for m in noise], 95))
+    return Interval(value, max(0.0, value - chance), max(value, high))
+
+
+def _displacement(similarity: Sim3, centres: Array) -> float:
+    return float(np.median(np.linalg.norm(similarity.apply(centres) - centres, axis=1)))
+
+
+def rotation_angle(rotation: Array) -> float:
+    """Angle of a rotation in degrees, exact for small ones too. [3, 3]"""
+    axis = rotation[[2, 0, 1], [1, 2, 0]] - rotation[[1, 2, 0], [2, 0, 1]]
+    return float(np.degrees(np.arctan2(np.linalg.norm(axis), np.trace(rotation) - 1)))
+
+
+def sampson_errors(pose_a: Array, pose_b: Array, ray_a: Rays, ray_b: Rays) -> Array:
+    """First-order distance of correspondences to the epipolar geometry, in pixels.
+
+    Args:
+        pose_a: [4, 4]
+        pose_b: [4, 4]
+        ray_a: [M]
+        ray_b: [M]
+
+    Returns:
+        NaN where the two cameras stand in one place. [M]
+    """
+    relative = pose_b @ np.linalg.inv(pose_a)
+    t = relative[:3, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    essential = cross @ relative[:3, :3]
+    one = np.ones((len(ray_a), 1))
+    a, b = np.hstack([ray_a.uv, one]), np.hstack([ray_b.uv, one])
+    line_b, line_a = a @ essential.T, b @ essential
+    # Gradient by pixels: divided by the focal lengths.
+    square = ((line_b[:, :2] / ray_b.focal) ** 2).sum(axis=1)
+    square += ((line_a[:, :2] / ray_a.focal) ** 2).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.abs((b * line_b).sum(axis=1)) / np.sqrt(square))

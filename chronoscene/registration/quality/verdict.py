@@ -1,0 +1,412 @@
+"""Pass, doubtful or fail: thresholds, each with its reason, and what to do.
+
+A pass promises that the periods lie within 0.1 degrees and 0.2% of the scene's extent of each
+other. It needs positive evidence: what could not be measured is never in favour. A fail is said
+only where something measured contradicts the registration; everything between is doubtful.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from chronoscene.registration.quality.certificate import Certificate, PairFigures, PeriodFigures
+from chronoscene.registration.quality.gps_fit import GpsFit
+from chronoscene.registration.quality.localisation import Localisation
+from chronoscene.registration.quality.misalignment import FEWEST_TRACKS, Misalignment
+from chronoscene.registration.quality.rays import Array
+from chronoscene.registration.quality.surface_distance import CloudDistance
+
+Level = Literal["pass", "doubtful", "fail"]
+
+LEVELS: tuple[Level, ...] = ("pass", "doubtful", "fail")
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """One check: from where on a figure is not good, and from where on it is bad."""
+
+    key: str
+    what: str
+    unit: str
+    doubtful: float
+    fail: float | None
+    """None where the figure alone proves no error."""
+    larger_is_better: bool
+    why: str
+    todo: str
+
+    def level(self, value: float) -> Level:
+        """Level of a measured figure."""
+        sign = -1.0 if self.larger_is_better else 1.0
+        if self.fail is not None and sign * value > sign * self.fail:
+            return "fail"
+        return "doubtful" if sign * value > sign * self.doubtful else "pass"
+
+
+_CLICK = "click tie points on the pairs that the report suggests and run again with --tie-points"
+
+THRESHOLDS: dict[str, Threshold] = {
+    t.key: t
+    for t in (
+        Threshold(
+            "registered", "share of the photos of a period that were registered", "",
+            0.6, 0.1, True,
+            "a period of which most photos are missing is not covered by what is measured here",
+            "see the reasons for the missing photos; add photos between the dates' viewpoints",
+        ),
+        Threshold(
+            "images", "registered images of a period", "images", 5, 3, True,
+            "fewer images do not place points by themselves, so nothing can be checked",
+            "add photos of this period",
+        ),
+        Threshold(
+            "rotation", "rotation left between two periods", "degrees",
+            0.1, 0.1, False,
+            "0.1 degrees are 1.7 pixels at a focal length of 1000: twice what matching leaves",
+            _CLICK,
+        ),
+        Threshold(
+            "shift", "displacement left between two periods", "% of extent",
+            0.2, 0.2, False,
+            "0.2% are 20 cm in 100 m: changes smaller than this cannot be told from misalignment",
+            _CLICK,
+        ),
+        Threshold(
+            "held_out", "held-out tracks between two periods", "tracks", 12, None, True,
+            "a similarity has seven unknowns; fewer tracks fit almost any",
+            _CLICK,
+        ),
+        Threshold(
+            "agreeing", "share of held-out observations that agree", "", 0.75, 0.15, True,
+            "right registrations reach 0.85 and more; with fewer, part of the matches, or part of "
+            "the poses, is wrong, or matching takes one thing for another",
+            "look at the worst pair in the report; remove the photos that it names",
+        ),
+        Threshold(
+            "excess", "held-out residual beyond the noise of matching, as an angle", "degrees",
+            0.1, 0.4, False,
+            "what a similarity cannot explain is a period bent by drift, or a wrong camera",
+            "use one camera per period and drone, or add oblique photos; else control points",
+        ),
+        Threshold(
+            "occupied", "share of the overlap of two periods that has tie points", "", 0.15, None,
+            True,
+            "matches in one spot can be of repeated structure, and say little of the rest",
+            "click tie points in the empty spots that the report shows",
+        ),
+        Threshold(
+            "tied", "share of the images of a period that see tie points", "", 0.5, None, True,
+            "images without any hang on their own period alone",
+            _CLICK,
+        ),
+        Threshold(
+            "localised", "pose of images localised from the other period, less its noise",
+            "times 0.1 degrees or 0.2%", 0.6, 10.0, False,
+            "the points of either period must put the images of the other where they are",
+            "look at the flicker comparisons; if they jump, " + _CLICK,
+        ),
+        Threshold(
+            "clouds", "shift between the surfaces of two periods, where its interval excludes 0",
+            "% of extent", 0.15, None, False,
+            "surfaces are compared apart from matches, so repeated structure shows here; but a "
+            "beach or a quarry may really have moved",
+            "look at the flicker comparisons; if they jump, " + _CLICK,
+        ),
+        Threshold(
+            "surfaces", "share of the surfaces that lie beyond their level of detection", "",
+            0.3, None, False,
+            "right registrations stay below 0.25 even where two thirds of what is seen is new; "
+            "with more, surfaces contradict the matches, as where these took one thing for its "
+            "like",
+            "look at the flicker comparisons; if they jump, " + _CLICK,
+        ),
+        Threshold(
+            "gps_offset", "horizontal offset between the GPS of two periods, beyond its spread",
+            "m", 5.0, 15.0, False,
+            "receivers are off by up to some 3.5 m as a whole from day to day; heights by more, "
+            "so they are not judged",
+            "if the GPS can be believed, " + _CLICK,
+        ),
+        Threshold(
+            "gps_residual", "residual of a period's cameras to its own GPS, median", "m",
+            12.0, None, False,
+            "receivers are off by 3 to 8 m, so more means that part of the poses is wrong, or that "
+            "the sky was hidden",
+            "look at the map in the report; register the period alone and see which photos bend it",
+        ),
+        Threshold(
+            "gps_scale", "scale of a period against its own GPS, beyond its spread", "%",
+            2.0, 10.0, False,
+            "GPS errs in place, hardly in scale",
+            "give ground control, or choose the route with GPS priors",
+        ),
+        Threshold(
+            "gps_turn", "turn of a period against its own GPS, beyond its spread", "degrees",
+            2.0, 10.0, False,
+            "GPS errs in place, hardly in direction",
+            "give ground control, or choose the route with GPS priors",
+        ),
+    )
+}  # fmt: skip
+
+
+FITTED = 1.3
+"""Noise of an observation against the residual that is left of it after fitting, at most."""
+
+FEWEST_LINK = 3
+"""Tie points, clicked ones say, without which nothing holds two periods together."""
+
+LACKING = ("held_out", "rotation", "shift", "occupied", "tied")
+"""Checks whose doubt is a lack of evidence: a way through other periods can make up for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One figure that is not good, or one that is missing and needed."""
+
+    level: Level
+    check: str
+    """Key in `THRESHOLDS`, ``link`` or ``chain``."""
+    place: str
+    """Period or pair of periods, in words."""
+    found: str
+    why: str
+    todo: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The judgement on a certificate."""
+
+    level: Level
+    text: str
+    """One or two sentences for people."""
+    findings: tuple[Finding, ...]
+    """The worst first."""
+    pairs: dict[tuple[int, int], Level | None]
+    """Of each pair of periods; None where nothing links the two directly."""
+
+    @property
+    def todo(self) -> tuple[str, ...]:
+        """What to do, without repetition, the most important first."""
+        return tuple(dict.fromkeys(f.todo for f in self.findings))
+
+
+def judge(certificate: Certificate) -> Verdict:
+    """Judge a registration by its certificate."""
+    findings = [f for p in certificate.periods for f in _of_period(p)]
+    findings += _between_gps(certificate)
+    pairs: dict[tuple[int, int], Level | None] = {}
+    for pair in certificate.pairs:
+        mine = list(_of_pair(certificate, pair))
+        measured = isinstance(pair.by_all, Misalignment) or not isinstance(pair.held_out, str)
+        linked = measured or pair.ties.points >= FEWEST_LINK
+        pairs[pair.a, pair.b] = _worst(f.level for f in mine) if linked else None
+        findings += mine if linked else []
+    good = _bounds(certificate, [k for k, level in pairs.items() if level == "pass"])
+    if all(good[k] <= 1 or level == "pass" for k, level in pairs.items()):
+        findings = [f for f in findings if not _made_up_for(f)]
+    findings += _links(certificate, pairs, good)
+    level = _worst(f.level for f in findings)
+    findings.sort(key=lambda f: -LEVELS.index(f.level))
+    return Verdict(level, _words(certificate, level, findings), tuple(findings), pairs)
+
+
+def _made_up_for(finding: Finding) -> bool:
+    """Whether a finding does not count where every period is linked to every other otherwise."""
+    return finding.level == "doubtful" and finding.check in LACKING
+
+
+def _worst(levels: Iterator[Level]) -> Level:
+    return max(levels, key=LEVELS.index, default="pass")
+
+
+def _check(key: str, value: float, place: str, note: str = "") -> Iterator[Finding]:
+    """A finding, unless the figure is good."""
+    threshold = THRESHOLDS[key]
+    level = threshold.level(value)
+    if level == "pass":
+        return
+    limit = threshold.doubtful if level == "doubtful" or threshold.fail is None else threshold.fail
+    side = "at least" if threshold.larger_is_better else "at most"
+    unit = f" {threshold.unit}" if threshold.unit else ""
+    found = f"{threshold.what}: {value:.3g}{unit}, {side} {limit:g} expected{note}"
+    yield Finding(level, key, place, found, threshold.why, threshold.todo)
+
+
+def _of_period(p: PeriodFigures) -> Iterator[Finding]:
+    place = f"period {p.label}"
+    yield from _check("registered", p.registered / max(p.photos, 1), place)
+    yield from _check("images", p.registered, place)
+    if isinstance(p.gps, GpsFit):
+        gps = p.gps
+        yield from _check("gps_residual", gps.median, place)
+        if gps.scale is not None and gps.scale_error is not None:
+            beyond = abs(gps.scale - 1) - 3 * gps.scale_error
+            yield from _check("gps_scale", 100 * beyond, place)
+        if gps.turn is not None and gps.turn_error is not None:
+            yield from _check("gps_turn", abs(gps.turn) - 3 * gps.turn_error, place)
+
+
+def _between_gps(certificate: Certificate) -> Iterator[Finding]:
+    """Offsets of the periods against their common median: which of two is wrong is not known."""
+    fits = [(p, p.gps) for p in certificate.periods if isinstance(p.gps, GpsFit)]
+    for i, (p, one) in enumerate(fits):
+        for q, other in fits[i + 1 :]:
+            gap = (one.offset - other.offset)[:2]
+            distance = float(np.linalg.norm(gap))
+            spread = np.hypot(one.offset_error[:2], other.offset_error[:2]).max()
+            beyond = distance - 3 * float(spread)
+            place = f"periods {p.label} and {q.label}"
+            yield from _check("gps_offset", beyond, place, f"; {distance:.1f} m in all")
+
+
+def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Finding]:
+    names = certificate.labels
+    place = f"periods {names[pair.a]} and {names[pair.b]}"
+    yield from _alignment(certificate, pair, place)
+    if not isinstance(pair.held_out, str) and pair.held_out.tracks >= FEWEST_TRACKS:
+        yield from _check("agreeing", pair.held_out.agreeing, place)
+        yield from _check("excess", _excess(certificate, pair), place)
+    yield from _check("occupied", pair.ties.occupied, place)
+    yield from _check("tied", min(pair.ties.tied_a, pair.ties.tied_b), place)
+    for found in (pair.localised_b, pair.localised_a):
+        if isinstance(found, Localisation) and found.images >= 3:
+            yield from _check("localised", _localised(found, certificate.extent), place)
+    if isinstance(pair.clouds, CloudDistance):
+        shift = pair.clouds.shift
+        if shift.low > 0:
+            yield from _check("clouds", 100 * shift.value / certificate.extent, place)
+        yield from _check("surfaces", pair.clouds.beyond, place)
+
+
+def _localised(found: Localisation, extent: float) -> float:
+    """The larger of both errors against its limit; beyond doubt only as far as it is certain."""
+    turn, place = found.rotation_excess, found.centre_excess
+    likely, certain = (
+        max(r / _limit("rotation"), 100 * c / extent / _limit("shift"))
+        for r, c in ((turn.value, place.value), (turn.low, place.low))
+    )
+    bad = THRESHOLDS["localised"].fail
+    assert bad is not None
+    return certain if certain > bad else min(likely, bad)
+
+
+def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Finding]:
+    """Whether the periods lie together, and whether that is known.
+
+    Wrong, if either measurement excludes the limit. Right, if the precise one (all ties) stays
+    below the limit with its whole interval, and the independent one (held out) agrees: its own
+    interval ends below the limit, or its estimate does while its spread reaches to twice.
+    """
+    held, by_all = pair.misalignment, pair.by_all
+    if isinstance(held, str) or isinstance(by_all, str):
+        tracks = 0 if isinstance(pair.held_out, str) else pair.held_out.tracks
+        reason = held if isinstance(held, str) else str(by_all)
+        yield from _check("held_out", min(tracks, 11), place, f" ({reason})")
+        if isinstance(by_all, str):
+            return
+        held = by_all
+    for key, factor in (("rotation", 1.0), ("shift", 100.0 / certificate.extent)):
+        limit = _limit(key)
+        one, every = getattr(held, key), getattr(by_all, key)
+        low = max(one.low, every.low) * factor
+        high, loose, estimate = every.high * factor, one.high * factor, one.value * factor
+        if low > limit:
+            yield from _check(key, max(one.value, every.value) * factor, place)
+        elif high > limit or (loose > limit and (estimate > limit or loose > 2 * limit)):
+            unit = THRESHOLDS[key].unit
+            bound = max(high, loose)
+            found = (
+                f"{THRESHOLDS[key].what}: {estimate:.3g} {unit}, but up to {bound:.3g} cannot be "
+                f"ruled out; at most {limit:g} expected"
+            )
+            yield Finding("doubtful", key, place, found, THRESHOLDS[key].why, THRESHOLDS[key].todo)
+
+
+def _limit(key: str) -> float:
+    return THRESHOLDS[key].doubtful
+
+
+def _excess(certificate: Certificate, pair: PairFigures) -> float:
+    """Held-out residual beyond what matching noise makes of it, in degrees.
+
+    The residuals of the model itself show the noise, a little less of it than there is, because
+    the points were fitted to them.
+    """
+    assert not isinstance(pair.held_out, str)
+    own = [certificate.periods[p].error or 0.0 for p in (pair.a, pair.b)]
+    beyond = np.sqrt(max(0.0, pair.held_out.noise**2 - (FITTED * max(own)) ** 2))
+    return float(np.degrees(np.arctan2(beyond, certificate.focal)))
+
+
+def _links(
+    certificate: Certificate, pairs: dict[tuple[int, int], Level | None], good: Array
+) -> Iterator[Finding]:
+    """Periods without anything in common that are not linked well by a chain of others.
+
+    Args:
+        certificate: What was measured.
+        pairs: Level of each pair; None where nothing links the two directly.
+        good: From `_bounds`, along pairs that passed.
+    """
+    names = certificate.labels
+    some = _bounds(certificate, [k for k, level in pairs.items() if level is not None])
+    for (a, b), level in pairs.items():
+        place = f"periods {names[a]} and {names[b]}"
+        if not np.isfinite(some[a, b]):
+            yield Finding(
+                "fail", "link", place, "nothing measured links the two",
+                "without matches between them, their alignment is not known at all", _CLICK,
+            )  # fmt: skip
+        elif level is None and not good[a, b] <= 1:
+            left = (
+                f"a chain of good pairs links the two, but leaves {good[a, b]:.2g} times the "
+                "limits open"
+                if np.isfinite(good[a, b])
+                else "no chain of good pairs links the two"
+            )
+            yield Finding("doubtful", "chain", place, left, "the errors of a chain add up", _CLICK)
+
+
+def _bounds(certificate: Certificate, pairs: list[tuple[int, int]]) -> Array:
+    """How far apart two periods can be, in units of the limits, by chains of pairs. [T, T]
+
+    Errors of the links of a chain are independent: their squares add up.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import shortest_path
+
+    weights = np.zeros((len(certificate.labels),) * 2)
+    for pair in certificate.pairs:
+        if (pair.a, pair.b) in pairs:
+            weights[pair.a, pair.b] = 1e6
+            if isinstance(pair.by_all, Misalignment):
+                shift = 100 * pair.by_all.shift.high / certificate.extent / _limit("shift")
+                worst = max(pair.by_all.rotation.high / _limit("rotation"), shift, 1e-3)
+                weights[pair.a, pair.b] = worst**2
+    return np.asarray(np.sqrt(shortest_path(csr_array(weights), directed=False)))
+
+
+def _words(certificate: Certificate, level: Level, findings: list[Finding]) -> str:
+    count = len(certificate.labels)
+    if level == "pass" and count == 1:
+        return (
+            "There is one period: nothing had to be aligned, so nothing across periods is judged."
+        )
+    if level == "pass":
+        return (
+            f"The {count} periods lie in one frame, within 0.1 degrees and 0.2% of the scene's "
+            "extent of each other, by matches that took no part in the estimation."
+        )
+    first = findings[0]
+    start = (
+        "The periods do not fit each other; do not use this registration as it is."
+        if level == "fail"
+        else "The registration may be right, but what was measured does not prove it."
+    )
+    return f"{start} {first.place.capitalize()}: {first.found}."

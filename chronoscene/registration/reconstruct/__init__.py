@@ -1,0 +1,1 @@
+"""From matches to one model of all periods, by one of three routes."""

@@ -1,0 +1,135 @@
+"""Poses against the matches of their images: which images contradict the others. Worker only.
+
+A mapper places an image by what it has seen so far. Where something repeats (a row of equal
+windows) it may take one place for the other, and what follows is placed by that image. The matches
+of such a group with the other images then contradict its poses, except for the few that led astray.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.reconstruct.model_edits import image_pose
+
+AGREEING_PIXELS = 4.0
+"""Distance from the epipolar line up to which a match agrees with the poses."""
+
+LEAST_SHARE = 0.7
+"""Of the matches of an image with those that are trusted: with fewer, its pose is contradicted.
+Among right poses the share is 0.95 and more, in a misplaced group 0.05 to 0.6."""
+
+LEAST_MATCHES = 30
+"""With fewer, nothing is said about an image."""
+
+BEGINNINGS = 10
+"""Images from which trust is grown, one at a time."""
+
+MOST_MISPLACED = 0.4
+"""Share of the images beyond which it is open which of them are wrong."""
+
+Mask = NDArray[np.bool_]
+
+Agreements = Mapping[tuple[int, int], tuple[int, int]]
+"""Pair of image ids to matches that agree with the poses, and all matches."""
+
+
+def pair_agreements(
+    model: pycolmap.Reconstruction, matches: Mapping[tuple[int, int], NDArray[np.int64]]
+) -> Agreements:
+    """How many of the matches of each pair of posed images lie near its epipolar lines."""
+    posed = {int(i): model.images[i] for i in model.reg_image_ids()}
+    rays, poses, focals = {}, {}, {}
+    for i, image in posed.items():
+        camera = model.cameras[image.camera_id]
+        xy = np.array([p.xy for p in image.points2D]).reshape(-1, 2)
+        rays[i] = np.column_stack([camera.cam_from_img(xy), np.ones(len(xy))])
+        poses[i] = image_pose(image)
+        focals[i] = float(camera.mean_focal_length())
+    found = {}
+    for (a, b), pairs in matches.items():
+        if a in posed and b in posed:
+            relative = poses[b] @ np.linalg.inv(poses[a])
+            errors = epipolar_distance(relative, rays[a][pairs[:, 0]], rays[b][pairs[:, 1]])
+            pixels = errors * (focals[a] + focals[b]) / 2
+            found[a, b] = (int((pixels < AGREEING_PIXELS).sum()), len(pairs))
+    return found
+
+
+def agreement(agreements: Agreements, images: Collection[int]) -> float:
+    """Share of all matches among some images that agree; 0 without matches."""
+    mine = [n for (a, b), n in agreements.items() if a in images and b in images]
+    return sum(n for n, _ in mine) / max(sum(n for _, n in mine), 1)
+
+
+def misplaced(
+    agreements: Agreements, images: Collection[int], trusted: Collection[int] = ()
+) -> list[int]:
+    """Images whose matches with the others contradict their poses.
+
+    Trust grows from one image, always to the one that has most agreeing matches with trusted ones;
+    those of which too few agree stay out. A group that agrees within itself alone is found that
+    way, which a look at one image at a time would not find. Of several beginnings, that counts in
+    which most matches agree: a single pair that leads astray early on leads nowhere.
+
+    Args:
+        agreements: From `pair_agreements`.
+        images: Ids of the posed images.
+        trusted: Ids that are right by definition.
+
+    Returns:
+        Ids, sorted; none if there are so many that the others could as well be wrong.
+    """
+    ids = sorted(images)
+    good, total = _matrices(agreements, ids)
+    certain = np.isin(ids, list(trusted))
+    if certain.any():
+        starts = [certain]
+    else:
+        best = np.argsort(-good.sum(axis=1), kind="stable")[:BEGINNINGS]
+        starts = [np.arange(len(ids)) == i for i in best]
+    grown = [_grown(good, total, start) for start in starts]
+    inside = max(grown, key=lambda group: int(group @ (2 * good - total) @ group))
+    wrong = ~inside & (total @ inside >= LEAST_MATCHES)
+    if wrong.sum() > MOST_MISPLACED * len(ids):
+        return []
+    return [ids[i] for i in np.flatnonzero(wrong)]
+
+
+def _grown(good: NDArray[np.int64], total: NDArray[np.int64], start: Mask) -> Mask:
+    """Which images are trusted, if those of the start are."""
+    inside = start.copy()
+    agreeing, known = good @ inside, total @ inside
+    while True:
+        ready = ~inside & (known > 0) & (agreeing >= LEAST_SHARE * known)
+        if not ready.any():
+            return inside
+        new = int(np.argmax(np.where(ready, agreeing, -1)))
+        inside[new] = True
+        agreeing, known = agreeing + good[new], known + total[new]
+
+
+def _matrices(agreements: Agreements, ids: list[int]) -> tuple[NDArray[np.int64], ...]:
+    """Agreeing and all matches of pairs of images. [N, N] each"""
+    position = {image_id: i for i, image_id in enumerate(ids)}
+    counts = np.zeros((2, len(ids), len(ids)), np.int64)
+    for (a, b), found in agreements.items():
+        if a in position and b in position:
+            i, j = position[a], position[b]
+            counts[:, i, j] = counts[:, j, i] = found
+    return counts[0], counts[1]
+
+
+def epipolar_distance(
+    b_from_a: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Sampson distances at depth 1 of rays x, y, 1 in two cameras. [N]"""
+    x, y, z = b_from_a[:3, 3]
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    essential = cross @ b_from_a[:3, :3]
+    lines_b, lines_a = a @ essential.T, b @ essential
+    norm = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
+    return np.asarray(np.abs((b * lines_b).sum(axis=1)) / np.sqrt(np.maximum(norm, 1e-30)))

@@ -1,0 +1,231 @@
+"""``registration.html``: the certificate and what a person needs to see, in one page.
+
+Styles, pictures and the map are in it; it loads nothing. Names are escaped by the template engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from chronoscene import __version__
+from chronoscene.io.files import write_text_atomic
+from chronoscene.registration.quality.certificate import Certificate, PairFigures
+from chronoscene.registration.quality.certificate_json import Figure, pair_figures, period_figures
+from chronoscene.registration.quality.rays import Array
+from chronoscene.registration.quality.verdict import THRESHOLDS, Level, Verdict
+from chronoscene.registration.report.camera_map import camera_map
+from chronoscene.registration.report.pictures import PHOTO_WIDTH, Photos
+from chronoscene.registration.report.spots import DrawnPair, Spot, drawn_pairs, spots
+from chronoscene.registration.report.template import PAGE
+from chronoscene.registration.result import Registered
+from chronoscene.registration.ties.tie_alignment import TieAlignment
+
+FLICKERS = 8
+"""Comparisons on the page, over all pairs of periods."""
+
+CLICKS = 6
+"""Spots that are suggested for clicking, for a pair of periods."""
+
+MOST_LINES = 120
+"""Matches that are drawn between two photos."""
+
+COLORS = (
+    "#2f7ed8", "#d9622b", "#2a9d5c", "#a44bd1", "#b8860b", "#0f9aa7", "#d1477f", "#6b7280",
+)  # fmt: skip
+"""Of the periods, in turn; each is legible on white and on near-black."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """A match on a drawn pair."""
+
+    x1: float
+    y1: float
+    x2: float
+    y2: float
+    level: Level
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """Two photos with their matches."""
+
+    title: str
+    names: tuple[str, str]
+    pictures: tuple[str, str]
+    heights: tuple[float, float]
+    lines: tuple[_Line, ...]
+    matches: int
+    median: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Flicker:
+    """One spot at two dates."""
+
+    names: tuple[str, str]
+    labels: tuple[str, str]
+    pictures: tuple[str, str]
+    tied: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Click:
+    """Images and pixels in which one spot should be clicked."""
+
+    places: tuple[tuple[str, str, float, float], ...]
+    """Label of the period, image, x, y."""
+
+
+def write_report(
+    path: Path,
+    model: Registered,
+    certificate: Certificate,
+    verdict: Verdict,
+    *,
+    ties: TieAlignment | None = None,
+    title: str = "Registration",
+) -> None:
+    """Write the page.
+
+    Args:
+        path: File to write.
+        model: The registration; its photos are read from ``images_root`` where they exist.
+        certificate: Of this model.
+        verdict: On this certificate.
+        ties: Result of clicked tie points, if there were any.
+        title: Of the page.
+    """
+    page = render_report(model, certificate, verdict, ties=ties, title=title)
+    write_text_atomic(path, page)
+
+
+def render_report(
+    model: Registered,
+    certificate: Certificate,
+    verdict: Verdict,
+    *,
+    ties: TieAlignment | None = None,
+    title: str = "Registration",
+) -> str:
+    """The page as text; see `write_report`."""
+    from jinja2 import Environment
+
+    photos = Photos(model)
+    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(PAGE)
+    return page.render(
+        title=title,
+        version=__version__,
+        certificate=certificate,
+        verdict=verdict,
+        levels={"pass": "Pass", "doubtful": "Doubtful", "fail": "Fail", None: "Not linked"},
+        colors=[COLORS[i % len(COLORS)] for i in range(len(certificate.labels))],
+        map=camera_map(model) if model.names else None,
+        periods=[(p, list(period_figures(certificate, p))) for p in certificate.periods],
+        pairs=[_pair_section(certificate, verdict, p) for p in certificate.pairs],
+        drawn=_drawn(model, photos),
+        photo_width=PHOTO_WIDTH,
+        flickers=_flickers(model, certificate, photos),
+        clicks=_clicks(model, certificate, verdict),
+        ties=ties,
+        thresholds=list(THRESHOLDS.values()),
+        unregistered=sorted(model.unregistered.items()),
+    )
+
+
+def _pair_section(
+    certificate: Certificate, verdict: Verdict, pair: PairFigures
+) -> tuple[str, Level | None, list[Figure]]:
+    names = f"{certificate.labels[pair.a]} and {certificate.labels[pair.b]}"
+    return names, verdict.pairs.get((pair.a, pair.b)), list(pair_figures(certificate, pair))
+
+
+def _drawn(model: Registered, photos: Photos) -> list[_Pair]:
+    """The pair with the largest held-out error, and that with the smallest."""
+    found = drawn_pairs(model)
+    chosen = [("Worst pair", found[-1])] if found else []
+    if len(found) > 1:
+        chosen.append(("Best pair", found[0]))
+    drawn = (_draw_pair(model, photos, title, pair) for title, pair in chosen)
+    return [d for d in drawn if d is not None]
+
+
+def _draw_pair(model: Registered, photos: Photos, title: str, pair: DrawnPair) -> _Pair | None:
+    first, second = photos.reduced(pair.a), photos.reduced(pair.b)
+    if first is None or second is None:
+        return None
+    scales = [PHOTO_WIDTH / model.cameras[i].width for i in (pair.a, pair.b)]
+    heights = [model.cameras[i].height * s for i, s in zip((pair.a, pair.b), scales, strict=True)]
+    step = len(pair.error) // MOST_LINES + 1
+    lines = [
+        _Line(*_scaled(a, scales[0]), *_scaled(b, scales[1]), _level(e))
+        for a, b, e in zip(pair.xy_a[::step], pair.xy_b[::step], pair.error[::step], strict=True)
+    ]
+    return _Pair(
+        title=title,
+        names=(model.names[pair.a], model.names[pair.b]),
+        pictures=(first, second),
+        heights=(heights[0], heights[1]),
+        lines=tuple(lines),
+        matches=len(pair.error),
+        median=pair.median,
+    )
+
+
+def _scaled(xy: Array, scale: float) -> tuple[float, float]:
+    return round(float(xy[0]) * scale, 1), round(float(xy[1]) * scale, 1)
+
+
+def _level(error: float) -> Level:
+    return "pass" if error < 2 else "doubtful" if error < 5 else "fail"
+
+
+def _flickers(model: Registered, certificate: Certificate, photos: Photos) -> list[_Flicker]:
+    """Comparisons of all pairs of periods in turn: at tie points, and where there are none."""
+    each = max(2, FLICKERS // max(len(certificate.pairs), 1))
+    found: list[_Flicker] = []
+    for pair in certificate.pairs:
+        gaps = spots(model, pair, each // 2, gaps=True)
+        chosen = spots(model, pair, each - len(gaps), gaps=False) + gaps
+        for spot in chosen:
+            pictures = photos.patches(spot)
+            if pictures is not None and len(found) < FLICKERS:
+                names = model.names[spot.a], model.names[spot.b]
+                labels = certificate.labels[pair.a], certificate.labels[pair.b]
+                found.append(_Flicker(names, labels, pictures, spot.tied))
+    return found
+
+
+def _clicks(
+    model: Registered, certificate: Certificate, verdict: Verdict
+) -> list[tuple[str, list[_Click]]]:
+    """For each pair of periods that did not pass: where to click next."""
+    found = []
+    for pair in certificate.pairs:
+        if verdict.pairs.get((pair.a, pair.b)) == "pass":
+            continue
+        chosen = spots(model, pair, CLICKS, gaps=True, twice=True)
+        if len(chosen) < CLICKS:
+            chosen += spots(model, pair, CLICKS - len(chosen), gaps=False, twice=True)
+        if chosen:
+            names = f"{certificate.labels[pair.a]} and {certificate.labels[pair.b]}"
+            found.append((names, [_click(model, certificate, pair, s) for s in chosen]))
+    return found
+
+
+def _click(model: Registered, certificate: Certificate, pair: PairFigures, spot: Spot) -> _Click:
+    views: Sequence[tuple[int, tuple[int, Array] | None]] = (
+        (pair.a, (spot.a, spot.xy_a)),
+        (pair.a, spot.more_a),
+        (pair.b, (spot.b, spot.xy_b)),
+        (pair.b, spot.more_b),
+    )
+    return _Click(
+        tuple(
+            (certificate.labels[p], model.names[v[0]], float(v[1][0]), float(v[1][1]))
+            for p, v in views
+            if v is not None
+        )
+    )

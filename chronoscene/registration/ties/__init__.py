@@ -1,0 +1,1 @@
+"""Tie points that a person clicked: read, compared with a model, used to align it."""

@@ -1,0 +1,314 @@
+"""Tie points that a person clicked: files of them, and what they say about a registration.
+
+Two forms are read. A CSV has a row for each click: point id, image, x, y, and for ground control
+also the point's world coordinates. OpenDroneMap's ``gcp_list.txt`` has a line with the projection,
+then ``geo_x geo_y geo_z im_x im_y image_name [gcp_name]`` for each click. Pixels are those of the
+photo as stored, without its orientation tag applied; the corner of the image is (0, 0).
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.errors import SceneError
+from chronoscene.geodesy import Georeference
+from chronoscene.scene.splits import read_text
+
+Array = NDArray[np.float64]
+
+COLUMNS = {
+    "point": ("point", "point id", "point_id", "id", "name", "label"),
+    "image": ("image", "image name", "image_name", "file", "photo"),
+    "x": ("x", "im_x", "u", "col"),
+    "y": ("y", "im_y", "v", "row"),
+    "world x": ("world x", "world_x", "wx", "geo_x", "east", "longitude"),
+    "world y": ("world y", "world_y", "wy", "geo_y", "north", "latitude"),
+    "world z": ("world z", "world_z", "wz", "geo_z", "up", "height", "altitude"),
+}
+"""Names of columns, in lower case; upper-case X, Y, Z are world coordinates."""
+
+_TODO_CSV = "write lines such as: corner1,2016/IMG_0001.jpg,812.5,334.0"
+_TODO_ODM = "write lines such as: 544256.7 5320919.9 5.0 3044.5 2622.0 IMG_0525.jpg gcp01"
+
+
+@dataclass(frozen=True, slots=True)
+class Click:
+    """One point in one image."""
+
+    image: str
+    """As the file names it."""
+    x: float
+    """Pixels."""
+    y: float
+    line: int
+    """Of the file, from 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class TiePoint:
+    """A point of the scene that a person found in images."""
+
+    name: str
+    clicks: tuple[Click, ...]
+    world: tuple[float, float, float] | None
+    """Where it is, for ground control, in the file's reference system."""
+
+
+@dataclass(frozen=True, slots=True)
+class TiePoints:
+    """What a file says."""
+
+    path: Path
+    points: tuple[TiePoint, ...]
+    """Sorted by name."""
+    crs: str | None
+    """Reference system of the world coordinates as PROJ reads it; None for that of the model."""
+
+    def located(self, georeference: Georeference | None) -> dict[str, Array]:
+        """World coordinates of the ground control in the frame of a model. Name -> [3]
+
+        Raises:
+            SceneError: If the file names a reference system and the model has none, or PROJ does
+                not know it.
+        """
+        known = {p.name: p.world for p in self.points if p.world is not None}
+        if self.crs is None or not known:
+            return {name: np.array(xyz) for name, xyz in known.items()}
+        if georeference is None:
+            raise SceneError(
+                self.path,
+                expected="world coordinates in the frame of the model, which is not georeferenced",
+                found=f"coordinates in {self.crs}",
+                todo="leave out the reference system: the model is then moved to the coordinates",
+            )
+        geodetic = _geodetic(self.path, self.crs, np.array(list(known.values())))
+        enu = georeference.to_enu(geodetic[:, 1], geodetic[:, 0], geodetic[:, 2])
+        return dict(zip(known, enu, strict=True))
+
+
+def read_tie_points(path: Path, *, scale: float = 1.0) -> TiePoints:
+    """Read tie points or ground control from a CSV or from ODM's ``gcp_list.txt``.
+
+    Args:
+        path: The file.
+        scale: Size of the photos in units of those that were clicked in.
+
+    Raises:
+        SceneError: If a line is wrong; the message names it.
+    """
+    lines = read_text(Path(path)).splitlines()
+    filled = [(n, line.strip()) for n, line in enumerate(lines, 1) if line.strip()]
+    if not filled:
+        raise SceneError(path, expected="tie points", found="an empty file", todo=_TODO_CSV)
+    if _is_projection(filled[0][1]):
+        crs: str | None = _projection(path, filled[0][1])
+        rows = _odm_rows(path, filled[1:])
+    else:
+        named = (
+            (n, found[1].strip())
+            for n, line in filled
+            if (found := re.fullmatch(r"#\s*crs\s*[:=]\s*(.+)", line, re.IGNORECASE))
+        )
+        crs = next((_checked_crs(f"{path}:{n}", text) for n, text in named), None)
+        rows = _csv_rows(path, [(n, line) for n, line in filled if not line.startswith("#")])
+    scaled = ((p, replace(c, x=scale * c.x, y=scale * c.y), w) for p, c, w in rows)
+    return _assemble(path, scaled, crs)
+
+
+_Row = tuple[str, Click, tuple[float, float, float] | None]
+
+
+def _assemble(path: Path, rows: Iterator[_Row], crs: str | None) -> TiePoints:
+    """Group clicks by point; refuse two places of one point, in an image or in the world."""
+    clicks: dict[str, dict[str, Click]] = {}
+    worlds: dict[str, tuple[float, float, float]] = {}
+    for name, click, world in rows:
+        mine = clicks.setdefault(name, {})
+        if click.image in mine:
+            raise _wrong(
+                path, click.line, f"one click of point {name!r} in {click.image}",
+                f"another one on line {mine[click.image].line}", "remove one of the two lines",
+            )  # fmt: skip
+        mine[click.image] = click
+        if world is not None and worlds.setdefault(name, world) != world:
+            raise _wrong(
+                path, click.line, f"the same world coordinates of point {name!r} on all its lines",
+                f"{world} after {worlds[name]}", "correct them, or give the points two names",
+            )  # fmt: skip
+    points = tuple(
+        TiePoint(name, tuple(mine.values()), worlds.get(name))
+        for name, mine in sorted(clicks.items())
+    )
+    if not points:
+        raise SceneError(path, expected="tie points", found="no clicks", todo=_TODO_CSV)
+    return TiePoints(Path(path), points, crs)
+
+
+def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
+    cells = [(n, [c.strip() for c in next(csv.reader([line]))]) for n, line in lines]
+    order = _header(path, *cells[0]) if cells else None
+    if order is None:
+        names = ("point", "image", "x", "y", "world x", "world y", "world z")
+        order = {name: i for i, name in enumerate(names)}
+    else:
+        cells = cells[1:]
+    for number, row in cells:
+        if len(row) <= max(order[name] for name in ("point", "image", "x", "y")):
+            found = f"{len(row)} fields"
+            raise _wrong(path, number, "point id, image, x, y", found, _TODO_CSV)
+        point, image = row[order["point"]], row[order["image"]]
+        if not point or not image:
+            raise _wrong(path, number, "a point id and an image", f"{row[:4]}", _TODO_CSV)
+        xy = [_number(path, number, row[order[name]], name) for name in ("x", "y")]
+        places = [order.get(name, len(row)) for name in ("world x", "world y", "world z")]
+        world = [row[i] for i in places if i < len(row) and row[i]]
+        if len(world) not in (0, 3):
+            raise _wrong(
+                path, number, "three world coordinates, or none", f"{len(world)}", _TODO_CSV
+            )
+        xyz = [_number(path, number, text, "a world coordinate") for text in world]
+        yield point, Click(image, xy[0], xy[1], number), (xyz[0], xyz[1], xyz[2]) if xyz else None
+
+
+def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | None:
+    """Which field is in which column; None if the first line is data."""
+    if len(row) > 3 and _is_number(row[2]) and _is_number(row[3]):
+        return None
+    order = {}
+    for i, name in enumerate(row):
+        if name in ("X", "Y", "Z") and any(n in row for n in ("x", "y")):
+            order[f"world {name.lower()}"] = i
+            continue
+        for key, names in COLUMNS.items():
+            if name.lower() in names:
+                order.setdefault(key, i)
+    missing = [key for key in ("point", "image", "x", "y") if key not in order]
+    if missing:
+        raise _wrong(
+            path, number, "a header with point, image, x, y, or a line of data",
+            f"no {', '.join(missing)} in {','.join(row)[:80]!r}", _TODO_CSV,
+        )  # fmt: skip
+    return order
+
+
+def _odm_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
+    for number, line in lines:
+        if line.startswith("#"):
+            continue
+        fields = line.split("\t") if line.count("\t") >= 5 else line.split()
+        fields = [f.strip() for f in fields]
+        if len(fields) < 6:
+            raise _wrong(
+                path, number, "geo_x geo_y geo_z im_x im_y image_name [gcp_name]",
+                f"{len(fields)} fields", _TODO_ODM,
+            )  # fmt: skip
+        names = ("geo_x", "geo_y", "geo_z", "im_x", "im_y")
+        x, y, z, u, v = (
+            _number(path, number, f, n) for f, n in zip(fields[:5], names, strict=True)
+        )
+        # Without a name, a point is known by where it is.
+        point = fields[6] if len(fields) > 6 and fields[6] else f"{fields[0]} {fields[1]}"
+        yield point, Click(fields[5], u, v, number), (x, y, z)
+
+
+def _is_projection(line: str) -> bool:
+    return bool(re.match(r"(\+proj|EPSG:|WGS84)", line, re.IGNORECASE))
+
+
+def _projection(path: Path, line: str) -> str:
+    """The first line of ``gcp_list.txt``: PROJ, EPSG, or ``WGS84 UTM 32N``."""
+    if utm := re.fullmatch(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", line, re.IGNORECASE):
+        zone = int(utm[1])
+        if 1 <= zone <= 60:
+            return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + zone}"
+    return _checked_crs(f"{path}:1", "EPSG:4326" if line.upper() == "WGS84" else line)
+
+
+def _checked_crs(place: str, text: str) -> str:
+    import pyproj
+
+    try:
+        pyproj.CRS.from_user_input(text)
+    except pyproj.exceptions.CRSError as error:
+        raise SceneError(
+            place,
+            expected="a reference system that PROJ knows, such as EPSG:32632 or WGS84 UTM 32N",
+            found=repr(text[:80]),
+            todo="correct it",
+        ) from error
+    return text
+
+
+def _geodetic(path: Path, crs: str, xyz: Array) -> Array:
+    """Longitude, latitude (degrees) and height of points in a reference system. [N, 3]"""
+    import pyproj
+
+    source = pyproj.CRS.from_user_input(crs)
+    # Heights stay as they are: geoid grids are not at hand, and photos mix the kinds anyway.
+    flat: Any = pyproj.Transformer.from_crs(source, "EPSG:4326", always_xy=True)
+    longitude, latitude = flat.transform(xyz[:, 0], xyz[:, 1])
+    out = np.column_stack([longitude, latitude, xyz[:, 2]])
+    if not np.isfinite(out).all():
+        raise SceneError(
+            path,
+            expected=f"world coordinates that lie within {crs}",
+            found=str(xyz[~np.isfinite(out).all(axis=1)][0].tolist()),
+            todo="check the reference system, and the order east, north, height",
+        )
+    return out
+
+
+def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int | None]:
+    """Index of the model's image for each image that is clicked in; None for those it lacks.
+
+    An image may be named by its whole path or by the end of it, where that is unique.
+
+    Raises:
+        SceneError: If the end of a path fits several images, or no click fits the model at all.
+    """
+    index = {name: i for i, name in enumerate(names)}
+    found: dict[str, int | None] = {}
+    for click in (c for p in tie_points.points for c in p.clicks):
+        if click.image in found:
+            continue
+        plain = re.sub(r"\s", "_", PurePosixPath(click.image.replace("\\", "/")).as_posix())
+        ends = [n for n in names if n == plain or n.endswith(f"/{plain}")]
+        if plain not in index and len(ends) > 1:
+            raise _wrong(
+                tie_points.path, click.line, "the name of one image",
+                f"{click.image!r}, which fits {ends[0]} and {ends[1]}",
+                "write the name with its folder",
+            )  # fmt: skip
+        found[click.image] = index.get(plain, index[ends[0]] if ends else None)
+    if all(i is None for i in found.values()):
+        first = tie_points.points[0].clicks[0]
+        raise _wrong(
+            tie_points.path, first.line, "images that are registered, such as "
+            f"{names[0] if names else '(there are none)'}", first.image, "correct the names",
+        )  # fmt: skip
+    return found
+
+
+def _number(path: Path, line: int, text: str, what: str) -> float:
+    if not _is_number(text):
+        raise _wrong(path, line, f"a number for {what}", repr(text[:40]), "correct the line")
+    return float(text)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False
+
+
+def _wrong(path: Path, line: int, expected: str, found: str, todo: str) -> SceneError:
+    return SceneError(f"{path}:{line}", expected=expected, found=found, todo=todo)

@@ -1,0 +1,1 @@
+"""What stands in a generated city, and how it changes from period to period."""

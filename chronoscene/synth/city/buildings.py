@@ -1,0 +1,198 @@
+"""Buildings: facades with openings, roofs, and the stages of a construction site."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.synth.city import palettes as pal
+from chronoscene.synth.city.facades import Front, facade
+from chronoscene.synth.city.roofs import flat_roof, pitched_roof
+from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.seeds import key_number, rng_for
+
+Array = NDArray[np.float64]
+Z = np.array([0.0, 0.0, 1.0])
+SLAB = 0.15
+"""Height of pavements above the road."""
+
+
+@dataclass(frozen=True, slots=True)
+class Building:
+    """A rectangular building. Metres; axes of the world."""
+
+    name: str
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+    storeys: int
+    roof: str
+    """``flat``, ``gable`` or ``hip``."""
+    wall: str
+    """``plaster``, ``brick``, ``panel`` or ``concrete``."""
+    blank: tuple[bool, bool, bool, bool] = (False, False, False, False)
+    """Sides without openings: south, east, north, west."""
+    shops: tuple[bool, bool, bool, bool] = (False, False, False, False)
+    """Sides with shop fronts."""
+    balconies: bool = False
+    storey: float = 3.1
+    ground: float = 3.6
+    look: int = 0
+    """Changes colours and windows without changing the volume."""
+    simple: bool = False
+    """Windows without relief, for the distance."""
+
+    @property
+    def wall_height(self) -> float:
+        return self.ground + self.storey * (self.storeys - 1)
+
+    @property
+    def sides(self) -> list[tuple[Array, Array, float]]:
+        """Lower left corner seen from outside, direction along the wall, width."""
+        a = np.array([self.x0, self.y0, SLAB])
+        b = np.array([self.x1, self.y0, SLAB])
+        c = np.array([self.x1, self.y1, SLAB])
+        d = np.array([self.x0, self.y1, SLAB])
+        x, y = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
+        dx, dy = self.x1 - self.x0, self.y1 - self.y0
+        return [(a, x, dx), (b, y, dy), (c, -x, dx), (d, -y, dy)]
+
+
+def finished(spec: Building, seed: int) -> Part:
+    """The finished building."""
+    rng = rng_for(seed, spec.name, "look", spec.look)
+    b = PartBuilder(key_number(spec.name, spec.look))
+    shape = rng_for(seed, spec.name, "shape")
+    front = Front.random(b, spec.wall, rng, shape, spec.storey, spec.ground)
+    for i, (corner, along, width) in enumerate(spec.sides):
+        facade(
+            b,
+            front,
+            corner,
+            along,
+            width,
+            spec.storeys,
+            blank=spec.blank[i],
+            shop=spec.shops[i],
+            balconies=spec.balconies and i % 2 == 0,
+            simple=spec.simple,
+            rng=shape,
+        )
+    # The roof keeps its own random numbers: a new look of the walls must not move its parts.
+    roof_rng = rng_for(seed, spec.name, "roof")
+    top = np.array([spec.x0, spec.y0, SLAB + spec.wall_height])
+    size = (spec.x1 - spec.x0, spec.y1 - spec.y0)
+    if spec.roof == "flat":
+        flat_roof(b, top, size, front.wall, roof_rng, plain=spec.simple)
+    else:
+        pitched_roof(b, top, size, spec.roof, front.wall, roof_rng, plain=spec.simple)
+    return b.build()
+
+
+def frame(spec: Building, storeys: int, seed: int) -> Part:
+    """Bare concrete frame of the first storeys: slabs, columns, core, a scaffold on one side."""
+    b = PartBuilder(key_number(spec.name, "frame"))
+    rng = rng_for(seed, spec.name, "frame")
+    concrete = pal.wall_style(b, "concrete", rng, spec.storey)
+    dx, dy = spec.x1 - spec.x0, spec.y1 - spec.y0
+    levels = SLAB + spec.ground + spec.storey * np.arange(-1, storeys)
+    levels[0] = SLAB
+    corners = np.stack([np.full(len(levels), spec.x0), np.full(len(levels), spec.y0), levels], 1)
+    b.boxes(corners - 0.28 * Z * (levels > 1)[:, None], [dx, 0, 0], [0, dy, 0], 0.28 * Z, concrete)
+    xs = np.linspace(spec.x0 + 0.4, spec.x1 - 0.8, max(3, round(dx / 5)))
+    ys = np.linspace(spec.y0 + 0.4, spec.y1 - 0.8, max(3, round(dy / 5)))
+    grid = np.stack(np.meshgrid(xs, ys, indexing="ij"), -1).reshape(-1, 2)
+    for low, high in pairwise(levels):
+        base = np.column_stack([grid, np.full(len(grid), low + 0.02)])
+        b.boxes(base, [0.4, 0, 0], [0, 0.4, 0], (high - low - 0.32) * Z, concrete)
+    core = [spec.x0 + 0.42 * dx, spec.y0 + 0.38 * dy, SLAB + 0.3]
+    b.boxes(core, [0.2 * dx, 0, 0], [0, 0.25 * dy, 0], (levels[-1] + 1.6) * Z, concrete)
+    _rods(b, spec, grid, float(levels[-1]))
+    _scaffold(b, spec, float(levels[-1]))
+    return b.build()
+
+
+def _rods(b: PartBuilder, spec: Building, grid: Array, top: float) -> None:
+    """Steel that waits for the next storey, and pallets on the top slab."""
+    steel = pal.plain_style(b, srgb(122, 78, 52))
+    base = np.column_stack([grid + 0.1, np.full(len(grid), top)])
+    b.boxes(base, [0.16, 0, 0], [0, 0.16, 0], 1.1 * Z, steel)
+    rng = rng_for(key_number(spec.name), "pallets")
+    wood = pal.wood_style(b, srgb(176, 138, 90))
+    n = 7
+    x = rng.uniform(spec.x0 + 1, spec.x1 - 3, n)
+    y = rng.uniform(spec.y0 + 1, spec.y1 - 3, n)
+    size = rng.uniform(0.7, 1.6, (n, 3))
+    zeros = np.zeros(n)
+    b.boxes(
+        np.column_stack([x, y, np.full(n, top)]),
+        np.column_stack([size[:, 0], zeros, zeros]),
+        np.column_stack([zeros, size[:, 1], zeros]),
+        np.column_stack([zeros, zeros, size[:, 2]]),
+        wood,
+        bottom=False,
+    )
+
+
+def _scaffold(b: PartBuilder, spec: Building, top: float) -> None:
+    """Poles and boards along the south side."""
+    pole = pal.metal_style(b, srgb(176, 150, 60))
+    board = pal.wood_style(b, srgb(184, 150, 100))
+    xs = np.arange(spec.x0, spec.x1 - 0.1, 2.5)
+    for y in (spec.y0 - 1.5, spec.y0 - 0.5):
+        base = np.column_stack([xs, np.full(len(xs), y), np.full(len(xs), SLAB)])
+        b.boxes(base, [0.14, 0, 0], [0, 0.14, 0], (top - SLAB) * Z, pole)
+    zs = np.arange(SLAB + 2.0, top, 2.1)
+    base = np.column_stack([np.full(len(zs), spec.x0), np.full(len(zs), spec.y0 - 1.4), zs])
+    b.boxes(base, [spec.x1 - spec.x0, 0, 0], [0, 0.9, 0], 0.08 * Z, board)
+
+
+def foundation(spec: Building, seed: int) -> Part:
+    """Ground slab with starter walls and stacks of material."""
+    b = PartBuilder(key_number(spec.name, "foundation"))
+    rng = rng_for(seed, spec.name, "foundation")
+    concrete = pal.wall_style(b, "concrete", rng, spec.storey)
+    dx, dy = spec.x1 - spec.x0, spec.y1 - spec.y0
+    b.boxes([spec.x0, spec.y0, SLAB], [dx, 0, 0], [0, dy, 0], 0.5 * Z, concrete, bottom=False)
+    for f in (0.0, 0.33, 0.66):
+        low = [spec.x0 + f * dx, spec.y0 + 0.5, SLAB + 0.5]
+        b.boxes(low, [0.3, 0, 0], [0, dy - 1.0, 0], (0.8 + f) * Z, concrete, bottom=False)
+    _rods(b, spec, np.array([[spec.x0 + 1.5, spec.y0 + 1.5]]), SLAB + 0.5)
+    return b.build()
+
+
+def rubble(spec: Building, seed: int) -> Part:
+    """What a demolition leaves: heaps of debris and a stump of wall."""
+    b = PartBuilder(key_number(spec.name, "rubble"))
+    rng = rng_for(seed, spec.name, "rubble")
+    n = 160
+    center = np.array([spec.x0 + spec.x1, spec.y0 + spec.y1]) / 2
+    half = np.array([spec.x1 - spec.x0, spec.y1 - spec.y0]) / 2
+    place = rng.uniform(-0.85, 0.85, (n, 2))
+    height = 1.9 * np.exp(-3.0 * (place**2).sum(1)) * rng.uniform(0.2, 1.0, n)
+    for kind in range(3):
+        mine = np.arange(n) % 3 == kind
+        c = (srgb(160, 120, 96), srgb(168, 164, 156), srgb(120, 88, 70))[kind]
+        turn = rng.uniform(0, 2 * np.pi, int(mine.sum()))
+        size = rng.uniform(0.35, 1.5, (int(mine.sum()), 3)) * [1, 0.7, 0.5]
+        a = np.column_stack([np.cos(turn), np.sin(turn), rng.normal(0, 0.25, len(turn))])
+        a /= np.linalg.norm(a, axis=1, keepdims=True)
+        side = np.cross(Z, a)
+        side /= np.linalg.norm(side, axis=1, keepdims=True)
+        up = np.cross(a, side)
+        at = np.column_stack([center + place[mine] * half, SLAB + height[mine]])
+        style = pal.plain_style(b, c, 0.4, 0.4)
+        b.boxes(at, a * size[:, :1], side * size[:, 1:2], up * size[:, 2:], style)
+    wall = pal.wall_style(b, "brick", rng, spec.storey)
+    low = [spec.x0, spec.y0, SLAB]
+    b.boxes(low, [0.4, 0, 0], [0, 0.6 * 2 * half[1], 0], 1.4 * Z, wall, bottom=False)
+    return b.build()
+
+
+def reclad(spec: Building, wall: str, look: int) -> Building:
+    """The same volume with other walls."""
+    return replace(spec, wall=wall, look=look)

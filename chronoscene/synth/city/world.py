@@ -1,0 +1,176 @@
+"""The world over time: named elements with the periods in which they exist, and the edits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.synth.render.light import Light
+from chronoscene.synth.render.mesh import Part, merge
+
+Array = NDArray[np.float64]
+
+CHANGE_VERBS = {
+    "building": "rebuild",
+    "facade": "reclad",
+    "tree": "grow",
+    "lawn": "season",
+    "ground": "resurface",
+}
+"""What a change of state is called, by kind of element; ``change`` for the others."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Element:
+    """One state of one object, with the periods in which it looks so."""
+
+    name: str
+    """Identity: the states of one object share it."""
+    kind: str
+    state: str
+    periods: tuple[int, ...]
+    part: Part
+
+
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """A difference between a period and the one before it."""
+
+    period: int
+    """The first period that shows the new state."""
+    action: str
+    """``add``, ``remove`` or a verb of change."""
+    target: str
+    kind: str
+    before: str | None
+    after: str | None
+    bounds: tuple[tuple[float, ...], tuple[float, ...]]
+    """Box around both states: lowest and highest corner in metres."""
+
+
+@dataclass(slots=True)
+class World:
+    """Everything that can be photographed."""
+
+    seed: int
+    lights: list[Light]
+    core: Array
+    """Rectangle of the city core: lowest and highest corner. [2, 2]"""
+    near: bool = False
+    """Whether cameras come close to the suburbs, which then need more detail."""
+    roads: list[tuple[Array, Array]] = field(default_factory=list)
+    """Centre lines of the core's roads, for walks. Each end [2]."""
+    focus: list[Array] = field(default_factory=list)
+    """Places that cameras look at. [3] each"""
+    elements: list[Element] = field(default_factory=list)
+    edits: list[Edit] = field(default_factory=list)
+    lifetime: frozenset[int] | None = None
+    """Periods in which what is being added exists; None for all. See `during`."""
+
+    @property
+    def periods(self) -> int:
+        return len(self.lights)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the objects in the order of their identity numbers."""
+        return list(dict.fromkeys(e.name for e in self.elements))
+
+    @contextmanager
+    def during(self, periods: Sequence[int]) -> Iterator[None]:
+        """Whatever is added in this block exists in these periods only."""
+        self.lifetime = frozenset(periods)
+        try:
+            yield
+        finally:
+            self.lifetime = None
+
+    def add(
+        self,
+        name: str,
+        kind: str,
+        states: Sequence[Hashable | None],
+        make: Callable[[Any], Part],
+    ) -> None:
+        """Add an object by its state in each period; None where it does not exist.
+
+        Args:
+            name: Identity, unique.
+            kind: Sort of object, for the edit list.
+            states: One per period; equal states share geometry.
+            make: Builds the geometry of a state.
+        """
+        assert len(states) == self.periods
+        if self.lifetime is not None:
+            states = [s if p in self.lifetime else None for p, s in enumerate(states)]
+        parts: dict[Hashable, Part] = {}
+        for state in states:
+            if state is not None and state not in parts:
+                parts[state] = make(state)
+        for state, part in parts.items():
+            periods = tuple(p for p, s in enumerate(states) if s == state)
+            self.elements.append(Element(name, kind, _label(state), periods, part))
+        for p in range(1, self.periods):
+            before, after = states[p - 1], states[p]
+            if before != after:
+                known = [parts[s] for s in (before, after) if s is not None]
+                self.edits.append(_edit(p, name, kind, before, after, known))
+
+    def place(
+        self, name: str, kind: str, present: Sequence[bool], make: Callable[[], Part]
+    ) -> None:
+        """Add an object that looks the same in all periods in which it is there."""
+        if any(present):
+            self.add(name, kind, ["there" if p else None for p in present], lambda _: make())
+
+    def always(self, name: str, kind: str, make: Callable[[], Part]) -> None:
+        """Add an object that never changes."""
+        self.place(name, kind, [True] * self.periods, make)
+
+    @property
+    def seasons(self) -> list[str]:
+        """Season of each period."""
+        return [light.season for light in self.lights]
+
+    def geometry(self, period: int) -> tuple[Part, NDArray[np.int32]]:
+        """All geometry of a period and the identity number of each triangle's object."""
+        number = {name: i for i, name in enumerate(self.names)}
+        here = [e for e in self.elements if period in e.periods]
+        ids = [np.full(len(e.part.tri_patch), number[e.name], np.int32) for e in here]
+        return merge([e.part for e in here]), np.concatenate(ids)
+
+
+def _label(state: Hashable) -> str:
+    """A state as text: its parts joined by blanks."""
+    if isinstance(state, tuple):
+        return " ".join(str(s) for s in state)
+    return str(state)
+
+
+def _edit(
+    period: int,
+    name: str,
+    kind: str,
+    before: Hashable | None,
+    after: Hashable | None,
+    parts: list[Part],
+) -> Edit:
+    verb = "add" if before is None else "remove"
+    if before is not None and after is not None:
+        verb = CHANGE_VERBS.get(kind, "change")
+    bounds = np.stack([p.bounds for p in parts])
+    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    return Edit(
+        period,
+        verb,
+        name,
+        kind,
+        None if before is None else _label(before),
+        None if after is None else _label(after),
+        (tuple(float(x) for x in low), tuple(float(x) for x in high)),
+    )

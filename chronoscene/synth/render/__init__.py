@@ -1,0 +1,1 @@
+"""Ray casting: textures, light and compiled shading."""

@@ -1,0 +1,164 @@
+"""Light of a period: sun, sky, haze, exposure; and the compiled sky."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.synth.render.compiled import inner
+from chronoscene.synth.render.noise import fbm, smooth
+from chronoscene.synth.seeds import rng_for
+
+Array = NDArray[np.float64]
+Color = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """Light settings of one period. Radiance units are relative; 1 is a white wall in the sun."""
+
+    name: str
+    season: str
+    """``summer``, ``spring``, ``autumn`` or ``winter``: palette of grass and leaves."""
+    azimuth: float
+    """Direction to the sun, degrees from +x towards +y."""
+    elevation: float
+    """Degrees above the horizon."""
+    sun: Color
+    """Radiance of a white surface that faces the sun."""
+    zenith: Color
+    horizon: Color
+    cloud: float
+    """Share of the sky under clouds, 0..1."""
+    haze: float
+    """Extinction per metre."""
+    exposure: float
+    white: Color
+    """Factors of the camera's white balance."""
+    sky_seed: int = 0
+    """Other clouds."""
+
+    @property
+    def direction(self) -> Array:
+        """Unit vector towards the sun. [3]"""
+        a, e = math.radians(self.azimuth), math.radians(self.elevation)
+        return np.array([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)])
+
+
+MOODS: tuple[Light, ...] = (
+    Light(
+        "summer noon", "summer", -60.0, 54.0, (1.95, 1.86, 1.68), (0.13, 0.27, 0.60),
+        (0.50, 0.61, 0.72), 0.45, 1 / 2600, 0.74, (1.0, 1.0, 1.0),
+    ),
+    Light(
+        "warm evening", "summer", -158.0, 20.0, (2.60, 1.50, 0.68), (0.15, 0.21, 0.40),
+        (0.68, 0.51, 0.38), 0.55, 1 / 1500, 1.12, (1.05, 0.98, 0.86),
+    ),
+    Light(
+        "cool autumn morning", "autumn", 25.0, 27.0, (1.35, 1.38, 1.45), (0.24, 0.34, 0.52),
+        (0.52, 0.60, 0.68), 0.65, 1 / 1900, 0.86, (0.91, 0.99, 1.13),
+    ),
+    Light(
+        "overcast spring", "spring", 95.0, 48.0, (0.35, 0.34, 0.33), (0.62, 0.66, 0.70),
+        (0.58, 0.61, 0.64), 0.95, 1 / 1400, 1.10, (0.97, 1.0, 1.03),
+    ),
+    Light(
+        "winter noon", "winter", -95.0, 19.0, (1.95, 1.66, 1.28), (0.16, 0.26, 0.50),
+        (0.50, 0.55, 0.62), 0.35, 1 / 1600, 1.10, (0.98, 1.0, 1.05),
+    ),
+    Light(
+        "spring morning", "spring", 40.0, 37.0, (1.95, 1.70, 1.35), (0.15, 0.28, 0.58),
+        (0.52, 0.58, 0.64), 0.50, 1 / 1700, 0.76, (1.02, 1.0, 0.97),
+    ),
+)  # fmt: skip
+"""Moods in the order that periods take them: neighbours differ in every respect."""
+
+
+def make_lights(seed: int, periods: int) -> list[Light]:
+    """One light per period: the moods in order, each turned and varied a little."""
+    rng = rng_for(seed, "light")
+    turn = float(rng.uniform(0, 360))
+    lights = []
+    for p in range(periods):
+        mood = MOODS[p % len(MOODS)]
+        azimuth = (mood.azimuth + turn + float(rng.uniform(-15, 15))) % 360
+        # Later rounds through the moods must not repeat the earlier ones.
+        azimuth = (azimuth + 67.0 * (p // len(MOODS))) % 360
+        lights.append(
+            Light(
+                mood.name,
+                mood.season,
+                round(azimuth, 2),
+                round(mood.elevation + float(rng.uniform(-3, 3)), 2),
+                mood.sun,
+                mood.zenith,
+                mood.horizon,
+                mood.cloud,
+                mood.haze,
+                round(mood.exposure * float(rng.uniform(0.94, 1.06)), 3),
+                mood.white,
+                100 * (p + 1) + seed % 89,
+            )
+        )
+    return lights
+
+
+class SkyArgs(NamedTuple):
+    """What compiled code needs of a light."""
+
+    direction: Array
+    sun: Array
+    zenith: Array
+    horizon: Array
+    cloud: float
+    haze: float
+    exposure: float
+    white: Array
+    sky_seed: int
+
+
+def sky_args(light: Light) -> SkyArgs:
+    """Arrays of a light for compiled code."""
+    return SkyArgs(
+        light.direction,
+        np.array(light.sun),
+        np.array(light.zenith),
+        np.array(light.horizon),
+        light.cloud,
+        light.haze,
+        light.exposure,
+        np.array(light.white),
+        light.sky_seed,
+    )
+
+
+@inner
+def sky_radiance(dx, dy, dz, a, detail):  # type: ignore[no-untyped-def]
+    """Radiance of the sky in a unit direction; ``detail`` False leaves the clouds out."""
+    up = max(dz, 0.0)
+    t = 1.0 - math.exp(-4.5 * up)
+    r = a.horizon[0] + (a.zenith[0] - a.horizon[0]) * t
+    g = a.horizon[1] + (a.zenith[1] - a.horizon[1]) * t
+    b = a.horizon[2] + (a.zenith[2] - a.horizon[2]) * t
+    towards = max(0.0, dx * a.direction[0] + dy * a.direction[1] + dz * a.direction[2])
+    sharp = towards * towards * towards
+    sharp *= sharp
+    wide, sharp = 0.10 * sharp, 0.30 * sharp**8
+    glow = wide + sharp
+    r, g, b = r + glow * a.sun[0], g + glow * a.sun[1], b + glow * a.sun[2]
+    # Below the clouds of a grey day little of the blue is left.
+    cover, white = 0.6 * a.cloud * a.cloud, 0.62
+    if detail and up > 0.01:
+        px, py = dx / (up + 0.12), dy / (up + 0.12)
+        n = fbm(px, py, 1.1, 6, a.sky_seed, 0.004) + 0.3 * fbm(px, py, 3.3, 2, a.sky_seed + 7, 0.01)
+        edge = 0.42 - 0.95 * a.cloud
+        cover = smooth(edge, edge + 0.45, n) * smooth(0.01, 0.10, up) * 0.9
+        white = 0.80 - 0.45 * smooth(edge + 0.2, edge + 0.8, n)
+    cr = white * (0.36 * a.sun[0] + 0.75 * a.horizon[0])
+    cg = white * (0.36 * a.sun[1] + 0.75 * a.horizon[1])
+    cb = white * (0.36 * a.sun[2] + 0.75 * a.horizon[2])
+    return r + (cr - r) * cover, g + (cg - g) * cover, b + (cb - b) * cover

@@ -1,0 +1,239 @@
+"""Rendering one period: images, depth, object and albedo maps, visibility tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from chronoscene.scene import Camera
+from chronoscene.synth.render.geometry_tables import MISS, Tables
+from chronoscene.synth.render.light import Light, sky_args
+from chronoscene.synth.render.mesh import Part
+from chronoscene.synth.render.probes import Probes, probe_values
+from chronoscene.synth.render.shade import albedo_at, camera_rays, shade, shadow_rays
+
+Array = NDArray[np.float64]
+MAX_SAMPLES = 1_500_000
+"""Rays that are in memory at once."""
+PROBE_RAYS = 64
+SUN_SPREAD = 0.009
+"""Radius of the sun's disc in radians; about twice the real one, for softer edges."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PixelMaps:
+    """What the rays through pixel centres hit. Sky has depth 0 and element -1."""
+
+    depth: NDArray[np.float32]
+    """z-depth in metres. [H, W]"""
+    element: NDArray[np.int32]
+    """Identity of the object. [H, W]"""
+    albedo: Array
+    """Linear. [H, W, 3]"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """First hits of rays."""
+
+    t: NDArray[np.float32]
+    """Parameter along the ray; infinite for a miss. [n]"""
+    tri: NDArray[np.uint32]
+    uv: NDArray[np.float32]
+    """[n, 2]"""
+
+
+class PeriodRenderer:
+    """Ray caster and shader of the world at one period.
+
+    Args:
+        part: All geometry of the period.
+        tri_element: Identity of the object of each triangle. [T]
+        light: Light settings.
+        supersample: Samples per pixel and axis.
+        probe_box: Lowest and highest corner of the region with its own indirect light. [2, 3]
+        probe_spacing: Metres between probes.
+    """
+
+    def __init__(
+        self,
+        part: Part,
+        tri_element: NDArray[np.int32],
+        light: Light,
+        *,
+        supersample: int,
+        probe_box: Array,
+        probe_spacing: float,
+    ) -> None:
+        self.light = light
+        self._sky = sky_args(light)
+        self._element = tri_element
+        self._ss = supersample
+        self._box, self._spacing = probe_box, probe_spacing
+        self.tables = Tables(
+            part.vertices,
+            part.normals,
+            part.tri_patch,
+            part.patches,
+            part.patch_style,
+            part.patch_seed,
+            part.styles,
+        )
+        self._scene = o3d.t.geometry.RaycastingScene()
+        corners = np.ascontiguousarray(part.vertices.reshape(-1, 3))
+        index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+        self._scene.add_triangles(_tensor(corners), _tensor(index))
+
+    def cast(self, rays: NDArray[np.float32]) -> Hits:
+        """First hits of rays (origin, direction). [n, 6]"""
+        found = self._scene.cast_rays(_tensor(rays))
+        return Hits(
+            found["t_hit"].numpy(), found["primitive_ids"].numpy(), found["primitive_uvs"].numpy()
+        )
+
+    def occluded(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Whether rays hit anything. [n]"""
+        return np.asarray(self._scene.test_occlusions(_tensor(rays)).numpy(), np.bool_)
+
+    def clearance(self, points: Array) -> Array:
+        """Distance from points [n, 3] to the nearest surface. [n]"""
+        query = _tensor(np.asarray(points, np.float32))
+        return np.asarray(self._scene.compute_distance(query).numpy(), np.float64)
+
+    def coarse_depth(self, camera: Camera, cam_from_world: Array) -> NDArray[np.float32]:
+        """z-depth along a coarse grid of the view; infinite for the sky. [n]"""
+        k = camera.K.copy()
+        k[0] *= 24 / camera.width
+        k[1] *= 18 / camera.height
+        return self.cast(camera_rays(np.linalg.inv(cam_from_world), k, 24, 0, 18, 1)).t
+
+    def image(self, camera: Camera, cam_from_world: Array) -> NDArray[np.uint8]:
+        """Photo of the period. [H, W, 3]"""
+        world_from_cam = np.linalg.inv(cam_from_world)
+        per_pixel = self._ss * self._ss
+        step = max(1, MAX_SAMPLES // (camera.width * per_pixel))
+        rows = []
+        for row in range(0, camera.height, step):
+            count = min(step, camera.height - row)
+            rays = camera_rays(world_from_cam, camera.K, camera.width, row, count, self._ss)
+            rows.append(self._shade(rays, per_pixel, 1.0 / (camera.K[0, 0] * self._ss)))
+        return np.concatenate(rows).reshape(camera.height, camera.width, 3)
+
+    def maps(self, camera: Camera, cam_from_world: Array) -> PixelMaps:
+        """Depth, objects and albedo at the pixel centres."""
+        shape = (camera.height, camera.width)
+        world_from_cam = np.linalg.inv(cam_from_world)
+        rays = camera_rays(world_from_cam, camera.K, camera.width, 0, camera.height, 1)
+        hits = self.cast(rays)
+        depth = np.where(hits.tri == MISS, np.float32(0), hits.t)
+        color = self.albedo(rays, hits, depth / camera.K[0, 0])
+        return PixelMaps(
+            depth.reshape(shape), self.elements(hits).reshape(shape), color.reshape(*shape, 3)
+        )
+
+    def elements(self, hits: Hits) -> NDArray[np.int32]:
+        """Identity of the object that each ray hit, -1 for a miss. [n]"""
+        return self.elements_of(hits.tri)
+
+    def surface_near(self, points: Array) -> NDArray[np.uint32]:
+        """Triangles that pass through points, `MISS` where none is within a millimetre. [n]"""
+        query = _tensor(np.asarray(points, np.float32))
+        found = self._scene.compute_closest_points(query)
+        gap = np.linalg.norm(found["points"].numpy() - points, axis=1)
+        limit = 1e-3 + 2e-6 * np.abs(points).max(axis=1)
+        return np.where(gap < limit, found["primitive_ids"].numpy(), np.uint32(MISS))
+
+    def elements_of(self, tri: NDArray[np.uint32]) -> NDArray[np.int32]:
+        """Identity of the objects of triangles, -1 for `MISS`. [n]"""
+        out = np.full(len(tri), -1, np.int32)
+        hit = tri != MISS
+        out[hit] = self._element[tri[hit]]
+        return out
+
+    def albedo_on(self, points: Array, tri: NDArray[np.uint32]) -> Array:
+        """Albedo in full detail at points on triangles. [n, 3]"""
+        return np.asarray(albedo_at(points, tri, self.tables, np.zeros(len(tri))))
+
+    def albedo(self, rays: NDArray[np.float32], hits: Hits, fw: NDArray[np.floating]) -> Array:
+        """Linear albedo at hits, seen with pixels of the given widths in metres. [n, 3]"""
+        t = np.where(hits.tri == MISS, 0, hits.t).astype(np.float64)[:, None]
+        points = rays[:, :3].astype(np.float64) + t * rays[:, 3:]
+        return np.asarray(albedo_at(points, hits.tri, self.tables, np.asarray(fw, np.float64)))
+
+    @cached_property
+    def probes(self) -> Probes:
+        """Indirect light of the period."""
+        low, high = self._box
+        count = np.maximum(2, np.ceil((high - low) / self._spacing).astype(int) + 1)
+        step = (high - low) / (count - 1)
+        grid = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1)
+        places = (low + grid * step).reshape(-1, 3)
+        directions = _sphere(PROBE_RAYS)
+        values, valid = [], []
+        for start in range(0, len(places), MAX_SAMPLES // PROBE_RAYS):
+            some = places[start : start + MAX_SAMPLES // PROBE_RAYS]
+            rays = np.empty((len(some), PROBE_RAYS, 6), np.float32)
+            rays[..., :3], rays[..., 3:] = some[:, None], directions
+            v, ok = self._probe_batch(rays.reshape(-1, 6))
+            values.append(v)
+            valid.append(ok)
+        shape = tuple(int(n) for n in count)
+        return Probes(
+            np.asarray(low, np.float64),
+            step,
+            np.concatenate(values).reshape(*shape, 4, 3),
+            np.concatenate(valid).reshape(shape),
+        )
+
+    def _probe_batch(
+        self, rays: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        hits = self.cast(rays)
+        lit = self._lit(rays, hits, 1)
+        means = _mean_albedo(self.tables.styles)
+        return probe_values(
+            rays, hits.t, hits.tri, hits.uv, lit, self.tables, means, self._sky, PROBE_RAYS
+        )
+
+    def _lit(self, rays: NDArray[np.float32], hits: Hits, count: int) -> NDArray[np.bool_]:
+        """Whether the sun reaches each hit. [n]"""
+        towards, need = shadow_rays(
+            rays, hits.t, hits.tri, hits.uv, self.tables, self._sky.direction, SUN_SPREAD, count
+        )
+        lit = np.zeros(len(need), np.bool_)
+        lit[need] = ~self.occluded(np.ascontiguousarray(towards[need]))
+        return lit
+
+    def _shade(
+        self, rays: NDArray[np.float32], per_pixel: int, fw_unit: float
+    ) -> NDArray[np.uint8]:
+        hits = self.cast(rays)
+        lit = self._lit(rays, hits, per_pixel)
+        return shade(
+            rays, hits.t, hits.tri, hits.uv, lit, self.tables, self._sky, self.probes, per_pixel,
+            fw_unit,
+        )  # fmt: skip
+
+
+def _tensor(array: Any) -> o3d.core.Tensor:
+
+    return o3d.core.Tensor(np.ascontiguousarray(array))  # type: ignore[call-overload]
+
+
+def _sphere(count: int) -> NDArray[np.float32]:
+    """Evenly spread unit directions (a Fibonacci lattice). [count, 3]"""
+    i = np.arange(count) + 0.5
+    z = 1 - 2 * i / count
+    turn = np.pi * (1 + 5**0.5) * i
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1).astype(np.float32)
+
+
+def _mean_albedo(styles: Array) -> Array:
+    """Rough colour of each style for indirect light. [S, 3]"""
+    return 0.7 * styles[:, 1:4] + 0.3 * styles[:, 4:7]

@@ -1,0 +1,255 @@
+"""Compiled shading: camera rays, hit points, light, tone curve.
+
+All loops run over pixels or samples that do not touch each other, so the result does not depend
+on the number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import prange
+
+from chronoscene.synth.render.compiled import inner, kernel
+from chronoscene.synth.render.geometry_tables import MISS, hit_normals
+from chronoscene.synth.render.light import sky_radiance
+from chronoscene.synth.render.noise import mix
+from chronoscene.synth.render.probes import probe_light
+from chronoscene.synth.render.textures import albedo
+
+
+@kernel
+def camera_rays(world_from_cam, k, width, row0, rows, ss):  # type: ignore[no-untyped-def]
+    """Rays with unit z in the camera, so that the hit parameter is z-depth. [n, 6]
+
+    Samples of a pixel are neighbours: index ((row * width + column) * ss + j) * ss + i.
+    """
+    rays = np.empty((rows * width * ss * ss, 6), np.float32)
+    for pixel in prange(rows * width):
+        row, column = row0 + pixel // width, pixel % width
+        for j in range(ss):
+            for i in range(ss):
+                x = (column + (i + 0.5) / ss - k[0, 2]) / k[0, 0]
+                y = (row + (j + 0.5) / ss - k[1, 2]) / k[1, 1]
+                n = (pixel * ss + j) * ss + i
+                for axis in range(3):
+                    m = world_from_cam[axis]
+                    rays[n, axis] = m[3]
+                    rays[n, 3 + axis] = m[0] * x + m[1] * y + m[2]
+    return rays
+
+
+@kernel
+def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ignore[no-untyped-def]
+    """Rays to the sun for all samples; whether each is needed.
+
+    Sample i uses direction ``i % count`` of the sun's disc: the offsets are fixed in the world, so
+    views agree about the soft edges of shadows.
+    """
+    n = len(t)
+    out = np.zeros((n, 6), np.float32)
+    need = np.zeros(n, np.bool_)
+    for i in prange(n):
+        if tri[i] == MISS:
+            continue
+        r = rays[i]
+        gx, gy, gz, _, _, _ = hit_normals(tables, tri[i], uv[i, 0], uv[i, 1], r[3], r[4], r[5])
+        turn = 2.399963 * (i % count)
+        radius = spread * math.sqrt((i % count + 0.5) / count)
+        # Two axes across the sun's direction; the sun is never in the zenith.
+        ax, ay = -direction[1], direction[0]
+        norm = math.sqrt(ax * ax + ay * ay)
+        ax, ay = ax / norm, ay / norm
+        bx, by, bz = -direction[2] * ay, direction[2] * ax, direction[0] * ay - direction[1] * ax
+        ca, sa = radius * math.cos(turn), radius * math.sin(turn)
+        lx = direction[0] + ca * ax + sa * bx
+        ly = direction[1] + ca * ay + sa * by
+        lz = direction[2] + sa * bz
+        facing = gx * lx + gy * ly + gz * lz
+        style = tables.styles[tables.patch_style[tables.tri_patch[tri[i]]]]
+        if facing <= 0.0 and style[22] <= 0.0:
+            continue
+        need[i] = True
+        eps = 2e-3 + 2e-5 * t[i]
+        side = eps if facing > 0.0 else -eps
+        out[i, 0] = r[0] + t[i] * r[3] + side * gx
+        out[i, 1] = r[1] + t[i] * r[4] + side * gy
+        out[i, 2] = r[2] + t[i] * r[5] + side * gz
+        out[i, 3], out[i, 4], out[i, 5] = lx, ly, lz
+    return out, need
+
+
+@inner
+def surface_albedo(tables, tri, x, y, z, fw):  # type: ignore[no-untyped-def]
+    """Texture of a triangle at a world point seen with pixels of width ``fw``."""
+    patch = tables.tri_patch[tri]
+    p = tables.patches[patch]
+    dx, dy, dz = x - p[0], y - p[1], z - p[2]
+    u = dx * p[3] + dy * p[4] + dz * p[5]
+    v = dx * p[6] + dy * p[7] + dz * p[8]
+    style = tables.styles[tables.patch_style[patch]]
+    return albedo(style, u, v, x, y, z, p[9], p[10], tables.patch_seed[patch], fw)
+
+
+@inner
+def _reflected(x, y, z, n, d, style, facing, lit, sky, probes):  # type: ignore[no-untyped-def]
+    """Mirror-like part of the light: sky or surroundings, and the sun's highlight."""
+    k = 2.0 * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
+    mx, my, mz = d[0] - k * n[0], d[1] - k * n[1], d[2] - k * n[2]
+    grazing = (1.0 - min(1.0, abs(0.5 * k))) ** 5
+    strength = style[20] + (1.0 - style[20]) * grazing * 0.6 * style[21]
+    r, g, b = probe_light(probes, x, y, z, mx, my, mz, 1.0)
+    if mz > 0.0:
+        sr, sg, sb = sky_radiance(mx, my, mz, sky, False)
+        r, g, b = 0.5 * (r + sr), 0.5 * (g + sg), 0.5 * (b + sb)
+    towards = mx * sky.direction[0] + my * sky.direction[1] + mz * sky.direction[2]
+    if facing > 0.0 and towards > 0.0:
+        spot = lit * 3.0 * towards ** (20.0 + 180.0 * style[21])
+        r, g, b = r + spot * sky.sun[0], g + spot * sky.sun[1], b + spot * sky.sun[2]
+    return strength * r, strength * g, strength * b, strength
+
+
+@inner
+def _base(ray, t, tri, u, v, tables, fw_unit):  # type: ignore[no-untyped-def]
+    """Albedo of a hit for samples of the given width at unit distance."""
+    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    gx, gy, gz, _, _, _ = hit_normals(tables, tri, u, v, dx, dy, dz)
+    slant = max(0.25, abs(gx * dx + gy * dy + gz * dz) / length)
+    fw = max(1e-4, fw_unit * t * length / math.sqrt(slant))
+    return surface_albedo(tables, tri, ray[0] + t * dx, ray[1] + t * dy, ray[2] + t * dz, fw)
+
+
+@inner
+def _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes):  # type: ignore[no-untyped-def]
+    """Radiance along a ray that hit a surface of albedo ``base``; ``lit`` is 0..1."""
+    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    d = (dx / length, dy / length, dz / length)
+    x, y, z = ray[0] + t * dx, ray[1] + t * dy, ray[2] + t * dz
+    gx, gy, gz, sx, sy, sz = hit_normals(tables, tri, u, v, dx, dy, dz)
+    style = tables.styles[tables.patch_style[tables.tri_patch[tri]]]
+    through = style[22]
+    if through <= 0.0 and sx * gx + sy * gy + sz * gz < 0.0:
+        sx, sy, sz = -sx, -sy, -sz  # the back of an open sheet
+    facing = sx * sky.direction[0] + sy * sky.direction[1] + sz * sky.direction[2]
+    flat = gx * sky.direction[0] + gy * sky.direction[1] + gz * sky.direction[2]
+    if through > 0.0:
+        # Leaves scatter forward as well: light wraps around the crown.
+        direct = lit * max(0.0, (facing + through) / (1.0 + through))
+    else:
+        direct = lit * max(0.0, facing) if flat > 0.0 else 0.0
+    ox, oy, oz = x + 0.8 * gx, y + 0.8 * gy, z + 0.8 * gz
+    er, eg, eb = probe_light(probes, ox, oy, oz, sx, sy, sz, 2.0 / 3.0)
+    r = base[0] * (direct * sky.sun[0] + er)
+    g = base[1] * (direct * sky.sun[1] + eg)
+    b = base[2] * (direct * sky.sun[2] + eb)
+    if style[20] > 0.0:
+        mr, mg, mb, s = _reflected(ox, oy, oz, (gx, gy, gz), d, style, flat, lit, sky, probes)
+        r, g, b = r * (1.0 - s) + mr, g * (1.0 - s) + mg, b * (1.0 - s) + mb
+    air = math.exp(-sky.haze * t * length)
+    hr, hg, hb = sky_radiance(d[0], d[1], 0.02, sky, False)
+    return r * air + hr * (1.0 - air), g * air + hg * (1.0 - air), b * air + hb * (1.0 - air)
+
+
+@inner
+def _sky(ray, sky):  # type: ignore[no-untyped-def]
+    """Radiance of the sky along a ray."""
+    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    return sky_radiance(dx / length, dy / length, dz / length, sky, True)
+
+
+@inner
+def _share(lit, first, count):  # type: ignore[no-untyped-def]
+    """Share of samples that the sun reaches."""
+    total = 0.0
+    for i in range(first, first + count):
+        total += 1.0 if lit[i] else 0.0
+    return total / count
+
+
+@inner
+def _uniform(tri, first, end, tables):  # type: ignore[no-untyped-def]
+    """Whether all samples of a pixel lie on one opaque patch."""
+    if tri[first] == MISS:
+        return False
+    patch = tables.tri_patch[tri[first]]
+    if tables.styles[tables.patch_style[patch], 22] > 0.0:
+        return False
+    for i in range(first + 1, end):
+        if tri[i] == MISS or tables.tri_patch[tri[i]] != patch:
+            return False
+    return True
+
+
+@inner
+def _tone(x):  # type: ignore[no-untyped-def]
+    """Filmic curve (a rational fit with toe and shoulder), then the sRGB transfer function."""
+    x = max(0.0, x)
+    y = x * (2.2 * x + 0.08) / (x * (2.1 * x + 0.95) + 0.20)
+    y = min(1.0, y)
+    return 12.92 * y if y <= 0.0031308 else 1.055 * y ** (1.0 / 2.4) - 0.055
+
+
+@kernel
+def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # type: ignore[no-untyped-def]
+    """Displayed colours of pixels. [pixels, 3] uint8
+
+    Args:
+        rays: [n, 6]; the samples of a pixel follow each other.
+        t: Hit parameters. [n]
+        tri: Triangles, or `MISS`. [n]
+        uv: Barycentric coordinates. [n, 2]
+        lit: Whether the sun reaches the sample. [n]
+        tables: Geometry and styles.
+        sky: Light settings.
+        probes: Indirect light.
+        per_pixel: Samples per pixel.
+        fw_unit: Width of a sample's footprint at unit distance.
+    """
+    out = np.empty((len(t) // per_pixel, 3), np.uint8)
+    for pixel in prange(len(out)):
+        r, g, b = 0.0, 0.0, 0.0
+        first, count, stride, wide = pixel * per_pixel, per_pixel, 1, fw_unit
+        uniform = per_pixel > 1 and _uniform(tri, first, first + per_pixel, tables)
+        old = (0.0, 0.0, 0.0)
+        if uniform:
+            # Textures are filtered, so two samples on a diagonal are enough on one patch.
+            count, stride, wide = 2, per_pixel - 1, fw_unit * math.sqrt(0.5 * per_pixel)
+        for k in range(count):
+            i = first + k * stride
+            u, v, sun = float(uv[i, 0]), float(uv[i, 1]), 1.0 if lit[i] else 0.0
+            if tri[i] == MISS:
+                c = _sky(rays[i], sky)
+            else:
+                base = _base(rays[i], float(t[i]), tri[i], u, v, tables, wide)
+                if uniform and k == 0:
+                    old = base
+                    continue
+                if uniform:
+                    base = mix(old, base, 0.5)
+                    sun = _share(lit, first, per_pixel)
+                c = _radiance(rays[i], float(t[i]), tri[i], u, v, sun, base, tables, sky, probes)
+            # A cap keeps one bright sample from whitening an edge.
+            weight = per_pixel if uniform else 1
+            r, g = r + weight * min(c[0], 6.0), g + weight * min(c[1], 6.0)
+            b += weight * min(c[2], 6.0)
+        gain = sky.exposure / per_pixel
+        out[pixel, 0] = int(255.0 * _tone(r * gain * sky.white[0]) + 0.5)
+        out[pixel, 1] = int(255.0 * _tone(g * gain * sky.white[1]) + 0.5)
+        out[pixel, 2] = int(255.0 * _tone(b * gain * sky.white[2]) + 0.5)
+    return out
+
+
+@kernel
+def albedo_at(points, tri, tables, fw):  # type: ignore[no-untyped-def]
+    """Albedo of hit points at given pixel widths; zero where nothing was hit. [n, 3]"""
+    out = np.zeros((len(points), 3))
+    for i in prange(len(points)):
+        if tri[i] != MISS:
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            c = surface_albedo(tables, tri[i], x, y, z, max(1e-4, fw[i]))
+            out[i, 0], out[i, 1], out[i, 2] = c[0], c[1], c[2]
+    return out

@@ -1,0 +1,1 @@
+"""From renders to a dataset: flights, sparse points with tracks, ground truth."""

@@ -1,0 +1,1 @@
+"""What rules compute: pixels, observations, reprojection, frames of periods, likeness of photos."""

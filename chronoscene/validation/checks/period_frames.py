@@ -1,0 +1,208 @@
+"""Whether a period has a frame of its own: mirrored, scaled or moved against the others.
+
+A period whose poses belong to another frame disagrees with the points that it shares with the
+others. Two explanations are tried: axes of world and camera that were negated, and a similarity,
+found from the same points as the period's own cameras place them.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.scene.projection import plane_of
+from chronoscene.scene.similarity import Similarity, fit_robustly
+from chronoscene.validation.scene_folder import RawScene
+
+Array = NDArray[np.float64]
+
+MOST_RAYS = 20_000
+"""Observations of a period that are looked at."""
+
+FEWEST_POINTS = 10
+"""Points that a period must place by itself."""
+
+LEAST_PARALLAX = 1e-4
+"""Smallest eigenvalue of the mean of ``I - d d^T`` over the rays of a point: sine squared of about
+half a degree."""
+
+STRAY = 100.0
+"""Distance of a camera from the others, in units of their median distance, beyond which its rays
+would pull all points away."""
+
+FITS = 0.02
+"""Median distance after the similarity, as a share of the extent of the points."""
+
+BETTER = 1 / 3
+"""Share of the median distance before the similarity that may be left after it."""
+
+WELL = 0.5
+"""Share of the limit, and of what a similarity leaves, that may be left where a factor explains all
+errors: cameras that look at one place from one distance see a wrong scale nearly like a wrong focal
+length."""
+
+SAME_FOCAL = 0.002
+"""Relative difference of focal lengths that explains nothing."""
+
+AXES = "xyz"
+
+
+class Rays:
+    """Observations of points by the images of one period (M observations)."""
+
+    def __init__(self, scene: RawScene, period: int) -> None:
+        """Take those whose camera is usable and whose pose is good.
+
+        Args:
+            scene: The scene, with its model.
+            period: Index of the period.
+        """
+        images, points, seen = scene.images, scene.points, scene.observations
+        table = scene.point_periods
+        assert images is not None and points is not None
+        assert seen is not None and table is not None
+        of_period = [r for r in scene.reprojections or () if scene.image_periods[r.image] == period]
+        share = table.sum(axis=1) > 1
+        if not (share & table[:, period]).any():
+            share = table[:, period]  # with its own points it may at least agree
+        rows = np.concatenate([np.zeros(0, np.int64), *(r.rows for r in of_period)])
+        rows = rows[share[seen.point[rows]]]
+        # Whole tracks, so that points keep several rays.
+        step = len(rows) // MOST_RAYS + 1
+        rows = rows[seen.point[rows] % step == 0]
+        self.image, self.point = seen.image[rows], seen.point[rows]
+        self.xyz = points.xyz[self.point]
+        self.rotation = rotation_from_quaternion(images.quaternions)[self.image]
+        self.translation = images.translations[self.image]
+        self.centre = scene.centres[self.image]
+        self.focal = np.ones((len(rows), 2))
+        """Pixels. [M, 2]"""
+        self.plane = images.keypoint_xy[seen.keypoint[rows]]
+        """Where the observations are on the plane one unit in front of the camera. [M, 2]"""
+        camera_ids = images.camera_ids[self.image]
+        for camera_id in np.unique(camera_ids).tolist():
+            camera, mine = scene.usable_cameras[camera_id], camera_ids == camera_id
+            self.focal[mine] = camera.K[[0, 1], [0, 1]]
+            self.plane[mine] = plane_of(camera, self.plane[mine])
+
+    def error(self, world: Array, camera: Array) -> float:
+        """Median error in pixels, without distortion, with some axes of both negated."""
+        local = np.einsum("nij,nj->ni", self.rotation, self.xyz * world) + self.translation
+        local = local * camera
+        distance = self._distances(local)
+        distance[~(local[:, 2] > 0)] = np.inf
+        return float(np.median(distance)) if len(distance) else np.inf
+
+    def error_in(self, similarity: Similarity) -> float:
+        """Median error in pixels with the points in the frame that a similarity leads from."""
+        own = np.linalg.solve(similarity.matrix, (self.xyz - similarity.translation).T).T
+        local = np.einsum("nij,nj->ni", self.rotation, own) + self.translation
+        return float(np.median(self._distances(local)))
+
+    def _distances(self, local: Array) -> Array:
+        """Pixels, without distortion, between points in the frames of the cameras and their
+        observations; infinite where there is no such number. [M, 3] -> [M]
+        """
+        shift = (local[:, :2] / local[:, 2:] - self.plane) * self.focal
+        distance = np.linalg.norm(shift, axis=1)
+        return np.where(np.isnan(distance), np.inf, distance)
+
+    def focal_factor(self) -> tuple[float, float]:
+        """Factor of the focal lengths that fits best, and the median error in pixels with it."""
+        local = np.einsum("nij,nj->ni", self.rotation, self.xyz) + self.translation
+        projected, observed = local[:, :2] / local[:, 2:] * self.focal, self.plane * self.focal
+        known = (local[:, 2] > 0) & np.isfinite(projected).all(axis=1)
+        known &= np.isfinite(observed).all(axis=1)
+        if not known.any():
+            return 1.0, np.inf
+        projected, observed = projected[known], observed[known]
+        factor = float(np.median((projected * observed).sum(axis=1) / (projected**2).sum(axis=1)))
+        return factor, float(np.median(np.linalg.norm(projected * factor - observed, axis=1)))
+
+    def place_points(self) -> tuple[NDArray[np.int64], Array]:
+        """Indices and positions of the points by these rays alone, those with enough parallax.
+
+        The position is the nearest to all rays: ``sum(I - d d^T) x = sum((I - d d^T) c)``.
+        """
+        local = np.column_stack([self.plane, np.ones(len(self.plane))])
+        direction = np.einsum("nji,nj->ni", self.rotation, local)
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        away = np.linalg.norm(self.centre - np.median(self.centre, axis=0), axis=1)
+        sound = np.isfinite(direction).all(axis=1) & (away <= STRAY * np.median(away))
+        direction, centre = direction[sound], self.centre[sound]
+        across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+        index, slot, count = np.unique(self.point[sound], return_inverse=True, return_counts=True)
+        left, right = np.zeros((len(index), 3, 3)), np.zeros((len(index), 3))
+        np.add.at(left, slot, across)
+        np.add.at(right, slot, np.einsum("nij,nj->ni", across, centre))
+        good = np.linalg.eigvalsh(left / count[:, None, None])[:, 0] > LEAST_PARALLAX
+        placed = np.linalg.solve(left[good], right[good][:, :, None])[:, :, 0]
+        return index[good], np.asarray(placed, np.float64)
+
+
+def explain(scene: RawScene, period: int, limit: float) -> str | None:
+    """In words, what brings a period that disagrees with the others into their frame.
+
+    Args:
+        scene: The scene, with its model.
+        period: Index of the period.
+        limit: Reprojection error in pixels that a right explanation leaves at most.
+    """
+    rays = Rays(scene, period)
+    if len(rays.point) < FEWEST_POINTS:
+        return None
+    signs = [np.array(s, np.float64) for s in product((1, -1), repeat=3)]
+    errors = {(i, j): rays.error(a, b) for i, a in enumerate(signs) for j, b in enumerate(signs)}
+    world, camera = min(errors, key=lambda key: errors[key])
+    if errors[world, camera] <= limit:
+        negated = min(*signs[world], *signs[camera]) < 0
+        return _negated(signs[world], signs[camera]) if negated else None
+    assert scene.points is not None
+    index, own = rays.place_points()
+    target = scene.points.xyz[index]
+    if len(index) < FEWEST_POINTS:
+        return None
+    found = fit_robustly(own, target, mirror=True)
+    extent = float(np.median(np.linalg.norm(target - np.median(target, axis=0), axis=1)))
+    if found is None or not np.median(found[1]) <= FITS * extent:
+        return None
+    before = float(np.median(np.linalg.norm(own - target, axis=1)))
+    if not np.median(found[1]) <= BETTER * before:
+        return None
+    _, focal_error = rays.focal_factor()
+    if focal_error <= WELL * min(limit, rays.error_in(found[0])):
+        return None  # not the frame is wrong, but the camera
+    return _moved(found[0], own, target)
+
+
+def focal_factor(rays: Rays, limit: float) -> float | None:
+    """What the focal lengths should be multiplied with, if that alone explains a period."""
+    if len(rays.point) < FEWEST_POINTS:
+        return None
+    factor, error = rays.focal_factor()
+    return factor if error <= WELL * limit and abs(factor - 1) > SAME_FOCAL else None
+
+
+def _negated(world: Array, camera: Array) -> str:
+    parts = []
+    for what, signs in (("world", world), ("camera", camera)):
+        if (signs < 0).any():
+            axes = " and ".join(AXES[i] for i in np.flatnonzero(signs < 0))
+            parts.append(f"{axes} of the {what} negated")
+    mirrored = "mirrored: " if np.prod(world) < 0 else ""
+    return f"a period {mirrored}it fits with {', '.join(parts)}"
+
+
+def _moved(similarity: Similarity, own: Array, target: Array) -> str:
+    rotation = similarity.matrix / similarity.scale
+    turn = rotation if not similarity.mirrored else -rotation
+    angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    shift = np.linalg.norm(np.median(target, axis=0) - np.median(own, axis=0))
+    mirrored = "mirrored, " if similarity.mirrored else ""
+    return (
+        f"a period in a frame of its own: it fits {mirrored}scaled by {similarity.scale:.4g}, "
+        f"turned by {angle:.3g} degrees and moved by {shift:.3g}"
+    )

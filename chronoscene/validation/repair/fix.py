@@ -1,0 +1,326 @@
+"""A corrected copy of a scene: what has one possible correction is corrected, the rest reported.
+
+The scene itself is only read. Files that stay as they are become hard links where the disk can.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import struct
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from chronoscene.colmap.model import MODEL_FILES
+from chronoscene.colmap.raw_model import FORMS, RawModel
+from chronoscene.colmap.write import write_raw_model
+from chronoscene.errors import ConfigError
+from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD
+from chronoscene.io.files import write_text_atomic
+from chronoscene.scene.splits import parse_split_text, parse_test_text
+from chronoscene.validation.checks.spelling import spelling
+from chronoscene.validation.finding import counted, shown
+from chronoscene.validation.other_formats import other_format
+from chronoscene.validation.repair.colmap_model import Repair, repair_model
+from chronoscene.validation.repair.orientation import set_upright
+from chronoscene.validation.repair.split_files import plain_table, repair_split, repair_test
+from chronoscene.validation.rules import split_file as split_rules
+from chronoscene.validation.rules import test_list as test_rules
+from chronoscene.validation.rules.image_files import images_of_other_shape
+from chronoscene.validation.run import quiet_numbers
+from chronoscene.validation.scene_folder import RawScene, TextFile, read_text_file
+
+
+def fix_scene(root: Path, out: Path) -> list[Repair]:
+    """Write a corrected copy; the folder appears complete or not at all.
+
+    Args:
+        root: The scene.
+        out: Folder that does not exist yet, or is empty, and is not inside the scene.
+
+    Returns:
+        What was done.
+
+    Raises:
+        ConfigError: If ``out`` is in use, inside the scene, or cannot be written, or the scene is
+            of another format.
+    """
+    _check_out(root, out)
+    _check_format(root)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
+            staged = Path(temporary) / "scene"
+            staged.mkdir()
+            with quiet_numbers():
+                repairs = _Fix(RawScene(root), staged).run()
+            if out.exists():
+                out.rmdir()
+            staged.rename(out)
+    except OSError as error:
+        raise ConfigError(
+            f"--fix {out}",
+            expected="a folder that can be written",
+            found=error.strerror or "an error",
+            todo="choose another place",
+        ) from error
+    return repairs
+
+
+def _check_out(root: Path, out: Path) -> None:
+    used = out.exists() and (not out.is_dir() or any(out.iterdir()))
+    inside = out.resolve().is_relative_to(root.resolve())
+    if used or inside:
+        found = "one in use" if used else "one inside the scene"
+        raise ConfigError(
+            f"--fix {out}",
+            expected="a new or empty folder beside the scene",
+            found=found,
+            todo="choose another folder",
+        )
+
+
+def _check_format(root: Path) -> None:
+    name = other_format(root)
+    if name is not None:
+        raise ConfigError(
+            f"--fix of {root}",
+            expected="a scene in the ChronoScene format",
+            found=f"one in {name}",
+            todo="chronoscene convert makes one of it, which can be corrected",
+        )
+
+
+class _Fix:
+    """One scene on its way into a folder."""
+
+    def __init__(self, scene: RawScene, out: Path) -> None:
+        self._scene = scene
+        self._out = out
+        self._repairs: list[Repair] = []
+        self._written: set[str] = set()
+        """Files that must not be copied: they were written, moved or left out."""
+
+    def run(self) -> list[Repair]:
+        self._model()
+        names = self._scene.names if self._scene.images is not None else None
+        self._split(names)
+        self._test(names)
+        self._misspelt_images()
+        self._orientation_tags()
+        self._copy_rest()
+        return self._repairs
+
+    def _model(self) -> None:
+        """Write the model in ``sparse/0/`` if anything about it is better otherwise."""
+        model, place = self._scene.model, self._scene.model_place
+        if model is None or place is None:
+            return
+        complete = model.cameras is not None and model.images is not None
+        if not complete or model.points is None or model.damages:
+            return
+        assert model.cameras is not None and model.images is not None
+        images, points, repairs = repair_model(model.images, model.points)
+        repairs += _form_repairs(model, place)
+        if not repairs:
+            return
+        folder = self._out / MODEL
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            write_raw_model(folder, model.cameras, images, points)
+        except (struct.error, OverflowError, ValueError):
+            for stem in MODEL_FILES:  # a number that no field holds; the rules name it
+                (folder / f"{stem}.bin").unlink(missing_ok=True)
+            return
+        self._repairs += repairs
+        below = f"{place}/" if place else ""
+        self._written |= {f"{below}{stem}{form}" for stem in MODEL_FILES for form in FORMS}
+        self._written |= {f"{MODEL}/{stem}.bin" for stem in MODEL_FILES}
+        if below != f"{MODEL}/" or set(model.files.values()) & {f"{s}.txt" for s in MODEL_FILES}:
+            self._move_rigs(model, below)
+
+    def _move_rigs(self, model: RawModel, below: str) -> None:
+        """Rigs and frames follow a binary model; those of a text model would not be read."""
+        binary = model.files.get("cameras", "").endswith(".bin")
+        for stem in ("rigs", "frames"):
+            for form in FORMS:
+                self._written.add(f"{below}{stem}{form}")
+            source = model.folder / f"{stem}.bin"
+            if binary and source.is_file():
+                _link(source, self._out / MODEL / f"{stem}.bin")
+
+    def _split(self, names: list[str] | None) -> None:
+        text = self._find_text(SPLIT, split_rules.ELSEWHERE, "CS301")
+        if text is None or names is None:
+            return
+        plain, repairs = plain_table(text.text, names)
+        entries, _ = parse_split_text(plain)
+        assert self._scene.images is not None
+        others = sorted(set(self._scene.images.names) - set(names))
+        better, new_ids, more = repair_split(text.data, plain, names, entries, others)
+        repairs += more
+        if not self._write(SPLIT, better):
+            return
+        self._repairs += repairs
+        if any(old != new for old, new in new_ids.items()):
+            self._number_periods(new_ids)
+
+    def _number_periods(self, new_ids: dict[int, int]) -> None:
+        """Give the labels of the periods their new ids, if they have exactly the old ones."""
+        text = read_text_file(self._scene.root / PERIODS)
+        try:
+            items = json.loads(text.text) if text else []
+            if [item["id"] for item in items] != sorted(new_ids):
+                return
+            items = [{**item, "id": new_ids[item["id"]]} for item in items]
+        except (ValueError, TypeError, KeyError, RecursionError):
+            return  # has its own rule
+        self._write(PERIODS, json.dumps(items, indent=1, ensure_ascii=False) + "\n")
+
+    def _test(self, names: list[str] | None) -> None:
+        text = self._find_text(TEST, test_rules.ELSEWHERE, "CS322")
+        if text is None or names is None:
+            return
+        lines, repairs = repair_test(names, parse_test_text(text.text))
+        if self._write(TEST, "".join(f"{line}\n" for line in lines)):
+            self._repairs += repairs
+
+    def _find_text(self, right: str, elsewhere: tuple[str, ...], code: str) -> TextFile | None:
+        """The text file of the right place, else of the one wrong place where there is one."""
+        root = self._scene.root
+        if os.path.lexists(root / right):
+            return read_text_file(root / right)
+        found = [place for place in elsewhere if (root / place).is_file()]
+        text = read_text_file(root / found[0]) if len(found) == 1 else None
+        if text is not None and self._write(right, text.text):
+            self._written.add(found[0])
+            self._repairs.append(Repair(code, f"{found[0]} moved to {right}"))
+        return text
+
+    def _misspelt_images(self) -> None:
+        """Files whose name differs from that in the model by case or Unicode form only."""
+        registered, present = set(self._scene.names), set(self._scene.present)
+        by_spelling: dict[str, list[str]] = {}
+        for file in self._scene.files:
+            by_spelling.setdefault(spelling(file), []).append(file)
+        renamed = []
+        for name in sorted(registered - present):
+            files = by_spelling.get(spelling(name), [])
+            if len(files) == 1 and files[0] not in registered and self._inside(files[0]):
+                self._written.add(f"images/{files[0]}")
+                _link(self._scene.image_path(files[0]), self._out / "images" / name)
+                renamed.append(name)
+        if renamed:
+            what = f"{counted(len(renamed), 'image')} renamed as in the model: {shown(renamed)}"
+            self._repairs.append(Repair("CS201", what))
+
+    def _orientation_tags(self) -> None:
+        """Images whose tag turns them in viewers while the poses refer to the pixels as stored."""
+        headers = self._scene.headers
+        turned = {n for n, h in headers.items() if h.problem is None and h.orientation > 1}
+        done = []
+        for name in sorted(turned - images_of_other_shape(self._scene)) if turned else ():
+            source = self._scene.image_path(name)
+            upright = set_upright(source.read_bytes()) if self._inside(name) else None
+            if upright is None:
+                continue
+            target = self._out / "images" / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(upright)
+            self._written.add(f"images/{name}")
+            done.append(name)
+        if done:
+            what = f"orientation tag of {counted(len(done), 'image')} set to upright: {shown(done)}"
+            self._repairs.append(Repair("CS207", what))
+
+    def _inside(self, name: str) -> bool:
+        images = (self._scene.root / "images").resolve()
+        return (images / name).resolve().is_relative_to(images)
+
+    def _copy_rest(self) -> None:
+        """Everything else, as it is; links that lead out of the scene are left out."""
+        top = self._scene.root.resolve()
+        left_out = []
+        for path, place in _files(top):
+            if place in self._written:
+                continue
+            if not path.resolve().is_relative_to(top):
+                left_out.append(place)
+            elif path.is_file():
+                _link(path, self._out / place)
+        kept = self._behind_links(top)
+        left_out = [p for p in left_out if not any(k == p or k.startswith(f"{p}/") for k in kept)]
+        if left_out:
+            what = f"{counted(len(left_out), 'link')} out of the scene left out: {shown(left_out)}"
+            self._repairs.append(Repair("", what))
+
+    def _behind_links(self, top: Path) -> list[str]:
+        """What makes up the scene and is still missing: it is in folders or files that are links.
+
+        Images elsewhere are linked again, so that nothing is copied from there but the model.
+        """
+        names = [f"images/{name}" for name in self._scene.present]
+        below = f"{self._scene.model_place}/" if self._scene.model_place else ""
+        stems = (*MODEL_FILES, "rigs", "frames")
+        model = [f"{below}{stem}{form}" for stem in stems for form in FORMS]
+        kept, linked = [], 0
+        for place in (*names, *model, SPLIT, TEST, PERIODS, WORLD):
+            source, target = self._scene.root / place, self._out / place
+            if place in self._written or os.path.lexists(target) or not source.is_file():
+                continue
+            kept.append(place)
+            if source.resolve().is_relative_to(top) or not place.startswith("images/"):
+                _link(source, target)
+            else:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.symlink_to(source.resolve())
+                linked += 1
+        if linked:
+            self._repairs.append(Repair("", f"{counted(linked, 'image')} linked from elsewhere"))
+        return kept
+
+    def _write(self, place: str, text: str) -> bool:
+        """Write a text file, unless it has names that are no text, which have their own rule."""
+        (self._out / place).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            write_text_atomic(self._out / place, text)
+        except UnicodeEncodeError:
+            return False
+        self._written.add(place)
+        return True
+
+
+def _form_repairs(model: RawModel, place: str) -> list[Repair]:
+    """What is wrong with the place and the form of the files."""
+    repairs = []
+    forms = {file[-4:] for file in model.files.values()}
+    if place != MODEL:
+        repairs.append(Repair("CS002", f"model moved from {place or 'the top'} to {MODEL}"))
+    if len(forms) > 1:
+        repairs.append(Repair("CS102", "model of mixed forms written as binary"))
+    elif forms == {".txt"}:
+        repairs.append(Repair("", "text model written as binary"))
+    elif any((model.folder / f"{stem}.txt").is_file() for stem in MODEL_FILES):
+        repairs.append(Repair("CS104", "text beside the binary model left out"))
+    return repairs
+
+
+def _files(top: Path) -> Iterator[tuple[Path, str]]:
+    """Files below a folder, and their names relative to it; folders are not followed as links."""
+    for folder, folders, files in os.walk(top):
+        for name in sorted(files) + [n for n in folders if os.path.islink(os.path.join(folder, n))]:
+            path = Path(folder) / name
+            yield path, path.relative_to(top).as_posix()
+
+
+def _link(source: Path, target: Path) -> None:
+    """A hard link, or a copy where the disk has none."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if os.path.lexists(target):
+        return  # never into a file that may be a link to the original
+    try:
+        os.link(source.resolve(), target)
+    except OSError:
+        shutil.copyfile(source, target)

@@ -1,0 +1,1 @@
+"""Outcome of a validation, for people and for programs."""

@@ -1,0 +1,154 @@
+"""Report as one HTML page that needs nothing else: styles and small pictures are in it.
+
+Everything from a scene is escaped by the template engine. Pictures are shown of the first images
+that findings name, and only of files that really lie below ``images/``.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby, islice
+from pathlib import Path
+
+from PIL import Image
+
+from chronoscene import __version__
+from chronoscene.validation.finding import NOTHING, SEVERITIES, Finding, Severity
+from chronoscene.validation.report.report import SceneReport, counts
+from chronoscene.validation.report.template import PAGE
+from chronoscene.validation.rule import RULES
+from chronoscene.validation.scene_folder import is_safe
+
+PICTURES = 24
+"""Pictures for one scene."""
+
+SIDE_BY_SIDE = 3
+"""Pictures of one finding."""
+
+PICTURE_SIDE = 160
+"""Pixels."""
+
+LARGEST_FILE = 50_000_000
+"""Bytes of an image file that is opened for a picture."""
+
+ROWS = 100
+"""Findings of one rule that are listed."""
+
+TITLES: dict[Severity, str] = {"error": "Errors", "warning": "Warnings", "info": "Remarks"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    place: str
+    expected: str
+    found: str
+    pictures: tuple[str, ...]
+    """As data URIs."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """All findings of one rule in one scene."""
+
+    code: str
+    name: str
+    what: str
+    rows: tuple[_Row, ...]
+    total: int
+    remedies: tuple[str, ...]
+
+
+def write_html(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
+    """All findings of some scenes as an HTML page."""
+    from jinja2 import Environment
+
+    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(PAGE)
+    return page.render(
+        scenes=[(report, _sections(report), _skipped(report)) for report in reports],
+        total=counts(reports),
+        valid=_is_valid(reports, strict),
+        is_valid=lambda report: _is_valid([report], strict),
+        severities=SEVERITIES,
+        titles=TITLES,
+        version=__version__,
+    )
+
+
+def _is_valid(reports: Sequence[SceneReport], strict: bool) -> bool:
+    total = counts(reports)
+    return not total["error"] and not (strict and total["warning"])
+
+
+def _sections(report: SceneReport) -> list[tuple[Severity, list[_Block]]]:
+    """Blocks by severity, those without findings left out."""
+    pictures = Pictures(report.path)
+    sections = []
+    for severity in SEVERITIES:
+        mine = [f for f in report.findings if f.severity == severity]
+        blocks = [_block(list(group), pictures) for _, group in groupby(mine, lambda f: f.code)]
+        if blocks:
+            sections.append((severity, blocks))
+    return sections
+
+
+def _block(findings: list[Finding], pictures: Pictures) -> _Block:
+    first = findings[0]
+    return _Block(
+        code=first.code,
+        name=first.name,
+        what=RULES[first.code].what if first.code in RULES else first.expected,
+        rows=tuple(
+            _Row(f.place, f.expected, f.found, pictures.of(f.place, f.also))
+            for f in findings[:ROWS]
+        ),
+        total=len(findings),
+        remedies=tuple(dict.fromkeys(f.remedy for f in findings if f.remedy != NOTHING))[:5],
+    )
+
+
+def _skipped(report: SceneReport) -> list[tuple[str, str]]:
+    """Reasons, and the rules that could not be run for them."""
+    reasons = dict.fromkeys(s.reason for s in report.skipped)
+    return [(r, ", ".join(s.code for s in report.skipped if s.reason == r)) for r in reasons]
+
+
+class Pictures:
+    """Small pictures of the first few images that are asked for."""
+
+    def __init__(self, root: Path) -> None:
+        self._images = root / "images"
+        self._left = PICTURES
+
+    def of(self, place: str, also: Sequence[str] = ()) -> tuple[str, ...]:
+        """Data URIs of the image that a place names and of some others, as far as there are any."""
+        found: list[str] = []
+        for name in islice((*_names(place), *also), SIDE_BY_SIDE):
+            if self._left > 0 and (picture := self._draw(name)) is not None:
+                self._left -= 1
+                found.append(picture)
+        return tuple(found)
+
+    def _draw(self, name: str) -> str | None:
+        try:
+            path = (self._images / name).resolve()
+            inside = is_safe(name) and path.is_relative_to(self._images.resolve())
+            if not inside or not path.is_file() or path.stat().st_size > LARGEST_FILE:
+                return None
+            with Image.open(path) as image:
+                image.draft("RGB", (2 * PICTURE_SIDE, 2 * PICTURE_SIDE))
+                image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
+                image.convert("RGB").save(file := io.BytesIO(), "JPEG", quality=70)
+        except Exception:  # damaged files make Pillow raise almost anything
+            return None
+        return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def _names(place: str) -> Iterator[str]:
+    """What in a place may be the name of an image."""
+    if place.startswith("images/"):
+        yield place.removeprefix("images/")
+    elif place.endswith(")") and " (" in place:
+        yield place[place.index(" (") + 2 : -1]

@@ -1,0 +1,128 @@
+"""Report for people: grouped by scene and rule, equal findings folded into one line."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+
+import click
+
+from chronoscene.validation.finding import NOTHING, SEVERITIES, Finding, Severity, counted
+from chronoscene.validation.report.report import SceneReport, Summary, counts
+from chronoscene.validation.rule import RULES, Rule
+
+FIRST = 3
+"""Places that are named of equal findings."""
+
+CODES = 8
+"""Rules that are named of those that were not run for one reason."""
+
+LINES = 5
+"""Different lines of one rule that are shown."""
+
+NARROWEST = 40
+"""Columns below which lines are not broken further."""
+
+COLOURS: dict[Severity, str] = {"error": "red", "warning": "yellow", "info": "cyan"}
+
+
+def write_text(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
+    """Readable report of some scenes."""
+    blocks = [_scene(report) for report in reports]
+    if len(reports) > 1:
+        bad = sum(bool(r.count("error") or (strict and r.count("warning"))) for r in reports)
+        blocks.append([f"{counted(len(reports), 'scene')}, {bad} not valid: {_total(reports)}"])
+    width = _width()
+    return "\n\n".join("\n".join(_fit(line, width) for line in block) for block in blocks) + "\n"
+
+
+def _width() -> int | None:
+    """Columns of the terminal; None without one: lines stay whole for other programs."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+
+
+def _fit(line: str, width: int | None) -> str:
+    """A line with what does not fit below it, further in."""
+    if width is None or len(click.unstyle(line)) <= width:
+        return line
+    indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
+    return textwrap.fill(
+        line,
+        max(width, NARROWEST),
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def describe_rule(rule: Rule) -> str:
+    """What a rule looks for, with an example and what to do."""
+    head = click.style(f"{rule.severity} {rule.code}", fg=COLOURS[rule.severity])
+    lines = (f"{head} {rule.name}: {rule.what}", f"  for example: {rule.bad}")
+    return "\n".join([*lines, f"  to do: {rule.remedy}"]) + "\n"
+
+
+def _scene(report: SceneReport) -> list[str]:
+    lines = [f"{click.style(report.name, bold=True)}: {_summary(report.summary)}"]
+    for code, group in groupby(report.findings, key=lambda f: f.code):
+        lines += _rule(code, list(group))
+    for reason in sorted({s.reason for s in report.skipped}):
+        codes = [s.code for s in report.skipped if s.reason == reason]
+        rest = f" and {len(codes) - CODES} more" if len(codes) > CODES else ""
+        lines.append(f"  not checked ({reason}): {', '.join(codes[:CODES])}{rest}")
+    return [*lines, f"  {_total([report])}"]
+
+
+def _rule(code: str, findings: list[Finding]) -> list[str]:
+    """Lines of all findings of one rule in one scene."""
+    first = findings[0]
+    head = click.style(f"{first.severity} {code}", fg=COLOURS[first.severity])
+    what = RULES[code].what if code in RULES else first.expected
+    times = f" ({len(findings)} findings)" if len(findings) > 1 else ""
+    lines = [f"  {head} {first.name}: {what}{times}"]
+    folded = _fold(findings)
+    lines += [f"    {line}" for line in folded[:LINES]]
+    if len(folded) > LINES:
+        lines.append(f"    and {len(folded) - LINES} more such lines (--format json has all)")
+    remedies = dict.fromkeys(f.remedy for f in findings if f.remedy != NOTHING)
+    return lines + [f"    to do: {remedy}" for remedy in list(remedies)[:LINES]]
+
+
+def _fold(findings: Iterable[Finding]) -> list[str]:
+    """One line for all findings that differ in their place only."""
+    places: dict[str, list[str]] = {}
+    for f in findings:
+        places.setdefault(f"expected {f.expected}, found {f.found}", []).append(f.place)
+    lines = []
+    for text, where in places.items():
+        rest = f" and {len(where) - FIRST} more" if len(where) > FIRST else ""
+        lines.append(f"{', '.join(where[:FIRST])}{rest}: {text}")
+    return lines
+
+
+def _summary(summary: Summary) -> str:
+    parts = [
+        _amount(summary.images, "image"),
+        _amount(summary.cameras, "camera"),
+        _amount(summary.points, "point"),
+    ]
+    if summary.periods:
+        each = ", ".join(
+            f"{p.id}: {p.images}" if p.test is None else f"{p.id}: {p.train} + {p.test} test"
+            for p in summary.periods
+        )
+        parts.append(f"{counted(len(summary.periods), 'period')} ({each})")
+    return ", ".join(parts)
+
+
+def _amount(number: int | None, noun: str) -> str:
+    return f"{noun}s unknown" if number is None else counted(number, noun)
+
+
+def _total(reports: Sequence[SceneReport]) -> str:
+    total = counts(reports)
+    nouns = {"error": "error", "warning": "warning", "info": "remark"}
+    return ", ".join(counted(total[severity], nouns[severity]) for severity in SEVERITIES)

@@ -1,0 +1,421 @@
+"""A scene folder as it lies on disk: read lazily, part by part, with nothing repaired.
+
+A part that cannot be had is None, and `RawScene.reason` says why; rules that need it are skipped
+with that reason. Nothing here raises for what is on the disk.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.colmap.model import MODEL_FILES
+from chronoscene.colmap.raw_model import FORMS, RawModel, numbered_models, read_raw_model
+from chronoscene.errors import SceneError
+from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name, is_usable
+from chronoscene.scene import Camera
+from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.scene.splits import (
+    IMAGE_SUFFIXES,
+    NameEntry,
+    Problem,
+    SplitEntry,
+    assign_periods,
+    assign_tests,
+    decode_text,
+    default_tests,
+    parse_split_text,
+    parse_test_text,
+)
+from chronoscene.validation.checks.observations import Observations, observe
+from chronoscene.validation.checks.pixels import (
+    Header,
+    Pixels,
+    hash_files,
+    read_headers,
+    read_pixels,
+)
+from chronoscene.validation.checks.reprojection import Reprojection, good_poses, reproject
+from chronoscene.validation.other_formats import Origin
+
+T = TypeVar("T")
+Track = Callable[[Sequence[T], str], Iterable[T]]
+"""Passes items on and shows how far it is, under a description."""
+
+MODEL_PLACES = (MODEL, "sparse", "colmap/sparse/0", "dense/sparse", "dense/0/sparse", "")
+"""Where a model is looked for; only the first is right."""
+
+FEWEST = 10
+"""Observations of an image from which the median of its errors means something."""
+
+LIMIT_SHARE, LEAST_LIMIT = 0.01, 4.0
+"""Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
+pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
+
+MOST_DEPTHS = 500
+"""Depths of an image that are looked at: enough for a percentile over a period."""
+
+FEWEST_IMAGES = 3
+"""Images with an error from which the median of a period means something."""
+
+MOST_CELLS = 500_000_000
+"""Points times periods, in bytes: a table of more is not made. Real scenes have a few percent."""
+
+_REASONS = {
+    "model": f"there is no COLMAP model in {MODEL}",
+    "cameras": "the cameras of the model cannot be read",
+    "images": "the images of the model cannot be read",
+    "points": "the points of the model cannot be read",
+    "observations": "the images or the points of the model cannot be read",
+    "reprojections": "the model cannot be read completely",
+    "split": f"{SPLIT} cannot be read",
+    "split_text": f"{SPLIT} cannot be read",
+    "periods": f"{SPLIT} or the images of the model cannot be read",
+    "test": "sparse/0/test.txt is absent or cannot be read",
+    "tests": f"{SPLIT}, test.txt or the images of the model cannot be read",
+    "point_periods": "points or periods cannot be read, or there are too many periods",
+    "pixels": "pixels are decoded with --decode only",
+}
+
+
+def no_progress(items: Sequence[T], description: str) -> Iterable[T]:
+    """A `Track` that shows nothing."""
+    return items
+
+
+@dataclass(frozen=True, slots=True)
+class TextFile:
+    """A small text file."""
+
+    data: bytes
+    text: str
+
+
+class RawScene:
+    """One scene folder. Every attribute is read when it is first used, then kept."""
+
+    def __init__(
+        self,
+        root: Path,
+        *,
+        decode: bool = False,
+        track: Track = no_progress,
+        origin: Origin | None = None,
+    ) -> None:
+        """Read nothing yet.
+
+        Args:
+            root: The scene folder.
+            decode: Whether rules may decode all images.
+            track: Shows the progress of what takes long.
+            origin: The other format that the scene has come from.
+        """
+        self.root = root
+        self.decode = decode
+        self.origin = origin
+        self._track = track
+
+    def reason(self, attribute: str) -> str:
+        """Why an attribute is None."""
+        return _REASONS[attribute]
+
+    @cached_property
+    def name(self) -> str:
+        return self.root.resolve().name
+
+    # The model.
+
+    @cached_property
+    def model_place(self) -> str | None:
+        """Where the model is, relative to the scene folder; None if there is none."""
+        for place in MODEL_PLACES:
+            if any((self.root / place / f"{s}{e}").is_file() for s in MODEL_FILES for e in FORMS):
+                return place
+        numbered = numbered_models(self.root)  # the first one may have been deleted
+        return f"sparse/{numbered[0].name}" if numbered else None
+
+    @cached_property
+    def model(self) -> RawModel | None:
+        place = self.model_place
+        return None if place is None else read_raw_model(self.root / place)
+
+    @property
+    def cameras(self) -> tuple[Camera, ...] | None:
+        return self.model.cameras if self.model else None
+
+    @property
+    def images(self) -> RawImages | None:
+        return self.model.images if self.model else None
+
+    @property
+    def points(self) -> RawPoints | None:
+        return self.model.points if self.model else None
+
+    def model_file(self, stem: str) -> str:
+        """Name of a model file for messages, relative to the scene folder."""
+        file = self.model.files.get(stem, f"{stem}.bin") if self.model else f"{stem}.bin"
+        return os.path.join(self.model_place or "", file)
+
+    def image_place(self, name: str) -> str:
+        """Place of an image of the model in messages."""
+        return f"{self.model_file('images')} ({name})"
+
+    @cached_property
+    def usable_cameras(self) -> dict[int, Camera]:
+        """Cameras by id, those with a size and focal lengths that mean something."""
+        usable = (c for c in self.cameras or () if is_usable(c) and c.model != "EQUIRECTANGULAR")
+        return {camera.camera_id: camera for camera in usable}
+
+    @cached_property
+    def observations(self) -> Observations | None:
+        if self.images is None or self.points is None:
+            return None
+        return observe(self.images, self.points)
+
+    @cached_property
+    def centres(self) -> NDArray[np.float64]:
+        """Camera centres in the world, NaN for poses that are not good. [I, 3]"""
+        if self.images is None:
+            return np.zeros((0, 3))
+        with np.errstate(all="ignore"):  # absurd translations become infinite
+            rotations = rotation_from_quaternion(self.images.quaternions)
+            centres = -np.einsum("nji,nj->ni", rotations, self.images.translations)
+        centres[~(good_poses(self.images) & np.isfinite(centres).all(axis=1))] = np.nan
+        return centres
+
+    @cached_property
+    def reprojections(self) -> list[Reprojection] | None:
+        """Of the images with a usable camera, a finite pose and observations."""
+        images, points, seen = self.images, self.points, self.observations
+        if self.cameras is None or images is None or points is None or seen is None:
+            return None
+        return list(reproject(self.usable_cameras, images, points, seen))
+
+    @cached_property
+    def image_errors(self) -> NDArray[np.float64]:
+        """Median reprojection error of each image in pixels, of the points in front of it.
+
+        NaN for images with fewer than `FEWEST` points. What a camera cannot see by its distortion
+        is infinitely wrong. [I]
+        """
+        errors = np.full(len(self.images or ()), np.nan)
+        for seen in self.reprojections or ():
+            front = seen.error[seen.depth > 0]
+            if len(front) >= FEWEST:
+                errors[seen.image] = np.median(np.where(np.isnan(front), np.inf, front))
+        return errors
+
+    def pose_limit(self, image: int) -> float:
+        """Reprojection error in pixels beyond which the pose of an image does not fit."""
+        assert self.images is not None
+        camera = self.usable_cameras[int(self.images.camera_ids[image])]
+        return max(LEAST_LIMIT, LIMIT_SHARE * float(np.hypot(camera.width, camera.height)))
+
+    @cached_property
+    def own_frames(self) -> dict[int, str]:
+        """Periods in a frame of their own, see `chronoscene.validation.checks.own_frames`."""
+        from chronoscene.validation.checks.own_frames import (
+            explain_periods,  # it asks for much of this
+        )
+
+        return explain_periods(self)
+
+    @cached_property
+    def period_errors(self) -> dict[int, float]:
+        """Median over the images of a period of `image_errors`, for periods with enough of them."""
+        medians = {}
+        for index, period in enumerate(self.period_ids):
+            errors = self.image_errors[self.image_periods == index]
+            errors = errors[~np.isnan(errors)]
+            if len(errors) >= FEWEST_IMAGES:
+                medians[period] = float(np.median(errors))
+        return medians
+
+    @cached_property
+    def _front(self) -> dict[int, NDArray[np.float64]]:
+        """Depths in front of the cameras by index of the period, some of each image."""
+        by_period: dict[int, list[NDArray[np.float64]]] = {}
+        for seen in self.reprojections or ():
+            depth = seen.depth[:: len(seen.depth) // MOST_DEPTHS + 1]
+            front = depth[(depth > 0) & np.isfinite(depth)]
+            if len(front):
+                by_period.setdefault(int(self.image_periods[seen.image]), []).append(front)
+        return {period: np.concatenate(depths) for period, depths in by_period.items()}
+
+    def depths(self, percent: float) -> dict[int, float]:
+        """Percentile of the depths by index of the period, of the periods that have some."""
+        return {period: float(np.percentile(d, percent)) for period, d in self._front.items()}
+
+    @cached_property
+    def typical_depth(self) -> float:
+        """Median distance of the points from the cameras that see them; 0 if unknown."""
+        every = np.concatenate([np.zeros(0), *self._front.values()])
+        return float(np.median(every)) if len(every) else 0.0
+
+    # Periods and split.
+
+    @cached_property
+    def split_text(self) -> TextFile | None:
+        return self._text(SPLIT)
+
+    @cached_property
+    def _parsed_split(self) -> tuple[list[SplitEntry], list[Problem]]:
+        return parse_split_text(self.split_text.text) if self.split_text else ([], [])
+
+    @property
+    def split(self) -> list[SplitEntry] | None:
+        """Readable lines of ``split.txt``."""
+        return self._parsed_split[0] if self.split_text else None
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of the registered images that stay below ``images/``, sorted, each once."""
+        return sorted({n for n in self.images.names if is_safe(n)}) if self.images else []
+
+    @cached_property
+    def _assigned(self) -> tuple[dict[str, int], list[Problem]]:
+        return assign_periods(self.names, self.split or [])
+
+    @property
+    def split_problems(self) -> list[Problem]:
+        """All problems of ``split.txt``; those of names only if the images can be read."""
+        found = list(self._parsed_split[1])
+        return found + (self._assigned[1] if self.periods is not None else [])
+
+    @property
+    def periods(self) -> dict[str, int] | None:
+        """Period by image name, for the images that have exactly one."""
+        if self.split is None or self.images is None:
+            return None
+        return self._assigned[0]
+
+    @cached_property
+    def test_text(self) -> TextFile | None:
+        return self._text(TEST)
+
+    @cached_property
+    def test(self) -> list[NameEntry] | None:
+        """Lines of ``test.txt``."""
+        return parse_test_text(self.test_text.text) if self.test_text else None
+
+    @cached_property
+    def _tested(self) -> tuple[set[str], list[Problem]]:
+        return assign_tests(self.names, self.test or [])
+
+    @property
+    def test_problems(self) -> list[Problem]:
+        return self._tested[1]
+
+    @cached_property
+    def tests(self) -> set[str] | None:
+        """Names of the test images, by ``test.txt`` or the default split."""
+        if self.periods is None:
+            return None
+        if self.test is not None:
+            return self._tested[0]
+        return None if os.path.lexists(self.root / TEST) else default_tests(self.periods)
+
+    @cached_property
+    def image_periods(self) -> NDArray[np.int64]:
+        """Index of the period of each image into `period_ids`, -1 for none. [I]"""
+        periods = self.periods or {}
+        index = {period: i for i, period in enumerate(self.period_ids)}
+        names = self.images.names if self.images else ()
+        return np.array([index[periods[n]] if n in periods else -1 for n in names], np.int64)
+
+    @cached_property
+    def point_periods(self) -> NDArray[np.bool_] | None:
+        """Whether an image of a period sees the point; columns as `period_ids`. [P, T]"""
+        points, seen = self.points, self.observations
+        if points is None or seen is None or self.periods is None:
+            return None
+        if len(points) * len(self.period_ids) > MOST_CELLS:
+            return None
+        table = np.zeros((len(points), len(self.period_ids)), bool)
+        period = np.append(self.image_periods, -1)[seen.image]
+        rows = (period >= 0) & seen.valid
+        table[seen.point[rows], period[rows]] = True
+        return table
+
+    @cached_property
+    def period_ids(self) -> list[int]:
+        """Ids of the periods that have images, sorted; there may be gaps."""
+        return sorted(set((self.periods or {}).values()))
+
+    # Files.
+
+    @cached_property
+    def files(self) -> list[str]:
+        """Image files below ``images/`` by their suffix, as relative names, sorted."""
+        found = []
+        top = self.root / "images"
+        for folder, _, files in os.walk(top):
+            below = Path(folder).relative_to(top)
+            found += [
+                (below / file).as_posix()
+                for file in files
+                if file.lower().endswith(IMAGE_SUFFIXES) and not file.startswith("._")
+            ]
+        return sorted(found)
+
+    def image_path(self, name: str) -> Path:
+        return self.root / "images" / name
+
+    @cached_property
+    def present(self) -> list[str]:
+        """Registered images with a file."""
+        return [n for n in self.names if os.path.isfile(self.image_path(n))]
+
+    @cached_property
+    def headers(self) -> dict[str, Header]:
+        """Headers of the present images."""
+        return read_headers(self.root / "images", self.present)
+
+    @cached_property
+    def readable(self) -> list[str]:
+        """Present images with a good header."""
+        return [name for name, header in self.headers.items() if header.problem is None]
+
+    @cached_property
+    def digests(self) -> dict[str, bytes]:
+        """SHA-256 of those present files that have the size of another; others are unique."""
+        return hash_files(self.root / "images", self.present, self._track)
+
+    @cached_property
+    def pixels(self) -> dict[str, Pixels] | None:
+        """Digests and thumbnails of the readable images, if they may be decoded."""
+        if not self.decode:
+            return None
+        return read_pixels(self.root / "images", self.readable, self._track)
+
+    def _text(self, place: str) -> TextFile | None:
+        return read_text_file(self.root / place)
+
+
+def read_text_file(path: Path) -> TextFile | None:
+    """A small text file, or None if it is absent, no file, or no text."""
+    try:
+        if not path.is_file():  # a pipe would block
+            return None
+        data = path.read_bytes()
+        text = decode_text(data)
+        return None if "\0" in text else TextFile(data, text)  # UTF-16 without its mark
+    except (OSError, UnicodeDecodeError):
+        return None
+
+
+def is_safe(name: str) -> bool:
+    """Whether an image name stays below ``images/``."""
+    try:
+        check_name(Path(), name)
+    except SceneError:
+        return False
+    return True

@@ -1,0 +1,195 @@
+"""Growth and pruning on cases worked out by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from chronoscene.anchors.density import (
+    AnchorArrays,
+    DensityRules,
+    DensityStatistics,
+    grow,
+    prune_mask,
+)
+
+RULES = DensityRules(voxel_size=0.001, random_mask=False)
+
+
+def arrays_of(positions: list[list[float]], features: list[list[float]]) -> AnchorArrays:
+    """One anchor in the origin cell with one Gaussian per position: offset scale 1."""
+    count = len(positions)
+    return AnchorArrays(
+        anchors=np.zeros((count, 3), np.float32),
+        offsets=np.array(positions, np.float32)[:, None],
+        log_scales=np.zeros((count, 6), np.float32),
+        features=np.array(features, np.float32),
+    )
+
+
+def statistics_of(gradients: list[float], hits: float) -> DensityStatistics:
+    statistics = DensityStatistics(len(gradients), 1)
+    statistics.hits[:, 0] = hits
+    statistics.grad_sum[:, 0] = np.array(gradients) * hits
+    return statistics
+
+
+def sizes(new_log_scales: np.ndarray) -> list[float]:
+    return sorted(
+        np.round(np.exp(new_log_scales[:, 0].astype(np.float64)), 6).tolist(), reverse=True
+    )
+
+
+@pytest.mark.parametrize(("gradient", "levels"), [(1e-4, 0), (3e-4, 1), (5e-4, 2), (9e-4, 3)])
+def test_larger_gradients_reach_finer_levels(gradient: float, levels: int) -> None:
+    """Each level finds its own free cell: 16, 4 and 1 voxels away from the anchors."""
+    arrays = arrays_of([[0.5, 0.0062, 0.0]], [[1.0]])
+    new = grow(arrays, statistics_of([gradient], 41), RULES, np.random.default_rng(0))
+    # The Gaussian's cells at 0.016, 0.004 and 0.001 are three different ones.
+    assert sizes(new.log_scales) == [0.016, 0.004, 0.001][:levels]
+
+
+def test_a_gaussian_needs_more_than_forty_hits() -> None:
+    arrays = arrays_of([[0.5, 0.0, 0.0]], [[1.0]])
+    assert len(grow(arrays, statistics_of([9e-4], 40), RULES, np.random.default_rng(0))) == 0
+    assert len(grow(arrays, statistics_of([9e-4], 41), RULES, np.random.default_rng(0))) > 0
+
+
+def test_nothing_at_the_coarsest_level_means_nothing_at_all() -> None:
+    # The coarse cell holds the anchor in the origin, the cells of 0.004 do not.
+    arrays = arrays_of([[0.0062, 0.0, 0.0]], [[1.0]])
+    statistics = statistics_of([9e-4], 41)
+    assert len(grow(arrays, statistics, RULES, np.random.default_rng(0))) == 0
+    unchained = dataclasses.replace(RULES, chained=False)
+    statistics = statistics_of([9e-4], 41)
+    new = grow(arrays, statistics, unchained, np.random.default_rng(0))
+    assert sizes(new.log_scales) == [0.004, 0.001]
+
+
+def test_a_new_anchor_sits_in_its_cell_with_the_largest_features_of_its_parents() -> None:
+    arrays = arrays_of([[0.501, 0, 0], [0.499, 0, 0]], [[1.0, -5.0], [-2.0, 3.0]])
+    one_level = dataclasses.replace(RULES, levels=1)
+    statistics = statistics_of([3e-4, 3e-4], 41)
+    new = grow(arrays, statistics, one_level, np.random.default_rng(0))
+    cell = np.round(0.5 / 0.016) * 0.016
+    np.testing.assert_allclose(new.positions, [[cell, 0, 0]], rtol=1e-6)
+    np.testing.assert_array_equal(new.features, [[1.0, 3.0]])
+    np.testing.assert_allclose(new.log_scales, np.full((1, 6), np.log(0.016)), rtol=1e-6)
+
+
+def test_offsets_count_in_units_of_the_anchor() -> None:
+    arrays = dataclasses.replace(
+        arrays_of([[1.0, 0, 0]], [[1.0]]), log_scales=np.full((1, 6), np.log(0.32), np.float32)
+    )
+    rules = dataclasses.replace(RULES, levels=1)
+    new = grow(arrays, statistics_of([3e-4], 41), rules, np.random.default_rng(0))
+    np.testing.assert_allclose(new.positions, [[0.32, 0, 0]], rtol=1e-6)
+
+
+def test_only_judged_gaussians_lose_their_counters() -> None:
+    arrays = arrays_of([[0.5, 0, 0], [0.6, 0, 0]], [[1.0], [1.0]])
+    statistics = statistics_of([1e-4, 1e-4], 41)
+    statistics.hits[1], statistics.grad_sum[1] = 40, 1.0
+    grow(arrays, statistics, RULES, np.random.default_rng(0))
+    assert statistics.hits[:, 0].tolist() == [0.0, 40.0]
+    assert statistics.grad_sum[:, 0].tolist() == [0.0, 1.0]
+
+
+def test_the_random_masks_keep_more_at_finer_levels() -> None:
+    count = 4000
+    # 0.0062 lies in other cells at every level, so no level takes the place of the next.
+    positions = [[0.5 + 0.1 * i, 0.0062, 0.0] for i in range(count)]
+    arrays = arrays_of(positions, [[0.0]] * count)
+    rules = dataclasses.replace(RULES, voxel_size=0.001, random_mask=True)
+    new = grow(arrays, statistics_of([9e-4] * count, 41), rules, np.random.default_rng(0))
+    edges, counts = np.unique(
+        np.round(np.exp(new.log_scales[:, 0].astype(np.float64)), 6), return_counts=True
+    )
+    shares = dict(zip(edges.tolist(), (counts / count).tolist(), strict=True))
+    expected = {0.016: 0.5, 0.004: 0.75, 0.001: 0.875}
+    assert shares == pytest.approx(expected, abs=0.03)
+
+
+def test_growth_stops_at_the_limit_and_repeats_with_the_seed() -> None:
+    arrays = arrays_of([[0.5 + 0.1 * i, 0, 0] for i in range(50)], [[0.0]] * 50)
+    limited = dataclasses.replace(RULES, max_anchors=57)
+    runs = [
+        grow(arrays, statistics_of([9e-4] * 50, 41), limited, np.random.default_rng(3))
+        for _ in range(2)
+    ]
+    assert len(runs[0]) == 7
+    np.testing.assert_array_equal(runs[0].positions, runs[1].positions)
+
+
+@pytest.mark.parametrize(
+    ("visits", "opacity_sum", "kept"),
+    [(81, 0.404, False), (81, 0.406, True), (80, 0.0, True)],
+)
+def test_faint_anchors_are_pruned(visits: float, opacity_sum: float, kept: bool) -> None:
+    statistics = DensityStatistics(1, 2)
+    statistics.visits[0], statistics.opacity_sum[0] = visits, opacity_sum
+    assert prune_mask(statistics, RULES).tolist() == [kept]
+    assert statistics.visits[0] == (80 if visits == 80 else 0)
+
+
+def test_the_paper_prunes_anchors_that_do_not_move() -> None:
+    statistics = DensityStatistics(2, 1)
+    statistics.visits[:], statistics.opacity_sum[:] = 100, 50.0
+    statistics.motion[:] = [0.0, 1.0]
+    rules = dataclasses.replace(RULES, prune_by="gradient")
+    assert prune_mask(statistics, rules).tolist() == [False, True]
+
+
+def test_statistics_of_a_view() -> None:
+    statistics = DensityStatistics(3, 2)
+    positions = np.array([0, 2, 3])  # the second Gaussian of the first anchor is off
+    opacities = np.array([0.5, 0.25, 0.5], np.float32)
+    radii = np.array([[1, 1], [0, 4], [2, 2]], np.int32)
+    grads = np.array([[3e-3, 4e-3], [9.0, 9.0], [0.0, 1e-3]], np.float32)
+    statistics.update(np.array([0, 2]), positions, opacities, radii, grads, 20, 40)
+    np.testing.assert_array_equal(statistics.visits, [1, 0, 1])
+    np.testing.assert_allclose(statistics.opacity_sum, [0.5, 0, 0.75])
+    # Gradients count in half images: 10 pixels across, 20 down. Off or culled ones do not count.
+    np.testing.assert_array_equal(statistics.hits, [[1, 0], [0, 0], [0, 1]])
+    np.testing.assert_allclose(
+        statistics.grad_sum, [[np.hypot(0.03, 0.08), 0], [0, 0], [0, 0.02]], rtol=1e-6
+    )
+
+
+def test_statistics_of_many_anchors() -> None:
+    """As counted one by one, whatever the anchors that a task takes together."""
+    rng = np.random.default_rng(0)
+    anchors, k = 1_700, 3
+    visible = np.flatnonzero(rng.random(anchors) < 0.9)
+    positions = np.flatnonzero(rng.random(len(visible) * k) < 0.3)
+    count = len(positions)
+    opacities = rng.random(count, dtype=np.float32)
+    radii = rng.integers(0, 2, (count, 2)).astype(np.int32)
+    grads = rng.normal(size=(count, 2)).astype(np.float32)
+    statistics = DensityStatistics(anchors, k)
+    statistics.update(visible, positions, opacities, radii, grads, 2, 2)
+    seen = radii.min(axis=1) > 0
+    owner = visible[positions // k]
+    norms = np.hypot(grads[:, 0], grads[:, 1])
+    np.testing.assert_array_equal(statistics.visits, np.isin(np.arange(anchors), visible))
+    np.testing.assert_allclose(
+        statistics.opacity_sum, np.bincount(owner, opacities, anchors), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        statistics.motion, np.bincount(owner[seen], norms[seen], anchors), rtol=1e-6
+    )
+    expected = np.zeros((anchors, k))
+    expected[owner[seen], positions[seen] % k] = norms[seen]
+    np.testing.assert_allclose(statistics.grad_sum, expected, rtol=1e-6)
+    np.testing.assert_array_equal(statistics.hits, expected > 0)
+
+
+def test_counters_follow_their_anchors() -> None:
+    statistics = DensityStatistics(3, 2)
+    statistics.visits[:] = [1, 2, 3]
+    statistics.extend(1)
+    statistics.keep(np.array([True, False, True, True]))
+    assert statistics.visits.tolist() == [1, 3, 0]
+    assert statistics.hits.shape == (3, 2)

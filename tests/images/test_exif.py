@@ -1,0 +1,191 @@
+"""Metadata of photos: what is there is read, what is damaged or absurd is None."""
+
+import io
+import struct
+from datetime import datetime
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from chronoscene.images.exif import DroneData, ExifData, exif_of, read_exif
+
+XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description
+ drone-dji:AbsoluteAltitude="+132.50" drone-dji:RelativeAltitude="+61.30"
+ drone-dji:GimbalYawDegree="-93.10" drone-dji:GimbalPitchDegree="-89.90"
+ drone-dji:GimbalRollDegree="+0.00" drone-dji:RtkFlag="50" drone-dji:RtkStdLon="0.0113"
+ drone-dji:RtkStdLat="0.0107" drone-dji:RtkStdHgt="0.0246"/></x:xmpmeta>"""
+
+ELEMENTS = """<rdf:Description><drone-dji:RelativeAltitude>+61.30</drone-dji:RelativeAltitude>
+<drone-dji:RtkFlag>nonsense</drone-dji:RtkFlag></rdf:Description>"""
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, on damaged tags
+
+
+def photo(form="JPEG", *, main=(), exif=(), gps=(), xmp=None):
+    """A file with tags, as bytes."""
+    tags = Image.Exif()
+    tags[0x010F] = "Maker"
+    tags.update(dict(main))
+    tags.get_ifd(0x8769).update(dict(exif))
+    tags.get_ifd(0x8825).update(dict(gps))
+    options = {} if xmp is None else {"xmp": xmp if isinstance(xmp, bytes) else xmp.encode()}
+    Image.new("RGB", (64, 48)).save(file := io.BytesIO(), form, exif=tags, **options)
+    return file.getvalue()
+
+
+def read(data):
+    with Image.open(io.BytesIO(data)) as image:
+        return exif_of(image)
+
+
+FULL = {
+    "main": {0x0110: "Model X", 0x0112: 6},
+    "exif": {
+        0x9003: "2016:05:03 12:30:00",
+        0x920A: 8.8,
+        0xA405: 24,
+        0xA002: 4000,
+        0xA003: 3000,
+    },
+    "gps": {
+        1: "S",
+        2: (33, 51, 24.12),
+        3: "W",
+        4: (70, 30, 0.0),
+        5: b"\1",
+        6: 12.5,
+    },
+}
+
+
+@pytest.mark.parametrize("form", ["JPEG", "PNG", "WEBP"])
+def test_all_tags(form):
+    data = read(photo(form, **FULL))
+    assert data.date == datetime(2016, 5, 3, 12, 30)
+    assert data.latitude == pytest.approx(-(33 + 51 / 60 + 24.12 / 3600), abs=1e-6)
+    assert data.longitude == pytest.approx(-70.5) and data.has_position
+    assert (data.altitude, data.altitude_ref) == (-12.5, "below")
+    assert data.focal_mm == pytest.approx(8.8) and data.focal_35mm == 24
+    assert (data.make, data.model, data.orientation) == ("Maker", "Model X", 6)
+    assert (data.width, data.height) == (4000, 3000)
+    assert data.drone is None
+
+
+def test_tags_of_a_tiff():
+    data = read(photo("TIFF", main=FULL["main"]))
+    assert (data.make, data.model, data.orientation) == ("Maker", "Model X", 6)
+
+
+def test_drone():
+    drone = read(photo(xmp=XMP)).drone
+    assert drone == DroneData(61.3, 132.5, -93.1, -89.9, 0.0, 50, (0.0113, 0.0107, 0.0246))
+
+
+def test_drone_with_elements_and_damage():
+    assert read(photo(xmp=ELEMENTS)).drone == DroneData(relative_altitude=61.3)
+
+
+def test_other_xmp_is_no_drone():
+    assert read(photo(xmp="<x:xmpmeta/>")).drone is None
+
+
+def test_nothing(tmp_path):
+    assert read_exif(tmp_path / "absent.jpg") == ExifData()
+    (tmp_path / "text.jpg").write_text("hello")
+    assert read_exif(tmp_path / "text.jpg") == ExifData()
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    assert read_exif(tmp_path / "a.png") == ExifData()
+
+
+@pytest.mark.parametrize(
+    "date", ["0000:00:00 00:00:00", "2016:13:01 00:00:00", "1980:01:01 00:00:00", "yesterday", ""]
+)
+def test_dates_that_are_none(date):
+    assert read(photo(exif={0x9003: date})).date is None
+
+
+def test_date_of_digitisation_where_there_is_no_other():
+    assert read(photo(exif={0x9004: "2016-05-03T12:00:00"})).date == datetime(2016, 5, 3, 12)
+    # The time of the last change by a program says nothing about the photo.
+    assert read(photo(main={0x0132: "2016:05:03 12:00:00"})).date is None
+
+
+@pytest.mark.parametrize(
+    "gps",
+    [
+        {1: "N", 2: (0, 0, 0), 3: "E", 4: (0, 0, 0)},
+        {1: "N", 2: (91, 0, 0), 3: "E", 4: (10, 0, 0)},
+        {1: "N", 2: (48, 0, 0)},
+    ],
+)
+def test_positions_that_are_none(gps):
+    assert not read(photo(gps=gps)).has_position
+
+
+def test_pixels_are_not_decoded(tmp_path):
+    path = tmp_path / "a.png"
+    Image.effect_noise((64, 48), 50).save(path)
+    path.write_bytes(path.read_bytes()[:200])  # a header, and hardly any pixels
+    assert read_exif(path) == ExifData()
+    with Image.open(path) as image:
+        exif_of(image)
+        assert image.tile  # still to be decoded
+
+
+def check(data):
+    """Whatever is in the file, the result is of the right types and ranges."""
+    try:
+        found = read(data)
+    except OSError:
+        return  # not even an image
+    assert found.latitude is None or -90 <= found.latitude <= 90
+    assert found.longitude is None or -180 <= found.longitude <= 180
+    assert found.orientation in range(1, 9)
+    assert found.focal_mm is None or 0 < found.focal_mm < float("inf")
+    assert found.make is None or (found.make.isprintable() and len(found.make) <= 100)
+
+
+@given(st.integers(0, 500), st.binary(max_size=12))
+def test_damaged_metadata(at, garbage):
+    good = photo(xmp=XMP, **FULL)
+    check(good[:at] + garbage + good[at + len(garbage) :])
+
+
+@given(st.binary(max_size=200))
+def test_any_tags(garbage):
+    begin = b"Exif\0\0II*\0" + struct.pack("<I", 8)
+    Image.new("RGB", (4, 4)).save(file := io.BytesIO(), "JPEG", exif=begin + garbage)
+    check(file.getvalue())
+
+
+@given(st.text(max_size=60))
+def test_any_xmp(text):
+    xmp = f'drone-dji:RtkFlag="{text}" drone-dji:GimbalYawDegree={text}'
+    drone = read(photo(xmp=xmp.encode("utf-8", "surrogatepass"))).drone
+    assert drone is None or drone.rtk_flag is None or isinstance(drone.rtk_flag, int)
+
+
+@pytest.mark.parametrize(
+    ("text", "date"),
+    [
+        ("2016:05:03 12:30:05.25", datetime(2016, 5, 3, 12, 30, 5)),
+        ("2016:05:03 12:30:05+02:00", datetime(2016, 5, 3, 12, 30, 5)),
+        ("2016-05-03T12:30:05Z", datetime(2016, 5, 3, 12, 30, 5)),
+        ("2016/05/03 12:30", datetime(2016, 5, 3, 12, 30)),
+        ("2016:5:3 9:5:0", datetime(2016, 5, 3, 9, 5)),
+        ("2016:05:03", datetime(2016, 5, 3)),
+        ("2016:05:03 24:00:00", datetime(2016, 5, 3)),
+        ("2016:05:031 12:00:00", None),
+    ],
+)
+def test_dates_as_programs_write_them(text, date):
+    assert read(photo(exif={0x9003: text})).date == date
+
+
+def test_date_of_the_gps_fix_where_there_is_no_other():
+    gps = {29: "2016:05:03", 7: (9.0, 30.0, 15.5)}
+    assert read(photo(gps=gps)).date == datetime(2016, 5, 3, 9, 30, 15, 500000)
+    assert read(photo(gps=gps, exif={0x9003: "2017:05:03 12:00:00"})).date.year == 2017
+    assert read(photo(gps={29: "2016:05:03", 7: (99.0, 0.0, 0.0)})).date == datetime(2016, 5, 3)

@@ -1,0 +1,48 @@
+"""Files appear complete or not at all."""
+
+import os
+import signal
+
+import pytest
+
+from chronoscene.io.files import replacing, stoppable, write_text_atomic
+
+
+def test_text_is_utf8_with_plain_line_ends(tmp_path):
+    path = tmp_path / "a.txt"
+    write_text_atomic(path, "früher\nspäter\n")
+    assert path.read_bytes() == "früher\nspäter\n".encode()
+    write_text_atomic(path, "new\n")
+    assert path.read_bytes() == b"new\n"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_a_block_that_fails_leaves_the_old_file_alone(tmp_path, error):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(error), replacing(path) as partial:
+        partial.write_text("half")
+        assert path.read_text() == "old"
+        raise error
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_cannot_be_put_in_place_leaves_nothing(tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError):
+        write_text_atomic(tmp_path / "folder", "text")
+    assert [p.name for p in tmp_path.iterdir()] == ["folder"]
+    with pytest.raises(FileNotFoundError):
+        write_text_atomic(tmp_path / "absent" / "a.txt", "text")
+
+
+def test_a_request_to_end_cleans_up(tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end, stoppable(), replacing(tmp_path / "a.txt") as partial:
+        partial.write_text("half")
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert end.value.code == 128 + signal.SIGTERM
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(signal.SIGTERM) == before

@@ -1,0 +1,119 @@
+"""Finding photos, their periods, and reasons against some of them."""
+
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from chronoscene.errors import SceneError
+from chronoscene.registration.photos.captures import read_captures
+
+
+def photo(path: Path, *, size: tuple[int, int] = (96, 72), taken: str | None = None) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = Image.effect_noise(size, 60).convert("RGB")
+    exif = Image.Exif()
+    if taken is not None:
+        exif.get_ifd(0x8769)[0x9003] = taken
+    image.save(path, exif=exif)
+    return path
+
+
+def test_folders_are_periods_ordered_by_the_dates_of_their_photos(tmp_path: Path) -> None:
+    photo(tmp_path / "after" / "a.jpg", taken="2016:05:01 10:00:00")
+    photo(tmp_path / "before" / "b.jpg", taken="2023:05:01 10:00:00")
+    found = read_captures(tmp_path)
+    assert [(p.label, p.date) for p in found.periods] == [
+        ("after", "2016-05-01"),
+        ("before", "2023-05-01"),
+    ]
+    assert [(c.name, c.period) for c in found.images] == [("after/a.jpg", 0), ("before/b.jpg", 1)]
+    assert found.images[0].taken == datetime(2016, 5, 1, 10)
+
+
+def test_folders_without_dates_are_in_natural_order(tmp_path: Path) -> None:
+    for label in ("t10", "t2", "t1"):
+        photo(tmp_path / label / "x.png")
+    assert [p.label for p in read_captures(tmp_path).periods] == ["t1", "t2", "t10"]
+
+
+def test_one_folder_is_cut_where_weeks_pass(tmp_path: Path) -> None:
+    for i, day in enumerate(("2016:09:01", "2016:09:03", "2017:01:10", "2017:01:11")):
+        photo(tmp_path / f"{i}.jpg", taken=f"{day} 12:00:00")
+    found = read_captures(tmp_path)
+    assert [c.period for c in found.images] == [0, 0, 1, 1]
+    assert [p.date for p in found.periods] == ["2016-09", "2017-01"]
+    assert "proposed" in " ".join(found.remarks)
+
+
+def test_one_folder_with_an_undated_photo_is_one_period(tmp_path: Path) -> None:
+    photo(tmp_path / "a.jpg", taken="2016:09:01 12:00:00")
+    photo(tmp_path / "b.jpg", taken="2019:09:01 12:00:00")
+    photo(tmp_path / "c.jpg")
+    found = read_captures(tmp_path)
+    assert len(found.periods) == 1
+    assert "1 of 3 photos have no date" in " ".join(found.remarks)
+
+
+def test_dates_in_file_names_count_where_exif_has_none(tmp_path: Path) -> None:
+    photo(tmp_path / "20160901_a.jpg")
+    photo(tmp_path / "2017-05-02_b.jpg")
+    assert [p.date for p in read_captures(tmp_path).periods] == ["2016-09-01", "2017-05-02"]
+
+
+def test_a_table_gives_periods(tmp_path: Path) -> None:
+    photo(tmp_path / "images" / "a.jpg")
+    photo(tmp_path / "images" / "b c.jpg")
+    table = tmp_path / "periods.csv"
+    table.write_text("file,period,lat\na.jpg,1,\nb c.jpg,0,\n")
+    for captures in (read_captures(tmp_path, table=table), read_captures(table)):
+        assert [(c.name, c.period) for c in captures.images] == [("a.jpg", 1), ("b c.jpg", 0)]
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "found"),
+    [
+        ("a.jpg,0\n", "t.csv", "a.jpg,0"),
+        ("image,period\n../x.jpg,0\n", "t.csv:2", "'../x.jpg'"),
+        ("image,period\na.jpg,\n", "t.csv:2", "''"),
+        ("image,period\na.jpg,0\na.jpg,1\n", "t.csv:3", "'0' and '1'"),
+    ],
+)
+def test_wrong_tables_are_refused(tmp_path: Path, text: str, place: str, found: str) -> None:
+    photo(tmp_path / "a.jpg")
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(SceneError) as caught:
+        read_captures(tmp_path, table=tmp_path / "t.csv")
+    assert place in caught.value.place
+    assert found in caught.value.found
+
+
+def test_unusable_photos_are_named_with_reasons(tmp_path: Path) -> None:
+    photo(tmp_path / "0" / "good.jpg")
+    photo(tmp_path / "1" / "good.jpg")
+    whole = photo(tmp_path / "1" / "cut.jpg").read_bytes()
+    (tmp_path / "1" / "cut.jpg").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "1" / "text.jpg").write_text("no photo")
+    photo(tmp_path / "1" / "icon.png", size=(32, 32))
+    photo(tmp_path / "1" / "panorama.jpg", size=(400, 100))
+    xmp = b'<x:xmpmeta GPano:ProjectionType="equirectangular"/>'
+    Image.effect_noise((200, 100), 60).save(tmp_path / "1" / "sphere.jpg", xmp=xmp)
+    found = read_captures(tmp_path)
+    assert [c.name for c in found.images] == ["0/good.jpg", "1/good.jpg"]
+    reasons = {name: reason for name, _, reason in found.refused}
+    assert reasons["1/cut.jpg"].startswith("cannot be decoded")
+    assert reasons["1/text.jpg"].startswith("cannot be decoded")
+    assert reasons["1/icon.png"].endswith("too small")
+    assert "panorama" in reasons["1/panorama.jpg"]
+    assert "panorama" in reasons["1/sphere.jpg"]
+
+
+def test_nothing_to_register_is_said(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match="found no image files"):
+        read_captures(tmp_path)
+    with pytest.raises(SceneError, match="found nothing"):
+        read_captures(tmp_path / "absent")
+    (tmp_path / "x.jpg").write_text("no photo")
+    with pytest.raises(SceneError, match="none of which can be used"):
+        read_captures(tmp_path)

@@ -1,0 +1,329 @@
+"""Certificate and verdict on generated registrations: no wrong one passes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from chronoscene.registration.generated import CaseSettings, generate_case, pose_errors
+from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
+from chronoscene.registration.quality.certificate_json import pair_figures, period_figures, to_json
+from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
+from chronoscene.registration.quality.localisation import Localisation
+from chronoscene.registration.quality.misalignment import Misalignment
+from chronoscene.registration.quality.overlap import seen_by_period, tie_spread
+from chronoscene.registration.quality.rays import Placed
+from chronoscene.registration.quality.surface_distance import CloudDistance, cloud_distance
+from chronoscene.registration.quality.verdict import THRESHOLDS, judge
+from chronoscene.registration.result import HeldOutTracks, Registered
+from chronoscene.scene.geometry import Sim3, camera_centre
+
+GOOD = CaseSettings(ties=800, seed=21, held_out=0.3)
+
+
+@pytest.fixture(scope="module")
+def good() -> Registered:
+    return generate_case(GOOD).model
+
+
+@pytest.fixture(scope="module")
+def certificate(good: Registered) -> Certificate:
+    return certify(good)
+
+
+def without_held_out(model: Registered) -> Registered:
+    return replace(model, held_out=(), held_out_tracks=HeldOutTracks.empty())
+
+
+def test_a_good_registration_passes(certificate: Certificate) -> None:
+    verdict = judge(certificate)
+    assert verdict.level == "pass", verdict.findings
+    assert "took no part" in verdict.text
+    assert verdict.pairs == {(0, 1): "pass"}
+
+
+def test_every_figure_is_measured(certificate: Certificate) -> None:
+    (pair,) = certificate.pairs
+    assert isinstance(pair.held_out, HeldOut)
+    assert isinstance(pair.misalignment, Misalignment)
+    assert isinstance(pair.by_all, Misalignment)
+    assert isinstance(pair.localised_a, Localisation)
+    assert isinstance(pair.localised_b, Localisation)
+    assert isinstance(pair.clouds, CloudDistance)
+    assert all(isinstance(p.gps, GpsFit) for p in certificate.periods)
+    assert pair.held_out.median < 1.0
+    assert pair.held_out.distance < 0.4
+    assert pair.clouds.median < pair.clouds.level
+    assert pair.localised_b.images == 14
+
+
+def test_equal_models_give_equal_certificates(good: Registered, certificate: Certificate) -> None:
+    again = certify(good)
+    assert json.dumps(to_json(again, judge(again))) == json.dumps(
+        to_json(certificate, judge(certificate))
+    )
+
+
+def test_the_frame_does_not_matter(good: Registered, certificate: Certificate) -> None:
+    """Without a georeference, the same model in another frame and scale has the same figures."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_euler("xyz", [0.3, 1.0, -2.0]).as_matrix()
+    move = Sim3(0.01, turn, np.array([5.0, -3.0, 2.0]))
+    moved = replace(
+        good,
+        cam_from_world=move.apply_to_pose(good.cam_from_world),
+        points=move.apply(good.points),
+        georeference=None,
+    )
+    (a,), (b,) = certificate.pairs, certify(moved).pairs
+    assert isinstance(a.by_all, Misalignment) and isinstance(b.by_all, Misalignment)
+    assert isinstance(a.held_out, HeldOut) and isinstance(b.held_out, HeldOut)
+    assert b.by_all.rotation.value == pytest.approx(a.by_all.rotation.value, rel=0.02)
+    # The drawn numbers of the interval belong to other axes: equal up to chance.
+    assert b.by_all.rotation.high == pytest.approx(a.by_all.rotation.high, rel=0.3)
+    assert b.by_all.shift.value == pytest.approx(0.01 * a.by_all.shift.value, rel=0.02)
+    assert b.held_out.median == pytest.approx(a.held_out.median, rel=1e-3)
+
+
+CASES: dict[str, dict[str, Any]] = {
+    "rotation": {"rotation": 0.5},
+    "shift": {"shift": 1.5},
+    "scale": {"scale": 0.02},
+    "turned over": {"rotation": 160.0, "shift": 50.0},
+    "one step of a repetition": {"repeated": 1.0, "step": 6.0},
+    "repetition in one spot": {"repeated": 1.0, "step": 3.0, "cluster": 20.0},
+    "by GPS": {"by_gps": True},
+    "by GPS, few matches": {"by_gps": True, "ties": 20},
+    "nothing in common": {"by_gps": True, "ties": 0},
+    "few matches in one spot": {"ties": 25, "cluster": 8.0},
+    "drift": {"bend": 2.5},
+    "four periods, the last wrong": {"periods": 4, "rotation": 0.4},
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_wrong_registration_passes(name: str) -> None:
+    settings = CaseSettings(**({"ties": 400, "seed": 31, "points": 2500} | CASES[name]))
+    made = generate_case(settings)
+    model = made.model
+    rotation, centre = pose_errors(model.cam_from_world, made.truth, model.periods == 0)
+    last = model.periods == model.num_periods - 1
+    wrong = np.median(rotation[last]) > 0.1
+    wrong |= 100 * np.median(centre[last]) / scene_extent(model) > 0.2
+    verdict = judge(certify(model))
+    assert wrong, "the case must be a wrong one"
+    assert verdict.level != "pass"
+    assert verdict.findings and verdict.todo
+
+
+def test_gross_errors_fail() -> None:
+    for change in ({"rotation": 1.0}, {"shift": 4.0}, {"by_gps": True}):
+        made = generate_case(CaseSettings(ties=400, seed=32, **change))  # type: ignore[arg-type]
+        assert judge(certify(made.model)).level == "fail"
+
+
+def test_nothing_in_common_is_a_fail_that_says_so() -> None:
+    verdict = judge(certify(generate_case(CaseSettings(ties=0, by_gps=True, seed=33)).model))
+    assert verdict.level == "fail"
+    assert "nothing measured links" in verdict.text
+    assert verdict.pairs == {(0, 1): None}
+
+
+def test_a_chain_of_good_pairs_is_good() -> None:
+    """Periods 0 and 3 share nothing, but each is linked to the next."""
+    settings = CaseSettings(
+        periods=4, chain=True, ties=700, held_out=0.4, points=4000, noise=0.3, seed=34
+    )
+    made = generate_case(settings)
+    certificate = certify(made.model)
+    assert sum(p.ties.points == 0 for p in certificate.pairs) == 3
+    verdict = judge(certificate)
+    assert verdict.level == "pass", verdict.findings
+    assert verdict.pairs[0, 3] is None
+
+
+def test_without_held_out_tracks_there_is_no_pass(good: Registered) -> None:
+    certificate = certify(without_held_out(good))
+    verdict = judge(certificate)
+    assert verdict.level == "doubtful"
+    assert any(f.check == "held_out" for f in verdict.findings)
+    (pair,) = certificate.pairs
+    assert isinstance(pair.held_out, str)
+    texts = [f.text for f in pair_figures(certificate, pair)]
+    assert any(t.startswith("absent: no held-out track") for t in texts)
+
+
+def test_missing_photos_are_counted_with_their_reasons(good: Registered) -> None:
+    lost = {f"t1/lost{i}.jpg": "too few matches" for i in range(40)}
+    model = replace(good, unregistered=lost, unregistered_periods=dict.fromkeys(lost, 1))
+    certificate = certify(model)
+    assert certificate.periods[1].photos == 54
+    assert certificate.periods[1].reasons == {"too few matches": 40}
+    verdict = judge(certificate)
+    assert verdict.level == "doubtful"
+    assert verdict.findings[0].check == "registered"
+
+
+def test_a_period_without_any_image(good: Registered) -> None:
+    model = replace(good, num_periods=3, labels=("a", "b", "c"), dates=(None, None, None))
+    certificate = certify(model)
+    verdict = judge(certificate)
+    assert verdict.level == "fail"
+    assert any(f.place == "period c" and f.check == "images" for f in verdict.findings)
+    json.dumps(to_json(certificate, verdict), allow_nan=False)
+
+
+def test_one_image(good: Registered) -> None:
+    model = replace(
+        without_held_out(good),
+        names=good.names[:1],
+        periods=good.periods[:1],
+        cam_from_world=good.cam_from_world[:1],
+        cameras=good.cameras[:1],
+        points=np.zeros((0, 3)),
+        colors=np.zeros((0, 3), np.uint8),
+        track_start=np.zeros(1, np.int64),
+        track_image=np.zeros(0, np.int64),
+        track_xy=np.zeros((0, 2)),
+        gps_enu=good.gps_enu[:1],
+        gps_used=good.gps_used[:1],
+    )
+    certificate = certify(model)
+    assert judge(certificate).level == "fail"
+    json.dumps(to_json(certificate, judge(certificate)), allow_nan=False)
+
+
+def test_json_has_units_numbers_and_reasons(certificate: Certificate) -> None:
+    data = json.loads(json.dumps(to_json(certificate, judge(certificate)), allow_nan=False))
+    assert data["verdict"] == "pass"
+    assert data["unit"] == "metre"
+    figures = {f["name"]: f for f in data["pairs"][0]["figures"]}
+    assert figures["rotation by held-out tracks"]["unit"] == "degrees"
+    assert len(figures["rotation by held-out tracks"]["interval"]) == 2
+    assert "tracks" in figures["rotation by held-out tracks"]["over"]
+    for pair in data["pairs"]:
+        for figure in pair["figures"]:
+            assert (figure["value"] is None) == bool(figure["absent"]), figure
+    assert len(data["thresholds"]) == len(THRESHOLDS)
+    assert len(list(period_figures(certificate, certificate.periods[0]))) >= 6
+
+
+@pytest.mark.parametrize("threshold", THRESHOLDS.values(), ids=lambda t: t.key)
+def test_thresholds_are_in_order_and_explained(threshold: Any) -> None:
+    better = -1 if threshold.larger_is_better else 1
+    assert threshold.level(threshold.doubtful) == "pass"
+    assert threshold.level(threshold.doubtful + better * 1e-9) != "pass"
+    if threshold.fail is not None:
+        assert better * threshold.fail >= better * threshold.doubtful
+        assert threshold.level(threshold.fail + better * 1e-9) == "fail"
+    assert threshold.why and threshold.todo
+
+
+def test_tie_spread_tells_a_cluster_from_a_spread() -> None:
+    values = []
+    for cluster in (None, 12.0):
+        model = generate_case(CaseSettings(seed=41, ties=300, cluster=cluster)).model
+        values.append(tie_spread(model, seen_by_period(model), 0, 1))
+    assert values[0].occupied > 0.5 > 0.15 > values[1].occupied
+    assert values[0].hull > 0.7 > 0.2 > values[1].hull
+    assert len(values[1].gaps) == 20
+
+
+def plane(rng: np.random.Generator, count: int, noise: float) -> np.ndarray:
+    """Ground and two walls, so that all directions are seen."""
+    uv = rng.uniform(-10, 10, (count, 2))
+    ground = np.column_stack([uv, np.zeros(count)])
+    wall = np.column_stack([uv[:, 0], np.full(count, 10.0), uv[:, 1] + 10])
+    other = np.column_stack([np.full(count, 10.0), uv[:, 0], uv[:, 1] + 10])
+    return np.concatenate([ground, wall, other]) + rng.normal(0, noise, (3 * count, 3))
+
+
+def as_cloud(xyz: np.ndarray) -> Placed:
+    count = len(xyz)
+    return Placed(np.arange(count), xyz, np.tile(np.eye(3), (count, 1, 1)), np.zeros(count))
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.1, -0.2, 0.25)])
+def test_clouds_find_a_shift_without_matches(shift: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(0)
+    first, second = plane(rng, 2000, 0.02), plane(rng, 2000, 0.02) + shift
+    second[:600] += [0.0, 0.0, 3.0]  # a part that has changed
+    found = cloud_distance(as_cloud(first), as_cloud(second), np.zeros(3) + 5.0, 0.0)
+    assert isinstance(found, CloudDistance)
+    assert found.shift.low <= np.linalg.norm(shift) <= found.shift.high
+    assert found.shift.value == pytest.approx(np.linalg.norm(shift), abs=0.03)
+    if any(shift):
+        assert found.shift.low > 0.2
+        assert found.beyond > 0.4
+    else:
+        assert found.beyond < 0.1
+
+
+def test_clouds_too_small_or_apart_say_so() -> None:
+    rng = np.random.default_rng(0)
+    cloud = as_cloud(plane(rng, 200, 0.01))
+    few = cloud_distance(as_cloud(cloud.xyz[:5]), cloud, np.zeros(3), 0.0)
+    apart = cloud_distance(cloud, as_cloud(cloud.xyz + 500), np.zeros(3), 0.0)
+    assert isinstance(few, str) and "too few" in few
+    assert isinstance(apart, str) and "meet at" in apart
+
+
+def test_gps_finds_offset_scale_and_turn() -> None:
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(1)
+    centres = rng.uniform(-80, 80, (40, 3)) * [1, 1, 0.2]
+    turn = Rotation.from_euler("z", 5, degrees=True)
+    gps = 1.1 * turn.apply(centres) + [4.0, -3.0, 20.0] + rng.normal(0, 1.0, centres.shape)
+    gps[:4] += 200
+    gps[5] = np.nan
+    found = fit_gps(centres, gps)
+    assert isinstance(found, GpsFit)
+    assert found.positions == 39
+    assert found.outliers == 4
+    assert found.scale == pytest.approx(1.1, abs=0.03)
+    assert found.turn == pytest.approx(5.0, abs=1.5)
+    assert found.largest > 150 > 3 > found.median
+    assert isinstance(fit_gps(centres[:3], gps[:3]), str)
+    assert isinstance(fit_gps(centres, np.full_like(centres, np.nan)), str)
+
+
+def test_extent_of_cameras_that_stand_still(good: Registered) -> None:
+    poses = good.cam_from_world.copy()
+    poses[:, :3, 3] = -np.einsum("nij,j->ni", poses[:, :3, :3], [1.0, 2.0, 3.0])
+    still = replace(good, cam_from_world=poses)
+    assert np.ptp(camera_centre(poses), axis=0).max() < 1e-9
+    assert 5 < scene_extent(still) < 30
+
+
+def test_the_documented_thresholds_are_those_of_the_code() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "registration.md").read_text(encoding="utf-8")
+    for t in THRESHOLDS.values():
+        sign = "below" if t.larger_is_better else "above"
+        unit = f" {t.unit}" if t.unit else ""
+        fail = f"{sign} {t.fail:g}{unit}" if t.fail is not None else "-"
+        assert f"| {t.what} | {sign} {t.doubtful:g}{unit} | {fail} | {t.why} |" in text
+
+
+def test_a_period_far_from_its_own_gps_is_doubtful(good: Registered) -> None:
+    """Half of a period stands elsewhere: its GPS is the witness."""
+    gps = good.gps_enu.copy()
+    half = np.flatnonzero(good.periods == 1)[::2]
+    gps[half] += np.array([60.0, -50.0, 0.0])
+    gps[half[::2]] += np.array([-150.0, 90.0, 0.0])
+    verdict = judge(certify(replace(good, gps_enu=gps)))
+    assert verdict.level != "pass"
+    assert any(f.check == "gps_residual" and f.place == "period 2017" for f in verdict.findings)
+
+
+def test_one_period_is_not_praised_for_an_alignment() -> None:
+    made = generate_case(CaseSettings(ties=0, seed=34, periods=1))
+    verdict = judge(certify(made.model))
+    assert verdict.level != "fail"
+    assert "of each other" not in verdict.text

@@ -1,0 +1,186 @@
+"""Rays and the similarity between periods: exact cases, intervals that hold the truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from chronoscene.registration.generated import CaseSettings, Generated, generate_case, pose_errors
+from chronoscene.registration.quality.misalignment import (
+    measure,
+    rotation_angle,
+    sampson_errors,
+    transfer_errors,
+    transfers,
+)
+from chronoscene.registration.quality.rays import held_out_rays, model_rays, place, project
+from chronoscene.registration.result import Registered
+from chronoscene.scene.geometry import Sim3, camera_centre
+
+QUIET = CaseSettings(
+    points=1200, ties=400, held_out=0.5, noise=1e-9, outliers=0.0, gps_noise=None, views=10
+)
+
+
+@pytest.fixture(scope="module")
+def exact() -> Generated:
+    """Two periods whose poses and observations are those of the truth."""
+    made = generate_case(QUIET)
+    return replace(made, model=replace(made.model, cam_from_world=made.truth))
+
+
+def moved_period(model: Registered, move: Sim3) -> Registered:
+    poses = model.cam_from_world.copy()
+    poses[model.periods == 1] = move.apply_to_pose(poses[model.periods == 1])
+    return replace(model, cam_from_world=poses)
+
+
+def small_move(seed: int) -> Sim3:
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_rotvec(np.radians(rng.normal(0, 0.5, 3))).as_matrix()
+    return Sim3(float(1 + rng.normal(0, 0.01)), turn, rng.normal(0, 0.5, 3))
+
+
+def test_points_are_placed_where_their_rays_meet(exact: Generated) -> None:
+    rays = model_rays(exact.model)
+    placed = place(rays)
+    assert len(placed.track) > 0.9 * len(exact.model.points)
+    found, slot = placed.find(rays.track)
+    residual = project(rays.where(found), placed.xyz[slot])[0]
+    assert np.abs(residual).max() < 1e-6
+    assert placed.error.max() < 1e-6
+
+
+def test_derivative_of_the_projection(exact: Generated) -> None:
+    rays = model_rays(exact.model).where(np.arange(50))
+    xyz = exact.model.points[rays.track]
+    jacobian = project(rays, xyz)[1]
+    for axis in range(3):
+        step = 1e-6 * np.eye(3)[axis]
+        slope = (project(rays, xyz + step)[0] - project(rays, xyz - step)[0]) / 2e-6
+        np.testing.assert_allclose(jacobian[:, :, axis], slope, rtol=1e-5, atol=1e-5)
+
+
+def test_a_point_behind_the_camera_has_no_residual(exact: Generated) -> None:
+    rays = model_rays(exact.model).where(np.arange(3))
+    behind = camera_centre(rays.pose) - rays.pose[:, 2, :3]
+    assert np.isnan(project(rays, behind)[0]).all()
+
+
+def test_tracks_that_do_not_fit_their_own_images_are_dropped(exact: Generated) -> None:
+    rays = model_rays(exact.model)
+    track = rays.track[0]
+    uv = rays.uv.copy()
+    uv[np.flatnonzero(rays.track == track)[0]] += 0.1  # 40 pixels
+    placed = place(replace(rays, uv=uv))
+    assert track not in placed.track
+    assert track in place(rays).track
+
+
+def test_one_image_places_nothing(exact: Generated) -> None:
+    rays = model_rays(exact.model)
+    assert len(place(rays.where(rays.image == 0)).track) == 0
+    assert len(place(rays.where(rays.image < 0)).track) == 0
+
+
+def test_held_out_tracks_of_the_truth_transfer_exactly(exact: Generated) -> None:
+    moved, *_ = transfers(held_out_rays(exact.model), exact.model.periods, 0, 1)
+    assert len(moved) > 300
+    assert moved.backward.any() and not moved.backward.all()
+    error, expected, distance = transfer_errors(moved)
+    assert error.max() < 1e-5
+    assert distance.max() < 1e-5
+    assert (expected >= 1).all()
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_the_similarity_between_periods_is_found(exact: Generated, seed: int) -> None:
+    move = small_move(seed)
+    model = moved_period(exact.model, move)
+    centres = camera_centre(model.cam_from_world[model.periods == 1])
+    found = measure(*transfers(held_out_rays(model), model.periods, 0, 1), centres)
+    assert found is not None
+    np.testing.assert_allclose(found.similarity.to_matrix(), move.to_matrix(), atol=2e-3)
+    assert found.rotation.value == pytest.approx(rotation_angle(move.rotation), abs=2e-3)
+    assert found.scale.value == pytest.approx(abs(np.log(move.scale)), abs=1e-4)
+
+
+def test_a_gross_error_is_found_as_well(exact: Generated) -> None:
+    turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
+    move = Sim3(1.3, turn, np.array([30.0, -20.0, 5.0]))
+    model = moved_period(exact.model, move)
+    centres = camera_centre(model.cam_from_world[model.periods == 1])
+    found = measure(*transfers(held_out_rays(model), model.periods, 0, 1), centres)
+    assert found is not None
+    assert found.rotation.value == pytest.approx(40, abs=0.05)
+    assert found.rotation.low > 39
+
+
+def test_intervals_hold_the_truth() -> None:
+    """The upper bound must hold in nearly all cases; it is what a pass rests on."""
+    hits, tries = 0, 20
+    for seed in range(tries):
+        made = generate_case(
+            CaseSettings(seed=seed, points=1200, ties=250, held_out=0.4, noise=0.6, views=10)
+        )
+        model = made.model
+        centres = camera_centre(model.cam_from_world[model.periods == 1])
+        found = measure(*transfers(held_out_rays(model), model.periods, 0, 1), centres)
+        assert found is not None
+        rotation, _ = pose_errors(model.cam_from_world, made.truth, model.periods == 0)
+        truth = np.median(rotation[model.periods == 1])
+        hits += found.rotation.low <= truth <= found.rotation.high
+    assert hits >= 18
+
+
+def test_matches_in_one_spot_leave_more_open() -> None:
+    spread = CaseSettings(seed=5, points=2500, ties=300, held_out=0.4)
+    bounds = []
+    for case in (spread, replace(spread, cluster=15.0)):
+        model = generate_case(case).model
+        centres = camera_centre(model.cam_from_world)
+        found = measure(*transfers(held_out_rays(model), model.periods, 0, 1), centres)
+        assert found is not None
+        bounds.append(found.rotation.high)
+    assert bounds[1] > 3 * bounds[0]
+
+
+def test_too_few_tracks_give_nothing() -> None:
+    model = generate_case(CaseSettings(seed=1, points=1000, ties=15)).model
+    moved = transfers(held_out_rays(model), model.periods, 0, 1)
+    assert measure(*moved, camera_centre(model.cam_from_world)) is None
+
+
+def test_epipolar_errors_are_zero_for_the_truth_and_grow_with_a_turn(exact: Generated) -> None:
+    rays = held_out_rays(exact.model)
+    pair = exact.model.held_out[0]
+    a, b = rays.where(rays.image == pair.image_a), rays.where(rays.image == pair.image_b)
+    a, b = a.where(np.isin(a.track, b.track)), b.where(np.isin(b.track, a.track))
+    assert len(a) == len(b) == len(pair.track)
+    assert sampson_errors(a.pose[0], b.pose[0], a, b).max() < 1e-5
+    turned = b.pose[0].copy()
+    turned[:3] = Rotation.from_euler("y", 1, degrees=True).as_matrix() @ turned[:3]
+    assert np.median(sampson_errors(a.pose[0], turned, a, b)) > 0.5
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-7, 0.1, 90.0, 179.9])
+def test_angles_small_and_large(degrees: float) -> None:
+    turn = Rotation.from_rotvec(np.radians(degrees) * np.array([0.6, 0.0, 0.8])).as_matrix()
+    assert rotation_angle(turn) == pytest.approx(degrees, rel=1e-6, abs=1e-12)
+
+
+def test_pose_errors_do_not_depend_on_the_frame(exact: Generated) -> None:
+    poses = moved_period(exact.model, small_move(3)).cam_from_world
+    frame = Sim3(2.5, Rotation.from_euler("xyz", [1, 2, 3]).as_matrix(), np.array([1.0, 2, 3]))
+    reference = exact.model.periods == 0
+    one = pose_errors(poses, exact.truth, reference)
+    other = pose_errors(frame.apply_to_pose(poses), exact.truth, reference)
+    np.testing.assert_allclose(one[0], other[0], atol=1e-6)
+    np.testing.assert_allclose(one[1], other[1], atol=1e-6)
+    assert one[0][reference].max() < 1e-6

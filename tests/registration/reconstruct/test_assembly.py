@@ -1,0 +1,79 @@
+"""From models and held-out tracks to a registration."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from chronoscene.registration.reconstruct.assembly import (
+    cross_matches,
+    read_held_out,
+    reasons,
+    without_twins,
+)
+from chronoscene.scene import Points
+
+
+def make_points(tracks: list[list[tuple[int, float]]]) -> Points:
+    """Points with tracks of frames and x coordinates."""
+    flat = [observation for track in tracks for observation in track]
+    count = len(tracks)
+    return Points(
+        ids=np.arange(1, count + 1),
+        xyz=np.arange(3.0 * count).reshape(-1, 3),
+        rgb=np.zeros((count, 3), np.uint8),
+        error=np.zeros(count),
+        track_start=np.cumsum([0, *map(len, tracks)]),
+        track_frame=np.array([f for f, _ in flat], np.int32),
+        track_xy=np.array([[x, 1.0] for _, x in flat]),
+    )
+
+
+def test_of_twins_the_longer_track_stays() -> None:
+    twins = [[(0, 5.0), (1, 6.0)], [(0, 5.0), (1, 6.0), (2, 7.0)]]
+    others = [[(0, 9.0), (1, 9.0)], [(1, 5.0), (2, 6.0)]]
+    found = without_twins(make_points([*twins, *others]))
+    assert found.ids.tolist() == [2, 3, 4]
+    assert found.track_start.tolist() == [0, 3, 5, 7]
+    assert found.track_frame.tolist() == [0, 1, 2, 0, 1, 1, 2]
+    assert found.xyz[0].tolist() == [3.0, 4.0, 5.0]
+
+
+def test_no_points_have_no_twins() -> None:
+    assert len(without_twins(Points.empty())) == 0
+
+
+def test_held_out_tracks_of_two_periods_become_matches(tmp_path: Path) -> None:
+    known = {7: "a/1", 8: "a/2", 9: "b/1", 11: "b/lost"}
+    np.savez(
+        tmp_path / "held.npz",
+        track=np.array([0, 0, 0, 1, 1, 2, 2]),
+        image=np.array([7, 9, 8, 7, 8, 9, 11]),
+        xy=np.arange(14.0).reshape(7, 2),
+        names=np.frombuffer(json.dumps(known).encode(), np.uint8),
+    )
+    names = ("a/1", "a/2", "b/1")
+    periods = {"a/1": 0, "a/2": 0, "b/1": 1, "b/lost": 1}
+    tracks = read_held_out(tmp_path / "held.npz", names, periods)
+    assert tracks.start.tolist() == [0, 3]  # the second is of one period, the third of one image
+    assert tracks.image.tolist() == [0, 1, 2]
+    assert tracks.xy.tolist() == [[0.0, 1.0], [4.0, 5.0], [2.0, 3.0]]
+    first, second = cross_matches(tracks, np.array([0, 0, 1]))
+    assert (first.image_a, first.image_b) == (0, 2)
+    assert (second.image_a, second.image_b) == (1, 2)
+    assert first.xy_a.tolist() == [[0.0, 1.0]]
+    assert second.xy_b.tolist() == [[2.0, 3.0]]
+    assert first.track.tolist() == [0]
+
+
+def test_photos_without_a_pose_have_reasons() -> None:
+    names = dict.fromkeys(("there", "dark", "alone", "apart", "odd"), 0)
+    keypoints = {"there": 900, "dark": 12, "alone": 500, "apart": 800, "odd": 700}
+    partners = {"alone": 0, "apart": 4, "odd": 3}
+    found = reasons(names, {"there"}, keypoints, partners, [["apart", "another"]])
+    assert found == {
+        "alone": "none of its 500 features are matched in any other photo",
+        "apart": "in a model of 2 images that could not be placed",
+        "dark": "12 features only: blurred, dark, or without texture",
+        "odd": "matched with 3 photos, but too few of the matches agree with a pose",
+    }

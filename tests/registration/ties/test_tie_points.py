@@ -1,0 +1,297 @@
+"""Files of tie points, and what they do to a registration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from chronoscene.errors import SceneError
+from chronoscene.registration.generated import (
+    CAMERA,
+    CaseSettings,
+    Generated,
+    generate_case,
+    pose_errors,
+)
+from chronoscene.registration.quality.certificate import certify
+from chronoscene.registration.quality.verdict import judge
+from chronoscene.registration.ties.tie_alignment import (
+    align_with_tie_points,
+    move_periods,
+    robust_similarity,
+    with_tie_tracks,
+)
+from chronoscene.registration.ties.tie_points import TiePoints, match_images, read_tie_points
+from chronoscene.scene.geometry import Sim3
+
+CORNERS = np.array(
+    [[0, 0, 0], [25, 5, 8], [-20, 18, 3], [10, -24, 12], [-15, -12, 5], [18, 22, 1], [3, 9, 15.0]]
+)
+"""Places in the world that were clicked, metres."""
+
+
+def read(tmp_path: Path, text: str, name: str = "ties.csv") -> TiePoints:
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return read_tie_points(path)
+
+
+def clicks(
+    made: Generated, *, noise: float = 0.5, each: int = 4, control: bool = False, count: int = 7
+) -> str:
+    """Rows of a CSV: every corner in some images of every period."""
+    rng = np.random.default_rng(0)
+    rows = ["point,image,x,y" + (",X,Y,Z" if control else "")]
+    model = made.model
+    for number, xyz in enumerate(CORNERS[:count]):
+        for period in range(model.num_periods):
+            seen = 0
+            for i in np.flatnonzero(model.periods == period)[::2]:
+                local = made.truth[i, :3, :3] @ xyz + made.truth[i, :3, 3]
+                u, v = 400 * local[:2] / local[2] + [240, 180] + rng.normal(0, noise, 2)
+                if 0 < u < 480 and 0 < v < 360 and seen < each:
+                    seen += 1
+                    world = ",".join(str(c) for c in xyz) if control else ""
+                    rows.append(f"c{number},{model.names[i]},{u},{v}" + (f",{world}" * control))
+    return "\n".join(rows) + "\n"
+
+
+@pytest.fixture(scope="module")
+def apart() -> Generated:
+    """Two periods without a match between them, the second far from where it belongs."""
+    return generate_case(CaseSettings(ties=0, by_gps=True, seed=8, rotation=20, shift=30))
+
+
+def errors(made: Generated, poses: np.ndarray) -> tuple[float, float]:
+    periods = made.model.periods
+    rotation, centre = pose_errors(poses, made.truth, periods == 0)
+    return float(np.median(rotation[periods == 1])), float(np.median(centre[periods == 1]))
+
+
+def test_csv_with_and_without_a_header(tmp_path: Path) -> None:
+    for text in (
+        "p1,a.jpg,1.5,2\np1,b.jpg,3,4\np2,a.jpg,5,6,100,200,50\n",
+        "# corners\npoint id,image,x,y,X,Y,Z\np1,a.jpg,1.5,2,,,\n"
+        "p1,b.jpg,3,4,,,\n\np2,a.jpg,5,6,100,200,50\n",
+        "X,image,y,x,point,Y,Z\n,a.jpg,2,1.5,p1,,\n,b.jpg,4,3,p1,,\n100,a.jpg,6,5,p2,200,50\n",
+    ):
+        found = read(tmp_path, text)
+        assert [p.name for p in found.points] == ["p1", "p2"]
+        assert [(c.image, c.x, c.y) for c in found.points[0].clicks] == [
+            ("a.jpg", 1.5, 2.0), ("b.jpg", 3.0, 4.0),
+        ]  # fmt: skip
+        assert found.points[0].world is None
+        assert found.points[1].world == (100.0, 200.0, 50.0)
+        assert found.crs is None
+
+
+def test_odm_list(tmp_path: Path) -> None:
+    text = (
+        "WGS84 UTM 32N\n"
+        "544256.7 5320919.9 5 3044 2622 IMG_0525.jpg corner\n"
+        "544257.7 5320920.9 6 30 26 IMG_0526.jpg\n"
+        "544256.7\t5320919.9\t5\t304\t262\tmy photo.jpg\tcorner\n"
+    )
+    found = read(tmp_path, text, "gcp_list.txt")
+    assert found.crs == "EPSG:32632"
+    assert [p.name for p in found.points] == ["544257.7 5320920.9", "corner"]
+    assert [c.image for c in found.points[1].clicks] == ["IMG_0525.jpg", "my photo.jpg"]
+    assert found.points[1].world == (544256.7, 5320919.9, 5.0)
+    half = read_tie_points(tmp_path / "gcp_list.txt", scale=0.5)
+    assert half.points[1].clicks[0].x == 1522.0
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        ("p,a.jpg,1\n", 1, "header"),
+        ("point,image,x,y\np,a.jpg,1,2\np,b.jpg,1\n", 3, "3 fields"),
+        ("point,image,x,y\np,a.jpg,one,2\n", 2, "'one'"),
+        ("point,image,x,y\np,a.jpg,nan,2\n", 2, "'nan'"),
+        ("p,a.jpg,1,2\n,b.jpg,1,2\n", 2, "a point id and an image"),
+        ("p,a.jpg,1,2\np,a.jpg,5,6\n", 2, "line 1"),
+        ("p,a.jpg,1,2,3,4\n", 1, "three world coordinates"),
+        ("p,a.jpg,1,2,3,4,5\np,b.jpg,1,2,3,4,6\n", 2, "same world coordinates"),
+        ("image,x,y\na.jpg,1,2\n", 1, "no point"),
+        ("EPSG:32632\n1 2 3 4\n", 2, "4 fields"),
+        ("EPSG:32632\n1 2 3 4 z a.jpg\n", 2, "'z'"),
+        ("# crs: EPSG:999999\np,a.jpg,1,2\n", 1, "PROJ"),
+        ("+proj=nonsense\n1 2 3 4 5 a.jpg\n", 1, "PROJ"),
+        ("WGS84 UTM 99N\n1 2 3 4 5 a.jpg\n", 1, "PROJ"),
+    ],
+)
+def test_wrong_lines_are_named(tmp_path: Path, text: str, line: int, words: str) -> None:
+    with pytest.raises(SceneError) as caught:
+        read(tmp_path, text)
+    assert caught.value.place.endswith(f":{line}")
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "\n\n", "point,image,x,y\n", "EPSG:32632\n"])
+def test_files_without_clicks(tmp_path: Path, text: str) -> None:
+    with pytest.raises(SceneError, match="tie points"):
+        read(tmp_path, text)
+
+
+def test_images_are_found_by_the_end_of_their_path(tmp_path: Path) -> None:
+    names = ("2016/a.jpg", "2016/b_c.jpg", "2018/b_c.jpg", "2018/d.jpg")
+    found = match_images(read(tmp_path, "p,a.jpg,1,2\np,2018/b c.jpg,1,2\np,zz.jpg,1,2\n"), names)
+    assert found == {"a.jpg": 0, "2018/b c.jpg": 2, "zz.jpg": None}
+    with pytest.raises(SceneError, match=r"ties.csv:1: .*2016/b_c.jpg and 2018/b_c.jpg"):
+        match_images(read(tmp_path, "p,b_c.jpg,1,2\n"), names)
+    with pytest.raises(SceneError, match="registered"):
+        match_images(read(tmp_path, "p,other.jpg,1,2\n"), names)
+
+
+def test_a_failed_alignment_is_replaced(tmp_path: Path, apart: Generated) -> None:
+    assert errors(apart, apart.model.cam_from_world)[0] > 10
+    found = align_with_tie_points(apart.model, read(tmp_path, clicks(apart)))
+    assert found.replaced and not found.controlled
+    rotation, centre = errors(apart, found.model.cam_from_world)
+    assert rotation < 0.15
+    assert centre < 0.3
+    assert not found.outliers
+    assert all(r.pixels is not None and r.pixels < 2 for r in found.residuals)
+    assert all(r.distance is not None and r.distance < 0.6 for r in found.residuals)
+    # Points moved with their periods: they still fit their images.
+    before, after = certify(apart.model).periods, certify(found.model).periods
+    for a, b in zip(before, after, strict=True):
+        assert b.error == pytest.approx(a.error, rel=0.05)
+
+
+def test_clicks_alone_are_doubtful_not_passed(tmp_path: Path, apart: Generated) -> None:
+    ties = read(tmp_path, clicks(apart))
+    found = align_with_tie_points(apart.model, ties)
+    verdict = judge(certify(with_tie_tracks(found.model, ties)))
+    assert verdict.level == "doubtful"
+    assert judge(certify(apart.model)).level == "fail"
+
+
+def test_a_good_alignment_is_kept(tmp_path: Path) -> None:
+    made = generate_case(CaseSettings(seed=9, ties=500))
+    ties = read(tmp_path, clicks(made))
+    found = align_with_tie_points(made.model, ties)
+    assert not found.replaced
+    assert found.model is made.model
+    forced = align_with_tie_points(made.model, ties, mode="replace")
+    assert forced.replaced
+
+
+def test_a_wrong_click_is_named_and_does_no_harm(tmp_path: Path, apart: Generated) -> None:
+    rows = clicks(apart).splitlines()
+    wrong = next(i for i, row in enumerate(rows) if row.startswith("c3,"))
+    fields = rows[wrong].split(",")
+    fields[2] = str(min(470.0, float(fields[2]) + 90) if float(fields[2]) < 300 else 20.0)
+    rows[wrong] = ",".join(fields)
+    found = align_with_tie_points(apart.model, read(tmp_path, "\n".join(rows)))
+    assert "c3" in found.outliers
+    assert errors(apart, found.model.cam_from_world)[0] < 0.3
+    bad = next(r for r in found.residuals if r.name == "c3")
+    assert bad.note
+
+
+def test_a_point_that_moved_is_left_out(tmp_path: Path, apart: Generated) -> None:
+    """One corner was clicked on something that stands elsewhere at the second date."""
+    ties = read(tmp_path, clicks(apart))
+    moved = replace(apart, truth=apart.truth.copy())
+    second = apart.model.periods == 1
+    moved.truth[second, :3, 3] += moved.truth[second, :3, :3] @ [4.0, 3.0, 0.0]
+    other = read(tmp_path, clicks(moved), "other.csv")
+    points = tuple(
+        o if p.name == "c1" else p for p, o in zip(ties.points, other.points, strict=True)
+    )
+    found = align_with_tie_points(apart.model, replace(ties, points=points))
+    assert "c1" in found.outliers
+    assert any("without c1" in r for r in found.remarks)
+    assert errors(apart, found.model.cam_from_world)[1] < 0.4
+
+
+def test_too_few_points_say_what_is_needed(tmp_path: Path, apart: Generated) -> None:
+    with pytest.raises(SceneError, match=r"three points or more.*found 2 such points"):
+        align_with_tie_points(apart.model, read(tmp_path, clicks(apart, count=2)))
+    with pytest.raises(SceneError, match=r"found 0 such points"):
+        align_with_tie_points(apart.model, read(tmp_path, clicks(apart, each=1)))
+
+
+def test_ground_control_moves_the_model(tmp_path: Path) -> None:
+    made = generate_case(CaseSettings(seed=9, ties=500, gps_noise=None))
+    move = Sim3(0.2, np.eye(3)[[1, 2, 0]], np.array([4.0, 5.0, 6.0]))
+    model = replace(
+        made.model,
+        cam_from_world=move.apply_to_pose(made.model.cam_from_world),
+        points=move.apply(made.model.points),
+    )
+    found = align_with_tie_points(model, read(tmp_path, clicks(made, control=True)))
+    assert found.controlled and not found.replaced
+    from chronoscene.scene.geometry import camera_centre
+
+    gap = camera_centre(found.model.cam_from_world) - camera_centre(made.truth)
+    assert np.linalg.norm(gap, axis=1).max() < 0.5
+    assert all(r.distance is not None and r.distance < 0.6 for r in found.residuals)
+
+
+def test_control_in_utm_goes_through_the_georeference(tmp_path: Path) -> None:
+    import pyproj
+
+    made = generate_case(CaseSettings(seed=9, ties=500))
+    frame = made.model.georeference
+    assert frame is not None
+    geodetic = frame.to_geodetic(CORNERS)
+    utm = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
+    east, north = utm.transform(geodetic[:, 1], geodetic[:, 0])
+    rows = ["WGS84 UTM 32N"]
+    for line in clicks(made).splitlines()[1:]:
+        name, image, x, y = line.split(",")
+        k = int(name[1:])
+        rows.append(f"{east[k]:.4f} {north[k]:.4f} {geodetic[k, 2]:.4f} {x} {y} {image} {name}")
+    ties = read(tmp_path, "\n".join(rows), "gcp_list.txt")
+    for name, xyz in ties.located(frame).items():
+        np.testing.assert_allclose(xyz, CORNERS[int(name[1:])], atol=1e-3)
+    assert align_with_tie_points(made.model, ties).controlled
+    with pytest.raises(SceneError, match="not georeferenced"):
+        ties.located(None)
+
+
+def test_clicks_outside_the_photo(tmp_path: Path, apart: Generated) -> None:
+    name = apart.model.names[0]
+    with pytest.raises(SceneError, match=r"ties.csv:1: expected a pixel of .*found 4800, 20"):
+        align_with_tie_points(apart.model, read(tmp_path, f"p,{name},4800,20\n"))
+    assert CAMERA.width == 480
+
+
+def test_tie_points_become_points_of_the_model(tmp_path: Path) -> None:
+    made = generate_case(CaseSettings(seed=9, ties=500))
+    ties = read(tmp_path, clicks(made))
+    grown = with_tie_tracks(made.model, ties)
+    assert len(grown.points) == len(made.model.points) + 7
+    assert grown.track_start[-1] == len(grown.track_image) == len(grown.track_xy)
+    np.testing.assert_allclose(grown.points[-7:], CORNERS, atol=0.5)
+
+
+def test_moving_periods_splits_common_points() -> None:
+    made = generate_case(CaseSettings(seed=9, ties=500, noise=1e-6, outliers=0.0))
+    model = replace(made.model, cam_from_world=made.truth)
+    move = Sim3(1.5, np.eye(3)[[2, 0, 1]], np.array([1.0, 2.0, 3.0]))
+    moved = move_periods(model, {1: move})
+    point = np.repeat(np.arange(len(moved.points)), np.diff(moved.track_start))
+    low = np.minimum.reduceat(moved.periods[moved.track_image], moved.track_start[:-1])
+    assert (moved.periods[moved.track_image] == low[point]).all()
+    assert certify(moved).periods[1].error == pytest.approx(0, abs=1e-3)
+
+
+def test_similarity_of_few_points() -> None:
+    rng = np.random.default_rng(0)
+    move = Sim3(2.0, np.eye(3)[[1, 2, 0]], np.array([1.0, 2.0, 3.0]))
+    source = rng.normal(size=(6, 3))
+    target = move.apply(source)
+    target[2] += 3.0
+    found = robust_similarity(source, target)
+    assert found is not None
+    np.testing.assert_allclose(found[0].to_matrix(), move.to_matrix(), atol=1e-6)
+    assert found[1].tolist() == [True, True, False, True, True, True]
+    line = np.outer(np.arange(5.0), [1.0, 2.0, 3.0])
+    assert robust_similarity(line, line) is None
+    assert robust_similarity(source[:2], target[:2]) is None

@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+
+from chronoscene.scene import Camera
+from chronoscene.scene.projection import pixels_of
+from chronoscene.validation.scene_folder import RawScene
+
+CAMERAS, IMAGES = "sparse/0/cameras.txt", "sparse/0/images.txt"
+
+
+def test_observations_outside(scene):
+    scene.write(CAMERAS, ["1 PINHOLE 32 24 25 25 16 12"])
+    report = scene.validate()
+    finding = next(f for f in report.findings if f.code == "CS511")
+    assert finding.place == f"{CAMERAS} (camera 1)"
+    assert finding.expected == "observations within 32 x 24"
+    assert {f.code for f in report.findings} == {"CS205", "CS507", "CS511", "CS513"}
+
+
+def test_opengl_poses(scene):
+    flip = np.diag([1.0, -1.0, -1.0])
+    scene.change_poses(lambda r, t: (flip @ r, flip @ t), range(14))
+    scene.expect("CS512", place=IMAGES, found="560 of 560 observations behind")
+
+
+def test_camera_to_world_pose_of_one_image(scene):
+    scene.change_poses(lambda r, t: (r.T, -r.T @ t), [4])
+    report = scene.validate()
+    found = [f for f in report.findings if f.code == "CS513"]
+    assert [f.place for f in found] == [f"{IMAGES} (a004.png)"]
+    assert found[0].expected == "a median reprojection error below 4 px"
+
+
+def test_small_errors_are_silent(scene):
+    scene.change_poses(lambda r, t: (r, t + np.array([0.1, 0, 0])), [4])
+    assert "CS513" not in {f.code for f in scene.validate().findings}
+
+
+def test_wrong_focal_length(scene):
+    scene.write(CAMERAS, ["1 PINHOLE 64 48 150 150 32 24"])
+    scene.expect("CS513", place="period 0", found="px in 7 of 7: 'a0", times=2)
+
+
+LENSES = [
+    "1 SIMPLE_RADIAL 64 48 50 32 24 -0.3",
+    "1 OPENCV 64 48 50 50 32 24 -0.3 0.05 0.01 -0.02",
+    "1 OPENCV_FISHEYE 64 48 50 50 32 24 0.1 0.01 0 0",
+]
+
+
+def through_a_lens(scene, line):
+    """Give all images a camera with distortion, and move the keypoints as it does."""
+    camera_id, model, width, height, *params = line.split()
+    camera = Camera(int(camera_id), model, int(width), int(height), tuple(map(float, params)))
+    lines = scene.lines(IMAGES)
+    for row in range(1, len(lines), 2):
+        words = np.array(lines[row].split(), dtype=object)
+        x, y = (words[0::3].astype(float) - 32) / 50, (words[1::3].astype(float) - 24) / 50
+        for start, values in enumerate(pixels_of(camera, x, y, np.ones(len(x)))):
+            words[start::3] = [f"{v:.17g}" for v in values]
+        lines[row] = " ".join(words)
+    scene.write(IMAGES, lines)
+    scene.write(CAMERAS, [line])
+    return {"CS132" if model == "OPENCV_FISHEYE" else "CS133"}
+
+
+@pytest.mark.parametrize("line", LENSES)
+def test_distortion_is_part_of_the_projection(scene, line):
+    known = through_a_lens(scene, line)
+    assert {f.code for f in scene.validate().findings} == known | {"CS507"}
+    assert np.max(RawScene(scene.root).image_errors) < 1e-6
+    scene.write(CAMERAS, ["1 PINHOLE 64 48 50 50 32 24"])  # as if the lens were forgotten
+    assert np.min(RawScene(scene.root).image_errors) > 0.02
+
+
+@pytest.mark.parametrize("line", LENSES)
+def test_wrong_pose_behind_a_lens(scene, line):
+    known = through_a_lens(scene, line)
+    scene.change_poses(lambda r, t: (r, t + np.array([0.5, 0, 0])), [4])
+    scene.expect("CS513", place=f"{IMAGES} (a004.png)", found="px", also=known)
+
+
+@pytest.mark.parametrize("line", LENSES)
+def test_period_in_a_frame_of_its_own_behind_a_lens(scene, line):
+    through_a_lens(scene, line)
+    scene.change_poses(lambda r, t: (r, 3 * t), range(7, 14))
+    (finding,) = [f for f in scene.validate().findings if f.code == "CS519"]
+    assert finding.place == "period 1" and "scaled by 0.3333" in finding.found
