@@ -17,6 +17,7 @@ from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import find_scenes, format_names, read_scene
 from chronoscene.io.parallel import map_parallel
+from chronoscene.io.wording import printable
 from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.stats import (
     COUNT_RULES,
@@ -30,7 +31,6 @@ from chronoscene.stats import (
     measure_scene,
 )
 from chronoscene.stats.published import in_paper_order, published
-from chronoscene.validation.finding import printable
 
 Layout = Literal["full", "paper"]
 FIGURE_FORMATS = ("png", "pdf", "svg")

@@ -11,8 +11,8 @@ import click
 from chronoscene.cli.output import check_file, check_outside, emit
 from chronoscene.cli.progress import tracked
 from chronoscene.io.parallel import map_parallel
+from chronoscene.io.wording import counted, printable
 from chronoscene.kernels.allocator import keep_freed_memory
-from chronoscene.validation.finding import counted, printable
 from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.report.html import write_html
 from chronoscene.validation.report.json import write_json

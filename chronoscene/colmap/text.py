@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from chronoscene.colmap.arrays import CAMERA_MODELS, RawImages, RawPoints
 from chronoscene.colmap.binary import CAMERA_PARAMETERS
 from chronoscene.colmap.raw_model import Damage, DamagedError
+from chronoscene.io.wording import quote
 from chronoscene.scene import Camera
-from chronoscene.validation.finding import quote
 
 BLOCK = 20_000
 """Lines whose fields are in memory as text at one time."""

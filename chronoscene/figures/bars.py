@@ -9,9 +9,9 @@ from typing import Any
 
 from chronoscene.figures.canvas import GREY, GRID, new_figure, plain, quiet_axes, save
 from chronoscene.figures.colors import period_colors
+from chronoscene.io.wording import printable
 from chronoscene.stats.counts import PeriodCount, SceneCount
 from chronoscene.stats.titles import period_title
-from chronoscene.validation.finding import printable
 
 BAR = 0.3
 """Inches per scene."""

@@ -7,7 +7,7 @@ from typing import Any
 from warnings import catch_warnings, filterwarnings
 
 from chronoscene.io.files import replacing
-from chronoscene.validation.finding import printable
+from chronoscene.io.wording import printable
 
 DPI = 200
 """Pixels per inch of PNG files, and of the density inside PDF and SVG files."""

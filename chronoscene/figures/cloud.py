@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.io.wording import printable
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.stats.counts import assign_points
 from chronoscene.stats.extent import robust_range
 from chronoscene.stats.titles import period_name
-from chronoscene.validation.finding import printable
 
 Array = NDArray[np.float64]
 

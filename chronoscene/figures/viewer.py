@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from chronoscene.figures.cloud import Cloud, cloud_of, shown_box
 from chronoscene.figures.colors import period_colors
-from chronoscene.figures.viewer_template import TEMPLATE
 from chronoscene.io.files import write_text_atomic
+from chronoscene.io.pages import render_page
 from chronoscene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -42,9 +41,7 @@ def page_of(cloud: Cloud, rgb: NDArray[np.uint8], *, most_points: int = MOST_POI
     """The text of the page; see `write_page`. ``rgb``: colours of the points. [P, 3]"""
     data = json.dumps(_page_data(cloud, rgb, most_points), ensure_ascii=False)
     # No text can end the script: JSON has "<" inside of strings only.
-    filled = {"TITLE": html.escape(cloud.name), "DATA": data.replace("<", "\\u003c")}
-    # In one pass: a name may look like a mark.
-    return re.sub("@@(TITLE|DATA)@@", lambda mark: filled[mark[1]], TEMPLATE)
+    return render_page("viewer", title=cloud.name, data=Markup(data.replace("<", "\\u003c")))
 
 
 def _page_data(cloud: Cloud, rgb: NDArray[np.uint8], most_points: int) -> dict[str, Any]:

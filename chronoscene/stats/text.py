@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
-from chronoscene.validation.finding import printable
+from chronoscene.io.wording import printable
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -12,7 +12,8 @@ import numpy as np
 
 from chronoscene.colmap.raw_model import model_files
 from chronoscene.errors import SceneError
-from chronoscene.validation.finding import SEVERITIES, Finding, Hit, printable
+from chronoscene.io.wording import printable
+from chronoscene.validation.finding import SEVERITIES, Finding, Hit
 from chronoscene.validation.other_formats import in_our_format, other_format
 from chronoscene.validation.report.report import SceneReport, Skipped, Summary, summarise
 from chronoscene.validation.rule import Rule, all_rules

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import escape
 
 from chronoscene.figures.cloud import Cloud
 from chronoscene.figures.viewer import home_view, page_of, write_page
@@ -96,7 +97,7 @@ def test_names_and_labels_are_only_text(cloud):
     tags.feed(page)
     plain.feed(page_of(cloud, colors(cloud)))
     assert tags.names == plain.names
-    assert html.escape(NASTY) in page
+    assert escape(NASTY) in page
     assert data_of(page)["name"] == data_of(page)["periods"][0]["label"] == NASTY
 
 

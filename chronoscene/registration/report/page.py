@@ -11,6 +11,7 @@ from pathlib import Path
 
 from chronoscene import __version__
 from chronoscene.io.files import write_text_atomic
+from chronoscene.io.pages import render_page
 from chronoscene.registration.quality.certificate import Certificate, PairFigures
 from chronoscene.registration.quality.certificate_json import Figure, pair_figures, period_figures
 from chronoscene.registration.quality.rays import Array
@@ -18,7 +19,6 @@ from chronoscene.registration.quality.verdict import THRESHOLDS, Level, Verdict
 from chronoscene.registration.report.camera_map import camera_map
 from chronoscene.registration.report.pictures import PHOTO_WIDTH, Photos
 from chronoscene.registration.report.spots import DrawnPair, Spot, drawn_pairs, spots
-from chronoscene.registration.report.template import PAGE
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 
@@ -111,11 +111,9 @@ def render_report(
     title: str = "Registration",
 ) -> str:
     """The page as text; see `write_report`."""
-    from jinja2 import Environment
-
     photos = Photos(model)
-    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(PAGE)
-    return page.render(
+    return render_page(
+        "registration",
         title=title,
         version=__version__,
         certificate=certificate,

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.io.wording import counted
 from chronoscene.validation.checks.observations import observe
 from chronoscene.validation.checks.reprojection import good_poses
-from chronoscene.validation.finding import counted
 from chronoscene.validation.rules.poses import UNIT_TOLERANCE
 
 LEAST_KEPT = 0.5

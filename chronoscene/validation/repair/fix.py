@@ -19,9 +19,9 @@ from chronoscene.colmap.write import write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD
 from chronoscene.io.files import write_text_atomic
+from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
 from chronoscene.validation.checks.spelling import spelling
-from chronoscene.validation.finding import counted, shown
 from chronoscene.validation.other_formats import other_format
 from chronoscene.validation.repair.colmap_model import Repair, repair_model
 from chronoscene.validation.repair.orientation import set_upright

@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
+from chronoscene.io.wording import counted
 from chronoscene.scene.splits import NameEntry, NameIndex, SplitEntry
 from chronoscene.validation.checks.spelling import PUNCTUATION, Spellings, spelling
-from chronoscene.validation.finding import counted
 from chronoscene.validation.repair.colmap_model import Repair
 
 

@@ -16,9 +16,9 @@ from pathlib import Path
 from PIL import Image
 
 from chronoscene import __version__
+from chronoscene.io.pages import render_page
 from chronoscene.validation.finding import NOTHING, SEVERITIES, Finding, Severity
 from chronoscene.validation.report.report import SceneReport, counts
-from chronoscene.validation.report.template import PAGE
 from chronoscene.validation.rule import RULES
 from chronoscene.validation.scene_folder import is_safe
 
@@ -63,10 +63,8 @@ class _Block:
 
 def write_html(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
     """All findings of some scenes as an HTML page."""
-    from jinja2 import Environment
-
-    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(PAGE)
-    return page.render(
+    return render_page(
+        "validation",
         scenes=[(report, _sections(report), _skipped(report)) for report in reports],
         total=counts(reports),
         valid=_is_valid(reports, strict),

@@ -10,7 +10,8 @@ from itertools import groupby
 
 import click
 
-from chronoscene.validation.finding import NOTHING, SEVERITIES, Finding, Severity, counted
+from chronoscene.io.wording import counted
+from chronoscene.validation.finding import NOTHING, SEVERITIES, Finding, Severity
 from chronoscene.validation.report.report import SceneReport, Summary, counts
 from chronoscene.validation.rule import RULES, Rule
 

@@ -9,7 +9,8 @@ from datetime import datetime, time, timedelta
 from itertools import pairwise
 
 from chronoscene.formats.chronoscene import PERIODS, SPLIT
-from chronoscene.validation.finding import Hit, counted, shown
+from chronoscene.io.wording import counted, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.photo_metadata import (
     dates_of,

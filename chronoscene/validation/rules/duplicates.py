@@ -10,10 +10,11 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.io.wording import shown
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation.checks.near_duplicates import relit_pairs
 from chronoscene.validation.checks.pixels import THUMBNAIL, Pixels
-from chronoscene.validation.finding import Hit, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 

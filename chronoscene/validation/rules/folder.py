@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from chronoscene.colmap.raw_model import numbered_models
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
+from chronoscene.io.wording import shown
 from chronoscene.validation.checks.reader import reader_complaint
-from chronoscene.validation.finding import Hit, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 

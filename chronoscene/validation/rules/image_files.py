@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 
+from chronoscene.io.wording import quote
 from chronoscene.scene import Camera
 from chronoscene.validation.checks.spelling import Spellings
-from chronoscene.validation.finding import Hit, quote
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 

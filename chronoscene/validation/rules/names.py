@@ -7,8 +7,9 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 
+from chronoscene.io.wording import counted, quote, shown
 from chronoscene.validation.checks.spelling import spelling
-from chronoscene.validation.finding import Hit, counted, quote, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene, is_safe
 

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.formats.chronoscene import SPLIT, TEST
+from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene.splits import TEST_EVERY
-from chronoscene.validation.finding import Hit, counted, quote, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.image_files import GREY_MODES
 from chronoscene.validation.rules.test_list import ELSEWHERE

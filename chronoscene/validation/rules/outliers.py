@@ -7,9 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.io.wording import counted, shown
 from chronoscene.validation.checks.own_frames import LEAST_ERROR, WORSE, period_limit
 from chronoscene.validation.checks.period_frames import Rays, focal_factor
-from chronoscene.validation.finding import Hit, counted, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 

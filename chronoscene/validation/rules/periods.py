@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from chronoscene.formats.chronoscene import SPLIT, TEST
+from chronoscene.io.wording import counted
 from chronoscene.scene.splits import check_period_ids
-from chronoscene.validation.finding import Hit, counted
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.split_file import in_other_words, meant_in_split, problem_hit
 from chronoscene.validation.scene_folder import RawScene

@@ -7,8 +7,9 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.io.wording import counted, quote, shown
 from chronoscene.validation.checks.photo_consistency import Sight, sights
-from chronoscene.validation.finding import Hit, counted, quote, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 

@@ -12,9 +12,10 @@ import numpy as np
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import PERIODS, read_periods
 from chronoscene.images.exif import ExifData
+from chronoscene.io.wording import counted
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation.checks.gps_positions import GpsFit, fit_gps
-from chronoscene.validation.finding import Hit, counted
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 

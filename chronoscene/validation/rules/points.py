@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap.arrays import RawPoints
-from chronoscene.validation.finding import NOTHING, Hit, counted, shown
+from chronoscene.io.wording import counted, shown
+from chronoscene.validation.finding import NOTHING, Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 

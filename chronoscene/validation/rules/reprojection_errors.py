@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chronoscene.validation.finding import Hit, shown
+from chronoscene.io.wording import shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.conventions import pose_convention
 from chronoscene.validation.scene_folder import RawScene

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap.rigs import CAMERA, RawFrame, RawRigs, pose_matrices, read_rigs
+from chronoscene.io.wording import counted, shown
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.validation.checks.reprojection import good_poses
-from chronoscene.validation.finding import Hit, counted, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 

@@ -7,9 +7,10 @@ import re
 from collections.abc import Iterable, Iterator
 
 from chronoscene.formats.chronoscene import SPLIT
+from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene.splits import NameIndex, Problem, ProblemKind
 from chronoscene.validation.checks.spelling import Spellings
-from chronoscene.validation.finding import Hit, counted, quote, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene, TextFile
 

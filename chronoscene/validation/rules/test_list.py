@@ -6,8 +6,9 @@ import os
 from collections.abc import Iterator
 
 from chronoscene.formats.chronoscene import TEST
+from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene.splits import DEFAULT_RULE, NameIndex
-from chronoscene.validation.finding import Hit, counted, quote, shown
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.split_file import meant, not_text, problem_hits, unknown_hits
 from chronoscene.validation.scene_folder import RawScene

@@ -6,7 +6,8 @@ from pathlib import Path
 import click
 import pytest
 
-from chronoscene.validation.finding import Finding, counted, printable, quote, shown
+from chronoscene.io.wording import counted, printable, quote, shown
+from chronoscene.validation.finding import Finding
 from chronoscene.validation.report.json import SCHEMA_VERSION, write_json
 from chronoscene.validation.report.report import (
     PeriodSummary,

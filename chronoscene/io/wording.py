@@ -1,0 +1,32 @@
+"""Names and numbers inside of sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+LONGEST = 120
+"""Characters of a name from a file that a message repeats."""
+
+
+def printable(text: str) -> str:
+    """Text with everything that could disturb a terminal or an encoder as escapes."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def quote(text: str) -> str:
+    """A name in quotes, cut where it is absurdly long."""
+    return repr(text if len(text) <= LONGEST else text[:LONGEST] + "...")
+
+
+def shown(items: Iterable[str], limit: int = 3) -> str:
+    """The first few of some names, and how many more there are."""
+    names: Sequence[str] = tuple(items)
+    rest = len(names) - limit
+    return ", ".join(map(quote, names[:limit])) + (f" and {rest} more" if rest > 0 else "")
+
+
+def counted(number: int, noun: str) -> str:
+    """``1 image``, ``2 images``."""
+    return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -1,0 +1,112 @@
+"""Imports point one way; docs/architecture.md shows which."""
+
+from __future__ import annotations
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+LAYERS = (
+    ("leaderboard", "chronogs", "baselines"),
+    ("chronoscene.cli",),
+    ("chronoscene.bench", "chronoscene.registration", "chronoscene.figures", "chronoscene.synth"),
+    ("chronoscene.stats", "chronoscene.validation"),
+    ("chronoscene.anchors", "chronoscene.gaussians"),
+    ("chronoscene.training",),
+    ("chronoscene.rasterizer", "chronoscene.metrics"),
+    ("chronoscene.convert", "chronoscene.undistort"),
+    ("chronoscene.methods", "chronoscene.formats"),
+    ("chronoscene.images",),
+    ("chronoscene.colmap",),
+    ("chronoscene.scene",),
+    ("chronoscene.io", "chronoscene.geodesy"),
+    ("chronoscene.kernels",),
+    ("chronoscene.checks",),
+    ("chronoscene.errors",),
+)
+"""From the top of the house down. A module imports from its own room and from lower layers."""
+
+TORCH_SIDE = {f"chronoscene.{name}" for name in ("anchors", "gaussians", "training", "rasterizer")}
+"""Rooms that need torch and are used by methods only."""
+
+
+def modules() -> dict[str, Path]:
+    """All modules by name."""
+    found = {}
+    for package in ("chronoscene", "chronogs", "baselines", "leaderboard"):
+        for path in (ROOT / package).rglob("*.py"):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = modules()
+
+
+def imports(name: str) -> set[str]:
+    """Our modules that a module imports, also inside of its functions."""
+    targets = set()
+    for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            targets |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                targets.add(whole if whole in MODULES else node.module)
+    return {target for target in targets if target in MODULES and target != name}
+
+
+GRAPH = {name: imports(name) for name in MODULES}
+
+
+def layer(name: str) -> int:
+    """Height of a module, 0 at the bottom."""
+    for height, rooms in enumerate(reversed(LAYERS)):
+        if any(name == room or name.startswith(f"{room}.") for room in rooms):
+            return height
+    raise AssertionError(f"{name} is in no layer")
+
+
+def room(name: str) -> str:
+    """Room of a module, in the words of `LAYERS`."""
+    return next(r for rooms in LAYERS for r in rooms if name == r or name.startswith(f"{r}."))
+
+
+PACKAGED = [name for name in MODULES if name != "chronoscene"]
+
+
+@pytest.mark.parametrize("name", PACKAGED)
+def test_imports_point_down(name: str) -> None:
+    others = {t for t in GRAPH[name] if t != "chronoscene" and room(t) != room(name)}
+    upward = {t for t in others if layer(t) >= layer(name)}
+    assert not upward, f"{name} imports {sorted(upward)}"
+
+
+def test_no_circle() -> None:
+    try:
+        TopologicalSorter(GRAPH).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
+
+
+def test_torch_side_is_for_methods() -> None:
+    users = {
+        name: used
+        for name in MODULES
+        if room_or_none(name) not in TORCH_SIDE | {"chronogs", "baselines"}
+        and (used := {t for t in GRAPH[name] if room_or_none(t) in TORCH_SIDE})
+    }
+    assert not users
+
+
+def room_or_none(name: str) -> str | None:
+    """Room of a module; the package itself has none."""
+    return None if name == "chronoscene" else room(name)
+
+
+def test_few_modules_at_the_root() -> None:
+    assert len(list((ROOT / "chronoscene").glob("*.py"))) <= 8
