@@ -16,7 +16,7 @@ from chronoscene.rasterizer.types import RasterInfo, Rasterization
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["BACKENDS", "RasterInfo", "Rasterization", "rasterize"]
+__all__ = ["BACKENDS", "FAR_PLANE", "NEAR_PLANE", "RasterInfo", "Rasterization", "rasterize"]
 
 BACKENDS = {
     "reference": "chronoscene.rasterizer.reference",

@@ -47,4 +47,8 @@ EPS2D = 0.3
 """Variance in pixels squared added to both axes of the projected covariance: the blur of 3DGS."""
 
 NEAR_PLANE = 0.01
+"""Default near plane, in world units: Gaussians whose centres are nearer to the camera are culled.
+All methods use it unless they are told otherwise."""
+
 FAR_PLANE = 1e10
+"""Default far plane, likewise."""
