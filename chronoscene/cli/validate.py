@@ -19,7 +19,7 @@ from chronoscene.validation.report.json import write_json
 from chronoscene.validation.report.report import SceneReport, counts
 from chronoscene.validation.report.sarif import write_sarif
 from chronoscene.validation.report.text import describe_rule, write_text
-from chronoscene.validation.rule import choose_rules
+from chronoscene.validation.rules import choose_rules
 from chronoscene.validation.run import find_folders, lost_report, validate_scene
 from chronoscene.validation.scene_folder import Track, no_progress
 

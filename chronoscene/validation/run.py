@@ -16,7 +16,8 @@ from chronoscene.io.wording import printable
 from chronoscene.validation.finding import SEVERITIES, Finding, Hit
 from chronoscene.validation.other_formats import in_our_format, other_format
 from chronoscene.validation.report.report import SceneReport, Skipped, Summary, summarise
-from chronoscene.validation.rule import Rule, all_rules
+from chronoscene.validation.rule import Rule
+from chronoscene.validation.rules import all_rules
 from chronoscene.validation.rules.foreign_folder import OF_ORIGINS
 from chronoscene.validation.scene_folder import RawScene, Track, no_progress
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,6 +122,13 @@ class RawScene:
         self.decode = decode
         self.origin = origin
         self._track = track
+        self._derived: dict[Callable[[RawScene], Any], Any] = {}
+
+    def derived(self, compute: Callable[[RawScene], T]) -> T:
+        """What a function computes from this scene, computed once for all rules that ask for it."""
+        if compute not in self._derived:
+            self._derived[compute] = compute(self)
+        return cast(T, self._derived[compute])
 
     def reason(self, attribute: str) -> str:
         """Why an attribute is None."""
@@ -218,15 +225,6 @@ class RawScene:
         assert self.images is not None
         camera = self.usable_cameras[int(self.images.camera_ids[image])]
         return max(LEAST_LIMIT, LIMIT_SHARE * float(np.hypot(camera.width, camera.height)))
-
-    @cached_property
-    def own_frames(self) -> dict[int, str]:
-        """Periods in a frame of their own, see `chronoscene.validation.checks.own_frames`."""
-        from chronoscene.validation.checks.own_frames import (
-            explain_periods,  # it asks for much of this
-        )
-
-        return explain_periods(self)
 
     @cached_property
     def period_errors(self) -> dict[int, float]:

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from chronoscene.errors import ConfigError
-from chronoscene.validation.rule import RULES, all_rules, choose_rules, rule
+from chronoscene.validation.rule import RULES, rule
+from chronoscene.validation.rules import all_rules, choose_rules
 from chronoscene.validation.scene_folder import RawScene
 
 

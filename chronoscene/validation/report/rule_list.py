@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from chronoscene.validation.rule import GROUPS, Rule, all_rules
+from chronoscene.validation.rule import GROUPS, Rule
+from chronoscene.validation.rules import all_rules
 
 
 def rules_markdown() -> str:

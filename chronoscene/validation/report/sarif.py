@@ -17,7 +17,8 @@ from chronoscene import __version__
 from chronoscene.formats.chronoscene import SPLIT
 from chronoscene.validation.finding import Finding, Severity
 from chronoscene.validation.report.report import SceneReport
-from chronoscene.validation.rule import GROUPS, Rule, all_rules
+from chronoscene.validation.rule import GROUPS, Rule
+from chronoscene.validation.rules import all_rules
 from chronoscene.validation.run import RULE_FAILED
 
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"

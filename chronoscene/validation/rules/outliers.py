@@ -8,8 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.io.wording import counted, shown
-from chronoscene.validation.checks.own_frames import LEAST_ERROR, WORSE, period_limit
-from chronoscene.validation.checks.period_frames import Rays, focal_factor
+from chronoscene.validation.checks.period_frames import (
+    LEAST_ERROR,
+    WORSE,
+    Rays,
+    focal_factor,
+    own_frames,
+    period_limit,
+)
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
@@ -58,7 +64,7 @@ def _worse_periods(scene: RawScene) -> dict[int, float]:
     judged = np.flatnonzero(~np.isnan(scene.image_errors)).tolist()
     if not judged or limit > WORSE * np.median([scene.pose_limit(i) for i in judged]):
         return {}  # no period fits: nothing to compare with
-    explained = {scene.period_ids[index] for index in scene.own_frames}
+    explained = {scene.period_ids[index] for index in scene.derived(own_frames)}
     worse = (period for period, median in scene.period_errors.items() if median > limit)
     return {period: limit for period in worse if period not in explained}
 

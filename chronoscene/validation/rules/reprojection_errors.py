@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from chronoscene.io.wording import shown
+from chronoscene.validation.checks.period_frames import own_frames
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.conventions import pose_convention
@@ -86,7 +87,7 @@ def pose_disagrees(scene: RawScene) -> Iterator[Hit]:
     if wrong and any(pose_convention(scene)):
         return  # says why, for all of them
     for index in sorted({int(scene.image_periods[image]) for image in wrong}):
-        if index in scene.own_frames:
+        if index in scene.derived(own_frames):
             continue  # says why
         mine = [image for image in wrong if scene.image_periods[image] == index]
         of_period = sum(int(scene.image_periods[image]) == index for image in judged)

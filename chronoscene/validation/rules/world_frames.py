@@ -11,6 +11,7 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import WORLD, read_world
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation.checks.gps_positions import fit_gps
+from chronoscene.validation.checks.period_frames import own_frames
 from chronoscene.validation.checks.reprojection import project
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
@@ -51,7 +52,7 @@ REACH = 3.0
     needs=("images", "periods", "reprojections", "point_periods"),
 )
 def period_frame(scene: RawScene) -> Iterator[Hit]:
-    for index, explained in scene.own_frames.items():
+    for index, explained in scene.derived(own_frames).items():
         place = f"period {scene.period_ids[index]}"
         yield Hit(place, "the frame of the other periods", explained)
     yield from _other_depths(scene).values()
@@ -125,7 +126,7 @@ def period_apart(scene: RawScene) -> Iterator[Hit]:
         return
     share = common_view(scene)
     share[~(np.diag(share) >= OWN)] = np.nan  # cameras that miss their own points tell nothing
-    elsewhere = scene.own_frames.keys() | _other_depths(scene).keys()
+    elsewhere = scene.derived(own_frames).keys() | _other_depths(scene).keys()
     for index in elsewhere:  # what is seen in a wrong frame says nothing of places
         share[index], share[:, index] = np.nan, np.nan
     for index, period in enumerate(scene.period_ids):

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from chronoscene.validation.report.rule_list import rules_markdown
-from chronoscene.validation.rule import all_rules
+from chronoscene.validation.rules import all_rules
 
 DATASET = Path(__file__).parents[3] / "DATASET.md"
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.validation.report.sarif import split_place, write_sarif
-from chronoscene.validation.rule import all_rules
+from chronoscene.validation.rules import all_rules
 from chronoscene.validation.run import RULE_FAILED, validate_scene
 
 LEVELS = {"none", "note", "warning", "error"}
