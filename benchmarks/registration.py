@@ -4,8 +4,8 @@
     python benchmarks/registration.py images [--only NAME] [--work FOLDER] [--route joint]
     python benchmarks/registration.py photos FOLDER [FOLDER ...] [--work FOLDER] [--route joint]
 
-``observations`` generates matches and poses without images (`chronoscene.registration.generated`),
-in families of what can go wrong. ``images`` renders small cities at several dates and runs the
+``observations`` generates matches and poses without images (`generated_registrations.py`), in
+families of what can go wrong. ``images`` renders small cities at several dates and runs the
 command ``chronoscene register`` on the photos, with GPS noise of 3 m and 10% gross errors in them,
 by each of its routes. ``photos`` takes real photos, deals them into periods, and compares with the
 one reconstruction of all of them.
@@ -23,41 +23,17 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from generated_registrations import CaseSettings, generate_case
+from registration_images import run_images
+from registration_outcomes import REFUSED, Outcome, judged
+from registration_photos import run_photos
 
 from chronoscene.bench.identity import processor_name
-from chronoscene.registration.generated import CaseSettings, generate_case, pose_errors
 from chronoscene.registration.quality.certificate import certify
-from chronoscene.registration.quality.verdict import LEVELS, Verdict, judge
-from chronoscene.registration.result import Registered
-from chronoscene.scene.geometry import camera_centre
-
-REFUSED = "refused"
-
-ROTATION, CENTRE = 0.1, 0.2
-"""Degrees, and percent of the extent, within which a registration is right."""
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """One case: errors of each period but the first, and the verdict."""
-
-    family: str
-    route: str
-    """Empty where there is no choice."""
-    periods: tuple[tuple[float, float, float, float], ...]
-    """Rotation median and largest, degrees; centre median and largest, percent of the extent."""
-    verdict: str
-    reason: str
-    seconds: float
-    """CPU time."""
-
-    @property
-    def right(self) -> bool:
-        return all(r < ROTATION and c < CENTRE for r, _, c, _ in self.periods)
+from chronoscene.registration.quality.verdict import LEVELS, judge
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -122,41 +98,6 @@ def observation_cases(count: int, seed: int, only: str) -> Iterator[tuple[str, C
         yield family, CaseSettings(**values)  # type: ignore[arg-type]
 
 
-def judged(
-    family: str,
-    route: str,
-    model: Registered,
-    truth: np.ndarray,
-    verdict: Verdict,
-    seconds: float,
-    where: np.ndarray | None = None,
-) -> Outcome:
-    """Compare a registration with the truth [N, 4, 4], where that is known. [N]"""
-    where = np.ones(len(truth), bool) if where is None else where
-    rotation, centre = pose_errors(model.cam_from_world, truth, where & (model.periods == 0))
-    extent = true_extent(truth[where])
-    rows = []
-    for p in range(1, model.num_periods):
-        mine = where & (model.periods == p)
-        if not mine.any():
-            rows.append((np.inf,) * 4)
-            continue
-        r, c = rotation[mine], 100 * centre[mine] / extent
-        rows.append((np.median(r), r.max(), np.median(c), c.max()))
-    reason = verdict.findings[0].check if verdict.findings else ""
-    return Outcome(family, route, tuple(rows), verdict.level, reason, seconds)
-
-
-def refused(family: str, route: str, periods: int, seconds: float) -> Outcome:
-    """A command that ended with a message instead of a registration."""
-    return Outcome(family, route, ((np.inf,) * 4,) * (periods - 1), REFUSED, "", seconds)
-
-
-def true_extent(truth: np.ndarray) -> float:
-    """Diagonal of the box around the true cameras."""
-    return float(np.linalg.norm(np.ptp(camera_centre(truth), axis=0)))
-
-
 def run_observations(count: int, seed: int, only: str) -> list[Outcome]:
     outcomes = []
     for family, settings in observation_cases(count, seed, only):
@@ -217,12 +158,8 @@ def main() -> None:
     if options.tier == "observations":
         outcomes = run_observations(options.cases or 330, options.seed, options.only)
     elif options.tier == "photos":
-        from registration_photos import run_photos
-
         outcomes = run_photos(options)
     else:
-        from registration_images import run_images
-
         outcomes = run_images(options)
     print("\n" + errors_table(outcomes))
     if options.tier == "photos":  # what they are compared with is no truth

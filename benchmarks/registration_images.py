@@ -3,34 +3,36 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageEnhance
+from registration_outcomes import (
+    ROUTES,
+    Outcome,
+    cpu_seconds,
+    judged,
+    options_for,
+    print_outcome,
+    refused,
+    work_folder,
+)
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.geodesy import Georeference
 from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.photos.captures import read_captures
-from chronoscene.registration.pipeline import Options, run, run_into
+from chronoscene.registration.pipeline import run, run_into
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.synth import SynthSettings, generate
-
-if TYPE_CHECKING:
-    from registration import Outcome
 
 ORIGIN = Georeference(48.1, 11.5, 520.0, "as stated")
 
@@ -78,8 +80,6 @@ CASES = (
     ImageCase("other place, no GPS", 44, other_place=True, gps=False),
 )
 
-ROUTES = ("joint", "separate", "frozen")
-
 
 def run_images(options: argparse.Namespace) -> list[Outcome]:
     """Render, register and judge the cases, with the options of `benchmarks/registration.py`."""
@@ -93,21 +93,9 @@ def run_images(options: argparse.Namespace) -> list[Outcome]:
     return outcomes
 
 
-@contextmanager
-def work_folder(kept: Path | None) -> Iterator[Path]:
-    if kept is not None:
-        kept.mkdir(parents=True, exist_ok=True)
-        yield kept
-        return
-    with tempfile.TemporaryDirectory(prefix="chronoscene-") as folder:
-        yield Path(folder)
-
-
 def _run_case(
     case: ImageCase, folder: Path, truth: dict[str, NDArray[np.float64]], route: str
 ) -> Outcome:
-    from registration import judged, refused
-
     found: list[Inspection] = []
     start, cpu = time.perf_counter(), cpu_seconds()
     try:
@@ -132,17 +120,6 @@ def _run_case(
     return outcome
 
 
-def cpu_seconds() -> float:
-    """Seconds of this process and of those it started and waited for."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
-
-
-def options_for(work: Path, route: str | None) -> Options:
-    """As the command has them, with the page; None lets it choose the route."""
-    return Options(route=route, overwrite=True, work=work, page=True)  # type: ignore[arg-type]
-
-
 def _frozen(folder: Path, found: list[Inspection]) -> Registered:
     """All periods but the last are registered; the last is added to them."""
     periods = sorted(p.name for p in (folder / "photos").iterdir())
@@ -156,17 +133,6 @@ def _frozen(folder: Path, found: list[Inspection]) -> Registered:
     options = options_for(folder / "work-frozen", None)
     out = folder / "registered-frozen"
     return run_into(read_scene(base), captures, out, options, inspected=found.append)
-
-
-def print_outcome(outcome: Outcome, inspection: Inspection) -> None:
-    """Errors by period, the verdict, and what it rests on."""
-    for p, row in enumerate(outcome.periods, 1):
-        print(
-            f"  period {p}: rotation {row[0]:.4f} (largest {row[1]:.4f}) degrees, centre "
-            f"{row[2]:.4f} (largest {row[3]:.4f}) % of the extent"
-        )
-    told = "; ".join(f"{f.check} {f.place}: {f.found}" for f in inspection.verdict.findings[:2])
-    print(f"  verdict {outcome.verdict} {told}", flush=True)
 
 
 def _photos(case: ImageCase, folder: Path) -> dict[str, NDArray[np.float64]]:

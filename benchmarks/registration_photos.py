@@ -13,24 +13,29 @@ import shutil
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from generated_registrations import pose_errors
 from numpy.typing import NDArray
-from registration_images import ROUTES, cpu_seconds, options_for, print_outcome, work_folder
+from registration_outcomes import (
+    ROUTES,
+    Outcome,
+    cpu_seconds,
+    judged,
+    options_for,
+    print_outcome,
+    refused,
+    work_folder,
+)
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
-from chronoscene.registration.generated import pose_errors
 from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import run, run_into
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.splits import IMAGE_SUFFIXES
-
-if TYPE_CHECKING:
-    from registration import Outcome
 
 PSEUDO = ("first", "second")
 """Labels of the pseudo-periods."""
@@ -87,8 +92,6 @@ def _compare(
     reference: dict[str, NDArray[np.float64]],
     route: str,
 ) -> Outcome:
-    from registration import judged, refused
-
     found: list[Inspection] = []
     start, cpu, count = time.perf_counter(), cpu_seconds(), len(set(periods.values()))
     try:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from generated_registrations import pose_errors
 from PIL import Image, ImageOps
 
 from chronoscene.formats import read_scene
-from chronoscene.registration.generated import pose_errors
 from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import Options, run

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from chronoscene.errors import SceneError
-from chronoscene.registration.generated import (
+from generated_registrations import (
     CAMERA,
     CaseSettings,
     Generated,
     generate_case,
     pose_errors,
 )
+
+from chronoscene.errors import SceneError
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.ties.tie_alignment import (
