@@ -115,7 +115,7 @@ def measure(case: Case, data: Path) -> Run:
 @contextmanager
 def skeletons(folder: Path | None) -> Iterator[Path]:
     """Folder of the skeletons, which are made where there are none yet."""
-    from chronoscene.synth.scene.skeleton import write_dataset
+    from skeletons.dataset import write_dataset
 
     with tempfile.TemporaryDirectory() as temporary:
         data = folder or Path(temporary) / "skeletons"

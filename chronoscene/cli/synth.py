@@ -14,16 +14,11 @@ from chronoscene.errors import ConfigError
 from chronoscene.synth import PRESETS, generate, preset
 from chronoscene.synth.settings import KINDS
 
-SKELETON = "skeleton"
-"""The preset that is a dataset of the paper's size; see `chronoscene.synth.scene.skeleton`."""
-
 
 @click.command("synth")
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option("--preset", "name", default="demo", show_default=True,
-              help=f"Sizes: {', '.join(PRESETS)}, {SKELETON}.")  # fmt: skip
-@click.option("--scene", "scenes", multiple=True, metavar="NAME",
-              help=f"With --preset {SKELETON}: this scene only; may be repeated.")  # fmt: skip
+              help=f"Sizes: {', '.join(PRESETS)}.")  # fmt: skip
 @click.option("--periods", type=int, help="Number of dates of capture.")
 @click.option("--kind", help=f"Cameras: {' or '.join(KINDS)}.")
 @click.option("--size", metavar="WxH", help="Size of the images in pixels.")
@@ -34,53 +29,20 @@ SKELETON = "skeleton"
 @click.option("--rebuilt", type=float, help="Share of the blocks that are torn down and rebuilt.")
 @click.option("--off-centre/--centred", "off_centre", default=None,
               help="Principal point away from the image centre, or in it.")  # fmt: skip
-def command(
-    out: Path, name: str, scenes: tuple[str, ...], size: str | None, **changes: Any
-) -> None:
+def command(out: Path, name: str, size: str | None, **changes: Any) -> None:
     """Make a city photographed at several dates, in the new folder OUT.
 
     The scene is in the ChronoScene format; OUT/gt holds depth, change masks and the test views
     at every other date. The same options give the same bytes.
-
-    --preset skeleton is for measuring tools: OUT becomes a folder of scenes with as many images
-    and points per period as the twelve of the paper, with tiny images of coloured noise, without
-    ground truth. Of the other options it takes --scene, --size and --seed.
     """
     given = {key: value for key, value in changes.items() if value is not None}
     if size is not None:
         given["width"], given["height"] = parse_size(size)
-    if name == SKELETON:
-        _write_skeletons(out, scenes, given)
-        return
-    if scenes:
-        raise _not_together(f"--preset {name}", "--scene")
     settings = preset(name, **given)
     with progress_bar() as bar:
         generate(out, settings, lambda done, total, what: bar(what, done, total))
     console = Console(stderr=True, soft_wrap=True)
     console.print(f"{out}: {settings.periods} periods, seed {settings.seed}", highlight=False)
-
-
-def _write_skeletons(out: Path, scenes: tuple[str, ...], given: dict[str, Any]) -> None:
-    from chronoscene.synth.scene.skeleton import write_dataset
-
-    if unused := sorted(given.keys() - {"seed", "width", "height"}):
-        raise _not_together(f"--preset {SKELETON}", f"--{unused[0].replace('_', '-')}")
-    size = (given.get("width", 64), given.get("height", 48))
-    with progress_bar() as bar:
-        write_dataset(
-            out,
-            scenes=scenes or None,
-            seed=given.get("seed", 0),
-            size=size,
-            progress=lambda done, total, what: bar(what, done, total),
-        )
-
-
-def _not_together(one: str, other: str) -> ConfigError:
-    return ConfigError(
-        other, expected=f"options that go with {one}", found=other, todo="leave one of them out"
-    )
 
 
 def parse_size(text: str) -> tuple[int, int]:

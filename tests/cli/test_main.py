@@ -59,7 +59,7 @@ def test_a_full_disk_is_one_line_too(monkeypatch, capsys):
 
 def test_a_command_that_is_asked_to_end_leaves_nothing_behind(tmp_path):
     code = "from chronoscene.cli import main; main()"
-    arguments = ["synth", str(tmp_path / "out"), "--preset", "skeleton", "--scene", "Aerial3"]
+    arguments = ["synth", str(tmp_path / "out"), "--preset", "demo"]
     process = subprocess.Popen(
         [sys.executable, "-c", code, *arguments],
         stdout=subprocess.DEVNULL,

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from skeletons.dataset import write_skeleton
 
 from chronoscene.cli import cli
 from chronoscene.cli.stats import against_paper
 from chronoscene.errors import ConfigError
 from chronoscene.stats import WRITERS, PeriodCount, SceneCount
 from chronoscene.stats.published import PAPER_COUNTS
-from chronoscene.synth.scene.skeleton import write_skeleton
 
 
 def run(*args: object):

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from skeletons.dataset import write_skeleton
 
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.stats.counts import observation_counts
 from chronoscene.stats.measures import reproject
 from chronoscene.stats.view_overlap import DEEP, FARTHER, common_view
-from chronoscene.synth.scene.skeleton import write_skeleton
 
 PINHOLE = Camera(1, "PINHOLE", 100, 100, (50.0, 50.0, 50.0, 50.0))
 """Sees 45 degrees to every side."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from chronoscene.scene import Camera
-from chronoscene.synth.scene.skeleton_geometry import NO_HOUSE, Houses, Surface, sample_surface
+from skeletons.geometry import NO_HOUSE, Houses, Surface, sample_surface
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

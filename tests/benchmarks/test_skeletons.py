@@ -7,17 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from skeletons.dataset import write_dataset, write_skeleton
+from skeletons.tracks import LARGEST_RESIDUAL, LEAST_TRACK
 
-from chronoscene.cli import cli
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import load_rgb
 from chronoscene.scene import Scene
 from chronoscene.stats import count_scene
 from chronoscene.stats.published import PAPER_COUNTS, PAPER_TOTALS
-from chronoscene.synth.scene.skeleton import write_dataset, write_skeleton
-from chronoscene.synth.scene.skeleton_tracks import LARGEST_RESIDUAL, LEAST_TRACK
 from chronoscene.validation.run import validate_scene
 
 COUNTS = [(20, 700), (9, 300), (31, 1100)]
@@ -131,29 +129,12 @@ def test_counts_of_the_paper_add_up() -> None:
     assert sum(map(len, PAPER_COUNTS.values())) == 42
 
 
-def test_a_scene_of_the_paper_from_the_command_line(tmp_path: Path) -> None:
+def test_a_scene_of_the_paper(tmp_path: Path) -> None:
     out = tmp_path / "set"
-    args = ["synth", str(out), "--preset", "skeleton", "--scene", "Lawncourt", "--size", "32x24"]
-    result = CliRunner().invoke(cli, args, catch_exceptions=False)
-    assert (result.exit_code, result.stdout) == (0, "")
+    write_dataset(out, scenes=["Lawncourt"], size=(32, 24))
     assert [p.name for p in out.iterdir()] == ["Lawncourt"]
     counted = count_scene(read_scene(out / "Lawncourt"))
     assert tuple((p.images, p.points) for p in counted.periods) == PAPER_COUNTS["Lawncourt"]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--preset", "skeleton", "--periods", "3"], "--periods"),
-        (["--preset", "skeleton", "--off-centre"], "--off-centre"),
-        (["--preset", "skeleton", "--scene", "Nowhere"], "expected one of Lawncourt"),
-        (["--preset", "tiny", "--scene", "Lawncourt"], "--scene"),
-    ],
-)
-def test_bad_options(tmp_path: Path, options: list[str], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        CliRunner().invoke(cli, ["synth", str(tmp_path / "x"), *options], catch_exceptions=False)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unknown_scene_leaves_nothing_behind(tmp_path: Path) -> None:

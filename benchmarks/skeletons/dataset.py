@@ -23,14 +23,14 @@ from chronoscene.formats.shared.writing import staged_folder
 from chronoscene.scene import Camera, WorldFrame
 from chronoscene.scene.splits import TEST_EVERY, format_split_text
 from chronoscene.stats.published import PAPER_COUNTS
-from chronoscene.synth.scene.skeleton_geometry import (
+from chronoscene.synth.seeds import rng_for
+from skeletons.geometry import (
     flying_height,
     make_camera,
     make_houses,
     make_poses,
 )
-from chronoscene.synth.scene.skeleton_tracks import Flight, add_noise, make_tracks
-from chronoscene.synth.seeds import rng_for
+from skeletons.tracks import Flight, add_noise, make_tracks
 
 Progress = Callable[[int, int, str], None]
 """Called with scenes done, their total and the name of the one that comes."""

@@ -1,0 +1,1 @@
+"""Skeletons: valid scenes of any size, with tiny images, for measuring tools."""
