@@ -16,7 +16,7 @@ from chronoscene.formats import chronoscene as scene_format
 from chronoscene.scene import Camera, Frame, Period, Points, Scene, WorldFrame
 from chronoscene.synth.city.plan import make_world
 from chronoscene.synth.city.world import World
-from chronoscene.synth.render.renderer import PeriodRenderer
+from chronoscene.synth.render.renderer import PeriodRenderer, load_open3d
 from chronoscene.synth.scene.flights import View, make_camera, plan_views
 from chronoscene.synth.scene.sparse_points import make_points
 from chronoscene.synth.scene.truth import save_jpeg, write_truth
@@ -30,6 +30,7 @@ FIRST_YEAR = 2016
 
 def run(out: Path, settings: SynthSettings, progress: Progress | None = None) -> None:
     """Make a scene; see `chronoscene.synth.generate`. The folder appears complete or not at all."""
+    load_open3d()
     _refuse_used(out)
     _make_parent(out)
     with (

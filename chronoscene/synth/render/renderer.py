@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
+from chronoscene.errors import BackendError
 from chronoscene.scene import Camera
 from chronoscene.synth.render.geometry_tables import MISS, Tables
 from chronoscene.synth.render.light import Light, sky_args
@@ -84,7 +84,7 @@ class PeriodRenderer:
             part.patch_seed,
             part.styles,
         )
-        self._scene = o3d.t.geometry.RaycastingScene()
+        self._scene = load_open3d().t.geometry.RaycastingScene()
         corners = np.ascontiguousarray(part.vertices.reshape(-1, 3))
         index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
         self._scene.add_triangles(_tensor(corners), _tensor(index))
@@ -220,9 +220,29 @@ class PeriodRenderer:
         )  # fmt: skip
 
 
-def _tensor(array: Any) -> o3d.core.Tensor:
+@cache
+def load_open3d() -> Any:
+    """Import open3d, which casts the rays and nothing else needs.
 
-    return o3d.core.Tensor(np.ascontiguousarray(array))  # type: ignore[call-overload]
+    Raises:
+        BackendError: If it is not installed, or lacks libraries of the system.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise BackendError(
+            "open3d",
+            expected="the package that casts the rays of generated scenes",
+            found=str(error).splitlines()[0],
+            todo="pip install 'chronoscene[synth]', and on Debian or Ubuntu also apt-get install "
+            "libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6",
+        ) from error
+    return open3d
+
+
+def _tensor(array: Any) -> Any:
+    """An array as an open3d tensor."""
+    return load_open3d().core.Tensor(np.ascontiguousarray(array))
 
 
 def _sphere(count: int) -> NDArray[np.float32]:
