@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.colmap.model import from_pycolmap, to_pycolmap
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
@@ -16,6 +15,7 @@ from chronoscene.images.store import load_rgb
 from chronoscene.images.undistortion import CameraChange, move_pixels, pinhole_camera, sampling_map
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.scene import Camera, Period, WorldFrame
+from chronoscene.scene.cameras import from_pycolmap, to_pycolmap
 from chronoscene.scene.splits import split_hash
 from chronoscene.undistort import undistort, undistort_pixels
 

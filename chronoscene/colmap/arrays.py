@@ -9,28 +9,6 @@ from numpy.typing import NDArray
 
 from chronoscene.scene import select_tracks
 
-CAMERA_MODELS = (
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "OPENCV_FISHEYE",
-    "FULL_OPENCV",
-    "FOV",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-    "THIN_PRISM_FISHEYE",
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-    "SIMPLE_DIVISION",
-    "DIVISION",
-    "SIMPLE_FISHEYE",
-    "FISHEYE",
-    "EUCM",
-    "EQUIRECTANGULAR",
-)
-"""Names of COLMAP's camera models by their id."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawImages:

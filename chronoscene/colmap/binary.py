@@ -24,9 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap.record_reader import COUNT, RecordError, RecordReader, read_records
-
-CAMERA_PARAMETERS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12, 16, 4, 5, 3, 4, 6, 2)
-"""Number of parameters by COLMAP's model id, SIMPLE_PINHOLE (0) to EQUIRECTANGULAR (17)."""
+from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES
 
 _CAMERA_HEAD = struct.Struct("<iiQQ")
 _IMAGE_HEAD = struct.Struct("<i7di")
@@ -131,10 +129,11 @@ def _walk_cameras(reader: RecordReader) -> list[CameraRecord]:
     cameras = []
     for _ in reader.records("camera", _CAMERA_HEAD.size):
         camera_id, model, width, height = reader.unpack(_CAMERA_HEAD)
-        if not 0 <= model < len(CAMERA_PARAMETERS):
-            known = f"0..{len(CAMERA_PARAMETERS) - 1}"
+        if not 0 <= model < len(MODEL_NAMES):
+            known = f"0..{len(MODEL_NAMES) - 1}"
             raise RecordError(f"the unknown model id {model} for camera {camera_id}, not {known}")
-        params = reader.unpack(struct.Struct(f"<{CAMERA_PARAMETERS[model]}d"))
+        count = len(CAMERA_MODELS[MODEL_NAMES[model]].params)
+        params = reader.unpack(struct.Struct(f"<{count}d"))
         cameras.append(CameraRecord(camera_id, model, width, height, params))
     return cameras
 

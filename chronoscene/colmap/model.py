@@ -12,7 +12,7 @@ import re
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -31,6 +31,7 @@ from chronoscene.colmap.write import posed_images, write_raw_model, write_withou
 from chronoscene.errors import SceneError
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.scene import Camera, Frame, Points
+from chronoscene.scene.cameras import from_pycolmap
 from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
 
 MODEL_FILES = ("cameras", "images", "points3D")
@@ -148,59 +149,6 @@ def write_model(folder: Path, frames: Sequence[Frame], points: Points) -> None:
         track_keypoint=keypoints,
     )
     write_raw_model(folder, cameras, images, tracks)
-
-
-def to_pycolmap(camera: Camera) -> pycolmap.Camera:
-    """The same camera as a pycolmap object."""
-    return pycolmap.Camera(
-        camera_id=camera.camera_id,
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=list(camera.params),
-    )
-
-
-def from_pycolmap(camera: pycolmap.Camera) -> Camera:
-    """The same camera as our record."""
-    return Camera(
-        camera_id=int(camera.camera_id),
-        model=camera.model.name,
-        width=int(camera.width),
-        height=int(camera.height),
-        params=tuple(float(p) for p in camera.params),
-    )
-
-
-def undistorted_camera(camera: Camera) -> Camera:
-    """The PINHOLE camera that COLMAP's undistorter would give these images, with the same id.
-
-    Its size is the largest for which no pixel is blank.
-
-    Raises:
-        SceneError: If COLMAP cannot undistort the model.
-    """
-    try:
-        options = pycolmap.UndistortCameraOptions()
-        result = from_pycolmap(pycolmap.undistort_camera(options, to_pycolmap(camera)))
-    except (ValueError, RuntimeError) as error:
-        raise SceneError(
-            f"camera {camera.camera_id}",
-            expected="a perspective camera that COLMAP can undistort",
-            found=f"{camera.model} {camera.params}",
-            todo="render perspective views first, or correct the camera",
-        ) from error
-    return replace(result, camera_id=camera.camera_id)
-
-
-def unproject_pixels(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points at depth 1 that a camera sees at pixels; NaN where there are none. [N, 2] -> [N, 2]"""
-    return np.asarray(to_pycolmap(camera).cam_from_img(np.ascontiguousarray(xy, np.float64)))
-
-
-def project_points(camera: Camera, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels at which a camera sees points of its frame; NaN behind it. [N, 3] -> [N, 2]"""
-    return np.asarray(to_pycolmap(camera).img_from_cam(np.ascontiguousarray(xyz, np.float64)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

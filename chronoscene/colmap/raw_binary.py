@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene.colmap import binary as colmap_records
-from chronoscene.colmap.arrays import CAMERA_MODELS, RawImages, RawPoints
-from chronoscene.scene import Camera
+from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.scene.cameras import MODEL_NAMES, Camera
 
 
 def read_cameras(path: Path) -> tuple[Camera, ...]:
     """Cameras in the order of the file."""
     return tuple(
-        Camera(r.camera_id, CAMERA_MODELS[r.model_id], r.width, r.height, r.params)
+        Camera(r.camera_id, MODEL_NAMES[r.model_id], r.width, r.height, r.params)
         for r in colmap_records.read_cameras(path)
     )
 

@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import CAMERA_MODELS, RawImages, RawPoints
-from chronoscene.colmap.binary import CAMERA_PARAMETERS
+from chronoscene.colmap.arrays import RawImages, RawPoints
 from chronoscene.colmap.raw_model import Damage, DamagedError
 from chronoscene.io.wording import quote
-from chronoscene.scene import Camera
+from chronoscene.scene.cameras import CAMERA_MODELS, Camera
 
 BLOCK = 20_000
 """Lines whose fields are in memory as text at one time."""
@@ -56,7 +55,7 @@ def _camera(fields: list[str]) -> Camera | str:
     """The camera of a line, or what was expected."""
     if len(fields) < 4 or fields[1] not in CAMERA_MODELS:
         return '"<id> <model> <width> <height> <parameters>" with a model of COLMAP'
-    count = CAMERA_PARAMETERS[CAMERA_MODELS.index(fields[1])]
+    count = len(CAMERA_MODELS[fields[1]].params)
     try:
         camera_id, width, height = (int(fields[i]) for i in (0, 2, 3))
         params = tuple(float(text) for text in fields[4:])

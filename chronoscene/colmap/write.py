@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import CAMERA_MODELS, RawImages, RawPoints
+from chronoscene.colmap.arrays import RawImages, RawPoints
 from chronoscene.colmap.binary import KEYPOINT, POINT_HEAD
-from chronoscene.scene import Camera
+from chronoscene.scene.cameras import MODEL_NAMES, Camera
 from chronoscene.scene.geometry import quaternion_from_rotation
 
 _COUNT = struct.Struct("<Q")
@@ -105,7 +105,7 @@ def posed_images(
 def _cameras(cameras: Sequence[Camera]) -> bytes:
     parts = [_COUNT.pack(len(cameras))]
     for c in cameras:
-        model = CAMERA_MODELS.index(c.model)
+        model = MODEL_NAMES.index(c.model)
         parts.append(_CAMERA.pack(c.camera_id & _ID, model, c.width, c.height))
         parts.append(struct.pack(f"<{len(c.params)}d", *c.params))
     return b"".join(parts)

@@ -40,7 +40,8 @@ from chronoscene.formats.shared.transforms import (
 from chronoscene.formats.shared.transforms import make_scene as scene_from_shots
 from chronoscene.formats.shared.transforms_cameras import CameraTable
 from chronoscene.formats.shared.writing import ImageSource, Progress
-from chronoscene.scene import PINHOLE_MODELS, Camera, Points, Scene
+from chronoscene.scene import Camera, Points, Scene
+from chronoscene.scene.cameras import PINHOLE_MODELS
 from chronoscene.scene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
 
 NAME = "cl-splats"

@@ -25,20 +25,10 @@ from PIL import Image
 
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.scene import Camera, Frame, Scene
+from chronoscene.scene.cameras import CAMERA_MODELS
 
 MAX_WIDTH = 1600
 """Pixels; the limit that the field's loaders use."""
-
-_TWO_FOCALS = {
-    "SIMPLE_PINHOLE": ("PINHOLE", 0),
-    "SIMPLE_RADIAL": ("OPENCV", 3),
-    "RADIAL": ("OPENCV", 2),
-    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 3),
-    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 2),
-    "SIMPLE_DIVISION": ("DIVISION", 0),
-    "SIMPLE_FISHEYE": ("FISHEYE", 0),
-}
-"""Models with one focal length: the same model with two, and the zeros that it needs at the end."""
 
 _ORIENTATION_TAG = 0x0112
 _UNDO_ORIENTATION = {
@@ -96,13 +86,13 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
             todo="render perspective views of the panorama first",
         )
     x, y = (width, camera.width), (height, camera.height)
-    single = model in _TWO_FOCALS
-    if single and x[0] * y[1] == y[0] * x[1]:
+    two_focals = CAMERA_MODELS[model].two_focals
+    if two_focals and x[0] * y[1] == y[0] * x[1]:
         ratios: tuple[tuple[int, int], ...] = (x, x, y)
     else:
-        if single:
-            model, zeros = _TWO_FOCALS[model]
-            params = (params[0], *params, *(0.0,) * zeros)
+        if two_focals:
+            model, params = two_focals, (params[0], *params)
+            params += (0.0,) * (len(CAMERA_MODELS[model].params) - len(params))
         ratios = (x, y, x, y)
     scaled = tuple(p * new / old for p, (new, old) in zip(params, ratios, strict=False))
     return replace(

@@ -9,11 +9,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.model import project_points, undistorted_camera, unproject_pixels
 from chronoscene.errors import SceneError
-from chronoscene.formats.shared.colmap_layout import filter_observations
 from chronoscene.images.store import image_size, resize_camera
 from chronoscene.scene import Camera, Frame, Scene
+from chronoscene.scene.cameras import project_points, undistorted_camera, unproject_pixels
 
 ROWS = 128
 """Rows of a map that are computed at once, to bound the memory."""
@@ -123,9 +122,8 @@ def move_observations(scene: Scene, changes: list[CameraChange]) -> tuple[Scene,
         limits = np.array([change.target.width, change.target.height])
         inside[mine] = ((xy[mine] >= 0) & (xy[mine] <= limits)).all(axis=1)
         frames.append(replace(frame, camera=change.target))
-    moved = filter_observations(
-        replace(points, track_xy=xy), inside, np.arange(len(frames), dtype=np.int32)
-    )
+    rank = np.arange(len(frames), dtype=np.int32)
+    moved = replace(points, track_xy=xy).select_observations(inside, rank)
     lost = (np.diff(points.track_start) > 0) & (np.diff(moved.track_start) == 0)
     new = replace(scene.with_frames(frames), points=moved.select(~lost))
     return new, int((~inside).sum()), int(lost.sum())
@@ -136,13 +134,7 @@ def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.flo
     if change.is_copy or not len(xy):
         return xy
     fx, fy, cx, cy = change.target.params
-    if change.source.is_pinhole:  # exact, whatever the model
-        K = change.source.K
-        with np.errstate(over="ignore"):  # as in `sampling_map`
-            rays = (xy - K[:2, 2]) / K[[0, 1], [0, 1]]
-    else:
-        rays = _rays(change.source, xy)
-    return rays * [fx, fy] + [cx, cy]
+    return _rays(change.source, xy) * [fx, fy] + [cx, cy]
 
 
 def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -152,6 +144,8 @@ def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     the field of view of the model. So they are projected again, and NaN where that disagrees.
     """
     rays = unproject_pixels(camera, xy)
+    if camera.is_pinhole:
+        return rays
     again = project_points(camera, np.column_stack([rays, np.ones(len(rays))]))
     wrong = ~(np.abs(again - xy).max(axis=1) < LARGEST_DISAGREEMENT)
     rays[wrong] = np.nan

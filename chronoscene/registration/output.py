@@ -18,6 +18,7 @@ from chronoscene.formats.shared.writing import Progress
 from chronoscene.io.files import write_text_atomic
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Frame, Period, Points, Scene, WorldFrame
+from chronoscene.scene.cameras import project_points
 from chronoscene.scene.splits import default_tests, split_of
 from chronoscene.undistort import undistort
 
@@ -82,8 +83,6 @@ def point_errors(registered: Registered) -> np.ndarray:
 
 def observation_errors(registered: Registered) -> np.ndarray:
     """Reprojection error of each observation, pixels; NaN behind a camera. [O]"""
-    from chronoscene.colmap.model import project_points
-
     lengths = np.diff(registered.track_start)
     point = np.repeat(np.arange(len(lengths)), lengths)
     errors = np.full(len(point), np.nan)

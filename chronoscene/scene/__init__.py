@@ -1,9 +1,7 @@
 """The scene in memory and what follows from it alone: geometry, splits, similarities. No torch."""
 
+from chronoscene.scene.cameras import Camera
 from chronoscene.scene.scene import (
-    PINHOLE_MODELS,
-    POLYNOMIAL_MODELS,
-    Camera,
     Frame,
     Period,
     Points,
@@ -14,8 +12,6 @@ from chronoscene.scene.scene import (
 )
 
 __all__ = [
-    "PINHOLE_MODELS",
-    "POLYNOMIAL_MODELS",
     "Camera",
     "Frame",
     "Period",

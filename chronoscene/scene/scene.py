@@ -10,46 +10,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.scene.cameras import Camera
+
 Split = Literal["train", "test"]
-
-PINHOLE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE")
-"""Camera models without distortion."""
-
-POLYNOMIAL_MODELS = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Camera models that are a pinhole where all their distortion parameters are zero."""
-
-
-@dataclass(frozen=True, slots=True)
-class Camera:
-    """Intrinsics as COLMAP stores them. Units are pixels of an image of ``width`` x ``height``."""
-
-    camera_id: int
-    model: str
-    """COLMAP model name, ``PINHOLE`` for example."""
-    width: int
-    height: int
-    params: tuple[float, ...]
-    """In COLMAP's order: ``f, cx, cy, ...`` or ``fx, fy, cx, cy, ...``."""
-
-    @property
-    def K(self) -> NDArray[np.float64]:
-        """Calibration matrix with unequal fx, fy and the principal point kept. [3, 3]"""
-        single_focal = self.model.startswith("SIMPLE_") or self.model.startswith("RADIAL")
-        fx, fy, cx, cy = (self.params[0], *self.params[:3]) if single_focal else self.params[:4]
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-    @property
-    def distortion(self) -> tuple[float, ...]:
-        """The parameters after focal lengths and principal point."""
-        single_focal = self.model.startswith("SIMPLE_") or self.model.startswith("RADIAL")
-        return self.params[3:] if single_focal else self.params[4:]
-
-    @property
-    def is_pinhole(self) -> bool:
-        """Whether a pinhole projection describes the camera exactly: methods train on these."""
-        if self.model in POLYNOMIAL_MODELS:
-            return not any(self.distortion)
-        return self.model in PINHOLE_MODELS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,6 +78,21 @@ class Points:
             track_start=track_start,
             track_frame=self.track_frame[observed],
             track_xy=self.track_xy[observed],
+        )
+
+    def select_observations(self, keep: NDArray[np.bool_], rank: NDArray[np.int32]) -> Points:
+        """The same points with some of their observations, in frames of other indices.
+
+        Args:
+            keep: Which observations. [M]
+            rank: New index of each frame. [F]
+        """
+        before = np.concatenate([[0], np.cumsum(keep)])
+        return replace(
+            self,
+            track_start=before[self.track_start].astype(np.int64),
+            track_frame=rank[self.track_frame[keep]],
+            track_xy=self.track_xy[keep],
         )
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.scene import Scene
+from chronoscene.scene.cameras import project_points
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.scene.projection import pixels_of
 from chronoscene.stats.counts import CountRule, SceneCount, count_scene, observation_counts
 from chronoscene.stats.extent import robust_range
 from chronoscene.stats.view_overlap import common_view
@@ -125,11 +125,10 @@ def reproject(scene: Scene) -> Reprojection:
             rows = order[ends[i] : ends[i + 1]]
             local = points.xyz.take(of.take(rows), axis=0) @ frame.cam_from_world[:3, :3].T
             local += frame.cam_from_world[:3, 3]
-            u, v = pixels_of(frame.camera, *local.T)
+            u, v = project_points(frame.camera, local).T
             seen = points.track_xy.take(rows, axis=0)
             ahead = local[:, 2] > 0
-            error = np.hypot(u - seen[:, 0], v - seen[:, 1])
-            residual[rows] = np.where(ahead, error, np.nan)
+            residual[rows] = np.hypot(u - seen[:, 0], v - seen[:, 1])
             depth[rows] = np.where(ahead, local[:, 2], np.nan)
             if ahead.any():
                 depth_of_frame[i] = np.median(local[ahead, 2])

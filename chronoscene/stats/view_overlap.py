@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.scene import Camera, Frame, Scene
-from chronoscene.scene.projection import pixels_of
+from chronoscene.scene.cameras import project_points
 
 Array = NDArray[np.float64]
 
@@ -97,7 +97,7 @@ def _limit(camera: Camera) -> float:
     angle = np.arange(DIRECTIONS)[:, None] * (2 * np.pi / DIRECTIONS)
     tangent = np.linspace(0, WIDEST, STEPS)
     x, y = np.cos(angle) * tangent, np.sin(angle) * tangent
-    u, v = pixels_of(camera, x.ravel(), y.ravel(), np.ones(x.size))
+    u, v = project_points(camera, np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)).T
     u, v = u.reshape(x.shape), v.reshape(x.shape)
     outward = np.diff(np.hypot(u - u[:, :1], v - v[:, :1]), axis=1) > 0
     return float(tangent[outward.all(axis=0).argmin()]) if not outward.all() else np.inf
@@ -105,7 +105,7 @@ def _limit(camera: Camera) -> float:
 
 def _inside(camera: Camera, local: Array, limit: float) -> NDArray[np.bool_]:
     """Which points in front of a camera are in its image. [n, 3] -> [n]"""
-    u, v = pixels_of(camera, *local.T)
+    u, v = project_points(camera, local).T
     inside = (u >= 0) & (v >= 0) & (u <= camera.width) & (v <= camera.height)
     if np.isfinite(limit):
         inside &= np.hypot(local[:, 0], local[:, 1]) <= limit * local[:, 2]

@@ -11,19 +11,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chronoscene.colmap.binary import CAMERA_PARAMETERS, read_images, read_points
+from chronoscene.colmap.binary import read_images, read_points
 from chronoscene.colmap.model import (
-    from_pycolmap,
     model_kind,
     read_model,
     read_reconstruction,
-    to_pycolmap,
     write_model,
 )
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.scene import Camera, Points
+from chronoscene.scene.cameras import project_points
 
 
 @pytest.mark.parametrize("last", ["zlib.compress(b'x' * 1000)", "numpy.savez_compressed(f, a=[1])"])
@@ -52,20 +51,6 @@ def test_pycolmap_leaves_the_termination_signal_alone(handler):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.returncode == (-signal.SIGTERM if "SIG_DFL" in handler else 7)
     assert done.stderr == ""
-
-
-def test_camera_models_of_this_pycolmap():
-    """Our table of record lengths agrees with COLMAP for every model that it knows."""
-    for name, model in pycolmap.CameraModelId.__members__.items():
-        if name == "INVALID":
-            continue
-        camera = pycolmap.Camera.create_from_model_name(1, name, 100.0, 64, 48)
-        assert len(camera.params) == CAMERA_PARAMETERS[int(model)], name
-
-
-def test_camera_round_trip():
-    camera = Camera(7, "OPENCV", 640, 480, (500.0, 480.0, 310.0, 260.0, 0.05, -0.01, 0.002, 0.001))
-    assert from_pycolmap(to_pycolmap(camera)) == camera
 
 
 def test_quaternions_of_few_digits_are_rotations(make_scene_folder):
@@ -126,7 +111,7 @@ def test_rigs_of_several_cameras(tmp_path):
         for j in range(*model.points.track_start[i : i + 2]):
             image = model.images[model.points.track_frame[j]]
             x = image.cam_from_world[:3, :3] @ xyz + image.cam_from_world[:3, 3]
-            pixel = to_pycolmap(image.camera).img_from_cam(x)
+            (pixel,) = project_points(image.camera, x[None])
             np.testing.assert_allclose(pixel, model.points.track_xy[j], atol=1e-6)
 
 

@@ -20,8 +20,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.colmap.arrays import CAMERA_MODELS
-from chronoscene.colmap.binary import CAMERA_PARAMETERS
 from chronoscene.colmap.model import PosedImage
 from chronoscene.convert import convert
 from chronoscene.errors import ChronoSceneError
@@ -35,6 +33,7 @@ from chronoscene.images.undistortion import (
     sampling_map,
 )
 from chronoscene.scene import Camera
+from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES
 from chronoscene.scene.split_making import SplitSettings, make_split
 from chronoscene.undistort import undistort
 
@@ -334,16 +333,16 @@ def test_damaged_images_are_undistorted_or_refused(colmap_folder, run_damaged, t
 
 def test_any_camera_is_undistorted_or_refused(run_damaged):
     def survive(rng):
-        model = rng.randrange(len(CAMERA_MODELS))
+        name = MODEL_NAMES[rng.randrange(len(MODEL_NAMES))]
         size = rng.choice([(64, 48), (1, 1), (640, 480), (1, 5000)])
-        params = [rng.gauss(0, 0.1) for _ in range(CAMERA_PARAMETERS[model])]
+        params = [rng.gauss(0, 0.1) for _ in CAMERA_MODELS[name].params]
         if rng.random() < 0.8 and len(params) > 2:
-            focals = 1 if CAMERA_MODELS[model].startswith(("SIMPLE_", "RADIAL")) else 2
+            focals = CAMERA_MODELS[name].num_focals
             params[:focals] = [rng.uniform(10, 900)] * focals
             params[focals : focals + 2] = [rng.uniform(0, side) for side in size]
         for _ in range(rng.choice([0, 0, 1, 2])):
             params[rng.randrange(len(params))] = rng.choice(FLOATS)
-        camera = Camera(1, CAMERA_MODELS[model], *size, tuple(params))
+        camera = Camera(1, name, *size, tuple(params))
         check_image("place", PosedImage(1, "a.png", camera, np.eye(4)))
         change = CameraChange(camera, pinhole_camera(camera, center=rng.random() < 0.3))
         assert min(change.target.width, change.target.height) > 0

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from chronoscene.colmap.model import to_pycolmap
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import (
@@ -21,6 +20,7 @@ from chronoscene.images.store import (
     resize_camera,
 )
 from chronoscene.scene import Camera
+from chronoscene.scene.cameras import to_pycolmap
 
 CAMERAS = {
     "SIMPLE_PINHOLE": (500, 310, 260),

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chronoscene.colmap.model import to_pycolmap
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
+from chronoscene.scene.cameras import to_pycolmap
 
 MODELS = {
     "SIMPLE_PINHOLE": 3,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +12,7 @@ import numpy as np
 from chronoscene.colmap.model import Model, model_kind, read_model
 from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import SPLIT, check_image, make_frames
-from chronoscene.scene import Period, Points, Scene
+from chronoscene.scene import Period, Scene
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 MODELS = ("sparse/0", "sparse")
@@ -84,24 +83,7 @@ def keep_images(model: Model, names: Collection[str]) -> Model:
     rank[kept] = np.arange(len(kept), dtype=np.int32)
     images = tuple(model.images[i] for i in kept)
     points = model.points
-    return Model(images, filter_observations(points, rank[points.track_frame] >= 0, rank))
-
-
-def filter_observations(points: Points, keep: np.ndarray, rank: np.ndarray) -> Points:
-    """Points with some of their observations.
-
-    Args:
-        points: Their tracks refer to frames by index.
-        keep: Which observations stay. [M]
-        rank: New index of each frame. [F]
-    """
-    before = np.concatenate([[0], np.cumsum(keep)])
-    return replace(
-        points,
-        track_start=before[points.track_start].astype(np.int64),
-        track_frame=rank[points.track_frame[keep]],
-        track_xy=points.track_xy[keep],
-    )
+    return Model(images, points.select_observations(rank[points.track_frame] >= 0, rank))
 
 
 def make_scene(

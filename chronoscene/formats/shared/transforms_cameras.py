@@ -9,20 +9,18 @@ from typing import Any
 
 from chronoscene.formats.shared.json_values import json_error, number
 from chronoscene.images.store import image_size
-from chronoscene.scene import Camera
+from chronoscene.scene.cameras import CAMERA_MODELS, Camera
 
 LARGEST_SIDE = 1_000_000
 """Pixels; beyond any image."""
 
-MODEL_KEYS: dict[str, tuple[str, ...]] = {
-    "SIMPLE_PINHOLE": (),
-    "PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2"),
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-}
-"""Camera models that such a file can name, with their distortion in COLMAP's order."""
+MODEL_KEYS = {
+    name: CAMERA_MODELS[name].distortion
+    for name in (
+        "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE",
+    )
+}  # fmt: skip
+"""Camera models that such a file can name, with the keys of their distortion in COLMAP's order."""
 
 _LIST_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Order of ``distortion_params``."""
@@ -46,7 +44,7 @@ class CameraTable:
         fx, fy = _focals(place, data, width, height)
         cx, cy = number(place, data, "cx"), number(place, data, "cy")
         model, distortion = _model(place, data)
-        if model.startswith("SIMPLE_") or model == "RADIAL":
+        if CAMERA_MODELS[model].num_focals == 1:
             if fx != fy:
                 raise json_error(place, f"equal fl_x and fl_y of a {model}", f"{fx}, {fy}")
             focals: tuple[float, ...] = (fx,)

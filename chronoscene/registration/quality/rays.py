@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.model import unproject_pixels
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Camera
+from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import camera_centre
 
 Array = NDArray[np.float64]

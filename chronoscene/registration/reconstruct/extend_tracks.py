@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from chronoscene.scene import Frame, Points, Scene
+from chronoscene.scene.cameras import project_points
 
 SAME_PIXELS = 1.0
 """Two observations in one image this near to each other are of one point..."""
@@ -84,8 +85,6 @@ def _check(
     is_old: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
     """Undo pairs whose old point does not lie where new images see it."""
-    from chronoscene.colmap.model import project_points
-
     target = np.concatenate([target, np.full(len(b) - len(target), -1, np.int64)])
     bad = np.zeros(len(b), bool)
     for i in np.unique(b_frame[~is_old[b_frame]]).tolist():

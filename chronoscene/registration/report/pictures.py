@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from chronoscene.colmap.model import project_points
 from chronoscene.errors import ChronoSceneError
 from chronoscene.images.store import load_rgb
 from chronoscene.registration.quality.rays import Array
 from chronoscene.registration.report.spots import Spot
 from chronoscene.registration.result import Registered
+from chronoscene.scene.cameras import project_points
 
 PATCH = 260
 """Pixels: side of a patch on the page."""

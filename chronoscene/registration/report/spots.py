@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chronoscene.colmap.model import project_points
 from chronoscene.registration.quality.certificate import PairFigures
 from chronoscene.registration.quality.overlap import seen_by_period
 from chronoscene.registration.quality.rays import (
@@ -20,6 +19,7 @@ from chronoscene.registration.quality.rays import (
     unproject,
 )
 from chronoscene.registration.result import CrossMatches, Registered
+from chronoscene.scene.cameras import project_points
 from chronoscene.scene.geometry import camera_centre
 
 MARGIN = 0.06

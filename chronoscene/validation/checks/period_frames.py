@@ -12,8 +12,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import rotation_from_quaternion
-from chronoscene.scene.projection import plane_of
 from chronoscene.scene.similarity import Similarity, fit_robustly
 from chronoscene.validation.scene_folder import RawScene
 
@@ -139,7 +139,7 @@ class Rays:
         for camera_id in np.unique(camera_ids).tolist():
             camera, mine = scene.usable_cameras[camera_id], camera_ids == camera_id
             self.focal[mine] = camera.K[[0, 1], [0, 1]]
-            self.plane[mine] = plane_of(camera, self.plane[mine])
+            self.plane[mine] = unproject_pixels(camera, self.plane[mine])
 
     def error(self, world: Array, camera: Array) -> float:
         """Median error in pixels, without distortion, with some axes of both negated."""

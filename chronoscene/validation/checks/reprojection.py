@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap.arrays import RawImages, RawPoints
-from chronoscene.scene import Camera
+from chronoscene.scene.cameras import Camera, project_points
 from chronoscene.scene.geometry import rotation_from_quaternion
-from chronoscene.scene.projection import pixels_of
 from chronoscene.validation.checks.observations import Observations
 
 Array = NDArray[np.float64]
@@ -27,7 +26,7 @@ class Reprojection(NamedTuple):
     depth: NDArray[np.float64]
     """World units along the optical axis. [m]"""
     error: NDArray[np.float64]
-    """Distance in pixels between projection and observation. [m]"""
+    """Distance in pixels between projection and observation; NaN behind the camera. [m]"""
     outside: int
     """Observations that are not within the image."""
 
@@ -73,10 +72,9 @@ def project(
 ) -> tuple[Array, Array, Array]:
     """Depth, and pixel position along x and y, of points at ``x, y, z`` in the world. [m] each
 
-    Behind a camera with distortion, positions are NaN.
+    Behind the camera, positions are NaN.
     """
-    right, down, depth = (
-        row[0] * x + row[1] * y + row[2] * z + shift
-        for row, shift in zip(rotation.tolist(), translation.tolist(), strict=True)
-    )
-    return depth, *pixels_of(camera, right, down, depth)
+    local = np.empty((3, len(x)))
+    for i, (row, shift) in enumerate(zip(rotation.tolist(), translation.tolist(), strict=True)):
+        local[i] = row[0] * x + row[1] * y + row[2] * z + shift
+    return local[2], *project_points(camera, local.T).T

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.formats.chronoscene import is_usable
-from chronoscene.scene import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
+from chronoscene.scene.cameras import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene

@@ -1,18 +1,12 @@
 import numpy as np
 import pytest
 
-from chronoscene.colmap.arrays import CAMERA_MODELS
-from chronoscene.colmap.model import pycolmap, to_pycolmap
 from chronoscene.scene import Camera
+from chronoscene.scene.cameras import to_pycolmap
 from chronoscene.validation.rules.intrinsics import displacement
 
 CAMERAS = "sparse/0/cameras.txt"
 PLACE = f"{CAMERAS} (camera 1)"
-
-
-def test_model_names_are_those_of_colmap():
-    known = {int(v): k for k, v in pycolmap.CameraModelId.__members__.items() if int(v) >= 0}
-    assert dict(enumerate(CAMERA_MODELS)) == known
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from chronoscene.scene import Camera
-from chronoscene.scene.projection import pixels_of
+from chronoscene.scene.cameras import Camera, project_points
 from chronoscene.validation.scene_folder import RawScene
 
 CAMERAS, IMAGES = "sparse/0/cameras.txt", "sparse/0/images.txt"
@@ -56,7 +55,8 @@ def through_a_lens(scene, line):
     for row in range(1, len(lines), 2):
         words = np.array(lines[row].split(), dtype=object)
         x, y = (words[0::3].astype(float) - 32) / 50, (words[1::3].astype(float) - 24) / 50
-        for start, values in enumerate(pixels_of(camera, x, y, np.ones(len(x)))):
+        local = np.stack([x, y, np.ones(len(x))], axis=1)
+        for start, values in enumerate(project_points(camera, local).T):
             words[start::3] = [f"{v:.17g}" for v in values]
         lines[row] = " ".join(words)
     scene.write(IMAGES, lines)
