@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from chronoscene.geodesy import Georeference
 from chronoscene.registration.quality.misalignment import measure, transfers
-from chronoscene.registration.quality.rays import Rays, place, rays_of
+from chronoscene.registration.quality.rays import Rays, place, rays_at
 from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered
 from chronoscene.scene import Camera
 from chronoscene.scene.geometry import Sim3, camera_centre, pose_from_rotation_translation
 from chronoscene.scene.similarity import fit_robustly
+from chronoscene.scene.tracks import track_owners
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -369,7 +370,7 @@ def _by_gps(poses: Array, gps: Array) -> Sim3 | None:
 
 def _by_ties(model: Registered, seen: _Sightings, a: int, b: int) -> Sim3 | None:
     """Robust similarity between matched points, refined on their reprojection."""
-    rays = rays_of(model, _starts(seen.track), seen.image, seen.xy)
+    rays = rays_at(model, track_owners(_starts(seen.track)), seen.image, seen.xy).finite()
     rays = rays.where(np.isin(model.periods[rays.image], (a, b)))
     moved, placed_a, placed_b = transfers(rays, model.periods, a, b)
     found, slot = placed_b.find(placed_a.track)
@@ -414,7 +415,7 @@ def _error(rng: np.random.Generator, settings: CaseSettings) -> Sim3:
 
 def _with_tracks(model: Registered, seen: _Sightings, held: _Sightings) -> Registered:
     """Place the points by all their images; what does not fit is split into its periods."""
-    rays = rays_of(model, _starts(seen.track), seen.image, seen.xy)
+    rays = rays_at(model, track_owners(_starts(seen.track)), seen.image, seen.xy).finite()
     order = np.repeat(np.arange(len(np.unique(seen.track))), np.diff(_starts(seen.track)))
     fits = np.isin(order, place(rays).track)
     key = order * (model.num_periods + 1)
@@ -422,7 +423,7 @@ def _with_tracks(model: Registered, seen: _Sightings, held: _Sightings) -> Regis
     by_key = np.lexsort([seen.image, key])
     key, image, xy = key[by_key], seen.image[by_key], seen.xy[by_key]
     start = _starts(key)
-    placed = place(rays_of(model, start, image, xy))
+    placed = place(rays_at(model, track_owners(start), image, xy).finite())
     number = np.repeat(np.arange(len(start) - 1), np.diff(start))
     kept = np.isin(number, placed.track)
     model = replace(

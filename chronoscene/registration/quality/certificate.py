@@ -11,6 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
+from chronoscene.registration.quality.evidence import MAX_OBSERVATIONS, Evidence, gather
 from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
@@ -22,31 +23,11 @@ from chronoscene.registration.quality.misalignment import (
     transfer_errors,
     transfers,
 )
-from chronoscene.registration.quality.overlap import (
-    TieSpread,
-    ground_plan,
-    seen_by_period,
-    tie_spread,
-)
-from chronoscene.registration.quality.rays import (
-    Array,
-    Ints,
-    Mask,
-    Placed,
-    Rays,
-    held_out_rays,
-    model_rays,
-    place,
-    project,
-    unproject,
-)
+from chronoscene.registration.quality.overlap import TieSpread, ground_plan, tie_spread
+from chronoscene.registration.quality.rays import Array, Mask, Placed, Rays, project
 from chronoscene.registration.quality.surface_distance import CloudDistance, cloud_distance
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
-
-MOST_OBSERVATIONS = 200_000
-"""Observations by which the cloud of a period is placed, and those of tie points by which a pair is
-measured: a sample of the points where there are more."""
 
 BADLY_PLACED = 4.0
 """Transfers whose point is less certain than this many pixels tell nothing."""
@@ -128,6 +109,8 @@ class Certificate:
     periods: tuple[PeriodFigures, ...]
     pairs: tuple[PairFigures, ...]
     """All pairs of periods, earlier first."""
+    evidence: Evidence
+    """What all of this was measured on."""
 
 
 def certify(model: Registered) -> Certificate:
@@ -136,15 +119,8 @@ def certify(model: Registered) -> Certificate:
     Everything is deterministic: equal models give equal certificates.
     """
     extent = scene_extent(model)
-    seen = seen_by_period(model)
-    clouds = [_cloud(model, seen, p) for p in range(model.num_periods)]
+    evidence = gather(model)
     cells = ground_plan(model.points)
-    shared = np.flatnonzero(seen.sum(axis=1) > 1)
-    sample = np.zeros(len(seen), bool)
-    lengths = np.diff(model.track_start)
-    most = MOST_OBSERVATIONS * max(1, model.num_periods - 1)
-    sample[shared[:: int(lengths[shared].sum()) // most + 1]] = True
-    held_out, ties = held_out_rays(model), model_rays(model, sample)
     focals = [np.sqrt(c.K[0, 0] * c.K[1, 1]) for c in model.cameras]
     return Certificate(
         route=model.route,
@@ -152,11 +128,12 @@ def certify(model: Registered) -> Certificate:
         extent=extent,
         focal=float(np.median(focals)) if focals else float("nan"),
         labels=tuple(model.labels),
-        periods=tuple(_period(model, p) for p in range(model.num_periods)),
+        periods=tuple(_period(model, evidence, p) for p in range(model.num_periods)),
         pairs=tuple(
-            _pair(model, (a, b), tie_spread(model, seen, a, b, cells), clouds, held_out, ties)
+            _pair(model, evidence, (a, b), tie_spread(model, evidence.seen, a, b, cells))
             for a, b in combinations(range(model.num_periods), 2)
         ),
+        evidence=evidence,
     )
 
 
@@ -172,30 +149,15 @@ def scene_extent(model: Registered) -> float:
     return size
 
 
-def _cloud(model: Registered, seen: Mask, period: int) -> Placed:
-    """Points of a period, placed by its images alone: a shared point would fit by construction."""
-    points = np.flatnonzero(seen[:, period])
-    chosen = np.zeros(len(seen), bool)
-    observations = int(np.diff(model.track_start)[points].sum())
-    chosen[points[:: observations // MOST_OBSERVATIONS + 1]] = True
-    rays = model_rays(model, chosen)
-    return place(rays.where(model.periods[rays.image] == period))
-
-
-def _period(model: Registered, period: int) -> PeriodFigures:
+def _period(model: Registered, evidence: Evidence, period: int) -> PeriodFigures:
     mine = model.periods == period
     missing = [n for n, p in model.unregistered_periods.items() if p == period]
     reasons: dict[str, int] = {}
     for name in missing:
         reason = model.unregistered.get(name, "unknown")
         reasons[reason] = reasons.get(reason, 0) + 1
-    rows = np.flatnonzero(mine[model.track_image])
-    rows = rows[:: len(rows) // 200_000 + 1]
-    point = np.repeat(np.arange(len(model.points)), np.diff(model.track_start))[rows]
-    uv, focal = unproject(model.cameras, model.track_image[rows], model.track_xy[rows])
-    pose = model.cam_from_world[model.track_image[rows]]
-    rays = Rays(point, model.track_image[rows], pose, uv, focal)
-    error = np.linalg.norm(project(rays, model.points[point])[0], axis=1)
+    rays = evidence.observed[period]
+    error = np.linalg.norm(project(rays, model.points[rays.track])[0], axis=1)
     error = error[np.isfinite(error)]
     gps: GpsFit | str = "the frame is not georeferenced"
     if model.georeference is not None:
@@ -207,35 +169,30 @@ def _period(model: Registered, period: int) -> PeriodFigures:
         photos=int(mine.sum()) + len(missing),
         reasons=reasons,
         error=float(np.median(error)) if len(error) else None,
-        observations=len(rows),
+        observations=len(rays),
         gps=gps,
     )
 
 
 def _pair(
-    model: Registered,
-    periods: tuple[int, int],
-    spread: TieSpread,
-    clouds: list[Placed],
-    held_out: Rays,
-    ties: Rays,
+    model: Registered, evidence: Evidence, periods: tuple[int, int], spread: TieSpread
 ) -> PairFigures:
     a, b = periods
     centres = camera_centre(model.cam_from_world[np.isin(model.periods, (a, b))])
-    moved, placed_a, placed_b = transfers(held_out, model.periods, a, b)
+    own = evidence.held_out_placed
+    moved, placed_a, placed_b = transfers(evidence.held_out, model.periods, a, b, (own[a], own[b]))
     good = transfer_errors(moved)[1] < BADLY_PLACED if len(moved) else np.zeros(0, bool)
     nothing = "no held-out track is placed by one period and seen by the other"
     figures: HeldOut | str = nothing
     misalignment: Misalignment | str = nothing
     if good.any():
-        figures = _held_out(model, moved, good, placed_a, placed_b, (a, b))
+        figures = _held_out(moved, good, (placed_a, placed_b), _epipolar(model, evidence, periods))
         measured = measure(moved, placed_a, placed_b, centres)
         misalignment = measured or (
             f"{figures.tracks} held-out tracks: fewer than {FEWEST_TRACKS}, or all in one spot"
         )
-    by_all = measure(*transfers(_joined(held_out, ties, a, b, model), model.periods, a, b), centres)
-    rays_a = ties.where(model.periods[ties.image] == a)
-    rays_b = ties.where(model.periods[ties.image] == b)
+    by_all = measure(*_all_transfers(model, evidence, a, b), centres)
+    of_a, of_b = (evidence.ties.where(model.periods[evidence.ties.image] == p) for p in periods)
     sigma = by_all.shift.high / 1.96 if by_all is not None else 0.0
     middle = np.median(camera_centre(model.cam_from_world), axis=0)
     return PairFigures(
@@ -245,34 +202,39 @@ def _pair(
         held_out=figures,
         misalignment=misalignment,
         by_all=by_all or "too few tracks are seen by two images of one period, or all in one spot",
-        localised_b=localise(rays_b, place(rays_a)),
-        localised_a=localise(rays_a, place(rays_b)),
-        clouds=cloud_distance(clouds[a], clouds[b], middle, sigma),
+        localised_b=localise(of_b, evidence.ties_placed[a]),
+        localised_a=localise(of_a, evidence.ties_placed[b]),
+        clouds=cloud_distance(evidence.clouds[a], evidence.clouds[b], middle, sigma),
     )
 
 
-def _joined(held_out: Rays, ties: Rays, a: int, b: int, model: Registered) -> Rays:
-    """Held-out tracks and a sample of the tie points of two periods, under numbers of their own."""
+def _all_transfers(
+    model: Registered, evidence: Evidence, a: int, b: int
+) -> tuple[Transfers, Placed, Placed]:
+    """By held-out tracks and a sample of the ties of two periods, under numbers of their own."""
+    held_out, ties = evidence.held_out, evidence.ties
     ties = ties.where(np.isin(model.periods[ties.image], (a, b)))
-    _, number = np.unique(ties.track, return_inverse=True)
-    ties = ties.where(number % (len(ties) // MOST_OBSERVATIONS + 1) == 0)
-    parts = held_out, replace(ties, track=ties.track + held_out.track.max(initial=-1) + 1)
-    names = ("track", "image", "pose", "uv", "focal")
-    return Rays(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+    tracks, number = np.unique(ties.track, return_inverse=True)
+    step = len(ties) // MAX_OBSERVATIONS + 1
+    ties = ties.where(number % step == 0)
+    sampled = np.zeros(len(model.points), bool)
+    sampled[tracks[::step]] = True
+    shift = held_out.track.max(initial=-1) + 1
+    rays = Rays.join(held_out, replace(ties, track=ties.track + shift))
+    both = tuple(
+        Placed.join(evidence.held_out_placed[p], evidence.ties_placed[p].of(sampled), shift)
+        for p in (a, b)
+    )
+    return transfers(rays, model.periods, a, b, (both[0], both[1]))
 
 
 def _held_out(
-    model: Registered,
-    moved: Transfers,
-    good: Mask,
-    placed_a: Placed,
-    placed_b: Placed,
-    periods: tuple[int, int],
+    moved: Transfers, good: Mask, placed: tuple[Placed, Placed], epipolar: Array
 ) -> HeldOut:
+    placed_a, placed_b = placed
     error, expected, distance = (x[good] for x in transfer_errors(moved))
     found, slot = placed_b.find(placed_a.track)
     gaps = np.linalg.norm(placed_a.xyz[found] - placed_b.xyz[slot], axis=1)
-    epipolar = _epipolar(model, periods)
     return HeldOut(
         tracks=len(np.unique(moved.rays.track[good])),
         observations=int(good.sum()),
@@ -288,28 +250,14 @@ def _held_out(
     )
 
 
-def _epipolar(model: Registered, periods: tuple[int, int]) -> Array:
+def _epipolar(model: Registered, evidence: Evidence, periods: tuple[int, int]) -> Array:
     """Epipolar distances of all held-out matches between two periods, pixels."""
-    chosen = [
-        m
-        for m in model.held_out
-        if {int(model.periods[m.image_a]), int(model.periods[m.image_b])} == set(periods)
-    ]
-    if not chosen:
-        return np.zeros(0)
-    counts = [len(m.xy_a) for m in chosen]
-    first = _rays(model, np.repeat([m.image_a for m in chosen], counts), [m.xy_a for m in chosen])
-    second = _rays(model, np.repeat([m.image_b for m in chosen], counts), [m.xy_b for m in chosen])
-    ends = np.cumsum(counts)
     errors = [
-        sampson_errors(first.pose[i], second.pose[i], first.where(rows), second.where(rows))
-        for i, j in zip(ends - counts, ends, strict=True)
-        if len(rows := np.arange(i, j))
+        sampson_errors(first.pose[0], second.pose[0], first, second)
+        for matches, (first, second) in zip(model.held_out, evidence.matches, strict=True)
+        if {int(model.periods[matches.image_a]), int(model.periods[matches.image_b])}
+        == set(periods)
+        and len(first)
     ]
     found = np.concatenate([np.zeros(0), *errors])
     return np.asarray(found[np.isfinite(found)])
-
-
-def _rays(model: Registered, image: Ints, xy: list[Array]) -> Rays:
-    uv, focal = unproject(model.cameras, image, np.concatenate(xy))
-    return Rays(image, image, model.cam_from_world[image], uv, focal)

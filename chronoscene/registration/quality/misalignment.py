@@ -72,7 +72,9 @@ class Misalignment:
     """``abs(log(scale ratio))``."""
 
 
-def transfers(rays: Rays, period: Ints, a: int, b: int) -> tuple[Transfers, Placed, Placed]:
+def transfers(
+    rays: Rays, period: Ints, a: int, b: int, placed: tuple[Placed, Placed] | None = None
+) -> tuple[Transfers, Placed, Placed]:
     """Tracks of two periods in both directions, and the points as each of them places them.
 
     Args:
@@ -80,17 +82,13 @@ def transfers(rays: Rays, period: Ints, a: int, b: int) -> tuple[Transfers, Plac
         period: Of each image. [N]
         a: Earlier period.
         b: Later period.
+        placed: The points that a and b place, if they are known.
     """
     of_a, of_b = rays.where(period[rays.image] == a), rays.where(period[rays.image] == b)
-    placed_a, placed_b = place(of_a), place(of_b)
+    placed_a, placed_b = placed or (place(of_a), place(of_b))
     forward, backward = _seen(placed_a, of_b), _seen(placed_b, of_a)
     both = Transfers(
-        rays=Rays(
-            *(
-                np.concatenate([getattr(forward[0], name), getattr(backward[0], name)])
-                for name in ("track", "image", "pose", "uv", "focal")
-            )
-        ),
+        rays=Rays.join(forward[0], backward[0]),
         xyz=np.concatenate([forward[1], backward[1]]),
         covariance=np.concatenate([forward[2], backward[2]]),
         backward=np.repeat([False, True], [len(forward[0]), len(backward[0])]),

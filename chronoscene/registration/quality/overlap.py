@@ -8,6 +8,7 @@ import numpy as np
 
 from chronoscene.registration.quality.rays import Array, Ints, Mask
 from chronoscene.registration.result import Registered
+from chronoscene.scene.tracks import select_tracks
 
 CELLS = 150
 """Cells into which the ground plan of the scene is cut."""
@@ -40,14 +41,6 @@ class TieSpread:
     """Middles of overlap cells without a tie point, the fullest first. [G, 3]"""
 
 
-def seen_by_period(model: Registered) -> Mask:
-    """Whether an image of the period sees the point. [P, T]"""
-    point = np.repeat(np.arange(len(model.points)), np.diff(model.track_start))
-    seen = np.zeros((len(model.points), model.num_periods), bool)
-    seen[point, model.periods[model.track_image]] = True
-    return seen
-
-
 def tie_spread(
     model: Registered, seen: Mask, a: int, b: int, cells: tuple[Array, Ints] | None = None
 ) -> TieSpread:
@@ -55,7 +48,7 @@ def tie_spread(
 
     Args:
         model: The registration.
-        seen: From `seen_by_period`.
+        seen: Whether an image of the period sees the point. [P, T]
         a: Earlier period.
         b: Later period.
         cells: From `ground_plan`, where it is at hand.
@@ -115,8 +108,8 @@ def _hull_area(plan: Array) -> float:
 def _tied_images(
     model: Registered, tie: Mask, periods: tuple[int, int]
 ) -> tuple[tuple[int, ...], tuple[float, float]]:
-    point = np.repeat(np.arange(len(tie)), np.diff(model.track_start))
-    count = np.bincount(model.track_image[tie[point]], minlength=len(model.names))
+    of_tie = select_tracks(model.track_start, tie)[1]
+    count = np.bincount(model.track_image[of_tie], minlength=len(model.names))
     enough = count >= TIES_OF_IMAGE
     shares = []
     for period in periods:

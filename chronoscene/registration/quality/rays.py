@@ -7,7 +7,7 @@ lengths: they are pixels for a pinhole camera, and pixels of the image centre fo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +16,13 @@ from chronoscene.registration.result import Registered
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.tracks import MIN_PARALLAX, meet, track_owners
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-LEAST_PARALLAX = 3e-4
-"""Smallest eigenvalue of the mean of ``I - d d^T`` over the rays of a point: sine squared of one
-degree. Points with less have no depth."""
-
-LARGEST_OWN_ERROR = 4.0
+MAX_OWN_ERROR = 4.0
 """Root mean square, pixels: tracks that do not even fit the images that place them are mismatched
 in their own period."""
 
@@ -54,6 +51,16 @@ class Rays:
             self.track[mask], self.image[mask], self.pose[mask], self.uv[mask], self.focal[mask]
         )
 
+    def finite(self) -> Rays:
+        """Without the pixels that COLMAP finds no ray for."""
+        return self.where(np.flatnonzero(np.isfinite(self.uv).all(axis=1)))
+
+    @classmethod
+    def join(cls, *parts: Rays) -> Rays:
+        """Observations of several, one after the other; tracks keep their numbers."""
+        names = ("track", "image", "pose", "uv", "focal")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Placed:
@@ -76,29 +83,35 @@ class Placed:
         found = self.track[slot] == track
         return found, slot[found]
 
+    def of(self, tracks: Mask) -> Placed:
+        """The points of some tracks, by a mask over the numbers of all."""
+        keep = tracks[self.track]
+        return Placed(self.track[keep], self.xyz[keep], self.covariance[keep], self.error[keep])
 
-def rays_of(model: Registered, start: Ints, image: Ints, xy: Array) -> Rays:
-    """Rays of tracks in flat form: observations of track i are ``start[i]:start[i + 1]``."""
-    track = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    @classmethod
+    def join(cls, first: Placed, second: Placed, shift: int) -> Placed:
+        """Points of both; the tracks of the second come after those of the first."""
+        second = replace(second, track=second.track + shift)
+        names = ("track", "xyz", "covariance", "error")
+        return cls(*(np.concatenate([getattr(p, name) for p in (first, second)]) for name in names))
+
+
+def rays_at(model: Registered, track: Ints, image: Ints, xy: Array) -> Rays:
+    """Rays of observations; NaN where COLMAP finds none. [O], [O], [O, 2]"""
     uv, focal = unproject(model.cameras, image, xy)
-    rays = Rays(track, image, model.cam_from_world[image], uv, focal)
-    return rays.where(np.flatnonzero(np.isfinite(uv).all(axis=1)))
+    return Rays(track, image, model.cam_from_world[image], uv, focal)
 
 
-def model_rays(model: Registered, points: Mask | None = None) -> Rays:
+def model_rays(model: Registered) -> Rays:
     """Rays of the points of a model; a track is the index of a point."""
-    track = np.repeat(np.arange(len(model.points)), np.diff(model.track_start))
-    keep = np.ones(len(track), bool) if points is None else points[track]
-    image, track = model.track_image[keep], track[keep]
-    uv, focal = unproject(model.cameras, image, model.track_xy[keep])
-    rays = Rays(track, image, model.cam_from_world[image], uv, focal)
-    return rays.where(np.flatnonzero(np.isfinite(uv).all(axis=1)))
+    track = track_owners(model.track_start)
+    return rays_at(model, track, model.track_image, model.track_xy).finite()
 
 
 def held_out_rays(model: Registered) -> Rays:
     """Rays of the tracks that took no part in the estimation."""
     tracks = model.held_out_tracks
-    return rays_of(model, tracks.start, tracks.image, tracks.xy)
+    return rays_at(model, track_owners(tracks.start), tracks.image, tracks.xy).finite()
 
 
 def unproject(cameras: Sequence[Camera], image: Ints, xy: Array) -> tuple[Array, Array]:
@@ -142,8 +155,7 @@ def project(rays: Rays, xyz: Array) -> tuple[Array, Array, Array]:
 def place(rays: Rays) -> Placed:
     """Points of tracks by their rays: those seen by two images or more, with parallax, that fit.
 
-    First the point nearest to all rays, ``sum(I - d d^T) x = sum((I - d d^T) c)``, then three
-    Gauss-Newton steps on the residuals in pixels.
+    First the point nearest to all rays, then three Gauss-Newton steps on the residuals in pixels.
     """
     first = _first_of_groups(rays.track)
     count = np.diff(np.append(first, len(rays)))
@@ -152,7 +164,10 @@ def place(rays: Rays) -> Placed:
     if not len(rays):
         return Placed(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
     first = np.cumsum(count) - count
-    xyz, parallax = _nearest_to_rays(rays, first, count)
+    local = np.column_stack([rays.uv, np.ones(len(rays))])
+    direction = np.einsum("nji,nj->ni", rays.pose[:, :3, :3], local)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    xyz, parallax = meet(direction, camera_centre(rays.pose), first)
     for _ in range(3):
         residual, jacobian, _ = project(rays, np.repeat(xyz, count, axis=0))
         normal, gradient = _normal_equations(residual, jacobian, first)
@@ -161,27 +176,13 @@ def place(rays: Rays) -> Placed:
     residual, jacobian, _ = project(rays, np.repeat(xyz, count, axis=0))
     normal, _ = _normal_equations(residual, jacobian, first)
     mean_square = np.add.reduceat((residual**2).sum(axis=1), first) / count
-    good = (parallax > LEAST_PARALLAX) & (mean_square < LARGEST_OWN_ERROR**2)
+    good = (parallax > MIN_PARALLAX) & (mean_square < MAX_OWN_ERROR**2)
     return Placed(
         track=rays.track[first][good],
         xyz=xyz[good],
         covariance=np.asarray(np.linalg.inv(normal[good]), np.float64),
         error=np.sqrt(mean_square[good]),
     )
-
-
-def _nearest_to_rays(rays: Rays, first: Ints, count: Ints) -> tuple[Array, Array]:
-    """Point nearest to the rays of each group, and the measure of parallax of the group."""
-    local = np.column_stack([rays.uv, np.ones(len(rays))])
-    direction = np.einsum("nji,nj->ni", rays.pose[:, :3, :3], local)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    left = np.add.reduceat(across, first)
-    right = np.add.reduceat(np.einsum("nij,nj->ni", across, camera_centre(rays.pose)), first)
-    parallax = np.linalg.eigvalsh(left / count[:, None, None])[:, 0]
-    left += 1e-12 * np.eye(3)
-    nearest = np.linalg.solve(left, right[:, :, None])[:, :, 0]
-    return nearest, np.asarray(parallax, np.float64)
 
 
 def _normal_equations(residual: Array, jacobian: Array, first: Ints) -> tuple[Array, Array]:

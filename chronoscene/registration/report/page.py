@@ -123,7 +123,7 @@ def render_report(
         map=camera_map(model) if model.names else None,
         periods=[(p, list(period_figures(certificate, p))) for p in certificate.periods],
         pairs=[_pair_section(certificate, verdict, p) for p in certificate.pairs],
-        drawn=_drawn(model, photos),
+        drawn=_drawn(model, certificate, photos),
         photo_width=PHOTO_WIDTH,
         flickers=_flickers(model, certificate, photos),
         clicks=_clicks(model, certificate, verdict),
@@ -140,9 +140,9 @@ def _pair_section(
     return names, verdict.pairs.get((pair.a, pair.b)), list(pair_figures(certificate, pair))
 
 
-def _drawn(model: Registered, photos: Photos) -> list[_Pair]:
+def _drawn(model: Registered, certificate: Certificate, photos: Photos) -> list[_Pair]:
     """The pair with the largest held-out error, and that with the smallest."""
-    found = drawn_pairs(model)
+    found = drawn_pairs(model, certificate.evidence)
     chosen = [("Worst pair", found[-1])] if found else []
     if len(found) > 1:
         chosen.append(("Best pair", found[0]))
@@ -184,9 +184,10 @@ def _flickers(model: Registered, certificate: Certificate, photos: Photos) -> li
     """Comparisons of all pairs of periods in turn: at tie points, and where there are none."""
     each = max(2, FLICKERS // max(len(certificate.pairs), 1))
     found: list[_Flicker] = []
+    seen = certificate.evidence.seen
     for pair in certificate.pairs:
-        gaps = spots(model, pair, each // 2, gaps=True)
-        chosen = spots(model, pair, each - len(gaps), gaps=False) + gaps
+        gaps = spots(model, seen, pair, each // 2, gaps=True)
+        chosen = spots(model, seen, pair, each - len(gaps), gaps=False) + gaps
         for spot in chosen:
             pictures = photos.patches(spot)
             if pictures is not None and len(found) < FLICKERS:
@@ -201,12 +202,13 @@ def _clicks(
 ) -> list[tuple[str, list[_Click]]]:
     """For each pair of periods that did not pass: where to click next."""
     found = []
+    seen = certificate.evidence.seen
     for pair in certificate.pairs:
         if verdict.pairs.get((pair.a, pair.b)) == "pass":
             continue
-        chosen = spots(model, pair, CLICKS, gaps=True, twice=True)
+        chosen = spots(model, seen, pair, CLICKS, gaps=True, twice=True)
         if len(chosen) < CLICKS:
-            chosen += spots(model, pair, CLICKS - len(chosen), gaps=False, twice=True)
+            chosen += spots(model, seen, pair, CLICKS - len(chosen), gaps=False, twice=True)
         if chosen:
             names = f"{certificate.labels[pair.a]} and {certificate.labels[pair.b]}"
             found.append((names, [_click(model, certificate, pair, s) for s in chosen]))

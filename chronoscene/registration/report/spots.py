@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from chronoscene.registration.quality.certificate import PairFigures
-from chronoscene.registration.quality.overlap import seen_by_period
-from chronoscene.registration.quality.rays import (
-    Array,
-    Ints,
-    Placed,
-    Rays,
-    held_out_rays,
-    place,
-    project,
-    unproject,
-)
+from chronoscene.registration.quality.evidence import Evidence
+from chronoscene.registration.quality.rays import Array, Ints, Mask, Placed, project, rays_at
 from chronoscene.registration.result import CrossMatches, Registered
 from chronoscene.scene.cameras import project_points
 from chronoscene.scene.geometry import camera_centre
@@ -66,18 +58,18 @@ class DrawnPair:
 
 
 def spots(
-    model: Registered, pair: PairFigures, count: int, *, gaps: bool, twice: bool = False
+    model: Registered, seen: Mask, pair: PairFigures, count: int, *, gaps: bool, twice: bool = False
 ) -> list[Spot]:
     """Places of two periods, spread over the scene.
 
     Args:
         model: The registration.
+        seen: Whether an image of the period sees the point. [P, T]
         pair: Figures of the two periods.
         count: Places at most.
         gaps: Whether to take places without tie points; else tie points.
         twice: Whether two images of either period must show a place.
     """
-    seen = seen_by_period(model)
     if gaps:
         places = pair.ties.gaps
     else:
@@ -175,15 +167,12 @@ def _normal(points: Array, xyz: Array, towards: Array) -> Array:
     return np.asarray(normal if flat else towards)
 
 
-def drawn_pairs(model: Registered) -> list[DrawnPair]:
+def drawn_pairs(model: Registered, evidence: Evidence) -> list[DrawnPair]:
     """All pairs of images with enough held-out matches, the best first."""
-    rays = held_out_rays(model)
-    periods = model.periods[rays.image]
-    placed = [place(rays.where(periods == p)) for p in range(model.num_periods)]
     pairs = []
     for matches in model.held_out:
         if len(matches.xy_a) >= FEWEST_MATCHES:
-            error = _match_errors(model, matches, placed)
+            error = _match_errors(model, matches, evidence.held_out_placed)
             good = np.isfinite(error)
             if good.sum() >= FEWEST_MATCHES:
                 xy = matches.xy_a[good], matches.xy_b[good]
@@ -191,7 +180,7 @@ def drawn_pairs(model: Registered) -> list[DrawnPair]:
     return sorted(pairs, key=lambda p: p.median)
 
 
-def _match_errors(model: Registered, matches: CrossMatches, placed: list[Placed]) -> Array:
+def _match_errors(model: Registered, matches: CrossMatches, placed: Sequence[Placed]) -> Array:
     """Distance of each match to where the other period puts its point; NaN where none does."""
     errors = np.full((2, len(matches.track)), np.nan)
     ends = (matches.image_a, matches.image_b, matches.xy_b), (
@@ -203,7 +192,6 @@ def _match_errors(model: Registered, matches: CrossMatches, placed: list[Placed]
         found, slot = points.find(matches.track[order])
         rows = order[found]
         image = np.full(len(rows), target, np.int64)
-        uv, focal = unproject(model.cameras, image, xy[rows])
-        rays = Rays(image, image, model.cam_from_world[image], uv, focal)
+        rays = rays_at(model, image, image, xy[rows])
         errors[k, rows] = np.linalg.norm(project(rays, points.xyz[slot])[0], axis=1)
     return np.asarray(np.where(np.isfinite(errors[0]), errors[0], errors[1]))

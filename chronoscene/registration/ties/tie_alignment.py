@@ -22,12 +22,13 @@ from chronoscene.registration.quality.rays import (
     model_rays,
     place,
     project,
-    unproject,
+    rays_at,
 )
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_points import TiePoints, match_images
 from chronoscene.scene.geometry import Sim3
 from chronoscene.scene.similarity import SIGMA, fit
+from chronoscene.scene.tracks import track_owners
 
 Mode = Literal["auto", "check", "replace"]
 
@@ -166,8 +167,7 @@ def _clicks(model: Registered, tie_points: TiePoints) -> tuple[_Clicks, list[str
             image.append(index)
             xy.append((click.x, click.y))
     images_of, places = np.array(image, np.int64), np.array(xy, np.float64).reshape(-1, 2)
-    uv, focal = unproject(model.cameras, images_of, places)
-    rays = Rays(np.array(track, np.int64), images_of, model.cam_from_world[images_of], uv, focal)
+    rays = rays_at(model, np.array(track, np.int64), images_of, places)
     return _Clicks(tuple(p.name for p in tie_points.points), rays, places), remarks
 
 
@@ -305,7 +305,7 @@ def move_periods(model: Registered, moves: dict[int, Sim3]) -> Registered:
     for p, move in moves.items():
         mine = model.periods == p
         poses[mine] = move.apply_to_pose(poses[mine])
-    point = np.repeat(np.arange(len(model.points)), np.diff(model.track_start))
+    point = track_owners(model.track_start)
     key = point * model.num_periods + model.periods[model.track_image]
     order = np.lexsort([np.arange(len(key)), key])
     kept, count = np.unique(key[order], return_counts=True)

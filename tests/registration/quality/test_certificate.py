@@ -13,10 +13,11 @@ from generated_registrations import CaseSettings, generate_case, pose_errors
 
 from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
 from chronoscene.registration.quality.certificate_json import pair_figures, period_figures, to_json
+from chronoscene.registration.quality.evidence import gather
 from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Misalignment
-from chronoscene.registration.quality.overlap import seen_by_period, tie_spread
+from chronoscene.registration.quality.overlap import tie_spread
 from chronoscene.registration.quality.rays import Placed
 from chronoscene.registration.quality.surface_distance import CloudDistance, cloud_distance
 from chronoscene.registration.quality.verdict import THRESHOLDS, judge
@@ -229,7 +230,7 @@ def test_tie_spread_tells_a_cluster_from_a_spread() -> None:
     values = []
     for cluster in (None, 12.0):
         model = generate_case(CaseSettings(seed=41, ties=300, cluster=cluster)).model
-        values.append(tie_spread(model, seen_by_period(model), 0, 1))
+        values.append(tie_spread(model, gather(model).seen, 0, 1))
     assert values[0].occupied > 0.5 > 0.15 > values[1].occupied
     assert values[0].hull > 0.7 > 0.2 > values[1].hull
     assert len(values[1].gaps) == 20

@@ -17,6 +17,7 @@ from PIL import Image
 
 from chronoscene.registration.inspection import inspect_registration
 from chronoscene.registration.quality.certificate import certify
+from chronoscene.registration.quality.evidence import gather
 from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.report.camera_map import camera_map
 from chronoscene.registration.report.page import render_report
@@ -132,9 +133,10 @@ def test_page_without_photos_matches_or_points(model: Registered) -> None:
 
 
 def test_spots_are_seen_well_inside_both_images(model: Registered) -> None:
-    (pair,) = certify(model).pairs
+    certificate = certify(model)
+    (pair,) = certificate.pairs
     for gaps in (False, True):
-        found = spots(model, pair, 4, gaps=gaps, twice=True)
+        found = spots(model, certificate.evidence.seen, pair, 4, gaps=gaps, twice=True)
         assert found
         for spot in found:
             assert model.periods[spot.a] == 0 and model.periods[spot.b] == 1
@@ -146,8 +148,8 @@ def test_spots_are_seen_well_inside_both_images(model: Registered) -> None:
 
 
 def test_patches_show_the_plane_of_the_spot_upright(model: Registered) -> None:
-    (pair,) = certify(model).pairs
-    spot = spots(model, pair, 1, gaps=False)[0]
+    certificate = certify(model)
+    spot = spots(model, certificate.evidence.seen, certificate.pairs[0], 1, gaps=False)[0]
     grid = patch_grid(model, spot)
     assert grid.shape == (PATCH, PATCH, 3)
     np.testing.assert_allclose(grid[PATCH // 2 - 1 : PATCH // 2 + 1,
@@ -162,7 +164,7 @@ def test_patches_show_the_plane_of_the_spot_upright(model: Registered) -> None:
 
 
 def test_pairs_are_drawn_from_best_to_worst(model: Registered) -> None:
-    pairs = drawn_pairs(model)
+    pairs = drawn_pairs(model, gather(model))
     medians = [p.median for p in pairs]
     assert len(pairs) > 2 and medians == sorted(medians)
     assert all(model.periods[p.a] != model.periods[p.b] for p in pairs)

@@ -1,0 +1,76 @@
+"""Tracks in flat form: who sees a point, and where the rays of those who see it meet.
+
+Observations of point i are ``start[i]:start[i + 1]`` (P points, M observations), as in
+`chronoscene.scene.Points`. Everything takes arrays, so that scenes, raw models and registrations
+share it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+MIN_PARALLAX = 3e-4
+"""Smallest eigenvalue of the mean of ``I - d d^T`` over the rays of a point that still has a depth.
+Two rays at an angle of 2a give sin(a)^2: this is a = 1 degree, where noise of one pixel at a focal
+length of 1000 pixels moves the point by 3 % of its distance."""
+
+
+def track_owners(track_start: Ints) -> Ints:
+    """Index of the point of each observation. [P + 1] -> [M]"""
+    return np.repeat(np.arange(len(track_start) - 1), np.diff(track_start))
+
+
+def select_tracks(track_start: Ints, keep: Mask) -> tuple[Ints, Mask]:
+    """Where the tracks of some points begin [kept + 1], and which observations are theirs [M].
+
+    Args:
+        track_start: Of all points. [P + 1]
+        keep: Which points. [P]
+    """
+    lengths = np.diff(track_start)
+    return np.concatenate([[0], np.cumsum(lengths[keep])]), np.repeat(keep, lengths)
+
+
+def count_views(point: Ints, period: Ints, shape: tuple[int, int]) -> Ints:
+    """How many observations each period has of each point. [P, T]
+
+    Args:
+        point: Of each observation, see `track_owners`. [M]
+        period: Of each observation. [M]
+        shape: Numbers of points and of periods.
+    """
+    cells = point * shape[1] + period
+    return np.bincount(cells, minlength=shape[0] * shape[1]).reshape(shape)
+
+
+def seen_by_period(point: Ints, period: Ints, shape: tuple[int, int]) -> Mask:
+    """Whether an image of the period sees the point; arguments as in `count_views`. [P, T]"""
+    seen = np.zeros(shape, bool)
+    seen[point, period] = True
+    return seen
+
+
+def meet(direction: Array, centre: Array, first: Ints) -> tuple[Array, Array]:
+    """Points nearest to bundles of rays, ``sum(I - d d^T) x = sum((I - d d^T) c)``.
+
+    Args:
+        direction: Unit vectors d in the world, bundle after bundle. [R, 3]
+        centre: Where the rays start, c. [R, 3]
+        first: First ray of each bundle. [B]
+
+    Returns:
+        xyz: The points; of no use where there is no parallax. [B, 3]
+        parallax: To be compared with `MIN_PARALLAX`. [B]
+    """
+    count = np.diff(np.append(first, len(direction)))
+    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    left = np.add.reduceat(across, first)
+    right = np.add.reduceat(np.einsum("nij,nj->ni", across, centre), first)
+    parallax = np.linalg.eigvalsh(left / count[:, None, None])[:, 0]
+    left += 1e-12 * np.eye(3)  # parallel rays have no single nearest point
+    return np.linalg.solve(left, right[:, :, None])[:, :, 0], np.asarray(parallax, np.float64)
