@@ -46,6 +46,10 @@ class ImageError(SceneError):
     """An image that is missing, damaged or of a kind that we do not read."""
 
 
+class RegistrationError(ChronoSceneError):
+    """Photos that do not give a model, or a step that stopped early; what was computed is kept."""
+
+
 class CheckpointError(ChronoSceneError):
     """A checkpoint or run folder that is incomplete or of another kind."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -172,16 +172,3 @@ def add_period(scene: Scene, registered: Registered, name: str) -> Scene:
     return replace(
         new, frames=frames, points=points, periods=(*scene.periods, period), world=scene.world
     )
-
-
-def registered_counts(registered: Registered, totals: Sequence[int]) -> list[dict[str, Any]]:
-    """Images by period, for the log."""
-    return [
-        {
-            "period": i,
-            "label": registered.labels[i],
-            "photos": totals[i],
-            "registered": int((registered.periods == i).sum()),
-        }
-        for i in range(registered.num_periods)
-    ]

@@ -170,7 +170,7 @@ def _log(registered: Registered, inputs: Inputs, context: Context) -> dict[str, 
         "options": context.options.record(),
         "route": registered.route,
         "unit": registered.unit,
-        "periods": output.registered_counts(registered, inputs.totals()),
+        "periods": registered.counts(inputs.totals()),
         "unregistered": [
             {"image": name, "period": registered.unregistered_periods[name], "reason": reason}
             for name, reason in sorted(registered.unregistered.items())

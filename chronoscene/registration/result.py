@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,3 +108,15 @@ class Registered:
     def unit(self) -> str:
         """``metre``, or ``unknown``."""
         return "unknown" if self.georeference is None else "metre"
+
+    def counts(self, totals: Sequence[int]) -> list[dict[str, Any]]:
+        """Photos of each period, of ``totals`` in all, for the log."""
+        return [
+            {
+                "period": i,
+                "label": self.labels[i],
+                "photos": totals[i],
+                "registered": int((self.periods == i).sum()),
+            }
+            for i in range(self.num_periods)
+        ]

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from chronoscene.errors import RegistrationError
 from chronoscene.io.files import write_text_atomic
-from chronoscene.registration.errors import RegistrationError
 
 VERSION = 1
 """Of what stages store; another version is not read."""

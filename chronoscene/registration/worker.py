@@ -20,8 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from chronoscene.errors import ChronoSceneError
-from chronoscene.registration.errors import RegistrationError
+from chronoscene.errors import ChronoSceneError, RegistrationError
 
 Report = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and its total."""
@@ -31,10 +30,10 @@ STEPS = {
     "pairs": "chronoscene.registration.features.pairs:choose_pairs",
     "matches": "chronoscene.registration.features.database:match",
     "holdout": "chronoscene.registration.features.holdout:hold_out",
-    "joint": "chronoscene.registration.reconstruct.joint:run",
-    "separate": "chronoscene.registration.reconstruct.separate:run",
-    "frozen": "chronoscene.registration.reconstruct.add_period:run",
-    "refine": "chronoscene.registration.reconstruct.refine:run",
+    "joint": "chronoscene.registration.reconstruct.routes:joint",
+    "separate": "chronoscene.registration.reconstruct.routes:separate",
+    "frozen": "chronoscene.registration.reconstruct.routes:add_period",
+    "refine": "chronoscene.registration.reconstruct.routes:refine",
 }
 """Name of a step to ``module:function``, which takes a dictionary and a `Report` and returns what
 JSON can hold."""

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.errors import SceneError
+from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.formats import read_scene
-from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import Options, run, run_into
 from chronoscene.registration.result import Registered

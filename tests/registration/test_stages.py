@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from chronoscene.errors import RegistrationError
 from chronoscene.registration import worker
-from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.stages import Stages, work_folder
 
 
@@ -73,7 +73,6 @@ def test_two_runs_do_not_share_a_work_folder(tmp_path: Path) -> None:
 
 STEPS = """
 import os, sys, time
-from chronoscene.registration.errors import RegistrationError
 
 def good(arguments, report):
     report("counting", 1, 2)

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from chronoscene.errors import SceneError
+from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.geodesy import Georeference, from_crs
 from chronoscene.images.store import image_size
 from chronoscene.registration.context import Context
-from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.photos import prepare
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.photo import Capture

@@ -1,8 +1,12 @@
-"""Similarities between models that share no image, and between a model and GPS.
+"""Robust similarities between models that share no image, from matches between their points.
 
-Between models, pairs of 3D points come from matches across them. Residuals are measured in pixels,
-in both images of a match, because a threshold in world units means nothing in a model of unknown
-scale and treats near and far points alike.
+Residuals are measured in pixels, in both images of a match, because a threshold in world units
+means nothing in a model of unknown scale and treats near and far points alike.
+
+The consensus counts places instead of matches. A heap of sand that grew, or a row of parked cars,
+can have more matches than the buildings around it. Points are therefore assigned to cells of space,
+and each cell has the same weight in drawing samples and in judging them: a change fills few cells,
+however much texture it has.
 """
 
 from __future__ import annotations
@@ -12,17 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.registration.reconstruct.place_consensus import (
-    cell_members,
-    cell_weights,
-    cells,
-    draw,
-)
-from chronoscene.scene.geometry import Sim3, camera_centre
-from chronoscene.scene.similarity import Similarity, fit, fit_robustly
+from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Similarity, fit
 
 TRIALS = 1_000
-MOST_JUDGED = 4_000
+MAX_JUDGED = 4_000
 """Matches by which a trial is judged."""
 
 SEARCH_PIXELS = 16.0
@@ -31,15 +29,15 @@ SEARCH_PIXELS = 16.0
 FINAL_PIXELS = 8.0
 """Residual of an inlier in the end."""
 
-LEAST_INLIERS = 15
-LEAST_CELLS = 4
+MIN_INLIERS = 15
+MIN_CELLS = 4
 """Fewer, or all in few places, do not fix a similarity that can be trusted."""
 
-MOST_SCALE_ERROR = 0.1
-"""Relative standard deviation of the scale above which GPS says nothing useful about it."""
+CELLS_PER_AXIS = 12
+"""Along each of the two directions in which the points spread most."""
 
-LINE_RATIO = 0.05
-"""Cameras that spread less than this across their line do not fix the rotation around it."""
+QUANTILE = 0.02
+"""Points outside of this quantile and its mirror image do not stretch the grid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +81,7 @@ class Alignment:
     @property
     def is_trustworthy(self) -> bool:
         """Whether enough pairs in enough places agree."""
-        return int(self.inliers.sum()) >= LEAST_INLIERS and self.cells >= LEAST_CELLS
+        return int(self.inliers.sum()) >= MIN_INLIERS and self.cells >= MIN_CELLS
 
 
 def align_by_points(pairs: PointPairs, *, seed: int = 0) -> Alignment | None:
@@ -94,13 +92,13 @@ def align_by_points(pairs: PointPairs, *, seed: int = 0) -> Alignment | None:
     cell = cells(pairs.target)
     members, weights = cell_members(cell), cell_weights(cell)
     judges = np.arange(len(pairs))
-    if len(judges) > MOST_JUDGED:
-        judges = rng.choice(len(judges), MOST_JUDGED, replace=False)
+    if len(judges) > MAX_JUDGED:
+        judges = rng.choice(len(judges), MAX_JUDGED, replace=False)
     judged, judged_weights = pairs.select(judges), weights[judges]
     best, most = None, 0.0
     for _ in range(TRIALS):
         sample = draw(rng, members, 3) if len(members) >= 3 else rng.choice(len(pairs), 3, False)
-        candidate = _fit(pairs.source[sample], pairs.target[sample]) if sample is not None else None
+        candidate = fit_sim3(pairs.source[sample], pairs.target[sample])
         if candidate is None:
             continue
         agreed = float(judged_weights[residual_pixels(candidate, judged) < SEARCH_PIXELS].sum())
@@ -115,7 +113,7 @@ def _polish(pairs: PointPairs, best: Sim3, cell: NDArray[np.int64]) -> Alignment
     for limit in (SEARCH_PIXELS, SEARCH_PIXELS, FINAL_PIXELS, FINAL_PIXELS):
         if inliers.sum() < 3:
             return None
-        better = _fit(pairs.source[inliers], pairs.target[inliers])
+        better = fit_sim3(pairs.source[inliers], pairs.target[inliers])
         if better is None:
             return None
         now = residual_pixels(better, pairs) < limit
@@ -149,7 +147,8 @@ def _reprojection(
     return np.where(ahead, np.linalg.norm(projected - rays, axis=1), np.inf)
 
 
-def _fit(source: NDArray[np.float64], target: NDArray[np.float64]) -> Sim3 | None:
+def fit_sim3(source: NDArray[np.float64], target: NDArray[np.float64]) -> Sim3 | None:
+    """Least-squares similarity of points; None where they do not determine one. [N, 3]"""
     found = fit(source, target)
     return None if found is None else as_sim3(found)
 
@@ -160,134 +159,46 @@ def as_sim3(similarity: Similarity) -> Sim3:
     return Sim3(scale, similarity.matrix / scale, similarity.translation)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class GpsAlignment:
-    """How a model lies in the frame of the GPS positions."""
+def cells(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Cell of each point, numbered without gaps. [N, 3] -> [N]
 
-    enu_from_model: Sim3
-    inliers: NDArray[np.bool_]
-    """Positions that agree with the model. [N]"""
-    residuals: NDArray[np.float64]
-    """Metres, NaN without a position. [N]"""
-    rms: float
-    """Of the inliers, metres."""
-    scale_error: float
-    """Relative standard deviation of the scale, from the residuals."""
-    on_a_line: bool
-    """Whether the rotation around the line of the cameras came from the horizon of the photos."""
-
-    @property
-    def is_useful(self) -> bool:
-        """Whether the positions say enough about scale and rotation."""
-        return bool(self.inliers.sum() >= 3 and self.scale_error < MOST_SCALE_ERROR)
-
-
-def align_to_gps(
-    poses: NDArray[np.float64], enu: NDArray[np.float64], believed: NDArray[np.bool_]
-) -> GpsAlignment | None:
-    """Robust similarity from camera centres to GPS positions.
-
-    Args:
-        poses: ``cam_from_world`` of the model. [N, 4, 4]
-        enu: Metres; NaN where unknown. [N, 3]
-        believed: Positions to use. [N]
-
-    Returns:
-        None with fewer than three positions.
+    The grid lies in the plane of the two principal directions: scenes are wide and flat.
     """
-    centres = camera_centre(poses)
-    use = np.flatnonzero(believed & np.isfinite(enu).all(axis=1))
-    if len(use) < 3:
-        return None
-    similarity = _first_guess(poses[use], enu[use])
-    if similarity is None:
-        return None
-    residuals = np.full(len(enu), np.nan)
-    on_a_line = False
-    for _ in range(3):
-        residuals[use] = np.linalg.norm(similarity.apply(centres[use]) - enu[use], axis=1)
-        limit = 4.0 * max(float(np.nanmedian(residuals)), 1e-9)
-        near = use[residuals[use] <= limit]
-        on_a_line = is_line(enu[near])
-        refined = _fit_with_horizon(poses[near], enu[near]) if on_a_line else None
-        refined = refined or _fit(centres[near], enu[near])
-        if refined is None:
-            break
-        similarity = refined
-    inliers = np.zeros(len(enu), bool)
-    inliers[near] = True
-    rms = float(np.sqrt(np.mean(residuals[near] ** 2)))
-    spread = float(np.sqrt(((enu[near] - enu[near].mean(axis=0)) ** 2).sum(axis=1).mean()))
-    scale_error = rms / max(spread * np.sqrt(len(near)), 1e-12)
-    return GpsAlignment(similarity, inliers, residuals, rms, scale_error, on_a_line)
+    if not len(points):
+        return np.zeros(0, np.int64)
+    low, high = np.quantile(points, [QUANTILE, 1 - QUANTILE], axis=0)
+    inside = np.clip(points, low, high)
+    centred = inside - inside.mean(axis=0)
+    _, _, axes = np.linalg.svd(centred, full_matrices=False)
+    flat = centred @ axes[:2].T
+    extent = max(float(np.ptp(flat, axis=0).max()), 1e-12)
+    index = np.floor((flat - flat.min(axis=0)) / extent * CELLS_PER_AXIS).astype(np.int64)
+    index = np.minimum(index, CELLS_PER_AXIS - 1)
+    key = np.zeros(len(points), np.int64)
+    for column in range(index.shape[1]):
+        key = key * CELLS_PER_AXIS + index[:, column]
+    return np.asarray(np.unique(key, return_inverse=True)[1], np.int64)
 
 
-def _first_guess(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
-    """Similarity on which most positions agree, whatever it does around a line."""
-    centres = camera_centre(poses)
-    result = fit_robustly(centres, enu)
-    if result is not None:
-        return as_sim3(result[0])
-    best: Sim3 | None = None
-    for i in range(len(enu)):  # all on one line exactly: any two fix scale and direction
-        pair = [i, (i + len(enu) // 2) % len(enu)]
-        guess = _fit_with_horizon(poses[pair], enu[pair])
-        if guess is not None and (
-            best is None
-            or _median_distance(guess, centres, enu) < _median_distance(best, centres, enu)
-        ):
-            best = guess
-    return best
+def cell_weights(cell: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Weight of each point such that a cell counts as the root of its number of points. [N]
 
-
-def _median_distance(sim: Sim3, centres: NDArray[np.float64], enu: NDArray[np.float64]) -> float:
-    return float(np.median(np.linalg.norm(sim.apply(centres) - enu, axis=1)))
-
-
-def is_line(positions: NDArray[np.float64]) -> bool:
-    """Whether positions lie along a line, on the map."""
-    flat = positions[:, :2] - positions[:, :2].mean(axis=0)
-    values = np.linalg.svd(flat, compute_uv=False)
-    return bool(values[-1] < LINE_RATIO * values[0])
-
-
-def _fit_with_horizon(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
-    """Similarity in which the photos also stand upright, or else look straight down.
-
-    Each camera gets a second point above it, as far up as the cameras are spread along the line.
-    Photos of one heading fit both; what the positions say of the bends in the line decides.
+    Between one vote for each point and one for each cell: an almost empty cell may be an accident.
     """
-    forward = poses[:, 2, :3].mean(axis=0)
-    down = -forward / max(float(np.linalg.norm(forward)), 1e-12)
-    found = [_fit_upwards(poses, enu, up) for up in (upright_direction(poses), down)]
-    centres = camera_centre(poses)
-    return min(
-        (sim for sim in found if sim is not None),
-        key=lambda sim: float(np.linalg.norm(sim.apply(centres) - enu)),
-        default=None,
-    )
+    counts = np.bincount(cell) if len(cell) else np.ones(1)
+    return 1.0 / np.sqrt(counts[cell])
 
 
-def _fit_upwards(
-    poses: NDArray[np.float64], enu: NDArray[np.float64], up: NDArray[np.float64]
-) -> Sim3 | None:
-    centres = camera_centre(poses)
-    model_spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
-    world_spread = float(np.linalg.norm(enu - enu.mean(axis=0), axis=1).mean())
-    source = np.concatenate([centres, centres + model_spread * up])
-    target = np.concatenate([enu, enu + world_spread * np.array([0.0, 0.0, 1.0])])
-    return _fit(source, target)
+def draw(
+    rng: np.random.Generator, members: list[NDArray[np.int64]], count: int
+) -> NDArray[np.int64]:
+    """Points of as many different cells. [count]"""
+    chosen = rng.choice(len(members), count, replace=False)
+    return np.array([members[c][rng.integers(len(members[c]))] for c in chosen])
 
 
-def upright_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vector that is up, if photos are taken without roll. [3]
-
-    The horizontal axes of all images lie in the horizontal plane; where they are all parallel, the
-    mean upward axis of the images decides.
-    """
-    right, down, forward = (poses[:, i, :3] for i in range(3))
-    values, vectors = np.linalg.eigh(right.T @ right / len(poses))
-    up = vectors[:, 0] if values[1] > 0.05 else -down.mean(axis=0)
-    sense = float(-(down @ up).mean() - (forward @ up).mean())
-    up = up if sense >= 0 else -up
-    return np.asarray(up / max(float(np.linalg.norm(up)), 1e-12))
+def cell_members(cell: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Points of each cell."""
+    order = np.argsort(cell, kind="stable")
+    edges = np.flatnonzero(np.diff(cell[order])) + 1
+    return np.split(order, edges) if len(order) else []

@@ -1,8 +1,8 @@
-"""Poses against the matches of their images: which images contradict the others. Worker only.
+"""Which images have poses that their matches contradict. Worker process only.
 
-A mapper places an image by what it has seen so far. Where something repeats (a row of equal
-windows) it may take one place for the other, and what follows is placed by that image. The matches
-of such a group with the other images then contradict its poses, except for the few that led astray.
+An incremental mapper registers an image by what it has seen so far. Where structure repeats (a row
+of equal windows) it may confuse one place with another, and later images follow. The matches of
+such a group with the other images then contradict its poses, except the few that misled the mapper.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.reconstruct.model_edits import image_pose
+from chronoscene.registration.reconstruct.models import image_pose
 
 AGREEING_PIXELS = 4.0
 """Distance from the epipolar line up to which a match agrees with the poses."""
 
-LEAST_SHARE = 0.7
-"""Of the matches of an image with those that are trusted: with fewer, its pose is contradicted.
-Among right poses the share is 0.95 and more, in a misplaced group 0.05 to 0.6."""
+MIN_SHARE = 0.7
+"""Share of the matches of an image with trusted ones that must agree with its pose. It is 0.95 and
+more among right poses, and 0.05 to 0.6 in a misplaced group."""
 
-LEAST_MATCHES = 30
-"""With fewer, nothing is said about an image."""
+MIN_MATCHES = 30
+"""An image with fewer is not judged."""
 
-BEGINNINGS = 10
-"""Images from which trust is grown, one at a time."""
+STARTS = 10
+"""Images from which the trusted set is grown, one at a time."""
 
-MOST_MISPLACED = 0.4
-"""Share of the images beyond which it is open which of them are wrong."""
+MAX_MISPLACED = 0.4
+"""Share of the images beyond which it is not known which of them are wrong."""
 
 Mask = NDArray[np.bool_]
 
@@ -70,10 +70,10 @@ def misplaced(
 ) -> list[int]:
     """Images whose matches with the others contradict their poses.
 
-    Trust grows from one image, always to the one that has most agreeing matches with trusted ones;
-    those of which too few agree stay out. A group that agrees within itself alone is found that
-    way, which a look at one image at a time would not find. Of several beginnings, that counts in
-    which most matches agree: a single pair that leads astray early on leads nowhere.
+    The trusted set grows from one image, always by the one with most agreeing matches in it;
+    images of which too few matches agree stay out. This finds a group that agrees with itself
+    alone, which a test of one image at a time would not. Of several starts, the one with most
+    agreeing matches counts, so that a single misleading pair does no harm.
 
     Args:
         agreements: From `pair_agreements`.
@@ -81,7 +81,7 @@ def misplaced(
         trusted: Ids that are right by definition.
 
     Returns:
-        Ids, sorted; none if there are so many that the others could as well be wrong.
+        Ids, sorted; none if there are so many that the others may be wrong instead.
     """
     ids = sorted(images)
     good, total = _matrices(agreements, ids)
@@ -89,12 +89,12 @@ def misplaced(
     if certain.any():
         starts = [certain]
     else:
-        best = np.argsort(-good.sum(axis=1), kind="stable")[:BEGINNINGS]
+        best = np.argsort(-good.sum(axis=1), kind="stable")[:STARTS]
         starts = [np.arange(len(ids)) == i for i in best]
     grown = [_grown(good, total, start) for start in starts]
     inside = max(grown, key=lambda group: int(group @ (2 * good - total) @ group))
-    wrong = ~inside & (total @ inside >= LEAST_MATCHES)
-    if wrong.sum() > MOST_MISPLACED * len(ids):
+    wrong = ~inside & (total @ inside >= MIN_MATCHES)
+    if wrong.sum() > MAX_MISPLACED * len(ids):
         return []
     return [ids[i] for i in np.flatnonzero(wrong)]
 
@@ -104,7 +104,7 @@ def _grown(good: NDArray[np.int64], total: NDArray[np.int64], start: Mask) -> Ma
     inside = start.copy()
     agreeing, known = good @ inside, total @ inside
     while True:
-        ready = ~inside & (known > 0) & (agreeing >= LEAST_SHARE * known)
+        ready = ~inside & (known > 0) & (agreeing >= MIN_SHARE * known)
         if not ready.any():
             return inside
         new = int(np.argmax(np.where(ready, agreeing, -1)))

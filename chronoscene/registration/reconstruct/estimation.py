@@ -2,33 +2,40 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from chronoscene.registration import output
+from chronoscene.colmap.model import read_model
+from chronoscene.errors import RegistrationError
 from chronoscene.registration.context import Context
-from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.features.matching import Matched
 from chronoscene.registration.photos.inputs import Inputs
-from chronoscene.registration.reconstruct import assembly
-from chronoscene.registration.result import Registered, Route
+from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered, Route
+from chronoscene.scene import Camera, Points
 from chronoscene.scene.geometry import camera_centre
 
-LEAST_CROSS_PAIRS = 3
-LEAST_CROSS_MATCHES = 100
-"""Verified pairs of images, and matches in them, with which two periods count as connected."""
+MIN_CROSS_PAIRS = 3
+MIN_CROSS_MATCHES = 100
+"""Verified pairs of images, and matches in them, that connect two periods."""
 
-LEAST_SHARE = 0.6
-"""Share of the photos of each period that the joint route must place; else periods are also tried
-one by one."""
+MIN_SHARE = 0.6
+"""Share of the photos of each period that the joint route must register; else the separate route is
+tried too."""
 
-SAME_PLACE = 0.01
-"""Share of the usual distance between neighbours; nobody stands so exactly where he stood."""
+SAME_POSITION = 0.01
+"""Share of the usual distance between neighbours: nobody returns to a position so exactly."""
+
+FEW_FEATURES = 100
 
 
 def estimate(inputs: Inputs, matched: Matched, context: Context) -> Registered:
@@ -38,9 +45,9 @@ def estimate(inputs: Inputs, matched: Matched, context: Context) -> Registered:
     if route == "joint" and context.options.route is None and len(inputs.labels) > 1:
         registered = _or_separate(registered, inputs, matched, context)
     if inputs.scene is not None:
-        remarks = same_places(registered, inputs.scene.num_periods)
+        remarks = same_positions(registered, inputs.scene.num_periods)
         context.stages.remark("route", *remarks)
-    counts = output.registered_counts(registered, inputs.totals())
+    counts = registered.counts(inputs.totals())
     told = [f"period {c['label']}: {c['registered']} of {c['photos']} photos" for c in counts]
     context.stages.remark("result", f"route {registered.route}", *told)
     return registered
@@ -52,7 +59,7 @@ def choose_route(inputs: Inputs, matched: Matched, context: Context) -> Route:
     if inputs.scene is not None:
         return "frozen"
     if context.options.route is not None:
-        remark("route", f"{context.options.route}: asked for")
+        remark("route", f"{context.options.route}: requested")
         return context.options.route
     if connected_periods(matched, len(inputs.labels)):
         remark("route", "joint: matches connect all periods")
@@ -63,32 +70,33 @@ def choose_route(inputs: Inputs, matched: Matched, context: Context) -> Route:
 
 def connected_periods(matched: Matched, count: int) -> bool:
     """Whether matches connect all periods, each with enough of them."""
-    group = list(range(count))
-    for key, pairs in matched.pairs_across.items():
-        a, b = (int(part) for part in key.split("-"))
-        if pairs >= LEAST_CROSS_PAIRS and matched.matches_across[key] >= LEAST_CROSS_MATCHES:
-            old, new = group[b], group[a]
-            group = [new if g == old else g for g in group]
-    return len(set(group)) == 1
+    links = [
+        tuple(int(part) for part in key.split("-"))
+        for key, pairs in matched.pairs_across.items()
+        if pairs >= MIN_CROSS_PAIRS and matched.matches_across[key] >= MIN_CROSS_MATCHES
+    ]
+    a, b = np.array(links, np.int64).reshape(-1, 2).T
+    graph = coo_matrix((np.ones(len(a)), (a, b)), (count, count))
+    return bool(connected_components(graph, directed=False)[0] == 1)
 
 
 def _or_separate(
     joint: Registered, inputs: Inputs, matched: Matched, context: Context
 ) -> Registered:
-    """The joint model, or that of periods one by one if it has more of the poorest period."""
+    """The joint model, or the separate one if it has more of the poorest period."""
     shares = _shares(joint, inputs)
     worst = min(shares, key=lambda period: shares[period])
-    if shares[worst] >= LEAST_SHARE:
+    if shares[worst] >= MIN_SHARE:
         return joint
     context.stages.remark(
         "route",
-        f"the joint model has {shares[worst]:.0%} of the photos of period {worst}: periods are "
-        "tried one by one too",
+        f"the joint model has {shares[worst]:.0%} of the photos of period {worst}: the separate "
+        "route is tried too",
     )
     try:
         other = _run_route("separate", inputs, matched, context)
     except RegistrationError as error:
-        context.stages.remark("route", f"periods one by one: {error}")
+        context.stages.remark("route", f"separate: {error}")
         return joint
     better = min(_shares(other, inputs).values()) > shares[worst]
     return other if better else joint
@@ -112,13 +120,8 @@ def _run_route(route: Route, inputs: Inputs, matched: Matched, context: Context)
         settings["keep_unplaced"] = context.options.tie_points is not None
     result = _estimate(route, route, settings, context)
     registered = _assemble(route, route, result, inputs, context)
-    lost = assembly.reasons(
-        inputs.periods,
-        set(registered.names),
-        matched.keypoints,
-        matched.partners,
-        result["left"],
-    )
+    missing = set(inputs.periods) - set(registered.names)
+    lost = reasons(missing, matched.keypoints, matched.partners, result["left"])
     registered = replace(registered, unplaced=frozenset(result["unplaced"]))
     return _with_lost(registered, lost, inputs)
 
@@ -126,11 +129,11 @@ def _run_route(route: Route, inputs: Inputs, matched: Matched, context: Context)
 def refined(
     registered: Registered, arguments: Mapping[str, Any], inputs: Inputs, context: Context
 ) -> Registered:
-    """A registration adjusted anew after tie points moved its periods."""
+    """A registration adjusted again after tie points have moved its periods."""
     result = _estimate("refine", "refined", dict(arguments), context)
     again = _assemble(registered.route, "refined", result, inputs, context)
     lost = set(registered.names) - set(again.names)
-    reason = "lost when the model was adjusted by tie points"
+    reason = "lost when the model was adjusted with tie points"
     return _with_lost(again, dict(registered.unregistered) | dict.fromkeys(lost, reason), inputs)
 
 
@@ -152,19 +155,132 @@ def _estimate(step: str, name: str, settings: dict[str, Any], context: Context) 
 def _assemble(
     route: Route, name: str, result: Mapping[str, Any], inputs: Inputs, context: Context
 ) -> Registered:
+    """Read a model and what was held out; photos without a pose are left to the caller."""
+    model = read_model(context.work / f"model-{name}")
+    points = without_twins(model.points)
+    names = tuple(image.name for image in model.images)
+    periods = np.array([inputs.periods[n] for n in names], np.int64)
+    tracks = read_held_out(context.held_out, names, inputs.periods)
+    gps = dict(zip((c.name for c in inputs.images), inputs.positions.enu, strict=True))
+    kept = {f.name: f for f in inputs.frames}  # poses and cameras of the scene, to the last bit
+    spare = max((f.camera.camera_id for f in inputs.frames), default=0)
+
+    def camera(name: str, found: Camera) -> Camera:
+        """Cameras of the scene keep their ids; those of new photos get ids after them."""
+        if name in kept:
+            return kept[name].camera
+        return replace(found, camera_id=spare + found.camera_id)
+
     georeferenced = result["is_georeferenced"] or inputs.scene is not None
-    parts = assembly.Assembly(
-        periods=inputs.periods,
+    return Registered(
+        names=names,
+        periods=periods,
+        cam_from_world=np.stack([kept.get(i.name, i).cam_from_world for i in model.images]),
+        cameras=tuple(camera(i.name, i.camera) for i in model.images),
+        points=points.xyz,
+        colors=points.rgb,
+        track_start=points.track_start,
+        track_image=points.track_frame.astype(np.int64),
+        track_xy=points.track_xy,
+        unregistered={},
+        unregistered_periods={},
+        route=route,
+        gps_enu=np.array([gps.get(n, np.full(3, np.nan)) for n in names]).reshape(-1, 3),
+        gps_used=np.isin(names, result["positions_used"]),
+        georeference=inputs.georeference if georeferenced else None,
+        num_periods=len(inputs.labels),
         labels=inputs.labels,
         dates=inputs.dates,
-        positions=assembly.position_map(inputs.images, inputs.positions),
-        positions_used=frozenset(result["positions_used"]),
-        georeference=inputs.georeference if georeferenced else None,
-        route=route,
-        images_root=context.photos,
-        frozen={f.name: f for f in inputs.frames},
+        held_out=cross_matches(tracks, periods),
+        held_out_tracks=tracks,
+        images_root=str(context.photos),
     )
-    return assembly.assemble(context.work / f"model-{name}", context.held_out, parts)
+
+
+def without_twins(points: Points) -> Points:
+    """Points of which no two are observed at one pixel of one image; the longer track stays.
+
+    SIFT gives a keypoint several features where it has several orientations, and each of them can
+    become a point: the same point twice.
+    """
+    lengths = np.diff(points.track_start)
+    row = np.repeat(np.arange(len(points)), lengths)
+    place = np.column_stack([points.track_frame, points.track_xy])
+    _, pixel = np.unique(place, axis=0, return_inverse=True)
+    count = len(points) + int(pixel.max(initial=-1)) + 1
+    graph = coo_matrix((np.ones(len(row)), (row, len(points) + pixel.ravel())), (count, count))
+    group = connected_components(graph, directed=False)[1][: len(points)]
+    order = np.lexsort((np.arange(len(points)), -lengths, group))
+    first = np.unique(group[order], return_index=True)[1]
+    keep = np.zeros(len(points), bool)
+    keep[order[first]] = True
+    return points.select(keep)
+
+
+def read_held_out(path: Path, names: tuple[str, ...], periods: Mapping[str, int]) -> HeldOutTracks:
+    """Held-out tracks that registered images of at least two periods see."""
+    import pandas as pd
+
+    with np.load(path) as data:
+        known: dict[str, str] = json.loads(bytes(data["names"]).decode())
+        track, image, xy = data["track"], data["image"], data["xy"]
+    index = {name: i for i, name in enumerate(names)}
+    slot = {int(image_id): index.get(name, -1) for image_id, name in known.items()}
+    place = np.array([slot[i] for i in image.tolist()], np.int64)
+    there = place >= 0
+    track, place, xy = track[there], place[there], xy[there]
+    if not len(track):
+        return HeldOutTracks.empty()
+    period = np.array([periods[name] for name in names])[place]
+    across = pd.Series(period).groupby(track).transform("nunique").to_numpy() > 1
+    order = np.lexsort((place[across], track[across]))
+    track, place, xy = track[across][order], place[across][order], xy[across][order]
+    start = np.append(np.flatnonzero(np.diff(track, prepend=-1)), len(track))
+    return HeldOutTracks(start.astype(np.int64), place, xy)
+
+
+def cross_matches(tracks: HeldOutTracks, periods: NDArray[np.int64]) -> tuple[CrossMatches, ...]:
+    """Held-out tracks as matches between images of different periods, by pair of images."""
+    import pandas as pd
+
+    count = np.diff(tracks.start)
+    seen = pd.DataFrame(
+        {
+            "track": np.repeat(np.arange(len(count)), count),
+            "image": tracks.image,
+            "row": np.arange(len(tracks.image)),
+        }
+    )
+    pairs = seen.merge(seen, on="track", suffixes=("_a", "_b"))
+    pairs = pairs[periods[pairs.image_a] < periods[pairs.image_b]]
+    return tuple(
+        CrossMatches(int(a), int(b), tracks.xy[m.row_a], tracks.xy[m.row_b], m.track.to_numpy())
+        for (a, b), m in pairs.groupby(["image_a", "image_b"])
+    )
+
+
+def reasons(
+    missing: set[str],
+    keypoints: Mapping[str, int],
+    partners: Mapping[str, int],
+    left: list[list[str]],
+) -> dict[str, str]:
+    """Why each image that has no pose has none, as far as is known."""
+    part_of = {name: len(group) for group in left for name in group}
+    found = {}
+    for name in sorted(missing):
+        count, matched = keypoints.get(name, 0), partners.get(name, 0)
+        if count < FEW_FEATURES:
+            found[name] = f"only {count} features: blurred, dark, or without texture"
+        elif name in part_of:
+            found[name] = f"in a submodel of {part_of[name]} images that could not be placed"
+        elif not matched:
+            found[name] = f"none of its {count} features are matched in any other photo"
+        else:
+            found[name] = (
+                f"matched with {matched} photos, but too few of the matches agree on a pose"
+            )
+    return found
 
 
 def _with_lost(registered: Registered, lost: Mapping[str, str], inputs: Inputs) -> Registered:
@@ -178,18 +294,19 @@ def _with_lost(registered: Registered, lost: Mapping[str, str], inputs: Inputs) 
     )
 
 
-def same_places(registered: Registered, new_period: int) -> list[str]:
-    """New images with the pose of an old one: probably the same photo, undistorted since."""
+def same_positions(registered: Registered, new_period: int) -> list[str]:
+    """New images at the position of an old one: probably the same photo, undistorted since."""
     new = np.flatnonzero(registered.periods == new_period)
     old = np.flatnonzero(registered.periods != new_period)
     if len(old) < 2:
         return []
     centres = camera_centre(registered.cam_from_world)
-    spacing = float(np.median(cKDTree(centres[old]).query(centres[old], k=2)[0][:, 1]))
-    distance, nearest = cKDTree(centres[old]).query(centres[new])
+    tree = cKDTree(centres[old])
+    spacing = float(np.median(tree.query(centres[old], k=2)[0][:, 1]))
+    distance, nearest = tree.query(centres[new])
     return [
-        f"{registered.names[i]} was taken from the very place of {registered.names[old[j]]}: is it "
-        "the same photo?"
+        f"{registered.names[i]} was taken from the same position as {registered.names[old[j]]}: "
+        "are they the same photo?"
         for i, j, d in zip(new.tolist(), nearest.tolist(), distance.tolist(), strict=True)
-        if d < SAME_PLACE * spacing
+        if d < SAME_POSITION * spacing
     ]

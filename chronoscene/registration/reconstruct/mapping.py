@@ -1,39 +1,40 @@
-"""Incremental mapping, triangulation and adjustment by pycolmap. Worker process only."""
+"""Incremental mapping, triangulation and bundle adjustment by pycolmap. Worker process only."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.errors import RegistrationError
-from chronoscene.registration.features.database import SEED
-from chronoscene.registration.reconstruct.submodels import Priors
+from chronoscene.registration.features.database import SEED, quiet
+from chronoscene.registration.reconstruct.gps_alignment import Priors
+from chronoscene.registration.reconstruct.models import summary, write_model
 from chronoscene.registration.worker import Report
 
-SMALLEST_MODEL = 3
-"""Images; what COLMAP gives up as too small is a large part of a small period."""
+MIN_MODEL_SIZE = 3
+"""Images. COLMAP's default discards models that are a large part of a small period."""
 
 SATISFIED = 0.9
-"""Share of the images in the largest model with which no other settings are tried."""
+"""No further settings are tried if the largest model has this share of the images."""
 
 LOSS_PIXELS = 1.0
-"""Scale of the Cauchy loss: an observation off by much more hardly pulls."""
+"""Scale of the Cauchy loss: observations with much larger errors have little weight."""
 
-LEAST_INLIERS = 20
-"""Points with which an image is placed against a model that is there."""
+MIN_INLIERS = 20
+"""2D-3D correspondences needed to register an image with an existing model."""
 
-MOST_ITERATIONS = 60
-LEAST_PROGRESS = 1e-6
-"""Of an adjustment: steps, and relative decrease of the cost below which it ends."""
+MAX_ITERATIONS = 60
+FUNCTION_TOLERANCE = 1e-6
+"""Bundle adjustment ends after so many steps, or at a smaller relative decrease of the cost."""
 
-MOST_REPROJECTION_ERROR = 4.0
-LEAST_ANGLE = 1.5
-"""Pixels and degrees beyond which observations and points are dropped."""
+MAX_REPROJECTION_ERROR = 4.0
+MIN_TRI_ANGLE = 1.5
+"""Pixels and degrees; observations and points beyond are dropped."""
 
 SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("default", {}),
@@ -50,81 +51,103 @@ SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 
 
-def map_images(
-    database: str, photos: str, names: Sequence[str], scratch: Path, threads: int, report: Report
-) -> tuple[list[pycolmap.Reconstruction], list[str]]:
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What the functions of one step share."""
+
+    database: str
+    photos: str
+    out: Path
+    """Folder of the model."""
+    scratch: Path
+    threads: int
+    report: Report
+    remarks: list[str]
+    """For the log; added to."""
+
+    @classmethod
+    def start(cls, arguments: Mapping[str, Any], report: Report) -> Job:
+        """Begin a step with its arguments."""
+        quiet()
+        database, photos, threads = (arguments[k] for k in ("database", "photos", "threads"))
+        out, scratch = Path(arguments["out"]), Path(arguments["scratch"])
+        return cls(database, photos, out, scratch, threads, report, [])
+
+    def finish(self, model: pycolmap.Reconstruction, **result: Any) -> dict[str, Any]:
+        """Write the model; the result of the step as JSON holds it."""
+        write_model(model, self.out, self.photos)
+        return {
+            "remarks": self.remarks,
+            "is_georeferenced": False,
+            "positions_used": [],
+            "model": summary(model),
+            "left": [],
+            "unplaced": [],
+        } | result
+
+
+def map_images(job: Job, names: Sequence[str], *, label: str = "") -> list[pycolmap.Reconstruction]:
     """Models of some images, the largest first; the best of several settings.
 
-    Returns:
-        Models, and remarks.
+    Args:
+        job: The step.
+        names: Images to map.
+        label: Prefix of the remarks, and folder below the scratch folder.
     """
     best: list[pycolmap.Reconstruction] = []
-    remarks = []
-    for number, (label, settings) in enumerate(SETTINGS):
-        options = pipeline_options(threads, photos)
+    for number, (kind, settings) in enumerate(SETTINGS):
+        options = pipeline_options(job)
         options.image_names = list(names)
         for key, value in settings.items():
             setattr(options.mapper, key, value)
-        out = scratch / f"mapping-{number}"
-        models = _run(database, photos, out, options, len(names), report)
+        models = _run(job, job.scratch / label / f"mapping-{number}", options, len(names))
         sizes = [int(m.num_reg_images()) for m in models]
-        remarks.append(f"mapping with {label} settings: models of {sizes or 'no'} images")
+        remark = f"mapping with {kind} settings: models of {sizes or 'no'} images"
+        job.remarks.append(f"{label.replace('-', ' ')}: {remark}" if label else remark)
         if sum(sizes[:1]) > sum(m.num_reg_images() for m in best[:1]):
             best = models
         if best and best[0].num_reg_images() >= SATISFIED * len(names):
             break
-    return best, remarks
+    return best
 
 
-def nothing_mapped(count: int, *, tied: bool) -> RegistrationError:
-    """The error of photos that give no model at all, with tie points or without."""
-    also = "tie points bring models together, they do not make them; " if tied else ""
-    return RegistrationError(
-        "structure from motion",
-        expected=f"a model of {count} photos",
-        found="no two photos from which one can be begun",
-        todo="give more photos that overlap by more than half, taken from different places; "
-        f"{also}features and matches are kept",
-    )
-
-
-def pipeline_options(threads: int, photos: str) -> pycolmap.IncrementalPipelineOptions:
+def pipeline_options(job: Job) -> pycolmap.IncrementalPipelineOptions:
     """Options that all mapping shares."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.min_model_size = SMALLEST_MODEL
+    options.min_model_size = MIN_MODEL_SIZE
     options.max_num_models = 20
     options.random_seed = SEED
-    options.num_threads = threads
-    options.image_path = photos
+    options.num_threads = job.threads
+    options.image_path = job.photos
     options.ba_global_frames_ratio = 1.2
     options.ba_global_points_ratio = 1.2
     return options
 
 
 def _run(
-    database: str,
-    photos: str,
-    out: Path,
-    options: pycolmap.IncrementalPipelineOptions,
-    total: int,
-    report: Report,
+    job: Job, out: Path, options: pycolmap.IncrementalPipelineOptions, total: int
 ) -> list[pycolmap.Reconstruction]:
     """Disjoint models of a mapping run, the largest first."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    count = _counter(job.report, "mapping", total)
+    models = pycolmap.incremental_mapping(
+        job.database, job.photos, str(out), options, next_image_callback=count
+    )
+    return _disjoint(sorted(models.values(), key=lambda m: -m.num_reg_images()))
+
+
+def _counter(report: Report, what: str, total: int) -> Callable[[], None]:
+    """Reports one more image at each call."""
     done = 0
 
     def count() -> None:
         nonlocal done
         done = min(done + 1, total)
-        report("mapping", done, total)
+        report(what, done, total)
 
-    report("mapping", 0, total)
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
-    models = pycolmap.incremental_mapping(
-        database, photos, str(out), options, next_image_callback=count
-    )
-    ordered = sorted(models.values(), key=lambda m: -m.num_reg_images())
-    return _disjoint(ordered)
+    report(what, 0, total)
+    return count
 
 
 def _disjoint(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
@@ -134,63 +157,55 @@ def _disjoint(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Recons
     for model in models:
         for image_id in sorted(set(model.reg_image_ids()) & taken):
             model.deregister_frame(model.images[image_id].frame_id)
-        if model.num_reg_images() >= SMALLEST_MODEL:
+        if model.num_reg_images() >= MIN_MODEL_SIZE:
             taken |= set(model.reg_image_ids())
             kept.append(model)
     return kept
 
 
-def place_rest(
-    model: pycolmap.Reconstruction,
-    database: str,
-    photos: str,
-    scratch: Path,
-    threads: int,
-    total: int,
-    report: Report,
+def register_rest(
+    model: pycolmap.Reconstruction, job: Job, total: int, folder: str
 ) -> pycolmap.Reconstruction:
-    """Place images that have no pose yet, one after the other; the others and their cameras stay.
+    """Register images that have no pose yet, one after the other; the others do not move.
 
     Args:
         model: With points from the matches of its images.
+        job: The step.
         total: Number of images in all.
+        folder: Below the scratch folder.
     """
+    scratch = job.scratch / folder
     shutil.rmtree(scratch, ignore_errors=True)
     for name in ("from", "to"):
         (scratch / name).mkdir(parents=True)
     model.write_binary(str(scratch / "from"))
-    options = pipeline_options(threads, photos)
+    options = pipeline_options(job)
     options.multiple_models = False
     options.fix_existing_frames = True
-    options.mapper.abs_pose_min_num_inliers = LEAST_INLIERS
+    options.mapper.abs_pose_min_num_inliers = MIN_INLIERS
     options.constant_cameras = {model.images[i].camera_id for i in model.reg_image_ids()}
-    left = total - int(model.num_reg_images())
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done = min(done + 1, left)
-        report("placing", done, left)
-
     models = pycolmap.incremental_mapping(
-        database,
-        photos,
+        job.database,
+        job.photos,
         str(scratch / "to"),
         options,
         str(scratch / "from"),
-        next_image_callback=count,
+        next_image_callback=_counter(job.report, "registering", total - model.num_reg_images()),
     )
     return max(models.values(), key=lambda m: m.num_reg_images()) if models else model
 
 
-def triangulate(
-    model: pycolmap.Reconstruction, database: str, photos: str, scratch: Path, threads: int
-) -> pycolmap.Reconstruction:
-    """New points of a model from all matches, poses and cameras as they are."""
+def triangulate(model: pycolmap.Reconstruction, job: Job, folder: str) -> pycolmap.Reconstruction:
+    """Points of a model triangulated anew from all matches; poses and cameras do not change."""
+    scratch = job.scratch / folder
     scratch.mkdir(parents=True, exist_ok=True)
-    options = pipeline_options(threads, photos)
     return pycolmap.triangulate_points(
-        model, database, photos, str(scratch), clear_points=True, options=options
+        model,
+        job.database,
+        job.photos,
+        str(scratch),
+        clear_points=True,
+        options=pipeline_options(job),
     )
 
 
@@ -201,13 +216,12 @@ def adjust(
     constant: Collection[int] = (),
     threads: int = 1,
 ) -> str:
-    """Bundle adjustment with a robust loss, and what is left off is dropped.
+    """Bundle adjustment with a robust loss, after which bad observations are dropped.
 
     Args:
         model: Changed in place.
-        priors: Positions that pull, robustly, at the images they belong to; the model must lie in
-            their frame.
-        constant: Ids of images whose poses and cameras must not move.
+        priors: Position priors of images, with a robust loss; the model must lie in their frame.
+        constant: Ids of images whose poses and cameras must not change.
         threads: Of the solver.
 
     Returns:
@@ -218,8 +232,8 @@ def adjust(
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_PIXELS
     options.ceres.solver_options.num_threads = threads
-    options.ceres.solver_options.max_num_iterations = MOST_ITERATIONS
-    options.ceres.solver_options.function_tolerance = LEAST_PROGRESS
+    options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
+    options.ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     config = pycolmap.BundleAdjustmentConfig()
     ids = sorted(model.reg_image_ids())
     for image_id in ids:
@@ -234,7 +248,7 @@ def adjust(
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     summary = adjuster.solve()
-    drop_bad_observations(model)
+    _drop_bad_observations(model)
     return str(summary.termination_type.name)
 
 
@@ -261,31 +275,9 @@ def _with_priors(
     return pycolmap.create_pose_prior_bundle_adjuster(options, settings, config, listed, model)
 
 
-def drop_bad_observations(model: pycolmap.Reconstruction) -> int:
-    """Drop observations with a large error and points seen under a small angle; their number."""
+def _drop_bad_observations(model: pycolmap.Reconstruction) -> None:
+    """Drop observations with a large error, and points with a small triangulation angle."""
     manager = pycolmap.ObservationManager(model)
-    dropped = manager.filter_all_points3D(MOST_REPROJECTION_ERROR, LEAST_ANGLE)
-    dropped += manager.filter_observations_with_negative_depth()
+    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, MIN_TRI_ANGLE)
+    manager.filter_observations_with_negative_depth()
     model.update_point_3d_errors()
-    return int(dropped)
-
-
-def write_model(model: pycolmap.Reconstruction, folder: Path, photos: str) -> None:
-    """Write a model with colours; the folder appears complete or not at all."""
-    model.extract_colors_for_all_images(photos)
-    partial = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    model.write_binary(str(partial))
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
-
-
-def summary(model: pycolmap.Reconstruction) -> Mapping[str, Any]:
-    """Numbers for the log."""
-    return {
-        "images": int(model.num_reg_images()),
-        "points": int(model.num_points3D()),
-        "observations": int(model.compute_num_observations()),
-        "reprojection_error_px": round(float(model.compute_mean_reprojection_error()), 4),
-    }

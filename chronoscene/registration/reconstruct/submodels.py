@@ -1,8 +1,8 @@
-"""Models that share no image: found, laid into one frame, and merged. Worker process only.
+"""Models that share no image: aligned in one frame, and merged. Worker process only.
 
-A unit is a model in a frame of its own: of a period, or a part of a joint model that did not hold
-together. Units are joined along the strongest links; a link is a set of matches between points of
-two units. Where appearance defeats matching, GPS places a unit.
+A submodel is a model in a frame of its own: of a period, or one of several that a joint mapping
+gave. Submodels are placed along the strongest links; a link is an alignment by matches between
+points of two of them. Where appearance defeats matching, GPS places a submodel.
 """
 
 from __future__ import annotations
@@ -16,45 +16,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.reconstruct.alignment import (
-    Alignment,
-    GpsAlignment,
-    PointPairs,
-    align_by_points,
-    align_to_gps,
+from chronoscene.registration.reconstruct.alignment import Alignment, PointPairs, align_by_points
+from chronoscene.registration.reconstruct.gps_alignment import GpsAlignment, Priors, gps_alignment
+from chronoscene.registration.reconstruct.models import (
+    as_pycolmap,
+    image_pose,
+    known_images,
+    set_pose,
+    sorted_ids,
 )
-from chronoscene.registration.reconstruct.model_edits import image_pose, merge, sorted_ids
 from chronoscene.scene.geometry import Sim3
 
-LEAST_POSITIONS = 6
-"""Positions that agree in a unit that is placed by GPS alone: three fit whatever they are."""
+MIN_POSITIONS = 6
+"""Consistent positions of a submodel that is placed by GPS alone: any three fit."""
 
-LEAST_PAIRS = 12
-"""Pairs of points below which no alignment is tried."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Priors:
-    """Positions by image name."""
-
-    enu: Mapping[str, Sequence[float]]
-    """Metres."""
-    sigma: Mapping[str, Sequence[float]]
-    """Metres."""
-
-    @classmethod
-    def of(cls, data: Mapping[str, Any] | None) -> Priors:
-        return cls({}, {}) if data is None else cls(data["enu"], data["sigma"])
+MIN_PAIRS = 12
+"""Pairs of points below which no alignment is attempted."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Unit:
-    """A model and how it is called in the log."""
+class Submodel:
+    """A model and its label in the log."""
 
     label: str
     model: pycolmap.Reconstruction
     period: int | None = None
-    """The period that it is a model of; None where it is of several."""
+    """The period that it is a model of; None for several."""
     is_largest: bool = True
     """Whether it is the largest of its period."""
 
@@ -62,83 +49,103 @@ class Unit:
     def size(self) -> int:
         return int(self.model.num_reg_images())
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(str(self.model.images[i].name) for i in sorted_ids(self.model))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Combined:
-    """Units in one frame."""
+    """Submodels in one frame."""
 
     model: pycolmap.Reconstruction
-    used: tuple[str, ...]
-    """Labels of the units in it."""
     left: tuple[tuple[str, ...], ...]
-    """Names of the images of each unit that could not be placed."""
+    """Names of the images of each submodel that could not be placed."""
     unplaced: tuple[str, ...]
-    """Names of images that are in the model, but lie in a frame of their own."""
+    """Names of images that are in the model, but in a frame of their own."""
     remarks: tuple[str, ...]
 
 
 def combine(
-    units: Sequence[Unit],
+    submodels: Sequence[Submodel],
     matches: Mapping[tuple[int, int], NDArray[np.int64]],
     priors: Priors,
     database: str | Path,
     *,
     keep_unplaced: bool = False,
 ) -> Combined:
-    """Lay units into the frame of the largest and merge them.
+    """Place submodels in the frame of the largest and merge them.
 
     Args:
-        units: At least one.
+        submodels: At least one.
         matches: Verified matches of all pairs of images, by image ids of the database. [M, 2]
         priors: Positions, where known.
-        database: Where all images are known.
-        keep_unplaced: Whether whole periods that cannot be placed come into the model nevertheless,
-            each as it lies in its own frame: tie points will place them.
+        database: With all images.
+        keep_unplaced: Whether whole periods that cannot be placed are merged nevertheless, each in
+            its own frame: tie points will place them.
     """
-    remarks: list[str] = []
-    links = find_links(units, matches)
-    for (i, j), link in sorted(links.items()):
-        remarks.append(_describe(units[i], units[j], link))
-    root = max(range(len(units)), key=lambda i: (units[i].size, -i))
-    placed = place_by_links(len(units), root, links)
-    _place_by_gps(units, placed, root, priors, remarks)
-    left = [i for i in range(len(units)) if i not in placed]
-    remarks += [f"{units[i].label}: {units[i].size} images could not be placed" for i in left]
-    there = {units[i].period for i in placed}
-    loose = [i for i in left if units[i].is_largest and units[i].period not in there]
-    loose = [i for i in loose if keep_unplaced and units[i].period is not None]
-    placed |= {i: Sim3.identity() for i in loose}
-    remarks += [f"{units[i].label}: kept in a frame of its own, for tie points" for i in loose]
-    left = [i for i in left if i not in loose]
-    order = sorted(placed)
-    model = merge([units[i].model for i in order], [placed[i] for i in order], database)
+    links = find_links(submodels, matches)
+    remarks = [_describe(submodels[i], submodels[j], k) for (i, j), k in sorted(links.items())]
+    root = max(range(len(submodels)), key=lambda i: (submodels[i].size, -i))
+    placed = place_by_links(len(submodels), root, links)
+    _place_by_gps(submodels, placed, root, priors, remarks)
+    left = [s for i, s in enumerate(submodels) if i not in placed]
+    remarks += [f"{s.label}: {s.size} images could not be placed" for s in left]
+    there = {submodels[i].period for i in placed}
+    loose = [s for s in left if keep_unplaced and s.period is not None]
+    loose = [s for s in loose if s.is_largest and s.period not in there]
+    remarks += [f"{s.label}: kept in a frame of its own, for tie points" for s in loose]
+    frames = {
+        s: placed.get(i, Sim3.identity())
+        for i, s in enumerate(submodels)
+        if i in placed or s in loose
+    }
     return Combined(
-        model=model,
-        used=tuple(units[i].label for i in order),
-        left=tuple(_names(units[i]) for i in left),
-        unplaced=tuple(name for i in loose for name in _names(units[i])),
+        model=merge(frames, database),
+        left=tuple(s.names for s in left if s not in loose),
+        unplaced=tuple(name for s in loose for name in s.names),
         remarks=tuple(remarks),
     )
 
 
-def _names(unit: Unit) -> tuple[str, ...]:
-    return tuple(str(unit.model.images[i].name) for i in sorted_ids(unit.model))
+def merge(frames: Mapping[Submodel, Sim3], database: str | Path) -> pycolmap.Reconstruction:
+    """One model of several that share no image, each transformed by its similarity.
+
+    Every image and camera gets its id in the database, whatever its id in its own submodel; images
+    are found by name. Points are left out: they are triangulated again from all matches, which
+    merges their tracks. Of a camera in several submodels, the calibration of the one with most
+    images is taken.
+    """
+    merged = known_images(database)
+    ids = {str(image.name): i for i, image in merged.images.items()}
+    calibrated: set[int] = set()
+    for submodel in sorted(frames, key=lambda s: -s.size):
+        model = pycolmap.Reconstruction(submodel.model)
+        model.transform(as_pycolmap(frames[submodel]))
+        for old in sorted_ids(model):
+            image = merged.images[ids[str(model.images[old].name)]]
+            if image.camera_id not in calibrated:
+                params = model.cameras[model.images[old].camera_id].params
+                merged.cameras[image.camera_id].params = params.tolist()
+            set_pose(merged, image.image_id, model.images[old].cam_from_world())
+        calibrated |= {merged.images[i].camera_id for i in merged.reg_image_ids()}
+    return merged
 
 
-def _describe(a: Unit, b: Unit, link: Alignment) -> str:
+def _describe(a: Submodel, b: Submodel, link: Alignment) -> str:
     verdict = "used" if link.is_trustworthy else "not trusted"
     return (
-        f"{b.label} in {a.label}: {int(link.inliers.sum())} of {len(link.inliers)} pairs of points "
-        f"agree, in {link.cells} places, median {link.median_pixels:.2f} px, scale "
+        f"{b.label} aligned to {a.label}: {int(link.inliers.sum())} of {len(link.inliers)} pairs "
+        f"of points agree, in {link.cells} cells, median {link.median_pixels:.2f} px, scale "
         f"{link.target_from_source.scale:.4f}: {verdict}"
     )
 
 
 def find_links(
-    units: Sequence[Unit], matches: Mapping[tuple[int, int], NDArray[np.int64]]
+    submodels: Sequence[Submodel], matches: Mapping[tuple[int, int], NDArray[np.int64]]
 ) -> dict[tuple[int, int], Alignment]:
-    """Alignment of unit j in unit i, for i < j with enough matches."""
-    owner = {n: k for k, unit in enumerate(units) for n in unit.model.reg_image_ids()}
+    """Alignment of submodel j to submodel i, for i < j with enough matches."""
+    owner = {n: k for k, submodel in enumerate(submodels) for n in submodel.model.reg_image_ids()}
     between: dict[tuple[int, int], list[tuple[int, int, NDArray[np.int64]]]] = {}
     for (a, b), pairs in matches.items():
         i, j = owner.get(a), owner.get(b)
@@ -148,8 +155,8 @@ def find_links(
         between.setdefault((min(i, j), max(i, j)), []).append(item)
     links = {}
     for (i, j), items in sorted(between.items()):
-        joined = point_pairs(units[j].model, units[i].model, items)
-        alignment = align_by_points(joined) if len(joined) >= LEAST_PAIRS else None
+        joined = point_pairs(submodels[j].model, submodels[i].model, items)
+        alignment = align_by_points(joined) if len(joined) >= MIN_PAIRS else None
         if alignment is not None:
             links[i, j] = alignment
     return links
@@ -208,7 +215,7 @@ def _point_ids(image: pycolmap.Image) -> list[int]:
 def place_by_links(
     count: int, root: int, links: Mapping[tuple[int, int], Alignment]
 ) -> dict[int, Sim3]:
-    """Frame of the root from that of each unit, along a tree of the strongest links (Prim)."""
+    """Frame of the root from that of each submodel, along a maximum spanning tree (Prim)."""
     placed = {root: Sim3.identity()}
     while len(placed) < count:
         best: tuple[int, int, Alignment, bool] | None = None
@@ -237,41 +244,31 @@ def chain(a: Sim3, b: Sim3) -> Sim3:
 
 
 def _place_by_gps(
-    units: Sequence[Unit],
+    submodels: Sequence[Submodel],
     placed: dict[int, Sim3],
     root: int,
     priors: Priors,
     remarks: list[str],
 ) -> None:
-    """Place what no link reached, if its positions and those of the root are good enough."""
-    missing = [i for i in range(len(units)) if i not in placed]
+    """Place what no link reaches, if its positions and those of the root are good enough."""
+    missing = [i for i in range(len(submodels)) if i not in placed]
     if not missing or not priors.enu:
         return
-    base = gps_alignment(units[root].model, priors)
+    base = gps_alignment(submodels[root].model, priors)
     if base is None or not _places_alone(base):
-        remarks.append(f"{units[root].label}: its GPS does not fix a frame")
+        remarks.append(f"{submodels[root].label}: its GPS does not determine a frame")
         return
     for i in missing:
-        found = gps_alignment(units[i].model, priors)
+        found = gps_alignment(submodels[i].model, priors)
         if found is None or not _places_alone(found):
-            remarks.append(f"{units[i].label}: its GPS does not fix a frame")
+            remarks.append(f"{submodels[i].label}: its GPS does not determine a frame")
             continue
         placed[i] = chain(base.enu_from_model.inverse(), found.enu_from_model)
         remarks.append(
-            f"{units[i].label}: no matches with the others hold; placed by GPS alone, whose rms "
-            f"residual is {found.rms:.2f} m"
+            f"{submodels[i].label}: not linked to the others by matches; placed by GPS alone, rms "
+            f"residual {found.rms:.2f} m"
         )
 
 
 def _places_alone(found: GpsAlignment) -> bool:
-    return found.is_useful and int(found.inliers.sum()) >= LEAST_POSITIONS
-
-
-def gps_alignment(model: pycolmap.Reconstruction, priors: Priors) -> GpsAlignment | None:
-    """How a model lies in the frame of the priors; rows in the order of `registered_names`."""
-    ids = sorted_ids(model)
-    names = [str(model.images[i].name) for i in ids]
-    nowhere = [np.nan] * 3
-    enu = np.array([priors.enu.get(name, nowhere) for name in names], np.float64).reshape(-1, 3)
-    poses = np.stack([image_pose(model.images[i]) for i in ids])
-    return align_to_gps(poses, enu, np.ones(len(enu), bool))
+    return found.is_useful and int(found.inliers.sum()) >= MIN_POSITIONS

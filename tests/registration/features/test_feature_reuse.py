@@ -14,11 +14,11 @@ from typing import Any
 
 import pytest
 
+from chronoscene.errors import RegistrationError
 from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration import worker
 from chronoscene.registration.context import Context, Options
-from chronoscene.registration.errors import RegistrationError
 from chronoscene.registration.features import database as sfm
 from chronoscene.registration.features import feature_reuse as carrying
 from chronoscene.registration.features.matching import Matched, find_matches

@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 from chronoscene.registration.reconstruct.alignment import (
     PointPairs,
     align_by_points,
-    align_to_gps,
+    cell_members,
+    cell_weights,
+    cells,
     residual_pixels,
-    upright_direction,
 )
-from chronoscene.registration.reconstruct.place_consensus import cell_members, cell_weights, cells
+from chronoscene.registration.reconstruct.gps_alignment import align_to_gps, upright_direction
 from chronoscene.scene.geometry import Sim3, camera_centre, pose_from_rotation_translation
 
 Array = NDArray[np.float64]

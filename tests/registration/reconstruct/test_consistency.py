@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import verified_matches
 from chronoscene.registration.reconstruct.consistency import (
-    LEAST_MATCHES,
+    MIN_MATCHES,
     agreement,
     misplaced,
     pair_agreements,
 )
-from chronoscene.registration.reconstruct.merge import take_out_misplaced
-from chronoscene.registration.reconstruct.model_edits import known_images, set_pose
+from chronoscene.registration.reconstruct.merge import deregister_misplaced
+from chronoscene.registration.reconstruct.models import known_images, set_pose
 
 
 def agreements(groups: list[int], false_edges: int, seed: int) -> dict[tuple[int, int], Any]:
@@ -67,7 +67,7 @@ def test_a_trusted_minority_is_right() -> None:
 def test_few_matches_say_nothing() -> None:
     found = agreements([9, 1], 0, 0)
     weak = {pair: (0, 3) if pair[1] == 9 else n for pair, n in found.items()}
-    assert LEAST_MATCHES > 9 * 3
+    assert MIN_MATCHES > 9 * 3
     assert misplaced(weak, range(10)) == []
     assert misplaced(found, range(10)) == [9]
 
@@ -98,7 +98,7 @@ def test_poses_that_were_spoiled_are_taken_out(
         wrong = pycolmap.Rigid3d(pose.rotation * turned.rotation.inverse(), pose.translation)
         set_pose(model, i, wrong)
     remarks: list[str] = []
-    assert take_out_misplaced(model, matches, remarks) == len(moved)
+    assert deregister_misplaced(model, matches, remarks) == len(moved)
     assert set(model.reg_image_ids()) == every - set(spoiled)
     assert len(remarks) == min(len(moved), 1)
     assert all(name in remarks[0] for name in names)

@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chronoscene.registration.errors import RegistrationError
-from chronoscene.registration.reconstruct import add_period as frozen
-from chronoscene.registration.reconstruct import joint, separate
+from chronoscene.errors import RegistrationError
+from chronoscene.registration.reconstruct.routes import add_period, joint, separate
 from chronoscene.scene.geometry import camera_centre
 
 IMAGES = 8
 """Of each period in the cases."""
 
-MOST_DEGREES = 0.1
-MOST_SHARE = 0.002
+MAX_DEGREES = 0.1
+MAX_SHARE = 0.002
 """What is asked of registrations: 0.2% of the extent."""
 
 
@@ -26,14 +25,14 @@ def silent(what: str, done: int, total: int) -> None:
 
 def assert_accurate(case: Any) -> None:
     for degrees, share in case.errors(reference=0).values():
-        assert degrees < MOST_DEGREES
-        assert share < MOST_SHARE
+        assert degrees < MAX_DEGREES
+        assert share < MAX_SHARE
 
 
 @pytest.mark.parametrize("route", [joint, separate])
 def test_routes_find_the_poses(make_case: Callable[..., Any], route: Any) -> None:
     case = make_case()
-    result = route.run(case.arguments(), silent)
+    result = route(case.arguments(), silent)
     assert result["model"]["images"] == len(case.truth)
     assert not result["is_georeferenced"]
     assert_accurate(case)
@@ -42,7 +41,7 @@ def test_routes_find_the_poses(make_case: Callable[..., Any], route: Any) -> Non
 @pytest.mark.parametrize("route", [joint, separate])
 def test_what_moved_does_not_drag_the_alignment(make_case: Callable[..., Any], route: Any) -> None:
     case = make_case(points=400, moved=0.35)
-    result = route.run(case.arguments(), silent)
+    result = route(case.arguments(), silent)
     assert result["model"]["images"] == len(case.truth)
     assert_accurate(case)
 
@@ -50,7 +49,7 @@ def test_what_moved_does_not_drag_the_alignment(make_case: Callable[..., Any], r
 def test_positions_give_metres_and_gross_errors_are_named(make_case: Callable[..., Any]) -> None:
     case = make_case(gps=1.0)
     assert case.priors is not None
-    result = separate.run(case.arguments(), silent)
+    result = separate(case.arguments(), silent)
     assert result["is_georeferenced"]
     wrong = sorted(case.truth)[::10]
     assert not set(wrong) & set(result["positions_used"])
@@ -67,7 +66,7 @@ def test_positions_give_metres_and_gross_errors_are_named(make_case: Callable[..
 
 def test_gps_places_periods_that_share_no_match(make_case: Callable[..., Any]) -> None:
     case = make_case(cross_matches=0.0, gps=0.5)
-    result = separate.run(case.arguments(), silent)
+    result = separate(case.arguments(), silent)
     assert result["model"]["images"] == len(case.truth)
     assert any("placed by GPS alone" in r for r in result["remarks"])
     for degrees, share in case.errors().values():
@@ -77,7 +76,7 @@ def test_gps_places_periods_that_share_no_match(make_case: Callable[..., Any]) -
 
 def test_periods_that_nothing_connects_are_left_apart(make_case: Callable[..., Any]) -> None:
     case = make_case(cross_matches=0.0)
-    result = separate.run(case.arguments(), silent)
+    result = separate(case.arguments(), silent)
     ((left,),) = [result["left"]]
     assert len(left) == len(case.truth) // 2
     assert len({case.periods[name] for name in left}) == 1
@@ -89,15 +88,15 @@ def test_a_frozen_scene_gets_a_period(make_case: Callable[..., Any]) -> None:
     case.extra["poses"] = {
         n: pose[:3].tolist() for n, pose in case.truth.items() if case.periods[n] == 0
     }
-    result = frozen.run(case.arguments(), silent)
+    result = add_period(case.arguments(), silent)
     assert result["model"]["images"] == len(case.truth)
     found = case.estimated()
     for name, pose in case.truth.items():
         if case.periods[name] == 0:
             np.testing.assert_allclose(found[name], pose, atol=1e-9)
     for degrees, share in case.errors(reference=0).values():
-        assert degrees < MOST_DEGREES
-        assert share < MOST_SHARE
+        assert degrees < MAX_DEGREES
+        assert share < MAX_SHARE
 
 
 def test_a_frozen_scene_that_nothing_matches_is_refused(make_case: Callable[..., Any]) -> None:
@@ -106,7 +105,7 @@ def test_a_frozen_scene_that_nothing_matches_is_refused(make_case: Callable[...,
         n: pose[:3].tolist() for n, pose in case.truth.items() if case.periods[n] == 0
     }
     with pytest.raises(RegistrationError, match="photos that match those of the scene"):
-        frozen.run(case.arguments(), silent)
+        add_period(case.arguments(), silent)
 
 
 def test_poses_that_do_not_fit_the_photos_are_refused(make_case: Callable[..., Any]) -> None:
@@ -117,27 +116,27 @@ def test_poses_that_do_not_fit_the_photos_are_refused(make_case: Callable[..., A
         n: case.truth[m][:3].tolist() for n, m in zip(names, shuffled, strict=True)
     }
     with pytest.raises(RegistrationError, match="check that its poses belong to its images"):
-        frozen.run(case.arguments(), silent)
+        add_period(case.arguments(), silent)
 
 
 def test_nothing_to_map_is_said(make_case: Callable[..., Any]) -> None:
     case = make_case(points=5)
-    with pytest.raises(RegistrationError, match="found no two photos"):
-        joint.run(case.arguments(), silent)
+    with pytest.raises(RegistrationError, match="found no pair of photos"):
+        joint(case.arguments(), silent)
     case.extra["keep_unplaced"] = True
-    with pytest.raises(RegistrationError, match="tie points bring models together"):
-        separate.run(case.arguments(), silent)
+    with pytest.raises(RegistrationError, match="tie points align models"):
+        separate(case.arguments(), silent)
 
 
 def test_a_period_without_matches_waits_for_tie_points(make_case: Callable[..., Any]) -> None:
     case = make_case(cross_matches=0.0)
     case.extra["keep_unplaced"] = True
-    result = separate.run(case.arguments(), silent)
+    result = separate(case.arguments(), silent)
     assert result["model"]["images"] == len(case.truth)
     assert result["left"] == []
     assert {case.periods[name] for name in result["unplaced"]} in ({0}, {1})
     assert len(result["unplaced"]) == IMAGES
     for period in (0, 1):
         degrees, share = case.errors(reference=period)[period]
-        assert degrees < MOST_DEGREES
-        assert share < MOST_SHARE
+        assert degrees < MAX_DEGREES
+        assert share < MAX_SHARE

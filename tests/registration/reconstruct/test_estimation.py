@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from chronoscene.registration.reconstruct.assembly import (
+from chronoscene.registration.reconstruct.estimation import (
     cross_matches,
     read_held_out,
     reasons,
@@ -67,13 +67,13 @@ def test_held_out_tracks_of_two_periods_become_matches(tmp_path: Path) -> None:
 
 
 def test_photos_without_a_pose_have_reasons() -> None:
-    names = dict.fromkeys(("there", "dark", "alone", "apart", "odd"), 0)
+    missing = {"dark", "alone", "apart", "odd"}
     keypoints = {"there": 900, "dark": 12, "alone": 500, "apart": 800, "odd": 700}
     partners = {"alone": 0, "apart": 4, "odd": 3}
-    found = reasons(names, {"there"}, keypoints, partners, [["apart", "another"]])
+    found = reasons(missing, keypoints, partners, [["apart", "another"]])
     assert found == {
         "alone": "none of its 500 features are matched in any other photo",
-        "apart": "in a model of 2 images that could not be placed",
-        "dark": "12 features only: blurred, dark, or without texture",
-        "odd": "matched with 3 photos, but too few of the matches agree with a pose",
+        "apart": "in a submodel of 2 images that could not be placed",
+        "dark": "only 12 features: blurred, dark, or without texture",
+        "odd": "matched with 3 photos, but too few of the matches agree on a pose",
     }

@@ -1,0 +1,221 @@
+"""A model against the GPS positions of its images, and in their frame. Worker process only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.reconstruct.alignment import as_sim3, fit_sim3
+from chronoscene.registration.reconstruct.models import as_pycolmap, image_pose, sorted_ids
+from chronoscene.scene.geometry import Sim3, camera_centre
+from chronoscene.scene.similarity import fit_robustly
+
+MAX_SCALE_ERROR = 0.1
+"""Relative standard deviation of the scale above which GPS says nothing useful about it."""
+
+LINE_RATIO = 0.05
+"""Cameras that spread less than this across their line do not fix the rotation around it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Priors:
+    """Positions by image name."""
+
+    enu: Mapping[str, Sequence[float]]
+    """Metres."""
+    sigma: Mapping[str, Sequence[float]]
+    """Metres."""
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any] | None) -> Priors:
+        return cls({}, {}) if data is None else cls(data["enu"], data["sigma"])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GpsAlignment:
+    """How a model lies in the frame of the GPS positions."""
+
+    enu_from_model: Sim3
+    inliers: NDArray[np.bool_]
+    """Positions that agree with the model. [N]"""
+    residuals: NDArray[np.float64]
+    """Metres, NaN without a position. [N]"""
+    rms: float
+    """Of the inliers, metres."""
+    scale_error: float
+    """Relative standard deviation of the scale, from the residuals."""
+    on_a_line: bool
+    """Whether the rotation around the line of the cameras came from the horizon of the photos."""
+
+    @property
+    def is_useful(self) -> bool:
+        """Whether the positions say enough about scale and rotation."""
+        return bool(self.inliers.sum() >= 3 and self.scale_error < MAX_SCALE_ERROR)
+
+
+def align_to_gps(
+    poses: NDArray[np.float64], enu: NDArray[np.float64], believed: NDArray[np.bool_]
+) -> GpsAlignment | None:
+    """Robust similarity from camera centres to GPS positions.
+
+    Args:
+        poses: ``cam_from_world`` of the model. [N, 4, 4]
+        enu: Metres; NaN where unknown. [N, 3]
+        believed: Positions to use. [N]
+
+    Returns:
+        None with fewer than three positions.
+    """
+    centres = camera_centre(poses)
+    use = np.flatnonzero(believed & np.isfinite(enu).all(axis=1))
+    if len(use) < 3:
+        return None
+    similarity = _first_guess(poses[use], enu[use])
+    if similarity is None:
+        return None
+    residuals = np.full(len(enu), np.nan)
+    on_a_line = False
+    for _ in range(3):
+        residuals[use] = np.linalg.norm(similarity.apply(centres[use]) - enu[use], axis=1)
+        limit = 4.0 * max(float(np.nanmedian(residuals)), 1e-9)
+        near = use[residuals[use] <= limit]
+        on_a_line = is_line(enu[near])
+        refined = _fit_with_horizon(poses[near], enu[near]) if on_a_line else None
+        refined = refined or fit_sim3(centres[near], enu[near])
+        if refined is None:
+            break
+        similarity = refined
+    inliers = np.zeros(len(enu), bool)
+    inliers[near] = True
+    rms = float(np.sqrt(np.mean(residuals[near] ** 2)))
+    spread = float(np.sqrt(((enu[near] - enu[near].mean(axis=0)) ** 2).sum(axis=1).mean()))
+    scale_error = rms / max(spread * np.sqrt(len(near)), 1e-12)
+    return GpsAlignment(similarity, inliers, residuals, rms, scale_error, on_a_line)
+
+
+def _first_guess(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
+    """Similarity on which most positions agree, whatever it does around a line."""
+    centres = camera_centre(poses)
+    result = fit_robustly(centres, enu)
+    if result is not None:
+        return as_sim3(result[0])
+    best: Sim3 | None = None
+    for i in range(len(enu)):  # all on one line exactly: any two fix scale and direction
+        pair = [i, (i + len(enu) // 2) % len(enu)]
+        guess = _fit_with_horizon(poses[pair], enu[pair])
+        if guess is not None and (
+            best is None
+            or _median_distance(guess, centres, enu) < _median_distance(best, centres, enu)
+        ):
+            best = guess
+    return best
+
+
+def _median_distance(sim: Sim3, centres: NDArray[np.float64], enu: NDArray[np.float64]) -> float:
+    return float(np.median(np.linalg.norm(sim.apply(centres) - enu, axis=1)))
+
+
+def is_line(positions: NDArray[np.float64]) -> bool:
+    """Whether positions lie along a line, on the map."""
+    flat = positions[:, :2] - positions[:, :2].mean(axis=0)
+    values = np.linalg.svd(flat, compute_uv=False)
+    return bool(values[-1] < LINE_RATIO * values[0])
+
+
+def _fit_with_horizon(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
+    """Similarity in which the photos also stand upright, or else look straight down.
+
+    Each camera gets a second point above it, as far up as the cameras are spread along the line.
+    Photos of one heading fit both; what the positions say of the bends in the line decides.
+    """
+    forward = poses[:, 2, :3].mean(axis=0)
+    down = -forward / max(float(np.linalg.norm(forward)), 1e-12)
+    found = [_fit_upwards(poses, enu, up) for up in (upright_direction(poses), down)]
+    centres = camera_centre(poses)
+    return min(
+        (sim for sim in found if sim is not None),
+        key=lambda sim: float(np.linalg.norm(sim.apply(centres) - enu)),
+        default=None,
+    )
+
+
+def _fit_upwards(
+    poses: NDArray[np.float64], enu: NDArray[np.float64], up: NDArray[np.float64]
+) -> Sim3 | None:
+    centres = camera_centre(poses)
+    model_spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).mean())
+    world_spread = float(np.linalg.norm(enu - enu.mean(axis=0), axis=1).mean())
+    source = np.concatenate([centres, centres + model_spread * up])
+    target = np.concatenate([enu, enu + world_spread * np.array([0.0, 0.0, 1.0])])
+    return fit_sim3(source, target)
+
+
+def upright_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit vector that is up, if photos are taken without roll. [3]
+
+    The horizontal axes of all images lie in the horizontal plane; where they are all parallel, the
+    mean upward axis of the images decides.
+    """
+    right, down, forward = (poses[:, i, :3] for i in range(3))
+    values, vectors = np.linalg.eigh(right.T @ right / len(poses))
+    up = vectors[:, 0] if values[1] > 0.05 else -down.mean(axis=0)
+    sense = float(-(down @ up).mean() - (forward @ up).mean())
+    up = up if sense >= 0 else -up
+    return np.asarray(up / max(float(np.linalg.norm(up)), 1e-12))
+
+
+def gps_alignment(model: pycolmap.Reconstruction, priors: Priors) -> GpsAlignment | None:
+    """How a model lies in the frame of the priors; rows in the order of `sorted_ids`."""
+    ids = sorted_ids(model)
+    names = [str(model.images[i].name) for i in ids]
+    nowhere = [np.nan] * 3
+    enu = np.array([priors.enu.get(name, nowhere) for name in names], np.float64).reshape(-1, 3)
+    poses = np.stack([image_pose(model.images[i]) for i in ids])
+    return align_to_gps(poses, enu, np.ones(len(enu), bool))
+
+
+def to_gps_frame(
+    model: pycolmap.Reconstruction, priors: Priors, remarks: list[str]
+) -> tuple[bool, Priors]:
+    """Transform a model into the frame of its GPS positions if they determine one.
+
+    Args:
+        model: Changed in place.
+        priors: Positions of its images.
+        remarks: Added to.
+
+    Returns:
+        Whether it was transformed, and the priors that agree with the model.
+    """
+    nothing = Priors({}, {})
+    if not priors.enu:
+        remarks.append("no GPS: the scale and the frame are arbitrary")
+        return False, nothing
+    found = gps_alignment(model, priors)
+    if found is None:
+        remarks.append("fewer than 3 registered photos have GPS: no frame")
+        return False, nothing
+    told = f"GPS against poses: rms {found.rms:.2f} m, scale known to {found.scale_error:.1%}"
+    if not found.is_useful:
+        remarks.append(f"{told}: not accurate enough for this model, which keeps its own scale")
+        return False, nothing
+    remarks.append(told)
+    model.transform(as_pycolmap(found.enu_from_model))
+    if found.on_a_line:
+        remarks.append("cameras lie on a line: the rotation around it is taken from the horizon")
+    names = [str(model.images[i].name) for i in sorted_ids(model)]
+    for name, residual, good in zip(names, found.residuals, found.inliers, strict=True):
+        if np.isfinite(residual) and not good:
+            remarks.append(f"{name}: GPS is {residual:.1f} m from its pose: not used")
+    agreeing = [name for name, good in zip(names, found.inliers, strict=True) if good]
+    # What cameras state is optimistic: the residuals of this very model have the last word.
+    sigma = max(found.rms / np.sqrt(3.0), 1e-3)
+    return True, Priors(
+        {name: priors.enu[name] for name in agreeing},
+        {name: np.maximum(priors.sigma[name], sigma).tolist() for name in agreeing},
+    )

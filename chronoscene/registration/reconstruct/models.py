@@ -1,0 +1,70 @@
+"""Poses, ids and files of pycolmap's models. Worker process only."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.scene.geometry import Sim3, pose_from_rotation_translation
+
+
+def image_pose(image: pycolmap.Image) -> NDArray[np.float64]:
+    """``cam_from_world`` of a registered image. [4, 4]"""
+    matrix = image.cam_from_world().matrix()
+    return pose_from_rotation_translation(matrix[:, :3], matrix[:, 3])
+
+
+def set_pose(
+    model: pycolmap.Reconstruction, image_id: int, cam_from_world: pycolmap.Rigid3d
+) -> None:
+    """Register an image with its pose."""
+    image = model.images[image_id]
+    model.frames[image.frame_id].set_cam_from_world(image.camera_id, cam_from_world)
+    model.register_frame(image.frame_id)
+
+
+def sorted_ids(model: pycolmap.Reconstruction) -> list[int]:
+    """Ids of the registered images in the order of their names."""
+    return sorted(model.reg_image_ids(), key=lambda i: str(model.images[i].name))
+
+
+def as_pycolmap(sim: Sim3) -> pycolmap.Sim3d:
+    """The same similarity as a pycolmap object."""
+    return pycolmap.Sim3d(np.column_stack([sim.scale * sim.rotation, sim.translation]))
+
+
+def known_images(database: str | Path) -> pycolmap.Reconstruction:
+    """A model with the cameras and images of a database, none of them registered."""
+    options = pycolmap.DatabaseCacheOptions()
+    options.load_all_images = True
+    with pycolmap.Database.open(str(database)) as opened:
+        cache = pycolmap.DatabaseCache.create(opened, options)
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    return model
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path, photos: str) -> None:
+    """Write a model with colours; the folder appears complete or not at all."""
+    model.extract_colors_for_all_images(photos)
+    partial = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    model.write_binary(str(partial))
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)
+
+
+def summary(model: pycolmap.Reconstruction) -> dict[str, Any]:
+    """Numbers for the log."""
+    return {
+        "images": int(model.num_reg_images()),
+        "points": int(model.num_points3D()),
+        "observations": int(model.compute_num_observations()),
+        "reprojection_error_px": round(float(model.compute_mean_reprojection_error()), 4),
+    }

@@ -1,0 +1,193 @@
+"""The routes from matches to one model, as steps of the worker process.
+
+``joint`` maps the photos of all periods together, ``separate`` each period alone, and
+``add_period`` registers new photos in a scene whose poses and cameras stay. ``refine`` adjusts a
+model again after tie points have moved its periods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from chronoscene.errors import RegistrationError
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.features.database import verified_matches
+from chronoscene.registration.reconstruct.consistency import agreement, pair_agreements
+from chronoscene.registration.reconstruct.mapping import (
+    Job,
+    adjust,
+    map_images,
+    register_rest,
+    triangulate,
+)
+from chronoscene.registration.reconstruct.merge import deregister_misplaced, merge_and_finish
+from chronoscene.registration.reconstruct.models import known_images, set_pose
+from chronoscene.registration.reconstruct.submodels import Submodel
+from chronoscene.registration.worker import Report
+
+MIN_POINTS = 50
+"""With fewer points from the photos of the scene, no new photos are registered against them."""
+
+MIN_AGREEMENT = 0.5
+"""Share of the matches among the photos of the scene that must agree with its poses."""
+
+TIE_COLOR = np.array([255, 255, 255], np.uint8)
+
+
+def joint(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Map all images together; submodels that did not connect are merged afterwards.
+
+    Arguments: ``database``, ``photos``, ``periods`` (by name), ``priors`` (``enu`` and ``sigma`` by
+    name, or null), ``keep_unplaced`` (see `submodels.combine`), ``out`` (model folder),
+    ``scratch``, ``threads``.
+    """
+    job = Job.start(arguments, report)
+    models = map_images(job, sorted(arguments["periods"]))
+    submodels = [Submodel(f"submodel {i}", model) for i, model in enumerate(models)]
+    return _merged(submodels, arguments, job)
+
+
+def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Map each period alone, then align, merge and adjust the models. Arguments as in `joint`."""
+    job = Job.start(arguments, report)
+    periods: Mapping[str, int] = arguments["periods"]
+    submodels = []
+    for period in sorted(set(periods.values())):
+        names = sorted(n for n, p in periods.items() if p == period)
+        models = map_images(job, names, label=f"period-{period}")
+        for i, model in enumerate(models):
+            adjust(model, threads=job.threads)
+            label = f"period {period}" + (f" submodel {i}" if len(models) > 1 else "")
+            submodels.append(Submodel(label, model, period, is_largest=i == 0))
+    return _merged(submodels, arguments, job)
+
+
+def _merged(
+    submodels: Sequence[Submodel], arguments: Mapping[str, Any], job: Job
+) -> dict[str, Any]:
+    if not submodels:
+        also = "tie points align models, they do not create them; "
+        raise RegistrationError(
+            "structure from motion",
+            expected=f"a model of {len(arguments['periods'])} photos",
+            found="no pair of photos that initialises one",
+            todo="add photos that overlap by more than half, taken from different positions; "
+            f"{also if arguments['keep_unplaced'] else ''}features and matches are kept",
+        )
+    return merge_and_finish(submodels, arguments, job)
+
+
+def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Register new photos in the frame of a scene.
+
+    The photos of the scene get new features, and points are triangulated from them at the poses of
+    the scene. New photos are then registered against these points one after the other, and a last
+    bundle adjustment moves only what is new.
+
+    Arguments: ``database``, ``photos``, ``poses`` (``cam_from_world``, 3 x 4, by name, of the
+    scene's images), ``periods`` (by name, of all), ``out``, ``scratch``, ``threads``.
+    """
+    job = Job.start(arguments, report)
+    poses = arguments["poses"]
+    model = known_images(job.database)
+    old = _set_poses(model, poses)
+    _, matches = verified_matches(job.database)
+    agreeing = agreement(pair_agreements(model, matches), old)
+    if agreeing < MIN_AGREEMENT:
+        raise RegistrationError(
+            "the scene",
+            expected=f"poses that agree with {MIN_AGREEMENT:.0%} of the matches of its images",
+            found=f"{agreeing:.0%}",
+            todo="check that its poses belong to its images: chronoscene validate",
+        )
+    report("triangulating", 0, 1)
+    model = triangulate(model, job, "base")
+    points = int(model.num_points3D())
+    job.remarks.extend(
+        [
+            f"{agreeing:.0%} of the matches within the scene agree with its poses",
+            f"{len(old)} images of the scene give {points} points; their poses are unchanged",
+        ]
+    )
+    if points < MIN_POINTS:
+        raise RegistrationError(
+            "the scene",
+            expected=f"at least {MIN_POINTS} points triangulated from its images at their poses",
+            found=f"{points}",
+            todo="check that its poses belong to its images: chronoscene validate",
+        )
+    model = register_rest(model, job, len(arguments["periods"]), "continued")
+    deregister_misplaced(model, matches, job.remarks, sorted(old))
+    new = [i for i in model.reg_image_ids() if i not in old]
+    if not new:
+        raise RegistrationError(
+            "the new period",
+            expected="photos that match those of the scene",
+            found="none that could be registered",
+            todo="add photos with viewpoints like those of the scene, or register all periods "
+            "together; features and matches are kept",
+        )
+    report("adjusting", 0, 1)
+    ended = adjust(model, constant=old, threads=job.threads)
+    moved = _max_change(model, poses)
+    job.remarks.extend(
+        [
+            f"{len(new)} new images registered",
+            f"bundle adjustment of the new images: {ended.lower()}; old poses changed by {moved:.1e}",
+        ]
+    )
+    return job.finish(model)
+
+
+def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Triangulate at given poses, add tie points, adjust, and write the model.
+
+    Arguments: ``database``, ``photos``, ``poses`` (3 x 4 by name), ``cameras`` (parameters by
+    name), ``ties`` (each with ``xyz`` and ``clicks``: name, x, y), ``out``, ``scratch``,
+    ``threads``.
+    """
+    job = Job.start(arguments, report)
+    model = known_images(job.database)
+    for image_id in _set_poses(model, arguments["poses"]):
+        image = model.images[image_id]
+        model.cameras[image.camera_id].params = arguments["cameras"][str(image.name)]
+    for i in range(2):
+        report("adjusting", i, 2)
+        model = triangulate(model, job, "")
+        _add_ties(model, arguments["ties"])
+        adjust(model, threads=job.threads)
+    job.remarks.append(f"adjusted with {len(arguments['ties'])} tie points")
+    return job.finish(model)
+
+
+def _set_poses(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> set[int]:
+    """Register images at their poses; their ids."""
+    ids = {str(image.name): int(i) for i, image in model.images.items()}
+    for name, pose in poses.items():
+        set_pose(model, ids[name], pycolmap.Rigid3d(np.array(pose, np.float64)))
+    return {ids[name] for name in poses}
+
+
+def _max_change(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> float:
+    """Largest change of any number in the poses of the scene's images: a check on the solver."""
+    changes = [
+        np.abs(image.cam_from_world().matrix() - np.array(poses[str(image.name)])).max()
+        for i in model.reg_image_ids()
+        if str((image := model.images[i]).name) in poses
+    ]
+    return float(max(changes, default=0.0))
+
+
+def _add_ties(model: pycolmap.Reconstruction, ties: Sequence[Mapping[str, Any]]) -> None:
+    """Add tie points with their clicks as observations."""
+    ids = {str(image.name): i for i, image in model.images.items()}
+    for tie in ties:
+        track = pycolmap.Track()
+        for name, x, y in tie["clicks"]:
+            points2D = model.images[ids[name]].points2D
+            points2D.append(pycolmap.Point2D(np.array([x, y], np.float64)))
+            track.add_element(ids[name], len(points2D) - 1)
+        model.add_point3D(np.array(tie["xyz"], np.float64), track, TIE_COLOR)
