@@ -73,6 +73,7 @@ def test_two_runs_do_not_share_a_work_folder(tmp_path: Path) -> None:
 
 STEPS = """
 import os, sys, time
+from chronoscene.errors import RegistrationError
 
 def good(arguments, report):
     report("counting", 1, 2)
