@@ -1,8 +1,8 @@
-"""Features and matches in a COLMAP database. Runs in the worker process only.
+"""Features and matches in a COLMAP database. Worker process only.
 
 Images enter the database in the order of the photos, so ids are the same in every run. Both steps
-go in small batches: what a batch has stored is not done again. What an earlier database has of the
-same photos is copied from there; see `chronoscene.registration.features.feature_reuse`.
+go in small batches: what a batch has stored is not done again. Features and matches of the same
+photos in an earlier database are copied; see `feature_reuse`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from chronoscene.io.files import write_text_atomic
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features import feature_reuse as carrying
+from chronoscene.registration.features import feature_reuse
 from chronoscene.registration.worker import Report
 
 FEATURE_BATCH = 8
@@ -38,14 +38,14 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     ``threads``.
 
     Returns:
-        ``keypoints``: number by name; ``focal_known``: whether the focal length of a group is known
-        beforehand; ``carried``: number of photos whose features an earlier database had.
+        ``keypoints``: number by name; ``focal_known``: whether the focal length of each camera is
+        known beforehand; ``carried``: number of photos with features from an earlier database.
     """
     quiet()
     database, photos = arguments["database"], arguments["photos"]
-    carrying.renew(Path(database), carrying.record_of(arguments))
+    feature_reuse.renew(Path(database), feature_reuse.record_of(arguments))
     _import(database, photos, arguments["groups"])
-    carried = carrying.carry_features(Path(database))
+    reused = feature_reuse.reuse_features(Path(database))
     names = sorted(name for group in arguments["groups"] for name in group["names"])
     left = [name for name, count in keypoint_counts(database).items() if count == 0]
     left = sorted(set(left) & set(names))
@@ -65,7 +65,7 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     return {
         "keypoints": {name: counts[name] for name in names},
         "focal_known": known,
-        "carried": carried,
+        "carried": reused,
     }
 
 
@@ -92,7 +92,7 @@ def _import(database: str, photos: str, groups: Sequence[Mapping[str, Any]]) -> 
             database, photos, pycolmap.CameraMode.SINGLE, group["names"], options
         )
     with pycolmap.Database.open(database) as opened:
-        opened.clear_pose_priors()  # positions are judged first; see georeference
+        opened.clear_pose_priors()  # positions are checked first; see gps_priors
 
 
 def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -109,7 +109,7 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     database = arguments["database"]
     pairs = read_pairs(Path(arguments["pairs"]))
     _drop_others(database, pairs)
-    carried = carrying.carry_matches(Path(database), pairs)
+    reused = feature_reuse.reuse_matches(Path(database), pairs)
     left = _unmatched(database, pairs)
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
@@ -126,17 +126,17 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     report("pairs", len(pairs), len(pairs))
     with pycolmap.Database.open(database) as opened:
         counts = [int(n) for n in opened.read_two_view_geometry_num_inliers()[1]]
-    carrying.forget(Path(database))
+    feature_reuse.forget(Path(database))
     return {
         "pairs": len(pairs),
         "verified": sum(n > 0 for n in counts),
         "inliers": sum(counts),
-        "carried": carried,
+        "carried": reused,
     }
 
 
 def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:
-    """Drop pairs that are not listed: an earlier list can have had others."""
+    """Drop pairs that are not listed: an earlier list may have had others."""
     with pycolmap.Database.open(database) as opened:
         ids = {str(image.name): image.image_id for image in opened.read_all_images()}
         listed = {pycolmap.image_pair_to_pair_id(ids[a], ids[b]) for a, b in pairs}
@@ -147,7 +147,7 @@ def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:
 
 
 def _unmatched(database: str, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Pairs without a geometry. Matches of such a pair are what a killed run left: COLMAP would
+    """Pairs without a geometry. If such a pair has matches, a killed run left them: COLMAP would
     verify them and then fail to store them a second time, so they are dropped."""
     left = []
     with pycolmap.Database.open(database) as opened:

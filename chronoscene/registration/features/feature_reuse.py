@@ -1,9 +1,9 @@
-"""What of an earlier database still holds when photos change. Runs in the worker process only.
+"""Features and matches of an earlier database that still hold when photos change. Worker only.
 
 Features depend on the content of a photo and a few settings, matches on the features and cameras
 of two photos. A record beside the database says from which contents and settings it was made. When
 these change, the database is set aside, a new one is made in the order of the photos, and what
-still holds is copied to it. The database set aside stays until all pairs are matched, so each of
+still holds is copied to it. The old database stays until all pairs are matched, so that each of
 these functions can be killed and called again.
 """
 
@@ -21,7 +21,7 @@ from chronoscene.io.files import write_text_atomic
 from chronoscene.io.pycolmap import pycolmap
 
 METHOD = 1
-"""Of extraction and matching, as far as settings do not say it; raise it when that changes."""
+"""Version of extraction and matching; raise it when they change in a way no setting shows."""
 
 Record = dict[str, Any]
 """``settings`` that all features depend on, ``groups`` of photos with one camera, and ``photos``:
@@ -48,10 +48,10 @@ def _digest(path: Path) -> str:
 
 
 def renew(database: Path, wanted: Record) -> None:
-    """Make way for a database of these photos, unless the one there is; it may be begun only.
+    """Set the database aside unless it is one of these photos, complete or not.
 
-    Of the database there and one that was set aside before, the one stays aside of which more can
-    be carried over. Records are right at every moment: a database goes before its record.
+    If one was set aside before, the one of which more can be reused is kept. Records are right at
+    every moment: a database is removed before its record.
     """
     if _read_record(database) == wanted:
         return
@@ -73,42 +73,35 @@ def set_aside(database: Path) -> Path:
 
 
 def forget(database: Path) -> None:
-    """Remove what was set aside: all that still holds was carried over."""
+    """Remove what was set aside: all that still holds has been reused."""
     _remove(set_aside(database))
     _record_path(set_aside(database)).unlink(missing_ok=True)
 
 
-def carry_features(database: Path) -> int:
-    """Copy features of photos whose content is in the database set aside.
-
-    Returns:
-        Number of photos that have their features from there.
-    """
-    carried = 0
+def reuse_features(database: Path) -> int:
+    """Copy features of photos whose content is in the old database; the number of these photos."""
+    reused = 0
     with _both(database) as (old, new, sources):
         for name, source in sources.items():
             was, now = old.ids.get(source), new.ids[name]
             if was is None or not old.database.num_keypoints_for_image(was):
                 continue
-            carried += 1
+            reused += 1
             if not new.database.exists_descriptors(now):
                 new.database.write_descriptors(now, old.database.read_descriptors(was))
             if not new.database.exists_keypoints(now):  # by which a photo counts as done
                 new.database.write_keypoints(now, old.database.read_keypoints(was))
-    return carried
+    return reused
 
 
-def carry_matches(database: Path, pairs: Sequence[tuple[str, str]]) -> int:
-    """Copy matches and geometries of pairs whose photos and cameras are what they were.
+def reuse_matches(database: Path, pairs: Sequence[tuple[str, str]]) -> int:
+    """Copy matches and geometries of pairs whose photos and cameras are the same; their number.
 
     COLMAP matches in the order of the names and verifies in the order of the ids, and neither is
-    symmetric to the last bit. Where an order has turned, the pair is matched anew, so that the
+    symmetric to the last bit. Where an order is reversed, the pair is matched again, so that the
     database is the same as one from scratch.
-
-    Returns:
-        Number of pairs that have theirs from there.
     """
-    carried = 0
+    reused = 0
     with _both(database) as (old, new, sources):
         known = {name: source for name, source in sources.items() if source in old.ids}
         for first, second in pairs:
@@ -118,9 +111,9 @@ def carry_matches(database: Path, pairs: Sequence[tuple[str, str]]) -> int:
             alike = old.verification(a, b) == new.verification(first, second)
             was = old.ordered(a, b)
             if alike and old.database.exists_two_view_geometry(*was):
-                carried += 1
+                reused += 1
                 _copy_pair(old, was, new, new.ordered(first, second))
-    return carried
+    return reused
 
 
 class _Opened:
@@ -134,12 +127,12 @@ class _Opened:
         self.camera_ids = {int(image.image_id): int(image.camera_id) for image in images}
 
     def ordered(self, first: str, second: str) -> tuple[int, int]:
-        """Ids of two images as COLMAP stores them, so that nothing is turned and rounded."""
+        """Ids of two images in the order of COLMAP, so that no geometry is inverted and rounded."""
         a, b = sorted((self.ids[first], self.ids[second]))
         return a, b
 
     def verification(self, first: str, second: str) -> tuple[Any, ...]:
-        """What the geometry of a pair depends on besides its features."""
+        """What the geometry of a pair depends on, apart from its features."""
         pair = self.ids[first], self.ids[second]
         a, b = (self.cameras[self.camera_ids[i]] for i in pair)
         turned, shared = pair[0] > pair[1], a.camera_id == b.camera_id
@@ -155,7 +148,7 @@ class _Opened:
 
 @contextmanager
 def _both(database: Path) -> Iterator[tuple[_Opened, _Opened, dict[str, str]]]:
-    """The database set aside, the new one, and the names in the former by those in the latter."""
+    """The old database, the new one, and the old name of each new one."""
     aside = set_aside(database)
     with pycolmap.Database.open(database) as new:
         if not aside.exists():
@@ -167,7 +160,7 @@ def _both(database: Path) -> Iterator[tuple[_Opened, _Opened, dict[str, str]]]:
 
 
 def _sources(was: Record | None, now: Record | None) -> dict[str, str]:
-    """Name of the same content in another record by name; the same name where it has it."""
+    """Old name of the same content by new name; the same name where possible."""
     if was is None or now is None or was["settings"] != now["settings"]:
         return {}
     names = {digest: name for name, digest in was["photos"].items()}
@@ -193,7 +186,7 @@ def _copy_pair(old: _Opened, was: tuple[int, int], new: _Opened, now: tuple[int,
 
 
 def _worth(database: Path, wanted: Record) -> tuple[int, int]:
-    """Verified pairs and photos with features that could be carried over, about."""
+    """About how many verified pairs, and photos with features, could be reused."""
     sources = set(_sources(_read_record(database), wanted).values())
     if not sources or not database.exists():
         return 0, 0
@@ -207,7 +200,7 @@ def _worth(database: Path, wanted: Record) -> tuple[int, int]:
             photos = sum(opened.num_keypoints_for_image(i) > 0 for i in ids)
     except RuntimeError:  # damaged
         return 0, 0
-    # With the last connection its journal went into it, so that it is one file again.
+    # Closing the last connection merges the journal, so that it is one file again.
     return (0, 0) if _journals(database) else (verified, photos)
 
 
@@ -217,7 +210,7 @@ def _journals(database: Path) -> list[Path]:
 
 
 def _remove(database: Path) -> None:
-    """Remove a database: SQLite ignores the journal of one that is gone."""
+    """Remove a database, then its journals, which SQLite ignores without it."""
     database.unlink(missing_ok=True)
     for path in _journals(database):
         path.unlink()

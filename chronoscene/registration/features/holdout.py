@@ -1,8 +1,8 @@
-"""Tracks that take no part in estimation, so that the result can be tested on them.
+"""Tracks that take no part in the estimation, so that the result can be tested on them.
 
 Matches are joined to tracks over all images. A share of the tracks that two periods see is drawn,
-and all their matches are taken out of the database that the mapper reads, within periods too: a
-held-out track cannot pull at any pose.
+and all their matches are removed from the database that the mapper reads, within periods too: a
+held-out track cannot affect any pose.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import keypoints_of, quiet, verified_matches
 from chronoscene.registration.worker import Report
 
-LEAST_LEFT = 16
-"""A pair of images keeps this many matches whatever the draw: sparse pairs are not made useless."""
+MIN_LEFT = 16
+"""A pair of images keeps at least this many matches: sparse pairs stay useful."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,8 +54,8 @@ def build_tracks(
 ) -> Tracks:
     """Connected components of matches.
 
-    SIFT gives a place several keypoints where it has several orientations. They count as one, or a
-    held-out place would be known to the mapper under its other names.
+    SIFT gives several keypoints at one pixel where it finds several orientations. They count as
+    one, or the mapper would know a held-out track by its other keypoints.
 
     Args:
         matches: Keypoint indices by pair of image ids. [M, 2]
@@ -91,18 +91,14 @@ def first_at_place(xy: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def eligible_tracks(tracks: Tracks, period_of: Mapping[int, int]) -> NDArray[np.int64]:
-    """Tracks of at least two periods that see no image twice, which wrong matches make."""
-    count = int(tracks.track.max()) + 1 if len(tracks.track) else 0
-    order = np.lexsort((tracks.image, tracks.track))
-    track, image = tracks.track[order], tracks.image[order]
-    twice = (track[1:] == track[:-1]) & (image[1:] == image[:-1])
-    consistent = np.ones(count, bool)
-    consistent[track[1:][twice]] = False
-    period = np.array([period_of[i] for i in image.tolist()], np.int64)
-    low, high = np.full(count, np.iinfo(np.int64).max), np.full(count, -1)
-    np.minimum.at(low, track, period)
-    np.maximum.at(high, track, period)
-    return np.flatnonzero(consistent & (high > low))
+    """Tracks of at least two periods without two keypoints in one image, which are mismatched."""
+    import pandas as pd
+
+    table = pd.DataFrame({"track": tracks.track, "image": tracks.image})
+    table["period"] = table.image.map(dict(period_of))
+    several = table.groupby("track").period.nunique() > 1
+    several[table.track[table.duplicated(["track", "image"])]] = False
+    return np.flatnonzero(several)
 
 
 def hold_out(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -157,7 +153,7 @@ def _filtered_copy(
 
     Returns:
         Whether a track is held out. A track whose removal would leave a pair with fewer than
-        `LEAST_LEFT` matches stays in. [tracks]
+        `MIN_LEFT` matches stays in. [tracks]
     """
     held = np.zeros(int(tracks.track.max()) + 1 if len(tracks.track) else 0, bool)
     held[chosen] = True
@@ -168,7 +164,7 @@ def _filtered_copy(
             pairs = [pycolmap.pair_id_to_image_pair(i) for i in pair_ids]
             for (i, _), geometry in zip(pairs, geometries, strict=True):
                 track = tracks.of(i, _first_column(geometry))
-                if (~held[track]).sum() < LEAST_LEFT:
+                if (~held[track]).sum() < MIN_LEFT:
                     held[track] = False
             for (i, j), geometry in zip(pairs, geometries, strict=True):
                 keep = ~held[tracks.of(i, _first_column(geometry))]

@@ -48,64 +48,53 @@ def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
         "max_image_size": options.max_image_size,
         "max_features": options.max_features,
     }
+    places = {
+        "database": str(context.database),
+        "photos": str(context.photos),
+        "threads": context.threads,
+    }
 
     def extract() -> tuple[Any, list[str]]:
-        places = {
-            "database": str(context.database),
-            "photos": str(context.photos),
-            "threads": context.threads,
-        }
-        # The database can become another one: pairs that an earlier one had may be missing in it.
+        # The database may be replaced: pairs that an earlier one had may be missing in it.
         (context.work / "stage-matches.json").unlink(missing_ok=True)
         found = context.step("features", settings | places)
-        total = sum(found["keypoints"].values())
-        known = sum(found["focal_known"].values())
+        count = len(found["keypoints"])
         remark = (
-            f"{total} features in {len(found['keypoints'])} photos, {len(groups)} cameras, "
-            f"{known} with a focal length from EXIF or the scene"
+            f"{sum(found['keypoints'].values())} features in {count} photos, {len(groups)} "
+            f"cameras, {sum(found['focal_known'].values())} with a focal length from EXIF or the "
+            "scene"
         )
-        return found, [remark, *_told(found["carried"], len(found["keypoints"]), "photos")]
+        return found, [remark, *_reused(found["carried"], count, "photos: features")]
 
     return dict(context.stages.run("features", settings, extract))
 
 
-def _told(carried: int, total: int, what: str) -> list[str]:
-    return [f"{carried} of {total} {what} carried over from the run before"] if carried else []
+def _reused(count: int, total: int, what: str) -> list[str]:
+    return [f"{count} of {total} {what} reused from the previous run"] if count else []
 
 
 def _matches(inputs: Inputs, context: Context) -> None:
-    listing = context.work / "pairs.txt"
     centres = inputs.centres()
     taken = {c.name: c.taken.isoformat() for c in inputs.images if c.taken is not None}
     images = [
-        {
-            "name": name,
-            "period": inputs.periods[name],
-            "enu": centres.get(name),
-            "taken": taken.get(name),
-        }
-        for name in sorted(inputs.periods)
+        {"name": name, "period": period, "enu": centres.get(name), "taken": taken.get(name)}
+        for name, period in sorted(inputs.periods.items())
     ]
     settings = {"images": images, "exhaustive_limit": context.options.exhaustive_limit}
+    database, listing = str(context.database), str(context.work / "pairs.txt")
 
     def choose() -> tuple[Any, list[str]]:
-        places = {"database": str(context.database), "out": str(listing)}
-        found = context.step("pairs", settings | places)
+        found = context.step("pairs", settings | {"database": database, "out": listing})
         kinds = ", ".join(f"{n} {kind}" for kind, n in found["kinds"].items())
         told = f"{found['pairs']} pairs ({kinds}), {found['across_periods']} across periods"
         return found, [told]
 
     def match() -> tuple[Any, list[str]]:
-        arguments = {
-            "database": str(context.database),
-            "pairs": str(listing),
-            "scratch": str(context.work),
-            "threads": context.threads,
-        }
-        found = context.step("matches", arguments)
+        places = {"database": database, "pairs": listing, "scratch": str(context.work)}
+        found = context.step("matches", places | {"threads": context.threads})
         pairs, verified, inliers = (found[k] for k in ("pairs", "verified", "inliers"))
         told = f"{verified} of {pairs} pairs verified, {inliers} matches"
-        return found, [told, *_told(found["carried"], pairs, "pairs")]
+        return found, [told, *_reused(found["carried"], pairs, "pairs: matches")]
 
     context.stages.run("pairs", settings, choose)
     context.stages.run("matches", None, match)
@@ -114,16 +103,18 @@ def _matches(inputs: Inputs, context: Context) -> None:
 def _hold_out(inputs: Inputs, context: Context) -> dict[str, Any]:
     options = context.options
     settings = {"periods": inputs.periods, "share": options.held_out, "seed": options.seed}
+    places = {
+        "database": str(context.database),
+        "out": str(context.mapping_database),
+        "held_out": str(context.held_out),
+    }
 
     def hold_out() -> tuple[Any, list[str]]:
-        places = {
-            "database": str(context.database),
-            "out": str(context.mapping_database),
-            "held_out": str(context.held_out),
-        }
         found = context.step("holdout", settings | places)
-        tracks = found["tracks_of_several_periods"]
-        told = [f"{found['held_out']} of {tracks} tracks of several periods held out"]
+        told = [
+            f"{found['held_out']} of {found['tracks_of_several_periods']} tracks of several "
+            "periods held out"
+        ]
         told += [
             f"periods {key}: {count} verified pairs, {found['matches_across'][key]} matches"
             for key, count in found["verified_pairs_across"].items()

@@ -1,8 +1,12 @@
-"""Which pairs of images to match. Runs in the worker process only.
+"""Which pairs of images to match. Worker process only.
 
-Few images are matched exhaustively. Many are matched with neighbours: in space by GPS, in time by
-the order in which they were taken, and in appearance by a global descriptor. Each is done within
-every period and between every two periods, so that no period hangs on one thread.
+Few images are matched exhaustively. Many are matched with their neighbours in space (by GPS), in
+time (by the order in which they were taken) and in appearance (by a global descriptor), within
+every period and between every two, so that no period depends on a single link.
+
+The global descriptor is VLAD over SIFT: residuals to the nearest of a few visual words, summed by
+word, power- and length-normalised (Jegou et al. 2010; Arandjelovic and Zisserman 2013). The words
+are learnt from the images themselves, so nothing has to be downloaded.
 """
 
 from __future__ import annotations
@@ -15,14 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import quiet, write_pairs
-from chronoscene.registration.features.retrieval import global_descriptors
 from chronoscene.registration.worker import Report
 
 SPATIAL_NEIGHBOURS = 10
 SEQUENTIAL_NEIGHBOURS = 4
 SIMILAR_NEIGHBOURS = 6
-"""Of each image, within its period, and again in every other period (no sequence there)."""
+"""Of each image in its period, and again in every other period (but for the sequence)."""
+
+WORDS = 64
+MAX_TRAINING = 20_000
+ITERATIONS = 10
+MAX_DESCRIPTORS = 2_000
+"""Of an image: those of the largest features, which are the most stable."""
 
 Pair = tuple[int, int]
 
@@ -31,8 +41,7 @@ def choose_pairs(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]
     """Write the list of pairs to match.
 
     Arguments: ``database``, ``out`` (list file), ``images`` (each with ``name``, ``period``,
-    ``enu`` or null, ``taken`` or null), ``exhaustive_limit``, ``skip`` (periods whose images are
-    only matched with others; may be empty).
+    ``enu`` or null, ``taken`` or null), ``exhaustive_limit``.
     """
     quiet()
     images = arguments["images"]
@@ -108,3 +117,61 @@ def similar_pairs(descriptors: NDArray[np.float32], periods: NDArray[np.int64]) 
         for i, row in enumerate(members[order].tolist()):
             found += [(i, j) for j in row]
     return _ordered(found)
+
+
+def global_descriptors(database: str | Path, names: Sequence[str]) -> NDArray[np.float32]:
+    """A unit vector for each image; zero for one without features. [N, WORDS * 128]"""
+    local = [_local(database, name) for name in names]
+    words = visual_words(np.concatenate(local))
+    return np.stack([vlad(descriptors, words) for descriptors in local])
+
+
+def _local(database: str | Path, name: str) -> NDArray[np.float32]:
+    """Descriptors of the largest features of an image, with unit length. [K, 128]"""
+    with pycolmap.Database.open(str(database)) as opened:
+        image = opened.read_image_with_name(name)
+        assert image is not None
+        keypoints = np.asarray(opened.read_keypoints(image.image_id))
+        data = np.asarray(opened.read_descriptors(image.image_id).data, np.float32)
+    if not len(data):
+        return np.zeros((0, 128), np.float32)
+    size = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
+    data = data[np.argsort(-size, kind="stable")[:MAX_DESCRIPTORS]]
+    return data / np.maximum(np.linalg.norm(data, axis=1, keepdims=True), 1e-6)
+
+
+def visual_words(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Centres of clusters of descriptors (Lloyd's algorithm, fixed seed). [K, 128]"""
+    rng = np.random.default_rng(0)
+    if len(descriptors) > MAX_TRAINING:
+        descriptors = descriptors[rng.choice(len(descriptors), MAX_TRAINING, replace=False)]
+    count = min(WORDS, max(1, len(descriptors)))
+    if not len(descriptors):
+        return np.zeros((1, 128), np.float32)
+    words = descriptors[rng.choice(len(descriptors), count, replace=False)].copy()
+    for _ in range(ITERATIONS):
+        nearest = assign(descriptors, words)
+        for word in range(count):
+            members = descriptors[nearest == word]
+            if len(members):
+                words[word] = members.mean(axis=0)
+    return words
+
+
+def assign(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Nearest word of each descriptor. [K]"""
+    scores = descriptors @ words.T - 0.5 * (words**2).sum(axis=1)
+    return np.asarray(scores.argmax(axis=1), np.int64)
+
+
+def vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The vector of an image. [WORDS * 128]"""
+    sums = np.zeros_like(words)
+    if len(descriptors):
+        nearest = assign(descriptors, words)
+        np.add.at(sums, nearest, descriptors - words[nearest])
+    norms = np.linalg.norm(sums, axis=1, keepdims=True)
+    sums /= np.maximum(norms, 1e-12)
+    vector = np.sign(sums) * np.sqrt(np.abs(sums))
+    length = float(np.linalg.norm(vector))
+    return np.asarray((vector / max(length, 1e-12)).ravel(), np.float32)

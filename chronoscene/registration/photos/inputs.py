@@ -13,8 +13,8 @@ from chronoscene.images.store import image_size
 from chronoscene.registration.context import Context
 from chronoscene.registration.photos import prepare
 from chronoscene.registration.photos.captures import Captures
+from chronoscene.registration.photos.gps_priors import Positions, locate
 from chronoscene.registration.photos.photo import Capture
-from chronoscene.registration.reconstruct.gps_priors import Positions, locate
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import chronoscene.colmap.model  # noqa: F401  # loads pycolmap safely
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features import database as sfm
+from chronoscene.registration.features.database import _unmatched
 
 
 def test_matches_that_a_killed_run_left_are_dropped(tmp_path: Path) -> None:
@@ -22,7 +22,7 @@ def test_matches_that_a_killed_run_left_are_dropped(tmp_path: Path) -> None:
         assert all(database.exists_matches(ids[a], ids[b]) for a, b in pairs)
         broken = pairs[1]
         database.delete_two_view_geometry(*(ids[name] for name in broken))
-    assert sfm._unmatched(path, pairs) == [broken]
+    assert _unmatched(path, pairs) == [broken]
     with pycolmap.Database.open(path) as database:
         left = [pair for pair in pairs if database.exists_matches(*(ids[n] for n in pair))]
     assert left == [pair for pair in pairs if pair != broken]

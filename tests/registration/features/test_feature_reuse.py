@@ -19,8 +19,8 @@ from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration import worker
 from chronoscene.registration.context import Context, Options
-from chronoscene.registration.features import database as sfm
-from chronoscene.registration.features import feature_reuse as carrying
+from chronoscene.registration.features import feature_reuse
+from chronoscene.registration.features.database import extract, match, write_pairs
 from chronoscene.registration.features.matching import Matched, find_matches
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.photos.inputs import gather
@@ -71,17 +71,17 @@ class Work:
             "max_features": max_features,
             "threads": 1,
         }
-        return int(sfm.extract(arguments, ran.report)["carried"])
+        return int(extract(arguments, ran.report)["carried"])
 
     def match(self, pairs: Sequence[tuple[str, str]], ran: Ran) -> int:
-        sfm.write_pairs(self.folder / "pairs.txt", pairs)
+        write_pairs(self.folder / "pairs.txt", pairs)
         arguments = {
             "database": str(self.database),
             "pairs": str(self.folder / "pairs.txt"),
             "scratch": str(self.folder),
             "threads": 1,
         }
-        return int(sfm.match(arguments, ran.report)["carried"])
+        return int(match(arguments, ran.report)["carried"])
 
     def run(self, *groups: Sequence[str], max_features: int = 1000) -> Ran:
         """Features and matches of photos, in groups that share a camera."""
@@ -159,7 +159,7 @@ def work(complete: Path, photos: Path, tmp_path: Path) -> Work:
 def from_scratch(
     complete: Path, photos: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Callable[..., dict[Any, Any]]:
-    """Content of a database of some of the photos that nothing was carried over to."""
+    """Content of a database of some of the photos that nothing was reused in."""
     known: dict[Any, Any] = {(tuple(ALL),): Work(complete, photos).content()}
 
     def content(*groups: Sequence[str]) -> dict[Any, Any]:
@@ -295,13 +295,13 @@ def test_photos_that_swap_names_are_matched_anew(
     check(work, ["1.jpg"], ["0.jpg"])
 
 
-def test_nothing_is_carried_over_to_other_settings(work: Work) -> None:
+def test_nothing_is_reused_with_other_settings(work: Work) -> None:
     ran = work.run(ALL, max_features=500)
     assert ran == Ran((0, 0), {"features": 6, "pairs": 15})
     assert work.run(ALL, max_features=500).computed == {"features": 0, "pairs": 0}
 
 
-def test_nothing_is_carried_over_from_another_pycolmap(
+def test_nothing_is_reused_from_another_pycolmap(
     work: Work, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pycolmap, "__version__", "0.0")
@@ -340,9 +340,9 @@ def test_a_database_that_has_more_than_the_one_before_is_kept(
     small = Work(tmp_path / "small", work.photos)
     small.run(ALL[:3])
     with monkeypatch.context() as patch:
-        patch.setattr(carrying, "forget", lambda database: None)
+        patch.setattr(feature_reuse, "forget", lambda database: None)
         small.run(ALL)  # killed when all was done
-    assert carrying.set_aside(small.database).exists()
+    assert feature_reuse.set_aside(small.database).exists()
     assert small.run(ALL[:5]) == Ran((5, 10), {"features": 0, "pairs": 0})
     check(small, ALL[:5])
 
@@ -413,7 +413,7 @@ def test_a_kill_between_any_two_changes_of_files_loses_nothing(
                 break
         for partial in copy.folder.glob(".*"):
             partial.unlink()
-        # Carried over, or in the new database already.
+        # Reused, or in the new database already.
         assert set(copy.run(ALL[2:]).computed.values()) == {0}
     assert kills >= 6
     check(copy, ALL[2:])
@@ -436,7 +436,8 @@ KILLED = """
 import os, signal, sys
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration import worker
-from chronoscene.registration.features import database as sfm, feature_reuse as carrying
+from chronoscene.registration.features import feature_reuse
+from chronoscene.registration.features.database import read_pairs
 
 write, calls = pycolmap.Database.write_two_view_geometry, []
 
@@ -447,14 +448,15 @@ def kill(*arguments):
     return write(*arguments)
 
 pycolmap.Database.write_two_view_geometry = kill
-carrying.carry_matches(carrying.Path(sys.argv[1]), sfm.read_pairs(carrying.Path(sys.argv[2])))
+database, listed = map(feature_reuse.Path, sys.argv[1:])
+feature_reuse.reuse_matches(database, read_pairs(listed))
 """
 
 
 def test_a_process_that_is_killed_while_it_copies(work: Work, check: Callable[..., None]) -> None:
     work.extract([ALL[1:]], Ran())
     listed = work.folder / "pairs.txt"
-    sfm.write_pairs(listed, every_pair(ALL[1:]))
+    write_pairs(listed, every_pair(ALL[1:]))
     command = [sys.executable, "-c", KILLED, str(work.database), str(listed)]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     assert Path(f"{work.database}-wal").stat().st_size > 0
@@ -513,7 +515,7 @@ def test_the_command_goes_on_from_the_run_before(
 ) -> None:
     write_table(captures, "2016", "2016", "2023", "2023")
     first, told, _ = matched(captures)
-    assert "carried" not in str(told)
+    assert "reused" not in str(told)
     assert told["pairs"] == ["6 pairs (6 exhaustive), 4 across periods"]
 
     write_table(captures, "2016", "2023", "2023", "2023")
@@ -526,8 +528,8 @@ def test_the_command_goes_on_from_the_run_before(
     write_table(captures, "2016", "2023", "2023", "2023", "2016")
     more, told, _ = matched(captures)
     verified = told["matches"][0]
-    assert told["features"][1:] == ["4 of 5 photos carried over from the run before"]
-    assert told["matches"][1:] == ["6 of 10 pairs carried over from the run before"]
+    assert told["features"][1:] == ["4 of 5 photos: features reused from the previous run"]
+    assert told["matches"][1:] == ["6 of 10 pairs: matches reused from the previous run"]
     assert moved.keypoints.items() <= more.keypoints.items()
 
     # A photo goes, and comes back after a kill: then the record of the stage speaks of matches
@@ -539,6 +541,6 @@ def test_the_command_goes_on_from_the_run_before(
             matched(captures)
     write_table(captures, "2016", "2023", "2023", "2023", "2016")
     again, told, ran = matched(captures, seed=1)
-    assert told["matches"] == [verified, "10 of 10 pairs carried over from the run before"]
+    assert told["matches"] == [verified, "10 of 10 pairs: matches reused from the previous run"]
     assert ran.computed["pairs"] == 0
     assert again.partners == more.partners

@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 
 from chronoscene.registration.features.holdout import build_tracks, eligible_tracks, first_at_place
-from chronoscene.registration.features.pairs import sequential_pairs, similar_pairs, spatial_pairs
-from chronoscene.registration.features.retrieval import assign, visual_words, vlad
+from chronoscene.registration.features.pairs import (
+    assign,
+    sequential_pairs,
+    similar_pairs,
+    spatial_pairs,
+    visual_words,
+    vlad,
+)
 
 
 def test_neighbours_in_space_are_found_in_every_period() -> None:

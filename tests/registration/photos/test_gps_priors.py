@@ -7,8 +7,8 @@ import pytest
 
 from chronoscene.geodesy import Georeference
 from chronoscene.images.exif import ExifData
+from chronoscene.registration.photos.gps_priors import locate
 from chronoscene.registration.photos.photo import Capture, Gps
-from chronoscene.registration.reconstruct.gps_priors import locate
 
 PLACE = (51.5, 10.25)
 METRES_PER_DEGREE = 111_320.0
