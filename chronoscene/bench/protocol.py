@@ -133,7 +133,8 @@ def _training_set(
             found="none",
             todo="move one from test to train, or use another strategy",
         )
-    seen = training_point_periods(scene, frames)
+    trained_on = [f.split == "train" and period in (None, f.period) for f in scene.frames]
+    seen = scene.point_periods(np.array(trained_on))
     kept = seen.any(axis=1)
     if not kept.any():
         raise SceneError(
@@ -162,18 +163,6 @@ def _training_view(
     pose = to_training.apply_to_pose(frame.cam_from_world)
     period = 0 if hide_period else frame.period
     return TrainingView(camera.K, camera.width, camera.height, pose, frame.name, period)
-
-
-def training_point_periods(scene: Scene, frames: Sequence[Frame]) -> NDArray[np.bool_]:
-    """Whether one of the given frames sees the point in the period. [P, T]"""
-    names = {f.name for f in frames}
-    chosen = np.array([f.name in names for f in scene.frames])
-    period = np.array([f.period for f in scene.frames])
-    rows = np.repeat(np.arange(len(scene.points)), np.diff(scene.points.track_start))
-    use = chosen[scene.points.track_frame]
-    seen = np.zeros((len(scene.points), scene.num_periods), bool)
-    seen[rows[use], period[scene.points.track_frame[use]]] = True
-    return seen
 
 
 def _camera_extent(frames: Sequence[Frame], to_training: Sim3) -> float:

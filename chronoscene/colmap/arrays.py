@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.scene import select_tracks
+from chronoscene.scene.tracks import select_tracks
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -75,7 +75,7 @@ def cloud_of(scene: Scene) -> Cloud:
         centres=camera_centre(poses),
         directions=poses[:, 2, :3],
         tops=-poses[:, 1, :3],
-        camera_period=np.array([f.period for f in scene.frames], np.int64),
+        camera_period=scene.frame_periods,
     )
 
 

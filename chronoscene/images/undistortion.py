@@ -13,6 +13,7 @@ from chronoscene.errors import SceneError
 from chronoscene.images.store import image_size, resize_camera
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.cameras import project_points, undistorted_camera, unproject_pixels
+from chronoscene.scene.tracks import by_image
 
 ROWS = 128
 """Rows of a map that are computed at once, to bound the memory."""
@@ -111,11 +112,9 @@ def move_observations(scene: Scene, changes: list[CameraChange]) -> tuple[Scene,
     """
     points = scene.points
     xy, inside = np.empty_like(points.track_xy), np.zeros(len(points.track_xy), bool)
-    order = np.argsort(points.track_frame, kind="stable")
-    ends = np.searchsorted(points.track_frame[order], np.arange(len(scene.frames) + 1))
+    rows_of = by_image(points.track_frame, len(scene.frames))
     frames: list[Frame] = []
-    for i, (frame, change) in enumerate(zip(scene.frames, changes, strict=True)):
-        mine = order[ends[i] : ends[i + 1]]
+    for frame, change, mine in zip(scene.frames, changes, rows_of, strict=True):
         size = np.array([frame.camera.width, frame.camera.height])
         file_size = np.array([change.source.width, change.source.height])
         xy[mine] = move_pixels(change, points.track_xy[mine] * (file_size / size))

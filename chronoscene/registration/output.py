@@ -18,8 +18,8 @@ from chronoscene.formats.shared.writing import Progress
 from chronoscene.io.files import write_text_atomic
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Frame, Period, Points, Scene, WorldFrame
-from chronoscene.scene.cameras import project_points
 from chronoscene.scene.splits import default_tests, split_of
+from chronoscene.scene.tracks import reproject, track_owners
 from chronoscene.undistort import undistort
 
 LOG = "registration_log.json"
@@ -75,25 +75,21 @@ def as_points(registered: Registered) -> Points:
 def point_errors(registered: Registered) -> np.ndarray:
     """Mean reprojection error of each point, pixels; 0 without observations. [P]"""
     errors = observation_errors(registered)
-    lengths = np.diff(registered.track_start)
-    rows = np.repeat(np.arange(len(lengths)), lengths)
-    sums = np.bincount(rows, weights=errors, minlength=len(lengths))
-    return np.asarray(sums / np.maximum(lengths, 1), np.float64)
+    point = track_owners(registered.track_start)
+    sums = np.bincount(point, weights=errors, minlength=len(registered.points))
+    return np.asarray(sums / np.maximum(np.diff(registered.track_start), 1), np.float64)
 
 
 def observation_errors(registered: Registered) -> np.ndarray:
-    """Reprojection error of each observation, pixels; NaN behind a camera. [O]"""
-    lengths = np.diff(registered.track_start)
-    point = np.repeat(np.arange(len(lengths)), lengths)
-    errors = np.full(len(point), np.nan)
-    for i, (camera, pose) in enumerate(
-        zip(registered.cameras, registered.cam_from_world, strict=True)
-    ):
-        mine = np.flatnonzero(registered.track_image == i)
-        if len(mine):
-            local = registered.points[point[mine]] @ pose[:3, :3].T + pose[:3, 3]
-            seen = project_points(camera, local)
-            errors[mine] = np.linalg.norm(seen - registered.track_xy[mine], axis=1)
+    """Reprojection error of each observation, pixels; 0 behind a camera. [O]"""
+    offset, _ = reproject(
+        list(zip(registered.cameras, registered.cam_from_world, strict=True)),
+        registered.points,
+        registered.track_start,
+        registered.track_image,
+        registered.track_xy,
+    )
+    errors = np.linalg.norm(offset, axis=1)
     return np.where(np.isfinite(errors), errors, 0.0)
 
 

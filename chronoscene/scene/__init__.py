@@ -8,7 +8,6 @@ from chronoscene.scene.scene import (
     Scene,
     Split,
     WorldFrame,
-    select_tracks,
 )
 
 __all__ = [
@@ -19,5 +18,4 @@ __all__ = [
     "Scene",
     "Split",
     "WorldFrame",
-    "select_tracks",
 ]

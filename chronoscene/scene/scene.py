@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.scene.cameras import Camera
+from chronoscene.scene.tracks import count_views, seen_by_period, select_tracks, track_owners
 
 Split = Literal["train", "test"]
 
@@ -96,19 +97,6 @@ class Points:
         )
 
 
-def select_tracks(
-    track_start: NDArray[np.int64], keep: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Where the tracks of some points begin [kept + 1], and which observations are theirs [M].
-
-    Args:
-        track_start: Of all points. [P + 1]
-        keep: Which points. [P]
-    """
-    lengths = np.diff(track_start)
-    return np.concatenate([[0], np.cumsum(lengths[keep])]), np.repeat(keep, lengths)
-
-
 @dataclass(frozen=True, slots=True)
 class Period:
     """One date of capture."""
@@ -164,14 +152,31 @@ class Scene:
     def image_path(self, frame: Frame) -> Path:
         return self.images_root / frame.name
 
-    def point_periods(self) -> NDArray[np.bool_]:
-        """Whether an image of the period sees the point. [P, T]"""
-        seen = np.zeros((len(self.points), self.num_periods), dtype=bool)
-        frame_period = np.array([f.period for f in self.frames], dtype=np.int64)
-        lengths = np.diff(self.points.track_start)
-        rows = np.repeat(np.arange(len(self.points)), lengths)
-        seen[rows, frame_period[self.points.track_frame]] = True
-        return seen
+    @property
+    def frame_periods(self) -> NDArray[np.int64]:
+        """Period of each frame. [F]"""
+        return np.array([f.period for f in self.frames], np.int64)
+
+    def count_views(self) -> NDArray[np.int64]:
+        """How many images of a period see a point. [P, T]"""
+        return count_views(*self._sightings(), (len(self.points), self.num_periods))
+
+    def point_periods(self, frames: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+        """Whether an image of the period sees the point. [P, T]
+
+        Args:
+            frames: Frames that count; None for all. [F]
+        """
+        point, period = self._sightings()
+        if frames is not None:
+            counts = frames[self.points.track_frame]
+            point, period = point[counts], period[counts]
+        return seen_by_period(point, period, (len(self.points), self.num_periods))
+
+    def _sightings(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Point and period of each observation. [M], [M]"""
+        points = self.points
+        return track_owners(points.track_start), self.frame_periods[points.track_frame]
 
     def with_frames(self, frames: Sequence[Frame]) -> Scene:
         """The same scene with other attributes on the same frames (same names, same order).

@@ -32,7 +32,7 @@ def blocked(scene: Scene, fraction: float, blocks: int | None, seed: int) -> set
             todo="ask for fewer blocks",
         )
     block = cut_into_blocks(centres, count)
-    periods = np.array([f.period for f in scene.frames])
+    periods = scene.frame_periods
     wanted = max(1, round(fraction * count))
     chosen = choose_blocks(block, periods, wanted, seed)
     return {f.name for f, b in zip(scene.frames, block.tolist(), strict=True) if b in chosen}

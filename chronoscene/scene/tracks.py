@@ -1,4 +1,4 @@
-"""Tracks in flat form: who sees a point, and where the rays of those who see it meet.
+"""Tracks in flat form: who sees a point, where it should be seen, and where its rays meet.
 
 Observations of point i are ``start[i]:start[i + 1]`` (P points, M observations), as in
 `chronoscene.scene.Points`. Everything takes arrays, so that scenes, raw models and registrations
@@ -7,8 +7,12 @@ share it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+
+from chronoscene.scene.cameras import Camera, project_points
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -53,6 +57,47 @@ def seen_by_period(point: Ints, period: Ints, shape: tuple[int, int]) -> Mask:
     seen = np.zeros(shape, bool)
     seen[point, period] = True
     return seen
+
+
+def by_image(track_image: NDArray[np.integer], images: int) -> list[Ints]:
+    """Observations of each image, in the order of the tracks. [M] -> one [m] for each image"""
+    # Keys of 16 bits are sorted several times faster.
+    keys = track_image.astype(np.uint16) if images <= 2**16 else track_image
+    ends = np.cumsum(np.bincount(track_image, minlength=images))
+    return np.split(np.argsort(keys, kind="stable"), ends[:-1]) if images else []
+
+
+def reproject(
+    views: Sequence[tuple[Camera, Array]],
+    xyz: Array,
+    track_start: Ints,
+    track_image: NDArray[np.integer],
+    track_xy: Array,
+) -> tuple[Array, Array]:
+    """Project every point into the images that see it, distortion included.
+
+    Args:
+        views: Camera and cam_from_world of each image.
+        xyz: In the world. [P, 3]
+        track_start: Where the observations of each point begin. [P + 1]
+        track_image: Index of a view. [M]
+        track_xy: Pixels of the observations. [M, 2]
+
+    Returns:
+        offset: Projection minus observation in pixels. [M, 2]
+        depth: World units. [M]
+        Both are NaN where the point is not in front of the camera.
+    """
+    point = track_owners(track_start)
+    offset, depth = np.full((len(point), 2), np.nan), np.full(len(point), np.nan)
+    with np.errstate(all="ignore"):  # absurd poses and points give NaN or infinity
+        rows_of = by_image(track_image, len(views))
+        for rows, (camera, cam_from_world) in zip(rows_of, views, strict=True):
+            local = xyz.take(point.take(rows), axis=0) @ cam_from_world[:3, :3].T
+            local += cam_from_world[:3, 3]
+            offset[rows] = project_points(camera, local) - track_xy.take(rows, axis=0)
+            depth[rows] = np.where(local[:, 2] > 0, local[:, 2], np.nan)
+    return offset, depth
 
 
 def meet(direction: Array, centre: Array, first: Ints) -> tuple[Array, Array]:

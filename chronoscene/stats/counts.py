@@ -63,21 +63,12 @@ class Unreadable:
     error: str
 
 
-def observation_counts(scene: Scene) -> NDArray[np.int64]:
-    """How often images of a period see a point. [P, T]"""
-    points, periods = len(scene.points), scene.num_periods
-    frame_period = np.array([f.period for f in scene.frames], dtype=np.int64)
-    rows = np.repeat(np.arange(points) * periods, np.diff(scene.points.track_start))
-    cells = rows + frame_period[scene.points.track_frame]
-    return np.bincount(cells, minlength=points * periods).reshape(points, periods)
-
-
 def assign_points(scene: Scene) -> NDArray[np.int64]:
     """The one period that each point is counted in: that with the most observations of it.
 
     Ties go to the earliest period; -1 marks a point that no image sees. [P]
     """
-    counts = observation_counts(scene)
+    counts = scene.count_views()
     if not counts.size:
         return np.full(len(counts), -1, np.int64)
     return np.where(counts.any(axis=1), counts.argmax(axis=1), -1)

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.scene import Scene
-from chronoscene.scene.cameras import project_points
+from chronoscene.scene import Scene, tracks
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.stats.counts import CountRule, SceneCount, count_scene, observation_counts
+from chronoscene.stats.counts import CountRule, SceneCount, count_scene
 from chronoscene.stats.extent import robust_range
 from chronoscene.stats.view_overlap import common_view
 
@@ -62,8 +61,8 @@ class SceneStatistics:
 
 def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatistics:
     """Count and measure a scene; ``count`` is that of `count_scene`."""
-    seen = observation_counts(scene)
-    periods = np.array([f.period for f in scene.frames], np.int64)
+    seen = scene.count_views()
+    periods = scene.frame_periods
     found = reproject(scene)
     baselines = camera_baselines(scene, found.depth_of_frame)
     coverage = period_coverage(scene.points.xyz, seen > 0)
@@ -116,31 +115,20 @@ class Reprojection:
 def reproject(scene: Scene) -> Reprojection:
     """Project every observed point, distortion included."""
     points = scene.points
-    of = np.repeat(np.arange(len(points), dtype=np.int32), np.diff(points.track_start))
-    order, ends = _by_frame(points.track_frame, len(scene.frames))
-    residual, depth = np.full((2, len(order)), np.nan)
-    depth_of_frame = np.full(len(scene.frames), np.nan)
-    with np.errstate(all="ignore"):  # absurd poses and points give NaN, which is left out
-        for i, frame in enumerate(scene.frames):
-            rows = order[ends[i] : ends[i + 1]]
-            local = points.xyz.take(of.take(rows), axis=0) @ frame.cam_from_world[:3, :3].T
-            local += frame.cam_from_world[:3, 3]
-            u, v = project_points(frame.camera, local).T
-            seen = points.track_xy.take(rows, axis=0)
-            ahead = local[:, 2] > 0
-            residual[rows] = np.hypot(u - seen[:, 0], v - seen[:, 1])
-            depth[rows] = np.where(ahead, local[:, 2], np.nan)
-            if ahead.any():
-                depth_of_frame[i] = np.median(local[ahead, 2])
-    return Reprojection(residual, depth, depth_of_frame)
+    views = [(f.camera, f.cam_from_world) for f in scene.frames]
+    offset, depth = tracks.reproject(
+        views, points.xyz, points.track_start, points.track_frame, points.track_xy
+    )
+    seen = (depth.take(rows) for rows in tracks.by_image(points.track_frame, len(views)))
+    return Reprojection(
+        residual=np.hypot(offset[:, 0], offset[:, 1]),
+        depth=depth,
+        depth_of_frame=np.array([_median_depth(d[~np.isnan(d)]) for d in seen]),
+    )
 
 
-def _by_frame(track_frame: NDArray[np.int32], frames: int) -> tuple[Index, Index]:
-    """Observations in the order of their frames [M], and where each frame's begin [frames + 1]."""
-    # Keys of 16 bits are sorted several times faster.
-    keys = track_frame.astype(np.uint16) if frames <= 2**16 else track_frame
-    counts = np.bincount(track_frame, minlength=frames)
-    return np.argsort(keys, kind="stable"), np.concatenate([[0], np.cumsum(counts)])
+def _median_depth(depth: Array) -> float:
+    return float(np.median(depth)) if len(depth) else np.nan
 
 
 def camera_baselines(scene: Scene, depths: Array) -> Array:
@@ -154,7 +142,7 @@ def camera_baselines(scene: Scene, depths: Array) -> Array:
         NaN for cameras without points, and for one that is alone in its period. [frames]
     """
     centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
-    periods = np.array([f.period for f in scene.frames])
+    periods = scene.frame_periods
     nearest = np.full(len(centres), np.nan)
     for p in range(scene.num_periods):
         mine = np.flatnonzero(periods == p)

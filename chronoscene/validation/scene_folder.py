@@ -35,6 +35,7 @@ from chronoscene.scene.splits import (
     parse_split_text,
     parse_test_text,
 )
+from chronoscene.scene.tracks import seen_by_period
 from chronoscene.validation.checks.observations import Observations, observe
 from chronoscene.validation.checks.pixels import (
     Header,
@@ -337,11 +338,10 @@ class RawScene:
             return None
         if len(points) * len(self.period_ids) > MOST_CELLS:
             return None
-        table = np.zeros((len(points), len(self.period_ids)), bool)
         period = np.append(self.image_periods, -1)[seen.image]
         rows = (period >= 0) & seen.valid
-        table[seen.point[rows], period[rows]] = True
-        return table
+        shape = len(points), len(self.period_ids)
+        return seen_by_period(seen.point[rows], period[rows], shape)
 
     @cached_property
     def period_ids(self) -> list[int]:

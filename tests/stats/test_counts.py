@@ -20,7 +20,6 @@ from chronoscene.stats import (
     assign_points,
     count_scene,
     count_table,
-    observation_counts,
     to_csv,
     to_json,
     to_latex,
@@ -85,7 +84,7 @@ def test_assigned_periods_add_up_and_seen_ones_do_not_fall_short(scene):
 @given(scenes())
 def test_assignment_equals_a_plain_loop(scene):
     """The rule spelt out point by point."""
-    counts = observation_counts(scene)
+    counts = scene.count_views()
     assigned = assign_points(scene)
     for i in range(len(scene.points)):
         span = slice(*scene.points.track_start[i : i + 2])

@@ -8,7 +8,6 @@ from skeletons.dataset import write_skeleton
 
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
-from chronoscene.stats.counts import observation_counts
 from chronoscene.stats.measures import reproject
 from chronoscene.stats.view_overlap import DEEP, FARTHER, common_view
 
@@ -41,7 +40,7 @@ def scene_of(camera: Camera, poses: list[np.ndarray], points: list, owners: list
 
 
 def views(scene: Scene) -> list[list[float | None]]:
-    seen = observation_counts(scene) > 0
+    seen = scene.count_views() > 0
     return [list(row) for row in common_view(scene, seen, reproject(scene).depth)]
 
 
@@ -83,7 +82,7 @@ def test_distortion_does_not_fold_the_outside_into_the_image() -> None:
 def test_equals_plain_loops(tmp_path) -> None:
     write_skeleton(tmp_path / "place", [(12, 250), (7, 120), (9, 300)], seed=5)
     scene = read_scene(tmp_path / "place")
-    seen, found = observation_counts(scene) > 0, reproject(scene)
+    seen, found = scene.count_views() > 0, reproject(scene)
     period = np.array([f.period for f in scene.frames])[scene.points.track_frame]
     for b in range(3):
         reach = FARTHER * np.percentile(found.depth[period == b], DEEP)

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from chronoscene.scene import Frame, Points, Scene
 from chronoscene.scene.cameras import project_points
+from chronoscene.scene.tracks import track_owners
 
 SAME_PIXELS = 1.0
 """Two observations in one image this near to each other are of one point..."""
@@ -33,7 +34,7 @@ def grow_points(scene: Scene, new: Scene, frames: Sequence[Frame]) -> Points:
     is_old[old_frame] = True
     a, b = scene.points, new.points
     a_frame, b_frame = old_frame[a.track_frame], new_frame[b.track_frame]
-    b_point = np.repeat(np.arange(len(b)), np.diff(b.track_start))
+    b_point = track_owners(b.track_start)
     wanted = np.zeros(len(b), bool)
     wanted[b_point[~is_old[b_frame]]] = True
     target = _same_points(scene, a_frame, b_point, b_frame, b.track_xy, is_old)
@@ -55,7 +56,7 @@ def _same_points(
     [new points]
     """
     a = scene.points
-    a_point = np.repeat(np.arange(len(a)), np.diff(a.track_start))
+    a_point = track_owners(a.track_start)
     shared = np.full(len(b_point), -1, np.int64)
     for frame in np.unique(b_frame[is_old[b_frame]]).tolist():
         mine, theirs = np.flatnonzero(b_frame == frame), np.flatnonzero(a_frame == frame)
@@ -110,7 +111,7 @@ def _concatenate(
     is_old: NDArray[np.bool_],
 ) -> Points:
     """Old points with longer tracks, then new ones."""
-    a_point = np.repeat(np.arange(len(a)), np.diff(a.track_start))
+    a_point = track_owners(a.track_start)
     joined = joins[b_point] & ~is_old[b_frame]
     fresh = is_new[b_point]
     number = np.cumsum(is_new) - 1 + len(a)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.scene.tracks import track_owners
 
 DENSE = 1_000_000
 """Ids over a range of about so many numbers are looked up in a table."""
@@ -49,7 +50,7 @@ class Observations:
 
 def observe(images: RawImages, points: RawPoints) -> Observations:
     """Look up what the tracks refer to."""
-    point = np.repeat(np.arange(len(points)), np.diff(points.track_start))
+    point = track_owners(points.track_start)
     if not len(images):
         nothing = np.full(len(point), -1, np.int64)
         return Observations(point, nothing, nothing)
