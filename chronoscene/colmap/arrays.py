@@ -1,4 +1,4 @@
-"""A COLMAP model as arrays, with nothing checked: what its files say, whatever that is."""
+"""The parts of a COLMAP model as arrays, with nothing checked: what its files say."""
 
 from __future__ import annotations
 
@@ -73,3 +73,53 @@ class RawPoints:
             track_image=self.track_image[observed],
             track_keypoint=self.track_keypoint[observed],
         )
+
+
+Pose = tuple[float, ...]
+"""Quaternion wxyz and translation."""
+
+IDENTITY: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+Sensor = tuple[int, int]
+"""Type and id."""
+
+CAMERA = 0
+"""Type of the sensors that are cameras."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawFrame:
+    """Where a rig was when its images were taken."""
+
+    frame_id: int
+    rig_id: int
+    rig_from_world: Pose
+    data: tuple[tuple[Sensor, int], ...]
+    """Sensors, and the ids of what they took: of cameras, image ids."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawRigs:
+    """``rigs`` and ``frames``, which COLMAP writes beside the three other files since 3.12."""
+
+    rigs: dict[int, dict[Sensor, Pose | None]]
+    """By rig id, the poses of its sensors (``sensor_from_rig``), None if not known."""
+    frames: tuple[RawFrame, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Why a file of the model, or a line of it, cannot be read."""
+
+    file: str
+    """Name of the file, with a line number for text (``cameras.txt:3``)."""
+    expected: str
+    found: str
+
+
+class DamagedError(Exception):
+    """Carries damages out of a reader."""
+
+    def __init__(self, *damages: Damage) -> None:
+        super().__init__("; ".join(f"{d.file}: {d.found}" for d in damages))
+        self.damages = damages

@@ -1,8 +1,9 @@
-"""Bulk reading of the records in COLMAP's binary files. Plain numpy.
+"""Bulk reading of COLMAP's binary files with plain numpy.
 
 Two reasons for a reader beside pycolmap: pycolmap gives points and observations one Python object
 at a time (seconds for a scene of half a million points), and it does not notice that a file ends
-early. Every length is checked against the size of the file before it is used.
+early. Every length is checked against the size of the file before it is used. Nothing else is
+checked, and nothing dropped: ids may come twice, names may be no text.
 
 Records are little endian; a count comes first (u64). Camera: i32 id, i32 model, u64 width, u64
 height, f64 parameters. Image: i32 id, f64 quaternion wxyz, f64 translation, i32 camera, name ended
@@ -16,169 +17,231 @@ u64 image id).
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.record_reader import COUNT, RecordError, RecordReader, read_records
-from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES
+from chronoscene.colmap.arrays import (
+    IDENTITY,
+    Pose,
+    RawFrame,
+    RawImages,
+    RawPoints,
+    RawRigs,
+    Sensor,
+)
+from chronoscene.errors import SceneError
+from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES, Camera
 
-_CAMERA_HEAD = struct.Struct("<iiQQ")
-_IMAGE_HEAD = struct.Struct("<i7di")
+T = TypeVar("T")
+
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 """A keypoint of an image."""
 POINT_HEAD = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
 """What stands before the track of a point."""
-_LENGTH_AT = POINT_HEAD.itemsize - COUNT.size
+
+_COUNT = struct.Struct("<Q")
+_CAMERA_HEAD, _IMAGE_HEAD = struct.Struct("<iiQQ"), struct.Struct("<i7di")
+_LENGTH_AT = POINT_HEAD.itemsize - _COUNT.size
 _TRACK_BYTES = 8
-_RIG_HEAD = struct.Struct("<II")
-_SENSOR_BYTES = 8
-_POSE_BYTES = 7 * 8
-_FRAME_HEAD = struct.Struct("<II7dI")
-_FRAME_IMAGE_BYTES = 16
+_U32, _U32_PAIR, _FLAG = struct.Struct("<I"), struct.Struct("<II"), struct.Struct("<B")
+_SENSOR, _POSE = struct.Struct("<iI"), struct.Struct("<7d")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PointRecords:
-    """The points of a model, sorted by id (P points, M observations)."""
-
-    heads: NDArray[np.void]
-    """See `POINT_HEAD`. [P]"""
-    track_start: NDArray[np.int64]
-    """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
-    tracks: NDArray[np.int32]
-    """Image id and keypoint index of each observation. [M, 2]"""
-
-
-def read_points(path: Path) -> PointRecords:
-    """Read ``points3D.bin``.
-
-    Raises:
-        SceneError: If the file cannot be read or ends inside a record.
-    """
-    return read_records(path, _walk_points)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraRecord:
-    """One record of ``cameras.bin``."""
-
-    camera_id: int
-    model_id: int
-    width: int
-    height: int
-    params: tuple[float, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ImageRecord:
-    """One record of ``images.bin``, whatever it says."""
-
-    image_id: int
-    quaternion: tuple[float, float, float, float]
-    """wxyz as stored: may be anything."""
-    translation: tuple[float, float, float]
-    camera_id: int
-    name: bytes
-    """As stored: may be no UTF-8."""
-    xy: NDArray[np.float64]
-    """Keypoints in pixels. [n, 2]"""
-    point_ids: NDArray[np.int64]
-    """Point of each keypoint, -1 for none. [n]"""
-
-
-def read_cameras(path: Path) -> list[CameraRecord]:
-    """Read ``cameras.bin``.
+def read_cameras(path: Path) -> tuple[Camera, ...]:
+    """Cameras in the order of ``cameras.bin``.
 
     Raises:
         SceneError: If the file cannot be read, ends inside a record, or has an unknown model.
     """
-    return read_records(path, _walk_cameras)
+    return _read(path, _walk_cameras)
 
 
-def read_images(path: Path) -> list[ImageRecord]:
-    """Read ``images.bin`` in the order of the file, without judging ids, names and poses.
+def read_images(path: Path) -> RawImages:
+    """Images in the order of ``images.bin``.
 
     Raises:
         SceneError: If the file cannot be read or ends inside a record.
     """
-    return read_records(path, _walk_images)
+    return _read(path, _walk_images)
 
 
-def check_records(folder: Path) -> None:
-    """Check the small files of a model: ``cameras.bin``, and ``rigs.bin`` and ``frames.bin``.
-
-    The last two are absent in models written by COLMAP before 3.12.
+def read_points(path: Path) -> RawPoints:
+    """Points of ``points3D.bin``, sorted by id.
 
     Raises:
-        SceneError: If a file ends inside a record, or has a camera model that COLMAP does not know.
+        SceneError: If the file cannot be read, ends inside a record, or has a point twice.
     """
-    read_records(folder / "cameras.bin", _walk_cameras)
-    for stem, walk in (("rigs", _walk_rigs), ("frames", _walk_frames)):
-        path = folder / f"{stem}.bin"
-        if path.exists():
-            read_records(path, walk)
+    return _read(path, _walk_points)
 
 
-def _walk_cameras(reader: RecordReader) -> list[CameraRecord]:
+def read_rigs(folder: Path) -> RawRigs | None:
+    """``rigs.bin`` and ``frames.bin``; None where one is absent, as in models before COLMAP 3.12.
+
+    Raises:
+        SceneError: If a file cannot be read or ends inside a record.
+    """
+    rigs, frames = folder / "rigs.bin", folder / "frames.bin"
+    found = _read(rigs, _walk_rigs) if rigs.exists() else None
+    posed = _read(frames, _walk_frames) if frames.exists() else None
+    return None if found is None or posed is None else RawRigs(found, posed)
+
+
+class _RecordError(Exception):
+    """What is wrong inside a file, in words."""
+
+
+class _Reader:
+    """Takes one thing after the other out of a file, and says which record the file ends inside."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self.at = 0
+        """Bytes taken so far."""
+        self.index: int | None = None
+        """Of the record that is being read; None while their number is read."""
+        self.kind = ""
+        self.parts = ""
+        """Parts that the record announces, in words. Forgotten at the next record."""
+
+    def records(self, kind: str, smallest: int) -> Iterator[int]:
+        """Index of each record; the walk takes its parts before it asks for the next.
+
+        Raises:
+            _RecordError: If so many records of at least ``smallest`` bytes cannot fit into the
+                file, or something follows the last.
+        """
+        (count,) = self.unpack(_COUNT)
+        if count * smallest > len(self.data) - self.at:
+            raise _RecordError(f"{count} records announced in {len(self.data)} bytes")
+        self.kind = kind
+        for self.index in range(count):
+            self.parts = ""
+            yield self.index
+        if self.at != len(self.data):
+            raise _RecordError(f"{len(self.data) - self.at} bytes after the last record")
+
+    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """The next values of a layout."""
+        return layout.unpack_from(self.data, self.skip(layout.size))
+
+    def skip(self, size: int) -> int:
+        """Go on by ``size`` bytes, which must be there; returns where they begin."""
+        begin = self.at
+        if size > len(self.data) - begin:
+            raise self.ends()
+        self.at += size
+        return begin
+
+    def text(self) -> bytes:
+        """The next bytes up to a zero byte, which is taken too."""
+        begin, end = self.at, self.data.find(b"\0", self.at)
+        if end < 0:
+            raise self.ends()
+        self.at = end + 1
+        return self.data[begin:end]
+
+    def ends(self) -> _RecordError:
+        """The complaint that the file ends too early."""
+        if self.index is None:
+            return _RecordError("a file that ends inside the number of its records")
+        announced = f", which announces {self.parts}" if self.parts else ""
+        return _RecordError(f"a file that ends inside {self.kind} record {self.index}{announced}")
+
+
+def _read(path: Path, walk: Callable[[_Reader], T]) -> T:
+    """What a walk makes of the records of a file."""
+    try:
+        return walk(_Reader(path.read_bytes()))
+    except OSError as error:
+        found = error.strerror or "unreadable"
+    except _RecordError as error:
+        found = str(error)
+    raise SceneError(
+        path,
+        expected="complete COLMAP records",
+        found=found,
+        todo="copy the file again or write the model again with COLMAP",
+    )
+
+
+def _walk_cameras(reader: _Reader) -> tuple[Camera, ...]:
     cameras = []
     for _ in reader.records("camera", _CAMERA_HEAD.size):
         camera_id, model, width, height = reader.unpack(_CAMERA_HEAD)
         if not 0 <= model < len(MODEL_NAMES):
             known = f"0..{len(MODEL_NAMES) - 1}"
-            raise RecordError(f"the unknown model id {model} for camera {camera_id}, not {known}")
-        count = len(CAMERA_MODELS[MODEL_NAMES[model]].params)
-        params = reader.unpack(struct.Struct(f"<{count}d"))
-        cameras.append(CameraRecord(camera_id, model, width, height, params))
-    return cameras
+            raise _RecordError(f"the unknown model id {model} for camera {camera_id}, not {known}")
+        name = MODEL_NAMES[model]
+        params = reader.unpack(struct.Struct(f"<{len(CAMERA_MODELS[name].params)}d"))
+        cameras.append(Camera(camera_id, name, width, height, params))
+    return tuple(cameras)
 
 
-def _walk_rigs(reader: RecordReader) -> None:
-    for _ in reader.records("rig", _RIG_HEAD.size):
-        _rig_id, sensors = reader.unpack(_RIG_HEAD)
-        reader.parts = f"{sensors} sensors"
-        reader.skip(_SENSOR_BYTES if sensors else 0)
-        for _ in range(sensors - 1):
-            has_pose = reader.data[reader.skip(_SENSOR_BYTES + 1) + _SENSOR_BYTES]
-            reader.skip(_POSE_BYTES if has_pose else 0)
-
-
-def _walk_frames(reader: RecordReader) -> None:
-    for _ in reader.records("frame", _FRAME_HEAD.size):
-        images = reader.unpack(_FRAME_HEAD)[-1]
-        reader.parts = f"{images} images"
-        reader.skip(_FRAME_IMAGE_BYTES * images)
-
-
-def _walk_images(reader: RecordReader) -> list[ImageRecord]:
-    images = []
-    for _ in reader.records("image", _IMAGE_HEAD.size + 1 + COUNT.size):
-        image_id, qw, qx, qy, qz, tx, ty, tz, camera_id = reader.unpack(_IMAGE_HEAD)
-        name = reader.text()
-        (length,) = reader.unpack(COUNT)
+def _walk_images(reader: _Reader) -> RawImages:
+    heads, names, lengths, keypoints = [], [], [], []
+    whole = memoryview(reader.data)
+    for _ in reader.records("image", _IMAGE_HEAD.size + 1 + _COUNT.size):
+        heads.append(reader.unpack(_IMAGE_HEAD))
+        names.append(reader.text().decode("utf-8", "surrogateescape"))
+        (length,) = reader.unpack(_COUNT)
         reader.parts = f"{length} keypoints"
         begin = reader.skip(length * KEYPOINT.itemsize)
-        records = np.frombuffer(reader.data, KEYPOINT, count=length, offset=begin)
-        images.append(
-            ImageRecord(
-                image_id=image_id,
-                quaternion=(qw, qx, qy, qz),
-                translation=(tx, ty, tz),
-                camera_id=camera_id,
-                name=name,
-                xy=np.ascontiguousarray(records["xy"]),
-                point_ids=np.ascontiguousarray(records["point_id"]),
-            )
-        )
-    return images
+        lengths.append(length)
+        keypoints.append(whole[begin : reader.at])
+    table = np.array(heads, np.float64).reshape(-1, 9)  # ids of 32 bits are exact
+    records = np.frombuffer(b"".join(keypoints), KEYPOINT)
+    return RawImages(
+        ids=table[:, 0].astype(np.int64),
+        names=tuple(names),
+        quaternions=np.ascontiguousarray(table[:, 1:5]),
+        translations=np.ascontiguousarray(table[:, 5:8]),
+        camera_ids=table[:, 8].astype(np.int64),
+        keypoint_start=np.cumsum([0, *lengths]),
+        keypoint_xy=np.ascontiguousarray(records["xy"]),
+        keypoint_point=np.ascontiguousarray(records["point_id"]),
+    )
 
 
-def _walk_points(reader: RecordReader) -> PointRecords:
+def _walk_rigs(reader: _Reader) -> dict[int, dict[Sensor, Pose | None]]:
+    rigs = {}
+    for _ in reader.records("rig", _U32_PAIR.size):
+        rig_id, count = reader.unpack(_U32_PAIR)
+        reader.parts = f"{count} sensors"
+        sensors: dict[Sensor, Pose | None] = {}
+        if count:
+            sensors[_sensor(reader)] = IDENTITY
+        for _ in range(count - 1):
+            sensor = _sensor(reader)
+            (known,) = reader.unpack(_FLAG)
+            sensors[sensor] = reader.unpack(_POSE) if known else None
+        rigs[rig_id] = sensors
+    return rigs
+
+
+def _walk_frames(reader: _Reader) -> tuple[RawFrame, ...]:
+    frames = []
+    for _ in reader.records("frame", _U32_PAIR.size + _POSE.size + _U32.size):
+        frame_id, rig_id = reader.unpack(_U32_PAIR)
+        pose = reader.unpack(_POSE)
+        (count,) = reader.unpack(_U32)
+        reader.parts = f"{count} images"
+        data = tuple((_sensor(reader), reader.unpack(_COUNT)[0]) for _ in range(count))
+        frames.append(RawFrame(frame_id, rig_id, pose, data))
+    return tuple(frames)
+
+
+def _sensor(reader: _Reader) -> Sensor:
+    kind, sensor_id = reader.unpack(_SENSOR)
+    return kind, sensor_id
+
+
+def _walk_points(reader: _Reader) -> RawPoints:
     """One step per record, since each says only how long itself is; all else in whole columns."""
     offsets = _quick_offsets(reader.data)
     if offsets is None:
@@ -190,12 +253,12 @@ def _walk_points(reader: RecordReader) -> PointRecords:
 
 def _quick_offsets(data: bytes) -> list[int] | None:
     """Where the records begin and the last ends, if the file is as it should be."""
-    if len(data) < COUNT.size:
+    if len(data) < _COUNT.size:
         return None
-    (count,) = COUNT.unpack_from(data)
+    (count,) = _COUNT.unpack_from(data)
     if count * POINT_HEAD.itemsize > len(data):
         return None
-    unpack, head, at = COUNT.unpack_from, POINT_HEAD.itemsize, COUNT.size
+    unpack, head, at = _COUNT.unpack_from, POINT_HEAD.itemsize, _COUNT.size
     offsets = [at]
     try:
         for _ in range(count):
@@ -206,14 +269,14 @@ def _quick_offsets(data: bytes) -> list[int] | None:
     return offsets if at == len(data) else None
 
 
-def _checked_offsets(reader: RecordReader) -> list[int]:
-    """The same, step by step, with a word on the record that is wrong."""
+def _checked_offsets(reader: _Reader) -> list[int]:
+    """The same, step by step; the error names the damaged record."""
     data, end = reader.data, len(reader.data)
-    offsets, at = [COUNT.size], COUNT.size
+    offsets, at = [_COUNT.size], _COUNT.size
     for _ in reader.records("point", POINT_HEAD.itemsize):
         if at + POINT_HEAD.itemsize > end:
             raise reader.ends()
-        (length,) = COUNT.unpack_from(data, at + _LENGTH_AT)
+        (length,) = _COUNT.unpack_from(data, at + _LENGTH_AT)
         at += POINT_HEAD.itemsize + _TRACK_BYTES * length
         if at > end:
             reader.parts = f"{length} observations"
@@ -225,7 +288,7 @@ def _checked_offsets(reader: RecordReader) -> list[int]:
 
 def _gather_points(
     data: bytes, offsets: NDArray[np.int64], lengths: NDArray[np.int64]
-) -> PointRecords:
+) -> RawPoints:
     """Copy the records at ``offsets`` out of the file, in the order of the point ids."""
     heads = _at_every_byte(data, POINT_HEAD)[offsets]
     if (heads["id"][1:] < heads["id"][:-1]).any():
@@ -233,15 +296,23 @@ def _gather_points(
         heads, offsets, lengths = heads[order], offsets[order], lengths[order]
     ids = heads["id"]
     if (ids[1:] == ids[:-1]).any():
-        raise RecordError(f"point id {ids[:-1][ids[1:] == ids[:-1]][0]} twice")
+        raise _RecordError(f"point id {ids[:-1][ids[1:] == ids[:-1]][0]} twice")
     if len(ids) and ids[-1] > np.iinfo(np.int64).max:
-        raise RecordError(f"point id {ids[-1]}, more than 63 bits")
+        raise _RecordError(f"point id {ids[-1]}, more than 63 bits")
     start = np.concatenate([[0], np.cumsum(lengths)])
     # Observation j of point i begins start[i] pairs after the first one of the point.
     first = offsets + POINT_HEAD.itemsize - _TRACK_BYTES * start[:-1]
     at = np.repeat(first, lengths) + _TRACK_BYTES * np.arange(start[-1])
     tracks = _at_every_byte(data, np.dtype("<i8"))[at].view("<i4").reshape(-1, 2)
-    return PointRecords(heads, start, tracks)
+    return RawPoints(
+        ids=ids.astype(np.int64),
+        xyz=np.ascontiguousarray(heads["xyz"]),
+        rgb=np.ascontiguousarray(heads["rgb"]),
+        error=np.ascontiguousarray(heads["error"]),
+        track_start=start,
+        track_image=tracks[:, 0].astype(np.int64),
+        track_keypoint=tracks[:, 1].astype(np.int64),
+    )
 
 
 def _at_every_byte(data: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:

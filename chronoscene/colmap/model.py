@@ -1,41 +1,31 @@
-"""COLMAP models to and from numpy.
+"""COLMAP models for use: read and checked, and written.
 
 pycolmap is the authority on cameras and poses (text and binary, models with and without rigs and
-frames). Points and observations come from the binary records (`chronoscene.colmap.binary`) and are
-checked here; pycolmap does not see those of binary models, which saves a third of the time. A text
-model is rewritten as binary in a temporary folder first.
+frames). Points and observations come from `chronoscene.colmap.binary` and are checked here;
+pycolmap does not see those of binary models, which saves a third of the time. A text model is
+rewritten as binary in a temporary folder first.
 """
 
 from __future__ import annotations
 
 import re
 import tempfile
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawPoints
-from chronoscene.colmap.binary import (
-    ImageRecord,
-    PointRecords,
-    check_records,
-    read_images,
-    read_points,
-)
+from chronoscene.colmap import binary
+from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.colmap.raw_model import model_kind, read_raw_model
 from chronoscene.colmap.write import posed_images, write_raw_model, write_without_observations
 from chronoscene.errors import SceneError
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.scene import Camera, Frame, Points
 from chronoscene.scene.cameras import from_pycolmap
 from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
-
-MODEL_FILES = ("cameras", "images", "points3D")
-"""Stems of the files that every model has."""
 
 UNIT = 1e-9
 """Deviation of the length of a quaternion from 1 that is rounding."""
@@ -62,15 +52,6 @@ class Model:
     """Sorted by id; ``track_frame`` is an index into `images`."""
 
 
-def model_kind(folder: Path) -> Literal["binary", "text"] | None:
-    """Which form of a complete model a folder has; binary wins, as in COLMAP."""
-    if all((folder / f"{stem}.bin").is_file() for stem in MODEL_FILES):
-        return "binary"
-    if all((folder / f"{stem}.txt").is_file() for stem in MODEL_FILES):
-        return "text"
-    return None
-
-
 def read_model(folder: Path) -> Model:
     """Read a model in any of COLMAP's forms.
 
@@ -86,17 +67,40 @@ def read_model(folder: Path) -> Model:
             found=", ".join(found[:8]) or "nothing",
             todo="copy the model there",
         )
-    with tempfile.TemporaryDirectory(prefix="chronoscene-") as name:
-        temporary = Path(name)
-        if kind == "text":
+    if kind == "text":
+        with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
             reconstruction = read_reconstruction(folder)
-            reconstruction.write_binary(name)
-            return _assemble(folder, reconstruction, _read_records(temporary)[1])
-        check_records(folder)
-        images, records = _read_records(folder)
-        posed = ((i.image_id, i.quaternion, i.translation, i.camera_id, i.name) for i in images)
-        write_without_observations(folder, posed, temporary)
-        return _assemble(folder, read_reconstruction(temporary, place=folder), records)
+            reconstruction.write_binary(temporary)
+            raw = binary.read_images(Path(temporary) / "images.bin")
+            points = binary.read_points(Path(temporary) / "points3D.bin")
+        row, xy = _observed(folder, raw, points)
+        images = _posed_images(folder, reconstruction)
+    else:
+        binary.read_cameras(folder / "cameras.bin")  # pycolmap does not notice that a file
+        binary.read_rigs(folder)  # ends early
+        raw = binary.read_images(folder / "images.bin")
+        points = binary.read_points(folder / "points3D.bin")
+        row, xy = _observed(folder, raw, points)
+        images = read_poses(folder, raw)
+    return Model(images, _checked_points(folder, images, raw, points, row, xy))
+
+
+def read_poses(folder: Path, images: RawImages) -> tuple[PosedImage, ...]:
+    """Registered images of a binary model as COLMAP understands them, sorted by name.
+
+    pycolmap judges all that takes part in a pose: cameras, rigs, frames, names. It is given the
+    model without points and keypoints, in a fraction of the time.
+
+    Args:
+        folder: Of the model.
+        images: What its ``images.bin`` says.
+
+    Raises:
+        SceneError: If pycolmap refuses the model, or a name is no text or comes twice.
+    """
+    with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
+        write_without_observations(folder, images, Path(temporary))
+        return _posed_images(folder, read_reconstruction(Path(temporary), place=folder))
 
 
 def read_reconstruction(folder: Path, *, place: Path | None = None) -> pycolmap.Reconstruction:
@@ -151,29 +155,43 @@ def write_model(folder: Path, frames: Sequence[Frame], points: Points) -> None:
     write_raw_model(folder, cameras, images, tracks)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Records:
-    """Observations of a binary model, checked against its images."""
+def copy_poses(source: Path, folder: Path) -> int:
+    """Give the images of a model the poses of the same images in another, to the last bit.
 
-    points: PointRecords
-    image_ids: NDArray[np.int64]
-    """All images of the model, registered or not, sorted. [I]"""
-    slot: NDArray[np.int64]
-    """Index into ``image_ids`` of every observation. [M]"""
-    xy: NDArray[np.float64]
-    """Pixel position of every observation. [M, 2]"""
+    Reading a pose as a matrix and writing it as a quaternion may change its last bits.
+
+    Args:
+        source: Folder of the other model.
+        folder: Binary model without rigs and frames, as `write_model` writes it.
+
+    Returns:
+        The number of images that got a pose.
+    """
+    old, new = read_raw_model(source).images, read_raw_model(folder)
+    assert old is not None and new.cameras and new.images is not None and new.points is not None
+    row = {name: i for i, name in enumerate(old.names)}
+    found = np.array([row.get(name, -1) for name in new.images.names], np.int64)
+    known = found >= 0
+    quaternions, translations = new.images.quaternions.copy(), new.images.translations.copy()
+    quaternions[known] = old.quaternions[found[known]]
+    translations[known] = old.translations[found[known]]
+    images = replace(new.images, quaternions=quaternions, translations=translations)
+    write_raw_model(folder, new.cameras, images, new.points)
+    return int(known.sum())
 
 
-def _read_records(folder: Path) -> tuple[list[ImageRecord], _Records]:
-    """Read images and points; refuse tracks over images or keypoints that do not exist."""
-    images = read_images(folder / "images.bin")
-    keypoints = {image.image_id: image.xy for image in images}
-    if len(keypoints) < len(images):
-        twice = Counter(image.image_id for image in images).most_common(1)[0][0]
-        raise _model_error(folder, "one image of each id", f"image id {twice} twice")
-    points = read_points(folder / "points3D.bin")
-    image, keypoint = points.tracks[:, 0], points.tracks[:, 1].astype(np.int64)
-    known = np.array(sorted(keypoints), np.int64)
+def _observed(
+    folder: Path, images: RawImages, points: RawPoints
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Row of the image [M] and pixel position [M, 2] of every observation.
+
+    Refuses two images of one id, and tracks over images or keypoints that do not exist.
+    """
+    order = np.argsort(images.ids, kind="stable")
+    known = images.ids[order]
+    if len(twice := known[1:][known[1:] == known[:-1]]):
+        raise _model_error(folder, "one image of each id", f"image id {twice[0]} twice")
+    image, keypoint = points.track_image, points.track_keypoint
     slot = np.searchsorted(known, image)
     # One past the end stands for ids above all known ones, and for all where there are none.
     lost = np.append(known, -1)[slot] != image
@@ -181,39 +199,42 @@ def _read_records(folder: Path) -> tuple[list[ImageRecord], _Records]:
         raise _model_error(
             folder, "tracks over images of the model", f"image {image[lost].min()}, which it lacks"
         )
-    lengths = np.array([len(keypoints[i]) for i in known.tolist()], np.int64)
-    wrong = (keypoint < 0) | (keypoint >= lengths[slot])
+    row = order[slot]
+    lengths = np.diff(images.keypoint_start)[row]
+    wrong = (keypoint < 0) | (keypoint >= lengths)
     if wrong.any():
         i = int(np.flatnonzero(wrong)[0])
         raise _model_error(
             folder,
             "tracks over keypoints of the images",
-            f"keypoint {keypoint[i]} of image {image[i]}, which has {lengths[slot[i]]}",
+            f"keypoint {keypoint[i]} of image {image[i]}, which has {lengths[i]}",
         )
-    first = np.concatenate([[0], np.cumsum(lengths)])
-    every = np.concatenate([np.zeros((0, 2)), *(keypoints[i] for i in known.tolist())])
-    return images, _Records(points, known, slot, every[first[slot] + keypoint])
+    return row, images.keypoint_xy[images.keypoint_start[row] + keypoint]
 
 
-def _assemble(folder: Path, reconstruction: pycolmap.Reconstruction, records: _Records) -> Model:
-    images = _posed_images(folder, reconstruction)
+def _checked_points(
+    folder: Path,
+    images: Sequence[PosedImage],
+    raw: RawImages,
+    points: RawPoints,
+    row: NDArray[np.int64],
+    xy: NDArray[np.float64],
+) -> Points:
+    """Points whose tracks refer to registered images; refuses tracks over others."""
     index = {image.image_id: i for i, image in enumerate(images)}
-    frame_of = np.array([index.get(i, -1) for i in records.image_ids.tolist()], np.int32)
-    frame = frame_of[records.slot]
+    frame = np.array([index.get(i, -1) for i in raw.ids.tolist()], np.int32)[row]
     if (frame < 0).any():
-        lost = records.image_ids[records.slot[frame < 0][0]]
+        lost = raw.ids[row[frame < 0][0]]
         raise _model_error(folder, "tracks over registered images", f"image {lost} without a pose")
-    heads = records.points.heads
-    points = Points(
-        ids=heads["id"].astype(np.int64),
-        xyz=np.ascontiguousarray(heads["xyz"]),
-        rgb=np.ascontiguousarray(heads["rgb"]),
-        error=np.ascontiguousarray(heads["error"]),
-        track_start=records.points.track_start,
+    return Points(
+        ids=points.ids,
+        xyz=points.xyz,
+        rgb=points.rgb,
+        error=points.error,
+        track_start=points.track_start,
         track_frame=frame,
-        track_xy=records.xy,
+        track_xy=xy,
     )
-    return Model(images, points)
 
 
 def _posed_images(folder: Path, model: pycolmap.Reconstruction) -> tuple[PosedImage, ...]:

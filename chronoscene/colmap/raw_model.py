@@ -12,34 +12,18 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from chronoscene.colmap.arrays import RawImages, RawPoints
-from chronoscene.colmap.binary import check_records
-from chronoscene.colmap.model import MODEL_FILES
+from chronoscene.colmap import binary, text
+from chronoscene.colmap.arrays import Damage, DamagedError, RawImages, RawPoints, RawRigs
 from chronoscene.errors import SceneError
 from chronoscene.scene import Camera
 
+MODEL_FILES = ("cameras", "images", "points3D")
+"""Stems of the files that every model has."""
+
 FORMS = (".bin", ".txt")
 """Suffixes of model files."""
-
-
-@dataclass(frozen=True, slots=True)
-class Damage:
-    """Why a file of the model, or a line of it, cannot be read."""
-
-    file: str
-    """Name of the file, with a line number for text (``cameras.txt:3``)."""
-    expected: str
-    found: str
-
-
-class DamagedError(Exception):
-    """Carries damages out of a reader."""
-
-    def __init__(self, *damages: Damage) -> None:
-        super().__init__("; ".join(f"{d.file}: {d.found}" for d in damages))
-        self.damages = damages
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,19 +36,19 @@ class RawModel:
     cameras: tuple[Camera, ...] | None
     images: RawImages | None
     points: RawPoints | None
+    rigs: RawRigs | None
+    """None also where one of the two files is absent."""
     damages: tuple[Damage, ...]
 
 
 def model_files(folder: Path) -> dict[str, str]:
     """Which file counts for each stem. A complete binary model wins, then a complete text one."""
-    binary, text = (
+    forms = [
         {stem: stem + form for stem in MODEL_FILES if (folder / (stem + form)).is_file()}
         for form in FORMS
-    )
-    for files in (binary, text):
-        if len(files) == len(MODEL_FILES):
-            return files
-    return {**text, **binary}
+    ]
+    complete = (files for files in forms if len(files) == len(MODEL_FILES))
+    return next(complete, {**forms[1], **forms[0]})
 
 
 def numbered_models(scene: Path) -> list[Path]:
@@ -76,19 +60,25 @@ def numbered_models(scene: Path) -> list[Path]:
     return [p for p in sorted(folders, key=lambda p: (int(p.name), p.name)) if model_files(p)]
 
 
+def model_kind(folder: Path) -> Literal["binary", "text"] | None:
+    """Which form of a complete model a folder has; binary wins, as in COLMAP."""
+    files = model_files(folder)
+    forms = {Path(file).suffix for file in files.values()}
+    if len(files) < len(MODEL_FILES) or len(forms) > 1:
+        return None
+    return "binary" if forms == {".bin"} else "text"
+
+
 def read_raw_model(folder: Path) -> RawModel:
     """Read what can be read; never raises for what is in the files."""
-    from chronoscene.colmap import raw_binary
-    from chronoscene.colmap import text as raw_text  # they import this module
-
     files = model_files(folder)
     readers: dict[str, Callable[[Path], Any]] = {
-        "cameras.bin": raw_binary.read_cameras,
-        "images.bin": raw_binary.read_images,
-        "points3D.bin": raw_binary.read_points,
-        "cameras.txt": raw_text.read_cameras,
-        "images.txt": raw_text.read_images,
-        "points3D.txt": raw_text.read_points,
+        "cameras.bin": binary.read_cameras,
+        "images.bin": binary.read_images,
+        "points3D.bin": binary.read_points,
+        "cameras.txt": text.read_cameras,
+        "images.txt": text.read_images,
+        "points3D.txt": text.read_points,
     }
     parts: dict[str, Any] = {}
     damages: list[Damage] = []
@@ -99,23 +89,18 @@ def read_raw_model(folder: Path) -> RawModel:
             damages.extend(error.damages)
         except (OSError, SceneError) as error:
             damages.append(_damage(file, error))
-    damages.extend(_rig_damages(folder, files, damages))
+    rigs = None
+    try:
+        is_text = files.get("cameras") == "cameras.txt"
+        rigs = text.read_rigs(folder) if is_text else binary.read_rigs(folder)
+    except SceneError as error:
+        if "cameras" in parts:
+            damages.append(_damage(Path(error.place).name, error))
     cameras, images, points = (parts.get(stem) for stem in MODEL_FILES)
-    return RawModel(folder, files, cameras, images, points, tuple(damages))
+    return RawModel(folder, files, cameras, images, points, rigs, tuple(damages))
 
 
 def _damage(file: str, error: OSError | SceneError) -> Damage:
     if isinstance(error, SceneError):
         return Damage(file, error.expected, error.found)
     return Damage(file, "a file that can be read", error.strerror or "an error")
-
-
-def _rig_damages(folder: Path, files: dict[str, str], damages: list[Damage]) -> list[Damage]:
-    """Damages of ``rigs.bin`` and ``frames.bin``, which binary models have since COLMAP 3.12."""
-    if files.get("cameras") != "cameras.bin" or any(d.file == "cameras.bin" for d in damages):
-        return []
-    try:
-        check_records(folder)
-    except SceneError as error:
-        return [_damage(Path(error.place).name, error)]
-    return []

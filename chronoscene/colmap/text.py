@@ -3,11 +3,13 @@
 Fields are separated by blanks. Cameras: ``id model width height params...``. Images take two lines:
 ``id qw qx qy qz tx ty tz camera_id name``, then ``x y point_id`` for each keypoint (an empty line
 for none). Points: ``id x y z r g b error``, then ``image_id keypoint_index`` for each observation.
-Empty lines and lines that begin with ``#`` are skipped where a new record may begin.
+Rigs and frames: the fields of `chronoscene.colmap.binary`, a sensor is ``CAMERA <id>``. Empty lines
+and lines that begin with ``#`` are skipped where a new record may begin.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -15,15 +17,25 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawImages, RawPoints
-from chronoscene.colmap.raw_model import Damage, DamagedError
+from chronoscene.colmap.arrays import (
+    CAMERA,
+    IDENTITY,
+    Damage,
+    DamagedError,
+    Pose,
+    RawFrame,
+    RawImages,
+    RawPoints,
+    RawRigs,
+    Sensor,
+)
 from chronoscene.io.wording import quote
 from chronoscene.scene.cameras import CAMERA_MODELS, Camera
 
 BLOCK = 20_000
 """Lines whose fields are in memory as text at one time."""
 
-MOST_DAMAGES = 100
+MAX_DAMAGES = 100
 """Damaged lines of one file that are listed."""
 
 _IMAGE_LINE = '"<id> <qw> <qx> <qy> <qz> <tx> <ty> <tz> <camera id> <name>" with blanks between'
@@ -32,6 +44,9 @@ _POINT_LINE = '"<id> <x> <y> <z> <r> <g> <b> <error>" and pairs "<image id> <key
 
 Line = tuple[int, str]
 """Number from 1, and the text without surrounding blanks."""
+
+Fields = deque[str]
+"""Of a line; they are taken from the left."""
 
 
 def read_cameras(path: Path) -> tuple[Camera, ...]:
@@ -144,6 +159,50 @@ def read_points(path: Path) -> RawPoints:
     )
 
 
+def read_rigs(folder: Path) -> RawRigs | None:
+    """``rigs.txt`` and ``frames.txt``; None where one is absent or damaged (COLMAP will say so)."""
+    rigs, frames = folder / "rigs.txt", folder / "frames.txt"
+    if not (rigs.is_file() and frames.is_file()):
+        return None
+    try:
+        return RawRigs(dict(map(_rig, _fields(rigs))), tuple(map(_frame, _fields(frames))))
+    except (OSError, ValueError, IndexError, OverflowError):
+        return None
+
+
+def _fields(path: Path) -> Iterator[Fields]:
+    for line in path.read_text(encoding="utf-8").split("\n"):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield deque(line.split())
+
+
+def _rig(fields: Fields) -> tuple[int, dict[Sensor, Pose | None]]:
+    rig_id, count = int(fields.popleft()), int(fields.popleft())
+    sensors: dict[Sensor, Pose | None] = {}
+    if count > 0:
+        sensors[_sensor(fields)] = IDENTITY
+    for _ in range(count - 1):  # ends with the fields
+        sensor, known = _sensor(fields), int(fields.popleft())
+        sensors[sensor] = _pose(fields) if known else None
+    return rig_id, sensors
+
+
+def _frame(fields: Fields) -> RawFrame:
+    frame_id, rig_id = int(fields.popleft()), int(fields.popleft())
+    pose, count = _pose(fields), int(fields.popleft())
+    data = [(_sensor(fields), int(fields.popleft())) for _ in range(count)]
+    return RawFrame(frame_id, rig_id, pose, tuple(data))
+
+
+def _pose(fields: Fields) -> Pose:
+    return tuple(float(fields.popleft()) for _ in range(7))
+
+
+def _sensor(fields: Fields) -> Sensor:
+    kind = fields.popleft()
+    return (CAMERA if kind == "CAMERA" else 1), int(fields.popleft())
+
+
 def _triples(count: int) -> bool:
     return count % 3 == 0
 
@@ -207,9 +266,9 @@ def _all_numbers(fields: Sequence[str]) -> bool:
 
 
 def _raise_any(damages: list[Damage]) -> None:
-    if len(damages) > MOST_DAMAGES:
+    if len(damages) > MAX_DAMAGES:
         file = damages[0].file.split(":")[0]
-        more = Damage(file, "records", f"{len(damages) - MOST_DAMAGES} more damaged lines")
-        raise DamagedError(*damages[:MOST_DAMAGES], more)
+        more = Damage(file, "records", f"{len(damages) - MAX_DAMAGES} more damaged lines")
+        raise DamagedError(*damages[:MAX_DAMAGES], more)
     if damages:
         raise DamagedError(*damages)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import shutil
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,11 +39,7 @@ def write_raw_model(
     (folder / "points3D.bin").write_bytes(_points(points))
 
 
-PosedRecord = tuple[int, Sequence[float], Sequence[float], int, bytes]
-"""Image id, quaternion wxyz, translation, camera id and name, as stored."""
-
-
-def write_without_observations(source: Path, images: Iterable[PosedRecord], folder: Path) -> None:
+def write_without_observations(source: Path, images: RawImages, folder: Path) -> None:
     """Write a binary model with the cameras, rigs, frames and poses of another, and no points.
 
     COLMAP judges all that takes part in a pose, in a fraction of the time.
@@ -55,11 +52,13 @@ def write_without_observations(source: Path, images: Iterable[PosedRecord], fold
     for file in ("cameras.bin", "rigs.bin", "frames.bin"):
         if (source / file).is_file():
             shutil.copyfile(source / file, folder / file)
-    parts = []
-    for image_id, quaternion, translation, camera_id, name in images:
-        head = _IMAGE.pack(image_id & _ID, *quaternion, *translation, camera_id & _ID)
-        parts.append(head + name + b"\0" + _COUNT.pack(0))
-    (folder / "images.bin").write_bytes(_COUNT.pack(len(parts)) + b"".join(parts))
+    bare = replace(
+        images,
+        keypoint_start=np.zeros(len(images) + 1, np.int64),
+        keypoint_xy=np.zeros((0, 2)),
+        keypoint_point=np.zeros(0, np.int64),
+    )
+    (folder / "images.bin").write_bytes(_images(bare))
     (folder / "points3D.bin").write_bytes(_COUNT.pack(0))
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.checks import check_choice
+from chronoscene.colmap.raw_model import model_kind
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Scene
 
@@ -77,8 +78,7 @@ def detect_format(path: Path) -> str:
 
 def _advice(path: Path) -> str:
     """What to do about a folder that no format matches."""
-    from chronoscene.colmap.model import model_kind  # pycolmap, loaded by the formats by now
-    from chronoscene.formats.shared.colmap_layout import find_model
+    from chronoscene.formats.shared.colmap_layout import find_model  # it loads pycolmap
 
     if model_kind(path):
         return "move this COLMAP model to sparse/0 in a folder with images/"

@@ -60,8 +60,12 @@ def matches(path: Path) -> bool:
     return (path / SPLIT).is_file()
 
 
-def read(path: Path) -> Scene:
+def read(path: Path, *, model: Model | None = None) -> Scene:
     """Read a scene; stops at the first problem.
+
+    Args:
+        path: Folder of the scene.
+        model: Its COLMAP model, where that was read before.
 
     Raises:
         SceneError: If a file is missing, damaged or contradicts another.
@@ -69,7 +73,7 @@ def read(path: Path) -> Scene:
     path = Path(path)
     entries, problems = parse_split_text(read_text(path / SPLIT))
     raise_first(path / SPLIT, problems)
-    model = read_model(path / MODEL)
+    model = model or read_model(path / MODEL)
     names = [image.name for image in model.images]
     for image in model.images:
         check_image(path / MODEL, image)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from chronoscene.colmap.model import copy_poses
 from chronoscene.errors import ConfigError
 from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
@@ -14,7 +15,6 @@ from chronoscene.registration.inspection import Inspection, inspect_registration
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.inputs import Inputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
-from chronoscene.registration.reconstruct.kept_bits import copy_poses, pose_bytes
 from chronoscene.registration.result import Registered
 from chronoscene.registration.stages import Stages, work_folder
 from chronoscene.registration.ties.apply import tie
@@ -154,7 +154,7 @@ def _stage_scene(registered: Registered, inputs: Inputs, name: str, context: Con
     counts = output.write_scene(scene, staged, progress=progress)
     told = [", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())]
     if old is not None:
-        kept = copy_poses(pose_bytes(old.root / "sparse/0"), staged / "sparse/0")
+        kept = copy_poses(old.root / "sparse/0", staged / "sparse/0")
         told.append(f"poses of {kept} images copied bit by bit")
     context.stages.remark("scene", *told)
     return staged

@@ -17,8 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.colmap.arrays import RawImages, RawPoints
-from chronoscene.colmap.model import MODEL_FILES
-from chronoscene.colmap.raw_model import FORMS, RawModel, numbered_models, read_raw_model
+from chronoscene.colmap.raw_model import (
+    FORMS,
+    MODEL_FILES,
+    RawModel,
+    numbered_models,
+    read_raw_model,
+)
 from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name, is_usable
 from chronoscene.scene import Camera

@@ -12,12 +12,8 @@ import numpy as np
 import pytest
 
 from chronoscene.colmap.binary import read_images, read_points
-from chronoscene.colmap.model import (
-    model_kind,
-    read_model,
-    read_reconstruction,
-    write_model,
-)
+from chronoscene.colmap.model import copy_poses, read_model, read_reconstruction, write_model
+from chronoscene.colmap.raw_model import model_kind, read_raw_model
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
@@ -194,10 +190,11 @@ def test_points_in_any_order_come_out_by_id(tmp_path):
         data += b"".join(struct.pack("<ii", *pair) for pair in track)
     (tmp_path / "points3D.bin").write_bytes(data)
     points = read_points(tmp_path / "points3D.bin")
-    assert points.heads["id"].tolist() == [4, 7, 9]
-    assert points.heads["xyz"][:, 0].tolist() == [4, 7, 9]
+    assert points.ids.tolist() == [4, 7, 9]
+    assert points.xyz[:, 0].tolist() == [4, 7, 9]
     assert points.track_start.tolist() == [0, 0, 2, 3]
-    assert points.tracks.tolist() == [[2, 0], [1, 0], [1, 0]]
+    assert points.track_image.tolist() == [2, 1, 1]
+    assert points.track_keypoint.tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -299,3 +296,25 @@ def test_real_models(shared_data):
     assert len({i.camera for i in shared.images}) == 1
     with pytest.raises(SceneError, match="expected a model that COLMAP reads"):
         read_model(models / "t265_fisheye_txt")
+
+
+@pytest.mark.parametrize("form", ["binary", "old", "text"])
+def test_poses_are_copied_to_the_last_bit(make_scene_folder, tmp_path, form):
+    source = make_scene_folder(form=form) / "sparse" / "0"
+    scene = read_scene(source.parents[1])
+    rng = np.random.default_rng(0)
+    turned = [
+        replace(f, cam_from_world=f.cam_from_world + rng.normal(0, 1e-3, (4, 4)) * np.eye(4)[3])
+        for f in scene.frames
+    ]
+    write_model(tmp_path, turned, scene.points)
+    before = read_raw_model(tmp_path)
+    assert copy_poses(source, tmp_path) == len(scene.frames)
+    old, new = read_raw_model(source).images, read_raw_model(tmp_path)
+    row = [old.names.index(name) for name in new.images.names]
+    assert new.images.quaternions.tobytes() == old.quaternions[row].tobytes()
+    assert new.images.translations.tobytes() == old.translations[row].tobytes()
+    assert new.points.track_keypoint.tolist() == before.points.track_keypoint.tolist()
+    assert new.images.keypoint_xy.tobytes() == before.images.keypoint_xy.tobytes()
+    for image, frame in zip(read_model(tmp_path).images, scene.frames, strict=True):
+        assert image.cam_from_world.tobytes() == frame.cam_from_world.tobytes()

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from chronoscene.colmap.raw_model import read_raw_model
-from chronoscene.colmap.rigs import read_rigs
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.validation.checks.pixels import read_header, read_pixels_of
@@ -175,7 +174,6 @@ def test_readers_alone(fuzzed, form):
         path = rng.choice(list(good))
         path.write_bytes(mutate(rng, good[path]))
         model = read_raw_model(folder)
-        read_rigs(folder, form)
         for part, kind in ((model.images, "images"), (model.points, "points3D")):
             assert part is not None or kind in "".join(d.file for d in model.damages)
         path.write_bytes(good[path])

@@ -9,7 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from chronoscene.colmap.model import Model, model_kind, read_model
+from chronoscene.colmap.model import Model, read_model
+from chronoscene.colmap.raw_model import model_kind
 from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import SPLIT, check_image, make_frames
 from chronoscene.scene import Period, Scene

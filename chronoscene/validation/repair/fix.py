@@ -13,8 +13,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from chronoscene.colmap.model import MODEL_FILES
-from chronoscene.colmap.raw_model import FORMS, RawModel
+from chronoscene.colmap.raw_model import FORMS, MODEL_FILES, RawModel
 from chronoscene.colmap.write import write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD

@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 
-from chronoscene.colmap.raw_model import numbered_models
+from chronoscene.colmap.model import Model, read_poses
+from chronoscene.colmap.raw_model import model_kind, numbered_models
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.io.wording import shown
-from chronoscene.validation.checks.reader import reader_complaint
+from chronoscene.scene import Points
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
@@ -111,10 +112,16 @@ def bad_world_json(scene: RawScene) -> Iterator[Hit]:
     last=True,
 )
 def reader_refuses(scene: RawScene) -> Iterator[Hit]:
-    assert scene.model is not None
-    error = reader_complaint(scene.root, scene.model)
-    if error is not None:
-        yield Hit(error.place, error.expected, error.found, error.todo)
+    model = scene.model
+    assert model is not None and model.images is not None
+    try:
+        if model_kind(model.folder) == "binary":  # the rules checked points and tracks already
+            images = read_poses(scene.root / our_format.MODEL, model.images)
+            our_format.read(scene.root, model=Model(images, Points.empty()))
+        else:
+            our_format.read(scene.root)
+    except ChronoSceneError as error:
+        yield relative_hit(scene, error, "scene")
 
 
 def relative_hit(scene: RawScene, error: ChronoSceneError, place: str) -> Hit:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chronoscene.colmap.model import MODEL_FILES
+from chronoscene.colmap.raw_model import MODEL_FILES
 from chronoscene.formats.chronoscene import MODEL
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule

@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from chronoscene.colmap.rigs import CAMERA, RawFrame, RawRigs, pose_matrices, read_rigs
+from chronoscene.colmap.arrays import CAMERA, RawFrame
 from chronoscene.io.wording import counted, shown
-from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.geometry import camera_centre, rotation_from_quaternion
 from chronoscene.validation.checks.reprojection import good_poses
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
@@ -59,7 +59,7 @@ def rigs_partial(scene: RawScene) -> Iterator[Hit]:
     needs=("cameras", "images"),
 )
 def rigs_inconsistent(scene: RawScene) -> Iterator[Hit]:
-    raw = _read(scene)
+    raw = scene.model.rigs if scene.model else None
     if raw is None:
         return
     assert scene.images is not None and scene.cameras is not None
@@ -112,7 +112,7 @@ def rigs_inconsistent(scene: RawScene) -> Iterator[Hit]:
     needs=("images",),
 )
 def rig_pose_differs(scene: RawScene) -> Iterator[Hit]:
-    raw, images = _read(scene), scene.images
+    raw, images = scene.model.rigs if scene.model else None, scene.images
     if raw is None or images is None or not len(images):
         return
     if scene.cameras is not None and any(rigs_inconsistent(scene)):
@@ -144,6 +144,15 @@ def rig_pose_differs(scene: RawScene) -> Iterator[Hit]:
         yield Hit(place, "the poses of rigs and frames", found, count=len(different))
 
 
+def pose_matrices(poses: ArrayLike) -> Array:
+    """``[R t; 0 1]`` of poses, each 7 numbers; not finite where the pose is not. [n, 4, 4]"""
+    values = np.asarray(poses, np.float64).reshape(-1, 7)
+    matrices = np.tile(np.eye(4), (len(values), 1, 1))
+    matrices[:, :3, :3] = rotation_from_quaternion(values[:, :4])
+    matrices[:, :3, 3] = values[:, 4:]
+    return matrices
+
+
 def _same_pose(a: Array, b: Array, extent: float) -> NDArray[np.bool_]:
     """Of poses [n, 4, 4]; false, too, where one is not finite. [n]"""
     turned = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2))
@@ -159,7 +168,3 @@ def _form(scene: RawScene) -> str:
     """The form of the model's files."""
     assert scene.model is not None
     return next(iter(scene.model.files.values()))[-4:]
-
-
-def _read(scene: RawScene) -> RawRigs | None:
-    return read_rigs(scene.model.folder, _form(scene)) if scene.model else None

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from chronoscene.formats import read_scene
-from chronoscene.formats.chronoscene import write
 from chronoscene.registration.reconstruct.extend_tracks import grow_points
-from chronoscene.registration.reconstruct.kept_bits import copy_poses, pose_bytes
 from chronoscene.scene import Points, Scene
 
 
@@ -80,23 +78,3 @@ def test_a_point_that_moved_does_not_join_the_old_one(scene: Scene) -> None:
     assert len(grown) == 31
     names = [f.name for f in scene.frames]
     assert tracks(grown, names)[int(old.points.ids[4])] == set(names[:2])
-
-
-@pytest.mark.parametrize("form", ["binary", "old", "text"])
-def test_poses_are_copied_to_the_last_bit(
-    make_scene_folder: Callable[..., Path], tmp_path: Path, form: str
-) -> None:
-    source = make_scene_folder(form=form)
-    scene = read_scene(source)
-    write(scene, tmp_path / "out")
-    model = tmp_path / "out" / "sparse/0"
-    poses = pose_bytes(source / "sparse/0")
-    turned = {n: np.frombuffer(p).copy() for n, p in poses.items()}
-    for numbers in turned.values():
-        numbers[4] = np.nextafter(numbers[4], np.inf)  # a change that only bits show
-    assert copy_poses({n: p.tobytes() for n, p in turned.items()}, model) == len(scene.frames)
-    assert pose_bytes(model) == {n: p.tobytes() for n, p in turned.items()}
-    assert copy_poses(poses, model) == len(scene.frames)
-    again = read_scene(tmp_path / "out")
-    for a, b in zip(scene.frames, again.frames, strict=True):
-        assert a.cam_from_world.tobytes() == b.cam_from_world.tobytes()

@@ -2,8 +2,6 @@ import struct
 
 import pytest
 
-from chronoscene.colmap.rigs import read_rigs
-
 FRAMES, RIGS, IMAGES = (f"sparse/0/{stem}.bin" for stem in ("frames", "rigs", "images"))
 FRAME = struct.Struct("<II7dIiIQ")
 """A frame with one image: id, rig, pose, 1, sensor type and id, image id."""
@@ -27,17 +25,6 @@ def edit_frame(scene, index, change):
 
 def test_good_model_with_rigs(rigs):
     assert {f.code for f in rigs.validate().findings} == {"CS507"}
-
-
-@pytest.mark.parametrize("form", [".bin", ".txt"])
-def test_both_forms_say_the_same(rigs, form, tmp_path):
-    from chronoscene.colmap.model import read_reconstruction
-
-    folder = rigs.path("sparse/0")
-    expected = read_rigs(folder, ".bin")
-    read_reconstruction(folder).write_text(str(tmp_path))
-    found = read_rigs(folder if form == ".bin" else tmp_path, form)
-    assert found == expected and len(found.frames) == 14
 
 
 @pytest.mark.parametrize(("gone", "left"), [("frames", "rigs"), ("rigs", "frames")])
@@ -69,15 +56,3 @@ def test_pose_of_the_frame_differs(rigs):
 def test_pose_of_the_frame_is_not_finite(rigs):
     edit_frame(rigs, 3, lambda v: v.__setitem__(6, float("nan")))
     rigs.expect("CS143", place=IMAGES, found="'a003.png'")
-
-
-@pytest.mark.parametrize("text", ["", "1", "1 2 CAMERA 1", "1 99999999999 CAMERA 1", "x y", "1 -1"])
-def test_damaged_text_is_none_or_empty(tmp_path, text):
-    (tmp_path / "rigs.txt").write_text(f"# comment\n{text}\n")
-    (tmp_path / "frames.txt").write_text("1 1 1 0 0 0 0 0 0 1 CAMERA 1 1\n")
-    found = read_rigs(tmp_path, ".txt")
-    assert found is None or not any(found.rigs.values())
-    (tmp_path / "rigs.txt").write_text("1 1 CAMERA 1\n")
-    (tmp_path / "frames.txt").write_text(f"{text}\n")
-    found = read_rigs(tmp_path, ".txt")
-    assert found is None or not found.frames
