@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.anchors.decode.heads import HeadWeights, decode, decode_living, decode_reference
+from chronoscene.anchors.decode.heads import HeadWeights, decode, decode_active, decode_reference
 from chronoscene.kernels.threads import available_threads, set_threads
 from chronoscene.training.losses import photometric_loss, photometric_loss_reference
 from chronoscene.training.optimizer import Adam
@@ -144,10 +144,10 @@ def time_decode(step: Step, repeats: int, reference: bool) -> None:
     share = f"{100 * float(living.float().mean()):.0f} %"
 
     def living_only() -> Sequence[Tensor]:
-        return step.run(decode_living)[0]  # type: ignore[index]
+        return step.run(decode_active)[0]  # type: ignore[index]
 
     rows: list[tuple[str, Callable[[], Sequence[Tensor]], Sequence[Tensor]]] = [
-        (f"decode_living, {share} living", living_only, few),
+        (f"decode_active, {share} living", living_only, few),
         (f"decode, gradients for {share}", partial(step.run, decode), some),  # type: ignore[list-item]
         ("decode, gradients for all", partial(step.run, decode), every),  # type: ignore[list-item]
     ]

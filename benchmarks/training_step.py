@@ -106,8 +106,8 @@ def train(part: Part, preset: str, steps: int, anchors: int, seed: int) -> Ancho
     method.setup(part.train, seed=seed, device="cpu")
     for index in range(steps):
         method.step(index, index / config.iterations)
-    assert method._trainer is not None
-    return method._trainer
+    assert method.trainer is not None
+    return method.trainer
 
 
 def resume(part: Part, preset: str, model: Path, seed: int) -> AnchorTrainer:

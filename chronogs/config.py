@@ -46,3 +46,11 @@ class ChronoGSConfig(AnchorConfig):
                 found=f"{self.period_dim}, {self.global_dim}",
                 todo="correct the value",
             )
+        lengths = (self.base_dim, self.period_dim, self.global_dim)
+        if self.fusion == "sum" and len({n for n in lengths if n}) > 1:
+            raise ConfigError(
+                "fusion=sum",
+                expected="base, period and global features of one length (or 0)",
+                found=", ".join(map(str, lengths)),
+                todo="set the three dimensions alike, or use fusion=concat",
+            )

@@ -1,36 +1,33 @@
 """ChronoGS as a plug-in of the harness.
 
 Source: ChronoGS (arXiv 2511.18794) and the official code; where they differ, `ChronoGSConfig`
-names both. The training machinery is shared with Scaffold-GS.
+names both. `model` holds what is special about it; the rest is shared with Scaffold-GS.
 """
 
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from chronogs.config import ChronoGSConfig
+from chronogs.model import ChronoGSModel
 from chronogs.periods import period_weights
 from chronogs.sharing import pack_features, share_periods, unpack_features
 from chronoscene.anchors.method import AnchorMethod
 from chronoscene.anchors.model import AnchorLayout
 from chronoscene.anchors.trainer import AfterUpdate
 from chronoscene.methods import Prediction, View
+from chronoscene.training.rendering import draw, prediction_of
 
 
 class ChronoGS(AnchorMethod):
-    """Anchors with a shared feature, one feature per period, and one global feature per period.
-
-    Args:
-        config: Options.
-    """
+    """Anchors with a shared feature, one feature per period, and one global feature per period."""
 
     name = "chronogs"
-
-    def __init__(self, config: ChronoGSConfig) -> None:
-        super().__init__(config)
-        self.config: ChronoGSConfig = config
+    model_class = ChronoGSModel
+    config: ChronoGSConfig
 
     def layout(self, num_periods: int) -> AnchorLayout:
         config = self.config
@@ -64,6 +61,7 @@ class ChronoGS(AnchorMethod):
     def weights(self, period: float) -> NDArray[np.float32]:
         return period_weights(period, self.num_periods)
 
+    @torch.no_grad()
     def render_split(
         self, view: View, *, geometry_period: float, appearance_period: float
     ) -> Prediction:
@@ -71,4 +69,15 @@ class ChronoGS(AnchorMethod):
 
         Opacities and shapes come from the first, colours from the second; both may be fractional.
         """
-        return self._draw(view, self.weights(geometry_period), self.weights(appearance_period))
+        model = self.model
+        seen = model.seen_from(view)
+        geometry, appearance = (
+            torch.from_numpy(self.weights(period)).to(model.device)
+            for period in (geometry_period, appearance_period)
+        )
+        splats, positions = model.decode_active(geometry, *seen)
+        splats = splats._replace(colors=model.decode(appearance, *seen).colors[positions])
+        near_plane = model.layout.near_plane
+        return prediction_of(
+            draw(splats, view, self.background, near_plane=near_plane, render_depth=True)
+        )

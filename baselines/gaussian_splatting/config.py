@@ -1,99 +1,12 @@
-"""Options of 3D Gaussian Splatting. The defaults are those of the 2023 release."""
+"""Options of 3D Gaussian Splatting."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-from chronoscene.checks import check_choice
-from chronoscene.errors import ConfigError
+from chronoscene.gaussians.config import GaussianConfig
 
 
 @dataclass(frozen=True)
-class GaussianSplattingConfig:
-    """Options; what is called a moment is an iteration of the schedule, see `stretch`."""
-
-    iterations: int = 30_000
-    """Training steps; one image each."""
-    stretch: bool = False
-    """False: moment i is step i, as published, so training longer than `schedule_length` leaves
-    the schedule as it is. True: the whole schedule is stretched or squeezed to the length of the
-    training."""
-    schedule_length: int = 30_000
-    """Moments that the schedule was made for; the positions' learning rate falls over these."""
-    near_plane: float = 0.01
-    """Nearest depth that is drawn, in units of the training frame. 0.01 is common to all methods
-    here; the official rasterizer has 0.2 in units of its scene, whatever their size."""
-    ssim_weight: float = 0.2
-    """Weight of 1 - SSIM in the loss; L1 gets the rest (lambda)."""
-
-    # Colour
-    sh_degree: int = 3
-    """Highest degree of the spherical harmonics, 0 to 3."""
-    sh_interval: int = 1_000
-    """Moments from one degree to the next."""
-
-    # Learning rates of Adam
-    position_lr_initial: float = 1.6e-4
-    """Times the extent of the cameras."""
-    position_lr_final: float = 1.6e-6
-    """The same, at the end of the schedule; log-linear between."""
-    sh_dc_lr: float = 0.0025
-    """Of the constant coefficients."""
-    sh_rest_lr: float = 0.000125
-    """Of the others."""
-    opacity_lr: float = 0.05
-    """Of the logit of the opacity. Late 2024 releases have 0.025."""
-    scale_lr: float = 0.005
-    """Of the logarithm of the scale."""
-    rotation_lr: float = 0.001
-    """Of the quaternion."""
-
-    # Densification
-    initial_opacity: float = 0.1
-    densify_from: int = 500
-    """Moment after which Gaussians are added and pruned."""
-    densify_until: int = 15_000
-    """Moment from which the set of Gaussians is final."""
-    densify_interval: int = 100
-    """Steps, not moments, from one round to the next: a round needs views, not time."""
-    gradient_threshold: float = 0.0002
-    """Mean norm of the gradient of the projected centre, in half image sizes (tau_pos)."""
-    clone_scale: float = 0.01
-    """Gaussians up to this scale, times the extent of the cameras, are copied; others split."""
-    split_factor: float = 1.6
-    """Each of the two halves is smaller by this (phi)."""
-    min_opacity: float = 0.005
-    """Gaussians below it are pruned (epsilon_alpha)."""
-    max_scale: float = 0.1
-    """Gaussians above this scale, times the extent of the cameras, are pruned."""
-    prune_large_from: int = 3_000
-    """Moment after which `max_scale` counts."""
-    reset_interval: int = 3_000
-    """Moments from one opacity reset to the next, while the set of Gaussians grows."""
-    reset_opacity: float = 0.01
-    """No opacity is above it after a reset."""
-    max_gaussians: int = 0
-    """No round grows the set beyond it; the largest gradients go first. 0: no limit."""
-
-    def __post_init__(self) -> None:
-        check_choice("sh_degree", str(self.sh_degree), ("0", "1", "2", "3"))
-        for field in fields(self):
-            value = getattr(self, field.name)
-            low = 1 if field.name in _AT_LEAST_ONE else 0
-            if not value >= low:
-                raise ConfigError(
-                    field.name,
-                    expected=f"at least {low}",
-                    found=str(value),
-                    todo="correct the value",
-                )
-
-
-_AT_LEAST_ONE = (
-    "iterations",
-    "schedule_length",
-    "sh_interval",
-    "densify_interval",
-    "reset_interval",
-    "split_factor",
-)
+class GaussianSplattingConfig(GaussianConfig):
+    """Nothing beside the shared options, whose defaults are those of the 2023 release."""

@@ -1,4 +1,4 @@
-"""Options that all methods with anchors share. Steps of the training are counted as shares of it.
+"""Options that all methods with anchors share. Moments of the training are shares of its length.
 
 Defaults are those of the official ChronoGS code, whose numbers are mostly those of Scaffold-GS.
 """
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
+from chronoscene.rasterizer import NEAR_PLANE
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,8 @@ class AnchorConfig:
     offsets_per_anchor: int = 10
     """Gaussians per anchor (K, also k)."""
     voxel_size: float = 0.001
-    """Edge of the cells that start anchors, in `voxel_unit`; 0 takes the size from the cloud."""
+    """Edge of the cells in which anchors start, in `voxel_unit`; 0 takes the size from the
+    cloud."""
     voxel_unit: str = "world"
     """``world``: scene units (official code); ``training``: units of the normalised frame;
     ``spacing``: multiples of the median distance of neighbouring sparse points."""
@@ -59,6 +61,8 @@ class AnchorConfig:
     visibility: str = "radius"
     """Anchors decoded per view. ``radius``: projected footprint touches the image (code);
     ``frustum``: centre inside the image (paper)."""
+    near_plane: float = NEAR_PLANE
+    """Nearest depth that is decoded and drawn, in units of the training frame."""
 
     # Resolution
     coarse_until: float = 0.0
@@ -91,7 +95,7 @@ class AnchorConfig:
 
     # Growth and pruning
     statistics_from: float = 500 / 40_000
-    """Share of the training after which views are counted."""
+    """Share of the training after which statistics of the views are collected."""
     density_from: float = 1_500 / 40_000
     """Share after which anchors grow and are pruned."""
     density_until: float = 0.5
@@ -102,16 +106,18 @@ class AnchorConfig:
     """``after``: the first round is the first multiple of the interval after `density_from`
     (code: 1600); ``at``: the multiple at `density_from` counts too (paper: 1500)."""
     grad_threshold: float = 0.0002
-    """Mean gradient of a 2-D centre that makes a Gaussian a candidate (tau_g)."""
+    """Mean gradient of a 2-D centre, in half image sizes, that makes a Gaussian a candidate
+    (tau_g)."""
     success_threshold: float = 0.8
     """Share of the interval in which an anchor must be visible to be judged."""
     min_opacity: float = 0.005
-    """Anchors whose mean summed opacity is below this are pruned."""
+    """Anchors whose summed opacity per visit is below this are pruned."""
     prune_by: str = "opacity"
     """``opacity`` (code); ``gradient`` (main text of the paper); ``both``."""
     prune_gradient: float = 1e-6
-    """Mean gradient per visit below which ``gradient`` prunes; the paper gives no value."""
+    """Summed gradient per visit below which ``gradient`` prunes; the paper gives no value."""
     growth_levels: int = 3
+    """Cell sizes that are tried, coarse to fine."""
     coarsest_cell: int = 16
     """Edge of the coarsest growth cell in voxels."""
     cell_refinement: int = 4
@@ -119,7 +125,8 @@ class AnchorConfig:
     chained_levels: bool = True
     """Finer levels are skipped in a round in which the coarser ones added nothing (code)."""
     random_growth: bool = True
-    """Candidates are dropped by chance (code)."""
+    """Candidates are dropped at random: half of them at the coarsest level, fewer at finer ones
+    (code)."""
     max_log_scale: float = 0.05
     """Upper bound of the logarithm of the Gaussians' scale, applied at each round (code)."""
 
@@ -153,6 +160,7 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 
 _LOWER_BOUNDS: dict[str, float] = {
     "iterations": 1,
+    "near_plane": 0.0,
     "offsets_per_anchor": 1,
     "voxel_size": 0.0,
     "point_stride": 1,

@@ -1,8 +1,8 @@
-"""Growth and pruning of anchors: statistics, where new anchors appear, which ones go.
+"""Density control of anchors: statistics, where new anchors appear, which ones are pruned.
 
-Source: Scaffold-GS, section 3.3, and the official code of Scaffold-GS and ChronoGS, which agree
-here. Everything is numpy or Numba on arrays of a fixed order, so a seed gives the same anchors
-whatever the number of threads.
+Source: Scaffold-GS (Lu et al., CVPR 2024), section 3.3, and the official code of Scaffold-GS and
+ChronoGS, which agree here. Everything is numpy or Numba on arrays of a fixed order, so a seed gives
+the same anchors for any number of threads.
 """
 
 from __future__ import annotations
@@ -13,52 +13,17 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.voxels import cell_indices, pack_cells
 
 Float = NDArray[np.float32]
-
-
-@dataclass(frozen=True, slots=True)
-class DensityRules:
-    """Numbers that decide about growth and pruning."""
-
-    voxel_size: float
-    """Smallest cell, in training units."""
-    grad_threshold: float = 2e-4
-    """Mean gradient of a 2-D centre, in normalised device units (tau_g)."""
-    min_hits: float = 40.0
-    """A Gaussian with more hits than this is judged."""
-    min_visits: float = 80.0
-    """An anchor with more visits than this is judged."""
-    min_opacity: float = 0.005
-    """An anchor goes when its mean summed opacity per visit is below this."""
-    prune_by: str = "opacity"
-    """``opacity``; ``gradient``: an anchor goes when its Gaussians hardly moved; ``both``: when
-    either holds."""
-    prune_gradient: float = 1e-6
-    """Summed gradient per visit below which ``gradient`` prunes."""
-    levels: int = 3
-    """Cell sizes that are tried, coarse to fine."""
-    coarsest: int = 16
-    """Edge of the coarsest cell in voxels."""
-    refinement: int = 4
-    """Ratio of the cell edges of neighbouring levels."""
-    chained: bool = True
-    """Skip finer levels while no anchor was added in this round, as the official code does."""
-    random_mask: bool = True
-    """Drop candidates by chance: half of them at the coarsest level, fewer at finer ones."""
-    max_anchors: int = 0
-    """Growth stops here; 0 means no limit."""
-
-    def cell_size(self, level: int) -> float:
-        return self.voxel_size * max(self.coarsest // self.refinement**level, 1)
 
 
 _COUNTERS = ("opacity_sum", "visits", "motion", "grad_sum", "hits")
 
 
 class DensityStatistics:
-    """What the training views told about each anchor and Gaussian since the last judgement."""
+    """What training views said about each anchor and Gaussian since it was last judged."""
 
     def __init__(self, anchors: int, offsets: int) -> None:
         self.opacity_sum = np.zeros(anchors, np.float32)
@@ -89,19 +54,9 @@ class DensityStatistics:
             height: Image height in pixels.
         """
         _accumulate(
-            visible,
-            positions,
-            opacities,
-            radii,
-            means2d_grad,
-            0.5 * width,
-            0.5 * height,
-            self.opacity_sum,
-            self.visits,
-            self.motion,
-            self.grad_sum,
-            self.hits,
-        )
+            visible, positions, opacities, radii, means2d_grad, 0.5 * width, 0.5 * height,
+            self.opacity_sum, self.visits, self.motion, self.grad_sum, self.hits,
+        )  # fmt: skip
 
     def extend(self, count: int) -> None:
         """Make room for new anchors, which start with zeros."""
@@ -121,20 +76,10 @@ _CHUNK = 512
 
 
 @njit(cache=True, parallel=True)
-def _accumulate(
-    visible: NDArray[np.int64],
-    positions: NDArray[np.int64],
-    opacities: Float,
-    radii: NDArray[np.int32],
-    grad: Float,
-    half_width: float,
-    half_height: float,
-    opacity_sum: Float,
-    visits: Float,
-    motion: Float,
-    grad_sum: Float,
-    hits: Float,
-) -> None:
+def _accumulate(  # type: ignore[no-untyped-def]
+    visible, positions, opacities, radii, grad, half_width, half_height,
+    opacity_sum, visits, motion, grad_sum, hits,
+):  # fmt: skip
     # Anchors are visible once, so no two rows write to the same place.
     k = grad_sum.shape[1]
     for chunk in prange((len(visible) + _CHUNK - 1) // _CHUNK):
@@ -161,7 +106,7 @@ def _accumulate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchorArrays:
-    """The per-anchor tensors of a model."""
+    """The tensors of a model that have a row per anchor."""
 
     anchors: Float
     """Positions in training units. [A, 3]"""
@@ -188,10 +133,16 @@ class NewAnchors:
         return len(self.positions)
 
 
+def min_visits(config: AnchorConfig) -> float:
+    """Views of an anchor since the last round above which it is judged; half for a Gaussian."""
+    return config.density_interval * config.success_threshold
+
+
 def grow(
     arrays: AnchorArrays,
     statistics: DensityStatistics,
-    rules: DensityRules,
+    config: AnchorConfig,
+    voxel_size: float,
     generator: np.random.Generator,
 ) -> NewAnchors:
     """Find new anchors where the gradients of Gaussians are large.
@@ -202,22 +153,24 @@ def grow(
     Args:
         arrays: The model.
         statistics: Counters of the Gaussians that were judged are zeroed.
-        rules: Thresholds and cell sizes.
+        config: Thresholds and cell sizes in voxels.
+        voxel_size: Smallest cell, in training units.
         generator: Source of the random masks.
     """
-    eligible = statistics.hits > rules.min_hits
+    eligible = statistics.hits > 0.5 * min_visits(config)
     gradients = statistics.grad_sum / np.maximum(statistics.hits, np.float32(1.0))
     occupied = arrays.anchors
     found: list[NewAnchors] = []
-    for level in range(rules.levels):
-        chosen = eligible & (gradients >= rules.grad_threshold * 2**level)
-        if rules.random_mask:
+    for level in range(config.growth_levels):
+        chosen = eligible & (gradients >= config.grad_threshold * 2**level)
+        if config.random_growth:
             chosen &= generator.random(chosen.shape, dtype=np.float32) > 0.5 ** (level + 1)
-        if level > 0 and rules.chained and not found:
+        if level > 0 and config.chained_levels and not found:
             continue
-        new = _new_in_level(arrays, chosen, occupied, rules.cell_size(level))
-        if rules.max_anchors:
-            new = _limited(new, rules.max_anchors - len(occupied), generator)
+        voxels = max(config.coarsest_cell // config.cell_refinement**level, 1)
+        new = _new_in_level(arrays, chosen, occupied, voxel_size * voxels)
+        if config.max_anchors:
+            new = _limited(new, config.max_anchors - len(occupied), generator)
         if len(new):
             found.append(new)
             occupied = np.concatenate([occupied, new.positions])
@@ -246,7 +199,7 @@ def _new_in_level(
 
 
 def _limited(new: NewAnchors, room: int, generator: np.random.Generator) -> NewAnchors:
-    """At most ``room`` of the new anchors; where there are more, chance decides."""
+    """At most ``room`` of the new anchors; of more, a random selection."""
     if len(new) <= room:
         return new
     rows = np.sort(generator.permutation(len(new))[: max(room, 0)])
@@ -264,12 +217,12 @@ def _concatenate(parts: list[NewAnchors], channels: int) -> NewAnchors:
     )
 
 
-def prune_mask(statistics: DensityStatistics, rules: DensityRules) -> NDArray[np.bool_]:
+def prune_mask(statistics: DensityStatistics, config: AnchorConfig) -> NDArray[np.bool_]:
     """Anchors that stay; counters of the anchors that were judged are zeroed. [A]"""
-    judged = statistics.visits > rules.min_visits
-    faint = statistics.opacity_sum < rules.min_opacity * statistics.visits
-    still = statistics.motion < rules.prune_gradient * statistics.visits
-    criterion = {"opacity": faint, "gradient": still, "both": faint | still}[rules.prune_by]
+    judged = statistics.visits > min_visits(config)
+    faint = statistics.opacity_sum < config.min_opacity * statistics.visits
+    still = statistics.motion < config.prune_gradient * statistics.visits
+    criterion = {"opacity": faint, "gradient": still, "both": faint | still}[config.prune_by]
     for name in ("opacity_sum", "visits", "motion"):
         getattr(statistics, name)[judged] = 0.0
     return ~(judged & criterion)

@@ -1,11 +1,10 @@
-"""What methods with anchors have in common as plug-ins: start, train, render, save, load."""
+"""What methods with anchors have in common as plug-ins."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -13,39 +12,28 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
-from chronoscene.anchors.model import AnchorLayout, AnchorModel, draw_model
+from chronoscene.anchors.model import AnchorLayout, AnchorModel
 from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer, learning_rates
-from chronoscene.anchors.voxels import (
-    finite_points,
-    initial_anchors,
-    initial_log_scales,
-    resolve_voxel_size,
-)
+from chronoscene.anchors.voxels import initial_anchors, resolve_voxel_size
 from chronoscene.errors import CheckpointError
-from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
-from chronoscene.rasterizer.types import Rasterization
-from chronoscene.training.checkpoint import build_meta, load_tensors, save_tensors
+from chronoscene.methods import TrainingSet, View
+from chronoscene.rasterizer import Rasterization
+from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
+from chronoscene.training.method import SplattingMethod
+from chronoscene.training.rendering import draw
+from chronoscene.training.sparse_points import finite_rows
 
 
-class AnchorMethod:
-    """Base of the methods; a subclass names itself and says what its layout adds.
+class AnchorMethod(SplattingMethod):
+    """Base of the methods; a subclass names itself and says what its layout and model add."""
 
-    Args:
-        config: Options of the method.
-    """
-
-    name: ClassVar[str]
-    version: ClassVar[str] = "1"
-
-    def __init__(self, config: AnchorConfig) -> None:
-        self.config = config
-        self._model: AnchorModel | None = None
-        self._trainer: AnchorTrainer | None = None
-        self._background = torch.zeros(3)
-        self._meta: dict[str, Any] = {}
+    primitive = "anchors"
+    model_class: ClassVar[type[AnchorModel]] = AnchorModel
+    config: AnchorConfig
+    trainer: AnchorTrainer | None
 
     def layout(self, num_periods: int) -> AnchorLayout:
-        """Lengths and rules of the model."""
+        """Sizes and rules of the model."""
         return AnchorLayout.of(self.config, num_periods)
 
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
@@ -53,16 +41,12 @@ class AnchorMethod:
         return learning_rates(self.config, camera_extent)
 
     def weights(self, period: float) -> NDArray[np.float32]:
-        """Weights of the periods' features. [T]"""
-        raise NotImplementedError
+        """Weights of the features of the periods; here there is one for all. [T]"""
+        return np.ones(1, np.float32)
 
     def after_update(self) -> AfterUpdate | None:
         """What a method does to the features after each optimiser step; here nothing."""
         return None
-
-    def stored_tensors(self) -> dict[str, Tensor]:
-        """The model as it goes to disk, by name."""
-        return self.model.tensors()
 
     def restored_tensors(
         self, stored: dict[str, Tensor], layout: AnchorLayout
@@ -73,19 +57,17 @@ class AnchorMethod:
     @property
     def model(self) -> AnchorModel:
         """The tensors, up to date; there are none before `setup` or `load`."""
-        assert self._model is not None, "setup or load comes first"
-        return self._model if self._trainer is None else self._trainer.snapshot()
+        return self._model if self.trainer is None else self.trainer.snapshot()
 
     @property
     def num_periods(self) -> int:
         """Of the model; asks for no tensors, which `model` brings up to date at every use."""
-        assert self._model is not None, "setup or load comes first"
         return self._model.layout.num_periods
 
-    def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
-        """Build anchors, MLPs and optimiser from a training set."""
+    def start(self, train: TrainingSet, *, seed: int, device: str) -> AnchorTrainer:
         config = self.config
-        points = finite_points(train.points[:: config.point_stride])
+        points = train.points[:: config.point_stride]
+        points = points[finite_rows(points)].astype(np.float64)
         size = resolve_voxel_size(
             points,
             config.voxel_size,
@@ -95,99 +77,42 @@ class AnchorMethod:
         anchors, size = initial_anchors(
             points, size, origin=config.voxel_origin, limit=config.max_initial_anchors
         )
-        generator = torch.Generator().manual_seed(seed)
-        self._start(train, anchors, generator, device)
-        self._trainer = AnchorTrainer(
+        layout, generator = self.layout(train.num_periods), torch.Generator().manual_seed(seed)
+        self._model = self.model_class.start(layout, config, anchors, generator).to(device)
+        self.meta |= {"layout": dataclasses.asdict(layout), "voxel_size": size}
+        return AnchorTrainer(
             config,
-            self.model,
+            self._model,
             train,
             voxel_size=size,
             seed=seed,
             rates=self.rates(train.camera_extent),
             after_update=self.after_update(),
         )
-        self._meta = build_meta(
-            self.name,
-            self.version,
-            config,
-            training_from_world=train.training_from_world,
-            num_periods=train.num_periods,
-            layout=dataclasses.asdict(self.model.layout),
-            background=train.background.tolist(),
-            voxel_size=size,
-        )
 
-    def _start(
-        self,
-        train: TrainingSet,
-        anchors: NDArray[np.float32],
-        generator: torch.Generator,
-        device: str,
-    ) -> None:
-        config = self.config
-        self._background = torch.from_numpy(train.background).to(device)
-        self._model = AnchorModel.start(
-            self.layout(train.num_periods),
-            anchors,
-            initial_log_scales(anchors),
-            generator,
-            feature_init=config.feature_init,
-            feature_init_scale=config.feature_init_scale,
-            global_init=getattr(config, "global_init", "zero"),
-        ).to(device)
-
-    def step(self, index: int, progress: float) -> StepReport:
-        """Learn from one training view."""
-        assert self._trainer is not None, "setup comes first"
-        return self._trainer.step(index, progress)
-
-    def render(self, view: View, period: float) -> Prediction:
-        """Render a view as of a period."""
-        return self._draw(view, self.weights(period))
-
-    def _draw(
-        self,
-        view: View,
-        geometry: NDArray[np.float32],
-        appearance: NDArray[np.float32] | None = None,
-    ) -> Prediction:
+    def draw(self, view: View, period: float) -> Rasterization:
         model = self.model
-        colors = None if appearance is None else torch.from_numpy(appearance).to(model.device)
-        weights = torch.from_numpy(geometry).to(model.device)
-        return _prediction(draw_model(model, view, self._background, weights, colors))
+        weights = torch.from_numpy(self.weights(period)).to(model.device)
+        splats, _ = model.decode_active(weights, *model.seen_from(view))
+        near_plane = model.layout.near_plane
+        return draw(splats, view, self.background, near_plane=near_plane, render_depth=True)
 
-    def save(self, folder: Path) -> None:
-        """Write the model; the optimiser's state is not kept."""
-        save_tensors(folder, self.stored_tensors(), self._meta)
+    def stored_tensors(self) -> dict[str, Tensor]:
+        return self.model.tensors()
 
-    def load(self, folder: Path, *, device: str) -> None:
-        """Read a model; its own layout and options count, not those given to the constructor."""
-        tensors, meta = load_tensors(folder, device=device, method=self.name)
-        if not isinstance(meta.get("layout"), dict):
+    def restore(self, folder: Path, tensors: dict[str, Tensor], device: str) -> None:
+        if not isinstance(self.meta.get("layout"), dict):
             raise CheckpointError(
-                folder / "model.json", expected="a layout", found="none", todo="train again"
+                folder / META_FILE, expected="a layout", found="none", todo="train again"
             )
-        layout = AnchorLayout.from_meta(meta["layout"])
+        layout = AnchorLayout.from_meta(self.meta["layout"])
         try:
-            self._model = AnchorModel.from_tensors(layout, self.restored_tensors(tensors, layout))
+            restored = self.restored_tensors(tensors, layout)
+            self._model = self.model_class.from_tensors(layout, restored)
         except KeyError as error:
             raise CheckpointError(
-                folder / "model.safetensors",
+                folder / TENSOR_FILE,
                 expected=f"the tensor {error}",
                 found=", ".join(sorted(tensors)),
                 todo="the model is of another version: train again",
             ) from error
-        self._background = torch.tensor(meta["background"], dtype=torch.float32, device=device)
-        self._trainer, self._meta = None, meta
-
-    def size(self) -> MethodSize:
-        """Anchors, and all stored numbers."""
-        tensors = self.stored_tensors()
-        return MethodSize(len(tensors["anchors"]), sum(t.numel() for t in tensors.values()))
-
-
-def _prediction(raster: Rasterization) -> Prediction:
-    assert raster.depths is not None
-    images: Sequence[Tensor] = (raster.image[0], raster.alphas[0, ..., 0], raster.depths[0, ..., 0])
-    rgb, alpha, depth = (image.detach().cpu().numpy() for image in images)
-    return Prediction(rgb=rgb.clip(0.0, 1.0), alpha=alpha, depth=depth)

@@ -1,8 +1,9 @@
 """The tensors of a model with anchors, and how they become Gaussians.
 
-An anchor holds offsets, scales and a feature; three small MLPs turn the feature, the viewing
-direction and a global feature into opacities, shapes and colours of k Gaussians. ChronoGS and
-Scaffold-GS differ only in the lengths of the parts: see `AnchorLayout`.
+An anchor holds offsets, scales and features; three small MLPs turn the features and the viewing
+direction into opacities, shapes and colours of k Gaussians. Features may vary: beside the base
+feature an anchor can have one per period, and a period can have one of its own (global).
+Scaffold-GS has neither; ChronoGS has both, and says in `chronogs.model` how they are fused.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -19,13 +20,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import HEADS, AnchorConfig
-from chronoscene.anchors.decode.heads import Decoded, HeadWeights, decode, decode_living
+from chronoscene.anchors.decode.heads import HeadWeights, decode, decode_active
 from chronoscene.anchors.visibility import visible_anchors
-from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.anchors.voxels import initial_log_scales
+from chronoscene.errors import CheckpointError
 from chronoscene.methods import View
-from chronoscene.rasterizer import rasterize
-from chronoscene.rasterizer.types import Rasterization
-from chronoscene.training.camera_tensors import camera_centre_tensor, camera_tensors
+from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.training.rendering import Splats, camera_centre_tensor
 
 PER_ANCHOR = ("offsets", "features", "log_scales")
 """Trained tensors with one row per anchor."""
@@ -36,7 +37,7 @@ _LAYERS = ("w1", "b1", "w2", "b2")
 
 @dataclass(frozen=True, slots=True)
 class AnchorLayout:
-    """Lengths and rules that a forward pass needs; stored with every model."""
+    """Sizes and rules that a forward pass needs; stored with every model."""
 
     num_periods: int
     offsets: int
@@ -45,37 +46,20 @@ class AnchorLayout:
     global_dim: int = 0
     hidden_dim: int = 32
     fusion: str = "concat"
-    """``concat``: base, period feature, direction, global feature side by side; ``sum``: the
-    three features, of equal length, are added."""
+    """How the MLPs get the features: ``concat``, side by side; ``sum``: see `chronogs.model`."""
     direction: str = "unit"
     direction_heads: tuple[str, ...] = HEADS
     global_heads: tuple[str, ...] = HEADS
+    """MLPs that see the global feature."""
     offset_unit: str = "anchor"
     scale_unit: str = "anchor"
     visibility: str = "radius"
-
-    def __post_init__(self) -> None:
-        parts = {n for n in (self.base_dim, self.period_dim, self.global_dim) if n}
-        if self.fusion == "sum" and len(parts) > 1:
-            raise ConfigError(
-                "fusion=sum",
-                expected="base, period and global features of one length (or 0)",
-                found=f"{self.base_dim}, {self.period_dim}, {self.global_dim}",
-                todo="set the three dimensions alike, or use fusion=concat",
-            )
+    near_plane: float = NEAR_PLANE
 
     @property
     def feature_dim(self) -> int:
         """Stored numbers per anchor: base, then one block per period."""
         return self.base_dim + self.num_periods * self.period_dim
-
-    def input_dim(self, head: str) -> int:
-        """Inputs of the first layer of an MLP."""
-        direction = 3 if head in self.direction_heads else 0
-        if self.fusion == "sum":
-            return max(self.base_dim, self.period_dim, self.global_dim) + direction
-        global_dim = self.global_dim if head in self.global_heads else 0
-        return self.base_dim + self.period_dim + direction + global_dim
 
     @classmethod
     def of(cls, config: AnchorConfig, num_periods: int, **parts: Any) -> AnchorLayout:
@@ -91,6 +75,7 @@ class AnchorLayout:
             offset_unit=config.offset_unit,
             scale_unit=config.scale_unit,
             visibility=config.visibility,
+            near_plane=config.near_plane,
             **parts,
         )
 
@@ -98,9 +83,8 @@ class AnchorLayout:
     def from_meta(cls, meta: Mapping[str, Any]) -> AnchorLayout:
         """Read what ``dataclasses.asdict`` stored in ``model.json``."""
         known = {f.name for f in dataclasses.fields(cls)}
-        values: dict[str, Any] = {
-            k: tuple(v) if isinstance(v, list) else v for k, v in meta.items()
-        }
+        values: dict[str, Any] = {"near_plane": NEAR_PLANE}  # older models do not say
+        values |= {k: tuple(v) if isinstance(v, list) else v for k, v in meta.items()}
         if set(values) != known:
             raise CheckpointError(
                 "model.json: layout",
@@ -115,7 +99,7 @@ class AnchorModel:
     """Tensors of a model.
 
     Args:
-        layout: Lengths and rules.
+        layout: Sizes and rules.
         anchors: Positions in the training frame; never trained. [A, 3]
         offsets: [A, k, 3]
         features: Base feature, then one block per period. [A, Fb + T * Fv]
@@ -154,28 +138,35 @@ class AnchorModel:
     def start(
         cls,
         layout: AnchorLayout,
+        config: AnchorConfig,
         anchors: NDArray[np.float32],
-        log_scales: NDArray[np.float32],
         generator: torch.Generator,
-        *,
-        feature_init: str = "zero",
-        feature_init_scale: float = 0.1,
-        global_init: str = "gaussian",
-    ) -> AnchorModel:
+    ) -> Self:
         """The model before training. Draws the heads first, so equal layouts start equal."""
-        heads = {name: _start_head(layout, name, generator) for name in HEADS}
-        count = len(anchors)
-        features = _draw((count, layout.feature_dim), feature_init, feature_init_scale, generator)
-        table = _draw((layout.num_periods, layout.global_dim), global_init, 1.0, generator)
+        heads = {name: cls._start_head(layout, name, generator) for name in HEADS}
+        shape = (len(anchors), layout.feature_dim)
         return cls(
             layout,
             anchors=torch.from_numpy(anchors),
-            offsets=torch.zeros(count, layout.offsets, 3),
-            features=features,
-            log_scales=torch.from_numpy(log_scales),
-            global_features=table,
+            offsets=torch.zeros(len(anchors), layout.offsets, 3),
+            features=draw_start(shape, config.feature_init, config.feature_init_scale, generator),
+            log_scales=torch.from_numpy(initial_log_scales(anchors)),
+            global_features=torch.zeros(layout.num_periods, layout.global_dim),
             heads=heads,
         )
+
+    @classmethod
+    def _start_head(
+        cls, layout: AnchorLayout, name: str, generator: torch.Generator
+    ) -> HeadWeights:
+        """Weights and biases uniform within 1/sqrt(inputs), as usual for linear layers."""
+        inputs, hidden = cls.input_dim(layout, name), layout.hidden_dim
+        outputs = _OUTPUTS[name] * layout.offsets
+        w1, w2 = 1.0 / math.sqrt(max(inputs, 1)), 1.0 / math.sqrt(hidden)
+        shapes = ((hidden, inputs), (hidden,), (outputs, hidden), (outputs,))
+        bounds = (w1, w1, w2, w2)
+        pairs = zip(shapes, bounds, strict=True)
+        return HeadWeights(*(draw_start(s, "uniform", b, generator) for s, b in pairs))
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that is stored, by name."""
@@ -185,51 +176,57 @@ class AnchorModel:
         return named
 
     @classmethod
-    def from_tensors(cls, layout: AnchorLayout, tensors: Mapping[str, Tensor]) -> AnchorModel:
+    def from_tensors(cls, layout: AnchorLayout, tensors: Mapping[str, Tensor]) -> Self:
         """Inverse of `tensors`."""
         heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in _LAYERS)) for h in HEADS}
         named = {name: tensors[name] for name in ("anchors", *PER_ANCHOR, "global_features")}
         return cls(layout, **named, heads=heads)
 
-    def to(self, device: str | torch.device) -> AnchorModel:
+    def to(self, device: str | torch.device) -> Self:
         """The same model on another device."""
         moved = {name: tensor.to(device) for name, tensor in self.tensors().items()}
-        return AnchorModel.from_tensors(self.layout, moved)
+        return self.from_tensors(self.layout, moved)
 
-    def requires_grad(self, required: bool = True) -> AnchorModel:
-        """Mark everything but the anchors' positions as trained, or as not."""
+    def requires_grad(self) -> Self:
+        """Mark everything but the positions of the anchors as trained."""
         for name, tensor in self.tensors().items():
             if name != "anchors":
-                tensor.requires_grad_(required)
+                tensor.requires_grad_()
         return self
 
     def visible(self, view: View) -> NDArray[np.int64]:
         """Anchors that a view can see, ascending. [M]"""
         anchors, log_scales = self.anchors.cpu().numpy(), self.log_scales.detach().cpu().numpy()
-        return visible_anchors(anchors, log_scales, view, by=self.layout.visibility)
+        by, near_plane = self.layout.visibility, self.layout.near_plane
+        return visible_anchors(anchors, log_scales, view, by=by, near_plane=near_plane)
 
-    def decode(self, period_weights: Tensor, centre: Tensor, visible: Tensor) -> Decoded:
-        """Gaussians of the visible anchors, in their order.
+    def seen_from(self, view: View) -> tuple[Tensor, Tensor]:
+        """Camera centre [3] and indices of the visible anchors [M], as `decode` takes them."""
+        visible = torch.from_numpy(self.visible(view)).to(self.device)
+        return camera_centre_tensor(view, self.device), visible
+
+    def decode(self, period_weights: Tensor, centre: Tensor, visible: Tensor) -> Splats:
+        """Gaussians of the visible anchors, in their order, k to each.
 
         Args:
-            period_weights: Weights of the periods' features, usually with the sum 1. [T]
+            period_weights: Weights of the features of the periods, usually with the sum 1. [T]
             centre: Camera centre that gives the viewing direction. [3]
             visible: Ascending indices, int64. [M]
         """
         inputs, base_dim = self._decode_arguments(period_weights, centre, visible)
         return decode(*inputs, base_dim=base_dim, period_dim=self.layout.period_dim)
 
-    def decode_living(
+    def decode_active(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
-    ) -> tuple[Decoded, Tensor]:
+    ) -> tuple[Splats, Tensor]:
         """`decode` without the Gaussians that are switched off.
 
         Returns:
-            decoded: The L Gaussians with an opacity above 0.
+            splats: The L Gaussians with an opacity above 0.
             positions: Their places in the output of `decode`, ascending. int64 [L]
         """
         inputs, base_dim = self._decode_arguments(period_weights, centre, visible)
-        return decode_living(*inputs, base_dim=base_dim, period_dim=self.layout.period_dim)
+        return decode_active(*inputs, base_dim=base_dim, period_dim=self.layout.period_dim)
 
     def _decode_arguments(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
@@ -245,7 +242,7 @@ class AnchorModel:
         return (*tensors, self.global_features, period_weights, *heads, centre, visible), base_dim
 
     def _scales_in_use(self) -> Tensor:
-        """Log-scales with zeros where a rule says that the frame's unit counts. [A, 6]"""
+        """Log-scales with zeros where a rule says that the unit of the frame counts. [A, 6]"""
         rules = (self.layout.offset_unit, self.layout.scale_unit)
         if rules == ("anchor", "anchor"):
             return self.log_scales
@@ -254,106 +251,45 @@ class AnchorModel:
         kept = [h if r == "anchor" else zeros for h, r in zip(halves, rules, strict=True)]
         return torch.cat(kept, dim=1)
 
-    def _kernel_head(self, name: str) -> HeadWeights:
-        """Weights with the first layer in the kernel's order: base, period, direction, global.
+    @staticmethod
+    def input_dim(layout: AnchorLayout, head: str) -> int:
+        """Inputs of the first layer of an MLP: base, period, direction, global side by side."""
+        direction = 3 if head in layout.direction_heads else 0
+        return layout.base_dim + layout.period_dim + direction + layout.global_dim
 
-        Inputs that a head does not see get zero columns; features that are added instead of put
-        side by side share their columns, which is the same function.
-        """
+    def first_layer(self, head: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Columns of ``w1`` that act on the base, period, direction and global input. [H, ·]"""
+        layout, w1 = self.layout, self.heads[head].w1
+        direction = 3 if head in layout.direction_heads else 0
+        dims = [layout.base_dim, layout.period_dim, direction, layout.global_dim]
+        base, period, direction_columns, table = w1.split(dims, dim=1)
+        return base, period, direction_columns, table
+
+    def _kernel_head(self, name: str) -> HeadWeights:
+        """Weights with the inputs of the kernel; one that the MLP does not see has zero columns."""
         layout, head = self.layout, self.heads[name]
-        sees_direction = name in layout.direction_heads
-        sees_global = name in layout.global_heads
-        plain = layout.fusion == "concat" and layout.direction == "unit"
-        if plain and sees_direction and sees_global:
+        kernel_inputs = layout.base_dim + layout.period_dim + 3 + layout.global_dim
+        if layout.direction == "unit" and head.w1.shape[1] == kernel_inputs:
             return head
-        w1 = head.w1
-        dims = (layout.base_dim, layout.period_dim, layout.global_dim)
-        feature_dim = max(dims) if layout.fusion == "sum" else dims[0] + dims[1]
-        direction = w1[:, feature_dim : feature_dim + 3] if sees_direction else _zeros(w1, 3)
-        if layout.fusion == "sum":
-            base, period, table = (w1[:, : feature_dim if n else 0] for n in dims)
-        else:
-            base, period = w1[:, : dims[0]], w1[:, dims[0] : feature_dim]
-            table = w1[:, w1.shape[1] - dims[2] :] if sees_global else w1[:, :0]
-        if not sees_global:
-            table = _zeros(w1, dims[2])
+        base, period, direction, table = self.first_layer(name)
+        if direction.shape[1] == 0:
+            direction = zero_columns(head.w1, 3)
         if layout.direction == "full":
-            parts = [base, direction, period, _zeros(w1, 3), table]
+            parts = [base, direction, period, zero_columns(head.w1, 3), table]
         else:
             parts = [base, period, direction, table]
-        return HeadWeights(torch.cat(parts, dim=1), head.b1, head.w2, head.b2)
+        return head._replace(w1=torch.cat(parts, dim=1))
 
 
-def draw(
-    decoded: Decoded,
-    view: View,
-    background: Tensor,
-    *,
-    render_depth: bool = False,
-    check_finite: bool = True,
-) -> Rasterization:
-    """Rasterize decoded Gaussians."""
-    viewmats, Ks = camera_tensors(view, decoded.means.device)
-    return rasterize(
-        decoded.means,
-        decoded.quats,
-        decoded.scales,
-        decoded.opacities,
-        decoded.colors,
-        viewmats,
-        Ks,
-        view.width,
-        view.height,
-        backgrounds=background[None],
-        render_depth=render_depth,
-        check_finite=check_finite,
-    )
+def zero_columns(like: Tensor, count: int) -> Tensor:
+    """Zeros beside a matrix. [rows, count]"""
+    return like.new_zeros(len(like), count)
 
 
-@torch.no_grad()
-def draw_model(
-    model: AnchorModel,
-    view: View,
-    background: Tensor,
-    geometry_weights: Tensor,
-    appearance_weights: Tensor | None = None,
-) -> Rasterization:
-    """Render a view, with depth.
-
-    Args:
-        model: What to render.
-        view: The camera.
-        background: [3]
-        geometry_weights: Period weights of opacities and shapes. [T]
-        appearance_weights: Period weights of colours, where they differ. [T]
-    """
-    visible = torch.from_numpy(model.visible(view)).to(model.device)
-    centre = camera_centre_tensor(view, model.device)
-    decoded, positions = model.decode_living(geometry_weights, centre, visible)
-    if appearance_weights is not None:
-        colors = model.decode(appearance_weights, centre, visible).colors
-        decoded = decoded._replace(colors=colors[positions])
-    return draw(decoded, view, background, render_depth=True)
-
-
-def _zeros(like: Tensor, columns: int) -> Tensor:
-    return like.new_zeros(len(like), columns)
-
-
-def _draw(shape: Sequence[int], rule: str, scale: float, generator: torch.Generator) -> Tensor:
+def draw_start(shape: Sequence[int], rule: str, scale: float, generator: torch.Generator) -> Tensor:
+    """Start of a tensor: ``zero``, ``uniform`` within +-scale, or ``gaussian``."""
     if rule == "zero":
         return torch.zeros(*shape)
     if rule == "uniform":
         return (2.0 * torch.rand(*shape, generator=generator) - 1.0) * scale
     return torch.randn(*shape, generator=generator) * scale
-
-
-def _start_head(layout: AnchorLayout, name: str, generator: torch.Generator) -> HeadWeights:
-    """Uniform within 1/sqrt(inputs) for weights and biases: the usual start of a linear layer."""
-    inputs, hidden = layout.input_dim(name), layout.hidden_dim
-    outputs = _OUTPUTS[name] * layout.offsets
-    w1, w2 = 1.0 / math.sqrt(max(inputs, 1)), 1.0 / math.sqrt(hidden)
-    shapes = ((hidden, inputs), (hidden,), (outputs, hidden), (outputs,))
-    bounds = (w1, w1, w2, w2)
-    drawn = (_draw(s, "uniform", b, generator) for s, b in zip(shapes, bounds, strict=True))
-    return HeadWeights(*drawn)

@@ -1,4 +1,4 @@
-"""One training step of a model with anchors; shared by ChronoGS and Scaffold-GS.
+"""One training step of a model with anchors.
 
 Every schedule follows the progress of the training. Gradients come from kernels that reduce in a
 fixed order or from elementwise torch, and random numbers only from the seed, so a seed gives the
@@ -16,24 +16,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
-from chronoscene.anchors.density import (
-    AnchorArrays,
-    DensityRules,
-    DensityStatistics,
-    grow,
-    prune_mask,
-)
-from chronoscene.anchors.model import PER_ANCHOR, AnchorModel, draw
+from chronoscene.anchors.density import AnchorArrays, DensityStatistics, grow, prune_mask
+from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
 from chronoscene.anchors.volume_loss import mean_volume
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
-from chronoscene.rasterizer.types import RasterInfo
-from chronoscene.training.camera_tensors import camera_centre_tensor
-from chronoscene.training.downscale import coarser_image, coarser_view
+from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.losses import photometric_loss
 from chronoscene.training.optimizer import Adam
+from chronoscene.training.rendering import camera_centre_tensor, draw
 from chronoscene.training.row_adam import make_table
-from chronoscene.training.sampler import ViewSampler
-from chronoscene.training.schedule import log_linear
+from chronoscene.training.schedule import (
+    ViewSampler,
+    downscale_image,
+    downscale_view,
+    log_linear,
+)
+from chronoscene.training.sparse_points import finite_rows
 
 Rates = Mapping[str, tuple[float, float]]
 AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]
@@ -61,38 +59,18 @@ def learning_rates(config: AnchorConfig, camera_extent: float) -> dict[str, tupl
     return rates
 
 
-def density_rules(config: AnchorConfig, voxel_size: float) -> DensityRules:
-    """Thresholds of growth and pruning: counts are shares of the steps between two rounds."""
-    visits = config.density_interval * config.success_threshold
-    return DensityRules(
-        voxel_size=voxel_size,
-        grad_threshold=config.grad_threshold,
-        min_hits=0.5 * visits,
-        min_visits=visits,
-        min_opacity=config.min_opacity,
-        prune_by=config.prune_by,
-        prune_gradient=config.prune_gradient,
-        levels=config.growth_levels,
-        coarsest=config.coarsest_cell,
-        refinement=config.cell_refinement,
-        chained=config.chained_levels,
-        random_mask=config.random_growth,
-        max_anchors=config.max_anchors,
-    )
-
-
 class AnchorTrainer:
     """Trains a model on the views of a training set.
 
     Args:
         config: Options.
-        model: Trained in place; `snapshot` has the present state.
+        model: Trained in place; `snapshot` gives its present state.
         train: Views, images, background.
         voxel_size: Smallest growth cell in training units.
         seed: All random choices follow from it.
         rates: Learning rates by tensor name.
         after_update: Called with the model and the learning rates after each step that changed
-            the features; makes every step update the features of all anchors.
+            the features; every step then updates the features of all anchors.
     """
 
     def __init__(
@@ -110,7 +88,7 @@ class AnchorTrainer:
         self.after_update = after_update
         self.model = model.requires_grad()
         self.train = train
-        self.rules = density_rules(config, voxel_size)
+        self.voxel_size = voxel_size
         trained = {n: t for n, t in model.tensors().items() if n in rates and t.numel() > 0}
         self.rates = {name: rates[name] for name in trained}
         layout = model.layout
@@ -128,7 +106,8 @@ class AnchorTrainer:
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed)
-        self._middle = train.points.astype(np.float64).mean(axis=0)
+        points = train.points[finite_rows(train.points)]
+        self._middle = points.astype(np.float64).mean(axis=0)
         self.growth_generator = np.random.default_rng((seed, 1))
         self.noise_generator = np.random.default_rng((seed, 2))
         self.statistics: DensityStatistics | None = None
@@ -141,7 +120,7 @@ class AnchorTrainer:
         photo = self.train.load_image(position)
         if done <= self.config.coarse_until:
             factor = self.config.coarse_factor
-            view, photo = coarser_view(view, factor), coarser_image(photo, factor)
+            view, photo = downscale_view(view, factor), downscale_image(photo, factor)
         visible = self.model.visible(view)
         if len(visible) == 0:  # nothing to learn from; the image is the background
             return StepReport(loss=float("nan"), primitives=len(self.model))
@@ -158,24 +137,25 @@ class AnchorTrainer:
         self, view: TrainingView, photo: NDArray[np.uint8], visible: np.ndarray, done: float
     ) -> float:
         everything = torch.arange(len(visible), device=self.model.device)
-        decoded, positions = self._seen(visible, view.period).decode_living(
+        splats, positions = self._seen(visible, view.period).decode_active(
             self._one_period, self._seen_from(view), everything
         )
-        raster = draw(decoded, view, self.background, check_finite=False)
+        near_plane = self.model.layout.near_plane
+        raster = draw(splats, view, self.background, near_plane=near_plane, check_finite=False)
         target = torch.from_numpy(photo).to(self.model.device)
         loss = photometric_loss(raster.image[0], target, ssim_weight=self.config.ssim_weight)
         if self.config.scale_weight:
-            volume = mean_volume(decoded.scales, decoded.opacities)
+            volume = mean_volume(splats.scales, splats.opacities)
             loss = loss + self.config.scale_weight * volume
         loss.backward()
         if self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN:
-            self._count(view, visible, positions, decoded.opacities, raster.info)
+            self._collect(view, visible, positions, splats.opacities, raster.info)
         return float(loss.detach())
 
     def _seen(self, visible: np.ndarray, period: int) -> AnchorModel:
         """The visible anchors with the features of one period: a model of a single period."""
         tables, model = self.tables, self.model
-        return AnchorModel(
+        return type(model)(
             self._seen_layout,
             anchors=model.anchors[torch.from_numpy(visible).to(model.device)],
             offsets=tables["offsets"].fetch(visible),
@@ -189,10 +169,10 @@ class AnchorTrainer:
         """The model up to date: in `model`, anchors that no view saw lately lag behind."""
         tensors = self.model.tensors()
         tensors |= {name: table.snapshot() for name, table in self.tables.items()}
-        return AnchorModel.from_tensors(self.model.layout, tensors)
+        return self.model.from_tensors(self.model.layout, tensors)
 
     def _seen_from(self, view: TrainingView) -> Tensor:
-        """Camera centre for the viewing directions, shifted by chance if so configured. [3]"""
+        """Camera centre for the viewing directions, with random noise if so configured. [3]"""
         centre = camera_centre_tensor(view, self.model.device)
         if self.config.direction_noise:
             distance = float(np.linalg.norm(centre.cpu().numpy() - self._middle))
@@ -200,7 +180,7 @@ class AnchorTrainer:
             centre = centre + torch.from_numpy(shift.astype(np.float32)).to(centre.device)
         return centre
 
-    def _count(
+    def _collect(
         self,
         view: TrainingView,
         visible: np.ndarray,
@@ -241,7 +221,7 @@ class AnchorTrainer:
         model = self.model
         names = ("anchors", "offsets", "log_scales", "features")
         arrays = AnchorArrays(*(getattr(model, n).detach().cpu().numpy() for n in names))
-        new = grow(arrays, statistics, self.rules, self.growth_generator)
+        new = grow(arrays, statistics, self.config, self.voxel_size, self.growth_generator)
         rows = {
             "offsets": np.zeros((len(new), *model.offsets.shape[1:]), np.float32),
             "features": new.features,
@@ -255,8 +235,8 @@ class AnchorTrainer:
         statistics.extend(len(new))
 
     def _prune(self, statistics: DensityStatistics) -> None:
-        """Drop anchors; bound the scales. A model is never left without any anchor."""
-        keep = prune_mask(statistics, self.rules)
+        """Drop anchors and bound the scales. A model is never left without any anchor."""
+        keep = prune_mask(statistics, self.config)
         if not keep.all() and keep.any():
             mask = torch.from_numpy(keep).to(self.model.device)
             for name, table in self.tables.items():
@@ -267,8 +247,8 @@ class AnchorTrainer:
             self.model.log_scales[:, 3:].clamp_(max=self.config.max_log_scale)
 
     def _update(self, done: float, *, resized: bool) -> None:
-        """Adam. After a round only MLPs and global features move, as in the official code, where
-        the anchors then have new tensors without gradients."""
+        """Adam. After a round only the MLPs and global features move, as in the official code,
+        where the anchors then have new tensors without gradients."""
         rates = {name: log_linear(done, *rate) for name, rate in self.rates.items()}
         self.optimizer.step(rates)
         self.optimizer.zero_grad()

@@ -11,12 +11,11 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from chronoscene.methods import View
+from chronoscene.rasterizer.constants import CLAMP_MARGIN, EPS2D, FAR_PLANE
 
-_BLUR = 0.3
-"""Variance in square pixels that the rasterizer adds to every footprint."""
 _EXTENT = 3.33
 """Half width of a footprint in standard deviations: where an opacity of 1 falls below 1/255."""
-_SLACK = 0.15
+_SLACK = CLAMP_MARGIN / 2
 """Share of the image by which the linearised projection may look beyond its edges."""
 
 
@@ -26,8 +25,8 @@ def visible_anchors(
     view: View,
     *,
     by: str = "radius",
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
+    near_plane: float,
+    far_plane: float = FAR_PLANE,
 ) -> NDArray[np.int64]:
     """Indices of the anchors to decode, ascending. [M]
 
@@ -38,7 +37,7 @@ def visible_anchors(
         by: ``radius``: the projected footprint touches the image; ``frustum``: the centre
             projects into it.
         near_plane: Anchors nearer than this are invisible.
-        far_plane: So are those farther than this.
+        far_plane: So are those farther away than this.
     """
     mask = np.empty(len(anchors), np.bool_)
     pose = np.ascontiguousarray(view.cam_from_world, dtype=np.float64)
@@ -52,18 +51,9 @@ def visible_anchors(
 
 
 @njit(cache=True, parallel=True)
-def _mark(
-    anchors: NDArray[np.float32],
-    log_scales: NDArray[np.float32],
-    pose: NDArray[np.float64],
-    intrinsics: NDArray[np.float64],
-    width: float,
-    height: float,
-    near: float,
-    far: float,
-    extent: float,
-    mask: NDArray[np.bool_],
-) -> None:
+def _mark(  # type: ignore[no-untyped-def]
+    anchors, log_scales, pose, intrinsics, width, height, near, far, extent, mask
+):
     fx, fy, cx, cy = intrinsics
     # The slope of a ray is held near the image before the projection is linearised, as in 3DGS.
     low_x, high_x = -(cx + _SLACK * width) / fx, ((1.0 + _SLACK) * width - cx) / fx
@@ -77,9 +67,10 @@ def _mark(
         x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
         y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
         u, v = fx * x / z + cx, fy * y / z + cy
+        # Footprint: Sigma' = J W Sigma W^T J^T (EWA), of which the diagonal is needed.
         slope_x = min(max(x / z, low_x), high_x)
         slope_y = min(max(y / z, low_y), high_y)
-        variance_u, variance_v = _BLUR, _BLUR
+        variance_u, variance_v = EPS2D, EPS2D
         for axis in range(3):
             spread = np.exp(2.0 * log_scales[i, axis])
             ju = fx / z * (pose[0, axis] - slope_x * pose[2, axis])

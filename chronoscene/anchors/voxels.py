@@ -1,21 +1,19 @@
 """Where anchors start: one per occupied voxel of the sparse cloud of all periods.
 
 Source: Scaffold-GS (Lu et al., CVPR 2024) and the official ChronoGS code. Differences are named
-options of `AnchorConfig`; numpy and scipy only.
+options of `AnchorConfig`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from chronoscene.errors import ConfigError, SceneError
+from chronoscene.errors import ConfigError
+from chronoscene.training.sparse_points import rms_spacing
 
 MIN_DISTANCE = 1e-7
 """Lower bound of a neighbour distance: keeps the log-scales of coinciding points finite."""
-
-_NEIGHBOURS = 3
 
 
 def cell_indices(
@@ -46,25 +44,15 @@ def pack_cells(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def neighbour_distances(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Root mean square distance to the three nearest other points. [P, 3] -> [P]
-
-    With fewer than four points it is taken over those that there are; a lone point gets the lower
-    bound `MIN_DISTANCE`.
-    """
-    neighbours = min(_NEIGHBOURS, len(points) - 1)
-    if neighbours < 1:
-        return np.full(len(points), MIN_DISTANCE)
-    distances, _ = cKDTree(points).query(points, k=neighbours + 1)
-    mean_square = np.square(distances[:, 1:]).mean(axis=1)
-    return np.maximum(np.sqrt(mean_square), MIN_DISTANCE)
+    """Root mean square distance to the three nearest other points, at least `MIN_DISTANCE`. [P]"""
+    return np.maximum(rms_spacing(points), MIN_DISTANCE)
 
 
 def median_spacing(points: NDArray[np.floating]) -> float:
     """Median distance of a point to its nearest other point, in the units of the points."""
     if len(points) < 2:
         return 1.0
-    distances, _ = cKDTree(points).query(points, k=2)
-    return float(max(np.median(distances[:, 1]), MIN_DISTANCE))
+    return float(max(np.median(rms_spacing(points, 1)), MIN_DISTANCE))
 
 
 def resolve_voxel_size(
@@ -106,23 +94,6 @@ def voxelize(
     cells = cell_indices(points, size, corner)
     _, first = np.unique(pack_cells(cells), return_index=True)
     return (cells[first] * size + corner).astype(np.float32)
-
-
-def finite_points(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Points with finite coordinates. [P, 3] -> [Q, 3]
-
-    Raises:
-        SceneError: If there is none.
-    """
-    finite: NDArray[np.float64] = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-    if len(finite) == 0:
-        raise SceneError(
-            "sparse points",
-            expected="at least one point with finite coordinates",
-            found=f"{len(points)} points",
-            todo="triangulate the scene: anchors start from its sparse points",
-        )
-    return finite
 
 
 def initial_anchors(

@@ -1,16 +1,83 @@
-"""Values that change with the progress of a training."""
+"""What a training step works with: the next view, the size of its photo, its learning rates."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.methods import TrainingView
+
+
+class ViewSampler:
+    """Draws view indices without replacement from a shuffled pool that is refilled when empty.
+
+    The order is a function of the seed and of the number of draws alone: pool number ``e`` is the
+    permutation of a generator seeded with ``(seed, e)``. A resumed run sets `drawn` and continues
+    as if it had never stopped, and nothing else can disturb the order.
+
+    Args:
+        count: Number of views to draw from.
+        seed: Seed of the run.
+    """
+
+    def __init__(self, count: int, seed: int) -> None:
+        if count < 1:
+            raise ValueError(f"count must be at least 1, not {count}")
+        self.count = count
+        self.seed = seed
+        self.drawn = 0
+        """Draws done so far; may be set to continue an interrupted run."""
+        self._pool_number = -1
+        self._pool: NDArray[np.int64] = np.zeros(0, np.int64)
+
+    def next(self) -> int:
+        """Index of the next view, 0..count-1."""
+        pool_number, position = divmod(self.drawn, self.count)
+        if pool_number != self._pool_number:
+            generator = np.random.default_rng((self.seed, pool_number))
+            self._pool = generator.permutation(self.count)
+            self._pool_number = pool_number
+        self.drawn += 1
+        return int(self._pool[position])
+
+
+def downscale_view(view: TrainingView, factor: int) -> TrainingView:
+    """The view at 1/factor of its size; rows and columns that fill no whole pixel are cut off.
+
+    Pixel (0, 0) is centred at (0.5, 0.5), so image positions are divided by the factor.
+    """
+    K = view.K.copy()
+    K[:2] /= factor
+    width, height = max(view.width // factor, 1), max(view.height // factor, 1)
+    return replace(view, K=K, width=width, height=height)
+
+
+def downscale_image(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Rounded mean over squares of pixels; the result has the size of `downscale_view`.
+
+    Args:
+        image: [H, W, 3]
+        factor: Edge of a square in pixels; squares are smaller where the image is.
+    """
+    height, width = (max(size // factor, 1) for size in image.shape[:2])
+    tall, wide = (min(factor, size) for size in image.shape[:2])
+    # Sums of every n-th pixel: ten times as fast as a sum over axes of a reshaped array.
+    sums = np.full((height, width, 3), tall * wide // 2, np.uint32)
+    for row in range(tall):
+        for column in range(wide):
+            sums += image[row : height * tall : tall, column : width * wide : wide]
+    return (sums // (tall * wide)).astype(np.uint8)
 
 
 def log_linear(progress: float, start: float, end: float) -> float:
-    """Interpolate in the logarithm: ``start^(1 - p) * end^p``.
+    """A learning rate that falls log-linearly: ``start^(1 - p) * end^p``.
 
     Args:
-        progress: Share of the training that is over; held to 0..1.
-        start: Value at progress 0, above 0; or 0 together with `end` for a value that is off.
+        progress: Share of the training that is over; clamped to 0..1.
+        start: Value at progress 0, above 0; or 0 together with `end` to switch it off.
         end: Value at progress 1.
     """
     p = min(max(progress, 0.0), 1.0)

@@ -7,15 +7,27 @@ import dataclasses
 import numpy as np
 import pytest
 
+from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import (
     AnchorArrays,
-    DensityRules,
     DensityStatistics,
+    NewAnchors,
     grow,
     prune_mask,
 )
 
-RULES = DensityRules(voxel_size=0.001, random_mask=False)
+CONFIG = AnchorConfig(random_growth=False)
+
+
+def grown(
+    arrays: AnchorArrays,
+    statistics: DensityStatistics,
+    config: AnchorConfig = CONFIG,
+    *,
+    voxel_size: float = 0.001,
+    seed: int = 0,
+) -> NewAnchors:
+    return grow(arrays, statistics, config, voxel_size, np.random.default_rng(seed))
 
 
 def arrays_of(positions: list[list[float]], features: list[list[float]]) -> AnchorArrays:
@@ -46,33 +58,33 @@ def sizes(new_log_scales: np.ndarray) -> list[float]:
 def test_larger_gradients_reach_finer_levels(gradient: float, levels: int) -> None:
     """Each level finds its own free cell: 16, 4 and 1 voxels away from the anchors."""
     arrays = arrays_of([[0.5, 0.0062, 0.0]], [[1.0]])
-    new = grow(arrays, statistics_of([gradient], 41), RULES, np.random.default_rng(0))
+    new = grown(arrays, statistics_of([gradient], 41))
     # The Gaussian's cells at 0.016, 0.004 and 0.001 are three different ones.
     assert sizes(new.log_scales) == [0.016, 0.004, 0.001][:levels]
 
 
 def test_a_gaussian_needs_more_than_forty_hits() -> None:
     arrays = arrays_of([[0.5, 0.0, 0.0]], [[1.0]])
-    assert len(grow(arrays, statistics_of([9e-4], 40), RULES, np.random.default_rng(0))) == 0
-    assert len(grow(arrays, statistics_of([9e-4], 41), RULES, np.random.default_rng(0))) > 0
+    assert len(grown(arrays, statistics_of([9e-4], 40))) == 0
+    assert len(grown(arrays, statistics_of([9e-4], 41))) > 0
 
 
 def test_nothing_at_the_coarsest_level_means_nothing_at_all() -> None:
     # The coarse cell holds the anchor in the origin, the cells of 0.004 do not.
     arrays = arrays_of([[0.0062, 0.0, 0.0]], [[1.0]])
     statistics = statistics_of([9e-4], 41)
-    assert len(grow(arrays, statistics, RULES, np.random.default_rng(0))) == 0
-    unchained = dataclasses.replace(RULES, chained=False)
+    assert len(grown(arrays, statistics)) == 0
+    unchained = dataclasses.replace(CONFIG, chained_levels=False)
     statistics = statistics_of([9e-4], 41)
-    new = grow(arrays, statistics, unchained, np.random.default_rng(0))
+    new = grown(arrays, statistics, unchained)
     assert sizes(new.log_scales) == [0.004, 0.001]
 
 
 def test_a_new_anchor_sits_in_its_cell_with_the_largest_features_of_its_parents() -> None:
     arrays = arrays_of([[0.501, 0, 0], [0.499, 0, 0]], [[1.0, -5.0], [-2.0, 3.0]])
-    one_level = dataclasses.replace(RULES, levels=1)
+    one_level = dataclasses.replace(CONFIG, growth_levels=1)
     statistics = statistics_of([3e-4, 3e-4], 41)
-    new = grow(arrays, statistics, one_level, np.random.default_rng(0))
+    new = grown(arrays, statistics, one_level)
     cell = np.round(0.5 / 0.016) * 0.016
     np.testing.assert_allclose(new.positions, [[cell, 0, 0]], rtol=1e-6)
     np.testing.assert_array_equal(new.features, [[1.0, 3.0]])
@@ -83,8 +95,8 @@ def test_offsets_count_in_units_of_the_anchor() -> None:
     arrays = dataclasses.replace(
         arrays_of([[1.0, 0, 0]], [[1.0]]), log_scales=np.full((1, 6), np.log(0.32), np.float32)
     )
-    rules = dataclasses.replace(RULES, levels=1)
-    new = grow(arrays, statistics_of([3e-4], 41), rules, np.random.default_rng(0))
+    rules = dataclasses.replace(CONFIG, growth_levels=1)
+    new = grown(arrays, statistics_of([3e-4], 41), rules)
     np.testing.assert_allclose(new.positions, [[0.32, 0, 0]], rtol=1e-6)
 
 
@@ -92,7 +104,7 @@ def test_only_judged_gaussians_lose_their_counters() -> None:
     arrays = arrays_of([[0.5, 0, 0], [0.6, 0, 0]], [[1.0], [1.0]])
     statistics = statistics_of([1e-4, 1e-4], 41)
     statistics.hits[1], statistics.grad_sum[1] = 40, 1.0
-    grow(arrays, statistics, RULES, np.random.default_rng(0))
+    grown(arrays, statistics)
     assert statistics.hits[:, 0].tolist() == [0.0, 40.0]
     assert statistics.grad_sum[:, 0].tolist() == [0.0, 1.0]
 
@@ -102,8 +114,8 @@ def test_the_random_masks_keep_more_at_finer_levels() -> None:
     # 0.0062 lies in other cells at every level, so no level takes the place of the next.
     positions = [[0.5 + 0.1 * i, 0.0062, 0.0] for i in range(count)]
     arrays = arrays_of(positions, [[0.0]] * count)
-    rules = dataclasses.replace(RULES, voxel_size=0.001, random_mask=True)
-    new = grow(arrays, statistics_of([9e-4] * count, 41), rules, np.random.default_rng(0))
+    rules = dataclasses.replace(CONFIG, random_growth=True)
+    new = grown(arrays, statistics_of([9e-4] * count, 41), rules)
     edges, counts = np.unique(
         np.round(np.exp(new.log_scales[:, 0].astype(np.float64)), 6), return_counts=True
     )
@@ -114,11 +126,8 @@ def test_the_random_masks_keep_more_at_finer_levels() -> None:
 
 def test_growth_stops_at_the_limit_and_repeats_with_the_seed() -> None:
     arrays = arrays_of([[0.5 + 0.1 * i, 0, 0] for i in range(50)], [[0.0]] * 50)
-    limited = dataclasses.replace(RULES, max_anchors=57)
-    runs = [
-        grow(arrays, statistics_of([9e-4] * 50, 41), limited, np.random.default_rng(3))
-        for _ in range(2)
-    ]
+    limited = dataclasses.replace(CONFIG, max_anchors=57)
+    runs = [grown(arrays, statistics_of([9e-4] * 50, 41), limited, seed=3) for _ in range(2)]
     assert len(runs[0]) == 7
     np.testing.assert_array_equal(runs[0].positions, runs[1].positions)
 
@@ -130,7 +139,7 @@ def test_growth_stops_at_the_limit_and_repeats_with_the_seed() -> None:
 def test_faint_anchors_are_pruned(visits: float, opacity_sum: float, kept: bool) -> None:
     statistics = DensityStatistics(1, 2)
     statistics.visits[0], statistics.opacity_sum[0] = visits, opacity_sum
-    assert prune_mask(statistics, RULES).tolist() == [kept]
+    assert prune_mask(statistics, CONFIG).tolist() == [kept]
     assert statistics.visits[0] == (80 if visits == 80 else 0)
 
 
@@ -138,7 +147,7 @@ def test_the_paper_prunes_anchors_that_do_not_move() -> None:
     statistics = DensityStatistics(2, 1)
     statistics.visits[:], statistics.opacity_sum[:] = 100, 50.0
     statistics.motion[:] = [0.0, 1.0]
-    rules = dataclasses.replace(RULES, prune_by="gradient")
+    rules = dataclasses.replace(CONFIG, prune_by="gradient")
     assert prune_mask(statistics, rules).tolist() == [False, True]
 
 

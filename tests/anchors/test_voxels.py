@@ -12,7 +12,6 @@ from chronoscene.anchors.visibility import visible_anchors
 from chronoscene.anchors.voxels import (
     MIN_DISTANCE,
     cell_indices,
-    finite_points,
     initial_anchors,
     initial_log_scales,
     median_spacing,
@@ -21,9 +20,9 @@ from chronoscene.anchors.voxels import (
     resolve_voxel_size,
     voxelize,
 )
-from chronoscene.errors import ConfigError, SceneError
+from chronoscene.errors import ConfigError
 from chronoscene.methods import View
-from chronoscene.rasterizer import rasterize
+from chronoscene.rasterizer import NEAR_PLANE, rasterize
 
 cells = st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=30)
 
@@ -106,13 +105,6 @@ def test_median_spacing_ignores_an_outlier(grid: np.ndarray) -> None:
     assert median_spacing(np.concatenate([grid, [[1e6, 0, 0]]])) == 2.0
 
 
-def test_points_that_are_not_finite_are_dropped_and_none_is_refused() -> None:
-    points = np.array([[0.0, 1.0, 2.0], [np.nan, 0, 0], [np.inf, 0, 0]])
-    np.testing.assert_array_equal(finite_points(points), [[0.0, 1.0, 2.0]])
-    with pytest.raises(SceneError, match="sparse points: expected at least one point"):
-        finite_points(points[1:])
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_every_anchor_that_the_rasterizer_would_draw_is_decoded(seed: int) -> None:
@@ -134,7 +126,7 @@ def test_every_anchor_that_the_rasterizer_would_draw_is_decoded(seed: int) -> No
         backend="reference",
     )
     drawn = np.flatnonzero((raster.info.radii[0] > 0).all(dim=1).numpy())
-    visible = visible_anchors(anchors, log_scales, view)
+    visible = visible_anchors(anchors, log_scales, view, near_plane=NEAR_PLANE)
     assert set(drawn) <= set(visible)
     assert len(visible) - len(drawn) <= 10  # the two bounds round differently
 
@@ -144,5 +136,9 @@ def test_the_frustum_rule_asks_for_the_centre() -> None:
     view = View(K=K, width=10, height=10, cam_from_world=np.eye(4))
     anchors = np.array([[0, 0, 1], [0.6, 0, 1], [0, 0, -1], [0, 0, 0.005]], np.float32)
     log_scales = np.full((4, 6), np.log(0.2), np.float32)
-    np.testing.assert_array_equal(visible_anchors(anchors, log_scales, view), [0, 1])
-    np.testing.assert_array_equal(visible_anchors(anchors, log_scales, view, by="frustum"), [0])
+    np.testing.assert_array_equal(
+        visible_anchors(anchors, log_scales, view, near_plane=NEAR_PLANE), [0, 1]
+    )
+    np.testing.assert_array_equal(
+        visible_anchors(anchors, log_scales, view, near_plane=NEAR_PLANE, by="frustum"), [0]
+    )

@@ -10,16 +10,17 @@ import torch
 
 from chronogs.method import ChronoGS
 from chronoscene.anchors.config import HEADS
-from chronoscene.anchors.decode.heads import Decoded
-from chronoscene.anchors.model import PER_ANCHOR, AnchorModel, draw
+from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
 from chronoscene.anchors.volume_loss import mean_volume
 from chronoscene.errors import ConfigError
+from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.training.rendering import Splats, draw
 
 Make = Callable[..., ChronoGS]
 CENTRE = torch.tensor([0.3, -0.2, 2.0])
 
 
-def decode_all(model: AnchorModel, weights: list[float], centre: torch.Tensor = CENTRE) -> Decoded:
+def decode_all(model: AnchorModel, weights: list[float], centre: torch.Tensor = CENTRE) -> Splats:
     return model.decode(torch.tensor(weights), centre, torch.arange(len(model)))
 
 
@@ -103,7 +104,7 @@ def test_gaussians_that_are_off_leave_the_background(method: Make, noise_set: Ca
     decoded = decode_all(made.model, [1.0, 0.0, 0.0])
     volume = mean_volume(decoded.scales, decoded.opacities)
     assert float(volume.detach()) == 0.0
-    (draw(decoded, view, torch.zeros(3)).image.sum() + volume).backward()
+    (draw(decoded, view, torch.zeros(3), near_plane=NEAR_PLANE).image.sum() + volume).backward()
     for name in ("features", "offsets", "log_scales"):
         grad = getattr(made.model, name).grad
         assert grad is None or not grad.any()

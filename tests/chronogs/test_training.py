@@ -17,6 +17,7 @@ from chronoscene.anchors.density import DensityStatistics
 from chronoscene.errors import CheckpointError
 from chronoscene.kernels.threads import set_threads
 from chronoscene.methods import TrainingSet
+from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.training.schedule import log_linear
 
 Make = Callable[..., ChronoGS]
@@ -58,7 +59,7 @@ def rounds(config: ChronoGSConfig, train_set: TrainingSet, total: int) -> list[i
     """Steps, counted from 1, after which anchors would grow, without doing the steps' work."""
     made = ChronoGS(config)
     made.setup(train_set, seed=0, device="cpu")
-    trainer = made._trainer
+    trainer = made.trainer
     assert trainer is not None
     trainer.statistics = object()  # type: ignore[assignment]
     trainer._grow = lambda statistics: None  # type: ignore[method-assign]
@@ -100,7 +101,7 @@ def test_anchors_grow_and_only_mlps_move_in_that_step(
 def test_faint_anchors_go_but_never_all(noise_set: Callable[[int], TrainingSet]) -> None:
     made = _set_up(ChronoGSConfig(**GROWING), noise_set(2))
     made.step(0, 0.0)
-    trainer, before = made._trainer, made.model.anchors.clone()
+    trainer, before = made.trainer, made.model.anchors.clone()
     assert trainer is not None
     statistics = DensityStatistics(len(before), 10)
     statistics.visits[:] = 100.0
@@ -173,6 +174,37 @@ def test_a_loaded_model_gives_the_same_pixels(
     ).read_bytes()
 
 
+def test_a_near_plane_is_trained_stored_and_rendered_with(
+    noise_set: Callable[[int], TrainingSet], tmp_path: Path
+) -> None:
+    near = train(_set_up(ChronoGSConfig(**GROWING, near_plane=2.0), noise_set(2)), 24)
+    near.save(tmp_path)
+    loaded = ChronoGS(ChronoGSConfig())
+    loaded.load(tmp_path, device="cpu")
+    view = noise_set(2).views[0]
+    ours, theirs = near.render(view, 0), loaded.render(view, 0)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    assert ours.depth[ours.alpha > 0].min() >= 2.0
+    usual = train(_set_up(ChronoGSConfig(**GROWING), noise_set(2)), 24).render(view, 0)
+    assert usual.depth[usual.alpha > 0].min() < 2.0
+
+
+def test_models_from_before_the_near_plane_was_stored_have_the_default(
+    noise_set: Callable[[int], TrainingSet], method: Make, tmp_path: Path
+) -> None:
+    made = method()
+    made.save(tmp_path)
+    meta = json.loads((tmp_path / "model.json").read_text())
+    del meta["layout"]["near_plane"], meta["config"]["near_plane"]
+    (tmp_path / "model.json").write_text(json.dumps(meta))
+    loaded = ChronoGS(ChronoGSConfig(near_plane=1.0))
+    loaded.load(tmp_path, device="cpu")
+    assert loaded.model.layout.near_plane == NEAR_PLANE
+    view = noise_set(3).views[0]
+    np.testing.assert_array_equal(made.render(view, 1).rgb, loaded.render(view, 1).rgb)
+
+
 def test_a_model_of_another_layout_is_refused(method: Make, tmp_path: Path) -> None:
     made = method()
     made.save(tmp_path)
@@ -210,6 +242,6 @@ def test_the_early_part_can_be_coarse(method: Make, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(anchor_training, "photometric_loss", watched)
     train(made, 4)
-    view = made._trainer.train.views[0]
+    view = made.trainer.train.views[0]
     whole, half = (view.height, view.width), (view.height // 2, view.width // 2)
     assert seen == [half, half, whole, whole]

@@ -1,13 +1,72 @@
-"""Log-linear schedules."""
+"""Which view comes next, how large its photo is, and how a learning rate falls."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.training.schedule import log_linear
+from chronoscene.methods import TrainingView
+from chronoscene.training.schedule import ViewSampler, downscale_image, downscale_view, log_linear
 
 POSITIVE = st.floats(1e-8, 1e3)
+
+
+@given(st.integers(1, 40), st.integers(0, 2**32), st.integers(1, 4))
+def test_every_pool_holds_every_view_once(count, seed, pools):
+    sampler = ViewSampler(count, seed)
+    for _ in range(pools):
+        assert sorted(sampler.next() for _ in range(count)) == list(range(count))
+
+
+@given(st.integers(1, 20), st.integers(0, 100), st.integers(0, 60))
+def test_a_resumed_sampler_continues_the_order(count, seed, done):
+    whole = ViewSampler(count, seed)
+    expected = [whole.next() for _ in range(done + 15)][done:]
+    resumed = ViewSampler(count, seed)
+    resumed.drawn = done
+    assert [resumed.next() for _ in range(15)] == expected
+
+
+def test_the_order_depends_on_the_seed_and_changes_between_pools():
+    orders = []
+    for seed in (0, 1):
+        sampler = ViewSampler(50, seed)
+        orders += [[sampler.next() for _ in range(50)] for _ in range(2)]
+    assert len({tuple(order) for order in orders}) == 4
+
+
+def test_no_views_is_an_error():
+    with pytest.raises(ValueError, match="at least 1"):
+        ViewSampler(0, 0)
+
+
+def view(width: int, height: int) -> TrainingView:
+    K = np.array([[50.0, 0.0, 0.5 * width], [0.0, 60.0, 0.4 * height], [0.0, 0.0, 1.0]])
+    return TrainingView(K, width, height, np.eye(4), "a.jpg", 0)
+
+
+@pytest.mark.parametrize(("size", "factor"), [((8, 6), 2), ((9, 7), 2), ((10, 10), 4), ((3, 1), 2)])
+def test_sizes_agree(size: tuple[int, int], factor: int) -> None:
+    small = downscale_view(view(*size), factor)
+    image = downscale_image(np.zeros((size[1], size[0], 3), np.uint8), factor)
+    assert image.shape == (small.height, small.width, 3)
+
+
+def test_a_pixel_is_the_rounded_mean_of_its_square() -> None:
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (7, 9, 3)).astype(np.uint8)
+    small = downscale_image(image, 2)
+    mean = image[4:6, 2:4].astype(float).mean(axis=(0, 1))
+    np.testing.assert_allclose(small[2, 1], mean, atol=0.5)
+
+
+def test_a_point_lands_at_the_same_place() -> None:
+    """The centre of a square of pixels is the centre of the pixel that stands for it."""
+    original = view(8, 6)
+    small = downscale_view(original, 2)
+    point = np.linalg.inv(original.K) @ [5.0, 3.0, 1.0]  # corner of pixels (4, 2) and (5, 3)
+    np.testing.assert_allclose(small.K @ point, [2.5, 1.5, 1.0])
+    np.testing.assert_array_equal(original.K[0], [50.0, 0.0, 4.0])
 
 
 @given(POSITIVE, POSITIVE)

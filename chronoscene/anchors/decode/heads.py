@@ -18,6 +18,7 @@ from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.decode.layout import MIN_DISTANCE, MIN_QUAT_NORM
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
+from chronoscene.training.rendering import Splats
 
 ALL = np.float32(-np.inf)
 """Opacity above which Gaussians live, if all shall."""
@@ -39,21 +40,6 @@ class HeadWeights(NamedTuple):
     """[O]"""
 
 
-class Decoded(NamedTuple):
-    """Gaussians of the M visible anchors, k to each, anchor by anchor."""
-
-    means: Tensor
-    """Centres in world units. [M * k, 3]"""
-    quats: Tensor
-    """Unit quaternions wxyz. [M * k, 4]"""
-    scales: Tensor
-    """In world units. [M * k, 3]"""
-    opacities: Tensor
-    """-1..1; a Gaussian with an opacity <= 0 is switched off. [M * k]"""
-    colors: Tensor
-    """RGB, 0..1. [M * k, 3]"""
-
-
 def decode_reference(
     anchors: Tensor,
     offsets: Tensor,
@@ -69,7 +55,7 @@ def decode_reference(
     *,
     base_dim: int,
     period_dim: int,
-) -> Decoded:
+) -> Splats:
     """Decode the visible anchors in plain torch; the definition that `decode` is compared with.
 
     With e the period weights, f = (base, sum_s e_s period_s), d the unit vector from the camera to
@@ -116,7 +102,7 @@ def decode_reference(
     )
     factors = torch.exp(log_scales[visible])[:, None, :]
     covariances = _mlp(inputs, covariance_head).reshape(-1, num_offsets, 7)
-    return Decoded(
+    return Splats(
         means=(centres[:, None] + offsets[visible] * factors[..., :3]).reshape(-1, 3),
         quats=_unit_quats(covariances[..., 3:].reshape(-1, 4)),
         scales=(factors[..., 3:] * torch.sigmoid(covariances[..., :3])).reshape(-1, 3),
@@ -140,7 +126,7 @@ def decode(
     *,
     base_dim: int,
     period_dim: int,
-) -> Decoded:
+) -> Splats:
     """Decode the visible anchors: `decode_reference`, compiled for float32 on a CPU.
 
     Only rows of visible anchors are read. Gradients of per-anchor tensors are dense, zero in other
@@ -156,7 +142,7 @@ def decode(
     return _decode(fixed, tensors, heads, (base_dim, period_dim), ALL)[0]
 
 
-def decode_living(
+def decode_active(
     anchors: Tensor,
     offsets: Tensor,
     features: Tensor,
@@ -171,7 +157,7 @@ def decode_living(
     *,
     base_dim: int,
     period_dim: int,
-) -> tuple[Decoded, Tensor]:
+) -> tuple[Splats, Tensor]:
     """Decode only what can be seen: `decode` without the Gaussians of opacity 0 or less.
 
     A rasterizer culls those anyway. With few offsets switched on this is much faster.
@@ -192,20 +178,20 @@ def _decode(
     heads: tuple[HeadWeights, HeadWeights, HeadWeights],
     dims: tuple[int, int],
     above: np.float32,
-) -> tuple[Decoded, Tensor]:
+) -> tuple[Splats, Tensor]:
     anchors, period_weights, camera_centre, visible = fixed
     _check(anchors, tensors, period_weights, heads, camera_centre, visible, *dims)
     weights = [weight for head in heads for weight in head]
     floats = (*fixed[:3], *tensors, *weights)
     if all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in floats):
         *outputs, index = Decode.apply(dims, above, fixed, *tensors, *weights)
-        return Decoded(*outputs), index
+        return Splats(*outputs), index
     decoded = decode_reference(
         anchors, *tensors, period_weights, *heads, camera_centre, visible,
         base_dim=dims[0], period_dim=dims[1],
     )  # fmt: skip
     index = (~(decoded.opacities <= float(above))).nonzero()[:, 0]
-    return Decoded(*(value[index] for value in decoded)), index
+    return Splats(*(value[index] for value in decoded)), index
 
 
 def _check(

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from chronoscene.anchors.decode.heads import (
-    Decoded,
     HeadWeights,
     decode,
-    decode_living,
+    decode_active,
     decode_reference,
 )
 from chronoscene.anchors.decode.layout import BLOCK, CHUNK
 from chronoscene.errors import ShapeError
+from chronoscene.training.rendering import Splats
 
 # Worst of 400 random problems against float64, relative to the largest number of a tensor (or to
 # `SMALL`, where sums cancel): values 1.6e-6, gradients 5e-6, from quaternions near zero.
@@ -39,7 +39,7 @@ class Problem:
     dims: dict[str, int]
     grads: tuple[Tensor, ...]
 
-    def run(self, function: Any) -> tuple[Decoded, dict[str, Tensor]]:
+    def run(self, function: Any) -> tuple[Splats, dict[str, Tensor]]:
         """Outputs and the gradients of all leaves."""
         named = dict(self.leaves)
         for kind, head in zip("ovc", self.heads, strict=True):
@@ -181,7 +181,7 @@ def test_definition_passes_gradcheck() -> None:
     problem = make_problem(weights=(0.4, 0.6, 0.0), **sizes).double()
     flat = [*problem.leaves.values(), *(weight for head in problem.heads for weight in head)]
 
-    def run(*tensors: Tensor) -> Decoded:
+    def run(*tensors: Tensor) -> Splats:
         leaves = dict(zip(problem.leaves, tensors[:4], strict=True))
         heads = tuple(HeadWeights(*tensors[first : first + 4]) for first in (4, 8, 12))
         return problem.call(decode_reference, leaves, heads)
@@ -287,18 +287,18 @@ def test_outputs_that_do_not_matter() -> None:
     assert torch.equal(ours, grads["features"])
 
 
-def living_gradients(problem: Problem, function: Any) -> tuple[Decoded, Tensor, dict[str, Tensor]]:
+def active_gradients(problem: Problem, function: Any) -> tuple[Splats, Tensor, dict[str, Tensor]]:
     """Run with gradients for living Gaussians only; outputs of those, their index, gradients."""
     with torch.no_grad():
         opacities = problem.call(decode, problem.leaves, problem.heads).opacities
     living = opacities > 0
     index = living.nonzero()[:, 0]
-    if function is decode_living:
+    if function is decode_active:
         whole, problem.grads = problem.grads, tuple(grad[index] for grad in problem.grads)
         found: list[Tensor] = []
 
-        def run(**arguments: Any) -> Decoded:
-            out, positions = decode_living(**arguments)
+        def run(**arguments: Any) -> Splats:
+            out, positions = decode_active(**arguments)
             found.append(positions)
             return out
 
@@ -309,7 +309,7 @@ def living_gradients(problem: Problem, function: Any) -> tuple[Decoded, Tensor, 
         grad * living.reshape(-1, *[1] * (grad.ndim - 1)) for grad in problem.grads
     )
     out, grads = problem.run(function)
-    return Decoded(*(value[index] for value in out)), index, grads
+    return Splats(*(value[index] for value in out)), index, grads
 
 
 @settings(max_examples=20, deadline=None)
@@ -326,8 +326,8 @@ def test_living_equals_the_living_part(
     problem = make_problem(visible=visible, offsets=offsets, hidden=hidden, seed=seed)
     with torch.no_grad():
         problem.heads[0].b2.add_(shift)
-    ours, index, our_grads = living_gradients(problem, decode_living)
-    whole, truth, grads = living_gradients(problem, decode)
+    ours, index, our_grads = active_gradients(problem, decode_active)
+    whole, truth, grads = active_gradients(problem, decode)
     assert torch.equal(index, truth)
     assert all(torch.equal(a, b) for a, b in zip(ours, whole, strict=True))
     assert all(torch.equal(our_grads[name], grad) for name, grad in grads.items())
@@ -339,10 +339,10 @@ def test_living_over_several_chunks_and_threads() -> None:
         problem.heads[0].b2.sub_(0.5)
     previous = numba.get_num_threads()
     numba.set_num_threads(1)
-    one, _, one_grads = living_gradients(problem, decode_living)
+    one, _, one_grads = active_gradients(problem, decode_active)
     one_grads = {name: grad.clone() for name, grad in one_grads.items()}
     numba.set_num_threads(previous)
-    many, _, many_grads = living_gradients(problem, decode_living)
+    many, _, many_grads = active_gradients(problem, decode_active)
     assert 0 < len(one.means) < 5 * (2 * CHUNK + 77)
     assert all(torch.equal(a, b) for a, b in zip(one, many, strict=True))
     assert all(torch.equal(grad, many_grads[name]) for name, grad in one_grads.items())
@@ -350,7 +350,7 @@ def test_living_over_several_chunks_and_threads() -> None:
 
 def test_living_in_double_is_the_living_part_of_the_definition() -> None:
     problem = make_problem().double()
-    out, index = problem.call(decode_living, problem.leaves, problem.heads)
+    out, index = problem.call(decode_active, problem.leaves, problem.heads)
     truth = problem.call(decode_reference, problem.leaves, problem.heads)
     assert torch.equal(index, (truth.opacities > 0).nonzero()[:, 0])
     assert torch.equal(out.colors, truth.colors[index])
@@ -362,7 +362,7 @@ def test_not_a_number_lives() -> None:
     first = int(problem.fixed["visible"][0])
     with torch.no_grad():
         problem.leaves["features"][first, 0] = float("nan")
-    out, index = problem.call(decode_living, problem.leaves, problem.heads)
+    out, index = problem.call(decode_active, problem.leaves, problem.heads)
     assert index[:3].tolist() == [0, 1, 2]
     assert bool(out.opacities[:3].isnan().all())
     assert bool(out.colors[:3].isnan().all())

@@ -1,8 +1,9 @@
-"""Adding and removing Gaussians: clone, split, prune, opacity reset.
+"""Density control: which Gaussians are cloned, split and pruned, and the opacity reset.
 
-Nothing here changes a tensor in place: a round says which rows stay and which are appended.
+Nothing here changes a tensor in place: a round says which rows stay and which are appended. Groups
+of parameters that a method adds to those of `model.SHAPES` are copied along.
 
-Source: Kerbl et al. 2023, section 5, with the values of the released code.
+Source: Kerbl et al. 2023 (3D Gaussian Splatting), section 5, with the values of the released code.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from baselines.gaussian_splatting.config import GaussianSplattingConfig
-from baselines.gaussian_splatting.gaussians import logit, opacities_of, scales_of
-from chronoscene.rasterizer.types import RasterInfo
+from chronoscene.gaussians.config import GaussianConfig
+from chronoscene.gaussians.model import logit, opacities_of, scales_of
+from chronoscene.rasterizer import RasterInfo
 from chronoscene.scene.geometry import rotation_from_quaternion
 
 PARTS = 2
@@ -34,19 +35,20 @@ class GradientStatistics:
 
         Args:
             info: Of a call with one camera.
-            width: Of the image in pixels; the gradient is taken in half image sizes, so that it
-                does not depend on the resolution.
-            height: Likewise.
+            width: Of the image in pixels; gradients count in half image sizes, so that they do
+                not depend on the resolution.
+            height: The same.
         """
         assert info.means2d.grad is not None
         gradient = info.means2d.grad[0]
+        # Norm of d loss / d (u, v), with u and v in normalised device coordinates.
         x, y = gradient[:, 0] * (0.5 * width), gradient[:, 1] * (0.5 * height)
         seen = (info.radii[0] > 0).all(-1)
         self._sums += torch.where(seen, (x * x + y * y).sqrt(), 0.0)
         self._views += seen
 
     def mean(self) -> Tensor:
-        """Mean norm; 0 for what was never seen. [N]"""
+        """Mean norm; 0 where never seen. [N]"""
         return self._sums / self._views.clamp_min(1)
 
 
@@ -55,34 +57,34 @@ class Round:
     """What a round of densification decided. The new set is the kept rows, then the new ones."""
 
     keep: Tensor
-    """Old rows that stay; a split Gaussian does not. bool [N]"""
+    """Old rows that stay; a Gaussian that was split does not. bool [N]"""
     new: dict[str, Tensor]
     """Rows to append: clones, then first parts, then second parts. They have no moments yet."""
 
 
 def choose_growth(
-    gradient: Tensor, largest_scale: Tensor, extent: float, config: GaussianSplattingConfig
+    gradient: Tensor, max_scale: Tensor, extent: float, config: GaussianConfig
 ) -> tuple[Tensor, Tensor]:
     """Rows to clone and rows to split.
 
     Args:
         gradient: `GradientStatistics.mean`. [N]
-        largest_scale: Largest of the three scales. [N]
+        max_scale: Largest of the three scales. [N]
         extent: `TrainingSet.camera_extent`.
-        config: Thresholds and the limit of the number.
+        config: Thresholds and limit of the number.
 
     Returns:
         clone: bool [N]
         split: bool [N]
     """
     grow = gradient >= config.gradient_threshold
-    # Either way the set grows by one per row.
+    # Cloned or split, a row adds one Gaussian.
     room = max(config.max_gaussians - len(gradient), 0) if config.max_gaussians else len(gradient)
     if int(grow.sum()) > room:
         order = torch.where(grow, gradient, -1.0).argsort(descending=True, stable=True)
         grow = torch.zeros_like(grow)
         grow[order[:room]] = True
-    small = largest_scale <= config.clone_scale * extent
+    small = max_scale <= config.clone_scale * extent
     return grow & small, grow & ~small
 
 
@@ -92,13 +94,13 @@ def densify(
     *,
     extent: float,
     prune_large: bool,
-    config: GaussianSplattingConfig,
+    config: GaussianConfig,
     generator: np.random.Generator,
 ) -> Round:
     """One round: clone, split, then prune old and new rows alike.
 
     Args:
-        parameters: Groups as `gaussians.SHAPES` says; left as they are.
+        parameters: Groups by name, see `model.SHAPES`; left as they are. [N, ...]
         gradient: Mean gradient. [N]
         extent: `TrainingSet.camera_extent`.
         prune_large: Whether Gaussians may be too large.
@@ -115,9 +117,9 @@ def densify(
 
 
 def _split(
-    parents: dict[str, Tensor], config: GaussianSplattingConfig, generator: np.random.Generator
+    parents: dict[str, Tensor], config: GaussianConfig, generator: np.random.Generator
 ) -> dict[str, Tensor]:
-    """Two smaller Gaussians for each, centred on samples of it."""
+    """Two smaller Gaussians for each, centred on samples of it: x ~ N(mean, R S S^T R^T)."""
     parts = {name: rows.repeat(PARTS, *(1,) * (rows.dim() - 1)) for name, rows in parents.items()}
     quats = parts["quats"].cpu().double().numpy()
     quats[np.linalg.norm(quats, axis=-1) == 0] = (1, 0, 0, 0)
@@ -133,7 +135,7 @@ def _useless(
     parameters: dict[str, Tensor],
     extent: float,
     prune_large: bool,
-    config: GaussianSplattingConfig,
+    config: GaussianConfig,
 ) -> Tensor:
     """Rows that are too faint or too large. bool [N]"""
     useless = opacities_of(parameters["logit_opacities"]) < config.min_opacity
@@ -143,6 +145,6 @@ def _useless(
     return useless
 
 
-def reset_opacities(logit_opacities: Tensor, highest: float) -> Tensor:
-    """The same with no opacity above `highest`. [N]"""
-    return logit_opacities.clamp_max(logit(highest))
+def reset_opacities(logit_opacities: Tensor, max_opacity: float) -> Tensor:
+    """The same with no opacity above a limit. [N]"""
+    return logit_opacities.clamp_max(logit(max_opacity))

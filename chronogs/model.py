@@ -1,0 +1,73 @@
+"""What ChronoGS adds to anchors: features that vary with the period, and how they are fused.
+
+With e(t) the period weights (one-hot for a whole period t, see `periods`), an anchor i has at t
+
+    v_i(t) = sum_s e_s(t) v_is        its varying feature, a mixture of one block per period,
+    g(t)   = sum_s e_s(t) g_s         the global feature of the period, equal for all anchors,
+
+beside the base feature b_i, which all periods share. Opacity, covariance and colour MLP see
+
+    concat:  (b_i, v_i(t), d_i, g(t))       official code,
+    sum:     (b_i + v_i(t) + g(t), d_i)     formula of the paper; needs equal lengths,
+
+where d_i is the viewing direction. Positions and offsets are shared by all periods: geometry
+changes by Gaussians that are switched on and off, opacity = tanh(MLP) <= 0 being off.
+
+Source: ChronoGS (arXiv 2511.18794), section 3, and the official code. The mixtures are computed in
+`chronoscene.anchors.decode`, whose inputs are those of ``concat``.
+"""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from chronogs.config import ChronoGSConfig
+from chronoscene.anchors.config import AnchorConfig
+from chronoscene.anchors.model import AnchorLayout, AnchorModel, draw_start, zero_columns
+
+
+class ChronoGSModel(AnchorModel):
+    """Anchors with a base feature, one feature per period, and one global feature per period."""
+
+    @classmethod
+    def start(
+        cls,
+        layout: AnchorLayout,
+        config: AnchorConfig,
+        anchors: NDArray[np.float32],
+        generator: torch.Generator,
+    ) -> Self:
+        assert isinstance(config, ChronoGSConfig)
+        model = super().start(layout, config, anchors, generator)
+        shape = (layout.num_periods, layout.global_dim)
+        model.global_features = draw_start(shape, config.global_init, 1.0, generator)
+        return model
+
+    @staticmethod
+    def input_dim(layout: AnchorLayout, head: str) -> int:
+        direction = 3 if head in layout.direction_heads else 0
+        if layout.fusion == "sum":
+            return max(layout.base_dim, layout.period_dim, layout.global_dim) + direction
+        global_dim = layout.global_dim if head in layout.global_heads else 0
+        return layout.base_dim + layout.period_dim + direction + global_dim
+
+    def first_layer(self, head: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        layout, w1 = self.layout, self.heads[head].w1
+        dims = (layout.base_dim, layout.period_dim, layout.global_dim)
+        unseen = zero_columns(w1, layout.global_dim)
+        if layout.fusion == "sum":
+            # w (b + v + g) = w b + w v + w g: features that are added share their columns.
+            feature_dim = max(dims)
+            base, period, table = (w1[:, : feature_dim if n else 0] for n in dims)
+            direction = w1[:, feature_dim:]
+        else:
+            global_dim = dims[2] if head in layout.global_heads else 0
+            direction_dim = w1.shape[1] - dims[0] - dims[1] - global_dim
+            parts = [dims[0], dims[1], direction_dim, global_dim]
+            base, period, direction, table = w1.split(parts, dim=1)
+        return base, period, direction, table if head in layout.global_heads else unseen

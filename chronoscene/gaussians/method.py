@@ -1,0 +1,109 @@
+"""What methods with explicit Gaussians have in common as plug-ins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import ClassVar
+
+from torch import Tensor
+
+from chronoscene.errors import CheckpointError
+from chronoscene.gaussians.config import GaussianConfig
+from chronoscene.gaussians.model import SHAPES, GaussianModel, initialise
+from chronoscene.gaussians.trainer import Due, GaussianTrainer
+from chronoscene.methods import TrainingSet, View
+from chronoscene.rasterizer import Rasterization
+from chronoscene.training.checkpoint import META_FILE
+from chronoscene.training.method import SplattingMethod
+from chronoscene.training.rendering import draw
+
+
+class GaussianMethod(SplattingMethod):
+    """Static Gaussians of one scene; a subclass names itself and says what it adds.
+
+    A deformation field, for example, is a `GaussianModel` with `at_period`, made by `make_model`
+    with its weights as shared tensors, and their learning rates.
+    """
+
+    primitive = "means"
+    config_class: ClassVar[type[GaussianConfig]]
+    config: GaussianConfig
+    model: GaussianModel
+    trainer: GaussianTrainer | None
+
+    def make_model(self, parameters: dict[str, Tensor], train: TrainingSet) -> GaussianModel:
+        """The model before training."""
+        return GaussianModel(parameters)
+
+    def restore_model(self, tensors: dict[str, Tensor]) -> GaussianModel:
+        """The model from what was stored, with its `meta`."""
+        return GaussianModel(tensors, sh_degree=self.meta["sh_degree"])
+
+    def learning_rates(self, due: Due) -> Mapping[str, float]:
+        """Learning rate of each tensor at a step."""
+        assert self.trainer is not None
+        config = self.config
+        return {
+            "means": due.position_lr * self.trainer.train.camera_extent,
+            "log_scales": config.scale_lr,
+            "quats": config.rotation_lr,
+            "logit_opacities": config.opacity_lr,
+            "sh_dc": config.sh_dc_lr,
+            "sh_rest": config.sh_rest_lr,
+        }
+
+    def start(self, train: TrainingSet, *, seed: int, device: str) -> GaussianTrainer:
+        parameters = initialise(train, opacity=self.config.initial_opacity)
+        self.model = self.make_model({k: v.to(device) for k, v in parameters.items()}, train)
+        return GaussianTrainer(
+            self.config,
+            self.model,
+            train,
+            seed=seed,
+            background=self.background,
+            learning_rates=self.learning_rates,
+        )
+
+    def draw(self, view: View, period: float) -> Rasterization:
+        return draw(
+            self.model.splats(view, period),
+            view,
+            self.background,
+            near_plane=self.config.near_plane,
+            render_depth=True,
+        )
+
+    def stored_tensors(self) -> dict[str, Tensor]:
+        return self.model.tensors()
+
+    def save(self, folder: Path) -> None:
+        self.meta["sh_degree"] = self.model.sh_degree
+        super().save(folder)
+
+    def restore(self, folder: Path, tensors: dict[str, Tensor], device: str) -> None:
+        try:
+            self.config = self.config_class(**self.meta["config"])
+        except (KeyError, TypeError) as error:
+            raise CheckpointError(
+                folder / META_FILE,
+                expected=f"the configuration of {self.name}",
+                found=str(error),
+                todo="use the version of the software that wrote it, or train again",
+            ) from error
+        _check_groups(folder, tensors)
+        self.model = self.restore_model(tensors)
+
+
+def _check_groups(folder: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Raise unless a checkpoint holds all groups, each with a row for each Gaussian."""
+    shapes = {name: tuple(tensors[name].shape) for name in SHAPES if name in tensors}
+    count = next(iter(shapes.get("means", ())), None)
+    if shapes != {name: (count, *shape) for name, shape in SHAPES.items()}:
+        found = ", ".join(f"{name} {list(tensor.shape)}" for name, tensor in tensors.items())
+        raise CheckpointError(
+            folder / META_FILE,
+            expected=f"the parameter groups {', '.join(SHAPES)}, one row per Gaussian",
+            found=found or "none",
+            todo="train again with this version",
+        )

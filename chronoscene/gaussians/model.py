@@ -1,0 +1,163 @@
+"""The parameters of a scene of Gaussians, what they mean, and where they start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chronoscene.gaussians.spherical_harmonics import NUM_BASES, dc_from_rgb, evaluate
+from chronoscene.methods import TrainingSet, View
+from chronoscene.training.rendering import Splats, camera_centre_tensor
+from chronoscene.training.sparse_points import finite_rows, rms_spacing
+
+SHAPES: dict[str, tuple[int, ...]] = {
+    "means": (3,),
+    "log_scales": (3,),
+    "quats": (4,),
+    "logit_opacities": (),
+    "sh_dc": (3,),
+    "sh_rest": (NUM_BASES - 1, 3),
+}
+"""Groups of parameters: name to the shape of one row."""
+
+MIN_SPACING = math.sqrt(1e-7)
+"""Points nearer to each other than this, in training units, start no smaller than it."""
+
+
+class GaussianModel:
+    """Gaussians and what a method trains beside them.
+
+    Args:
+        parameters: Groups with a row per Gaussian; density control adds and removes rows. A method
+            may have more groups than `SHAPES`. [N, ...]
+        shared: Trained tensors without a row per Gaussian, such as those of a deformation field.
+        sh_degree: Degree of the spherical harmonics in use.
+    """
+
+    def __init__(
+        self,
+        parameters: dict[str, Tensor],
+        shared: Mapping[str, Tensor] | None = None,
+        *,
+        sh_degree: int = 0,
+    ) -> None:
+        self.parameters = parameters
+        self.shared = dict(shared or {})
+        self.sh_degree = sh_degree
+
+    def __len__(self) -> int:
+        return len(self.parameters["means"])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that is trained and stored, by name."""
+        return self.parameters | self.shared
+
+    def at_period(self, period: float) -> Mapping[str, Tensor]:
+        """The parameters as of a period, before the activations; here always the same.
+
+        A method with a deformation field overrides this: what it returns is drawn, and gradients
+        flow through it to `parameters`, which density control works on, and to `shared`.
+        """
+        return self.parameters
+
+    def splats(self, view: View, period: float) -> Splats:
+        """The Gaussians to draw in a view as of a period."""
+        p = self.at_period(period)
+        centre = camera_centre_tensor(view, p["means"].device)
+        return Splats(
+            means=p["means"],
+            quats=p["quats"],
+            scales=scales_of(p["log_scales"]),
+            opacities=opacities_of(p["logit_opacities"]),
+            colors=evaluate(p["sh_dc"], p["sh_rest"], p["means"], centre, self.sh_degree),
+        )
+
+
+def initialise(train: TrainingSet, *, opacity: float) -> dict[str, Tensor]:
+    """One round Gaussian per sparse point, as large as the points around it are far.
+
+    The scale is the root mean square distance to the three nearest points.
+
+    Returns:
+        parameters: float32 on the CPU, as `SHAPES` says.
+
+    Raises:
+        SceneError: If the scene has no sparse points.
+
+    Source: Kerbl et al. 2023, section 5.1, and the released code.
+    """
+    rows = finite_rows(train.points)
+    points, colors = train.points[rows], train.colors[rows]
+    count = len(points)
+    scales = np.maximum(rms_spacing(points), MIN_SPACING)
+    quats = torch.zeros(count, 4)
+    quats[:, 0] = 1.0
+    return {
+        "means": torch.from_numpy(points.astype(np.float32)),
+        "log_scales": torch.from_numpy(np.log(scales).astype(np.float32))[:, None].repeat(1, 3),
+        "quats": quats,
+        "logit_opacities": torch.full((count,), logit(opacity)),
+        "sh_dc": dc_from_rgb(torch.from_numpy(colors.astype(np.float32)) / 255),
+        "sh_rest": torch.zeros(count, NUM_BASES - 1, 3),
+    }
+
+
+def logit(probability: float) -> float:
+    """Inverse of the sigmoid."""
+    return float(np.log(probability / (1 - probability)))
+
+
+class _Exp(torch.autograd.Function):
+    """``torch.exp`` whose bits do not depend on how its rows are shared among threads."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        y = _exp(x.detach())
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        (y,) = ctx.saved_tensors
+        return grads[0] * y
+
+
+class _Sigmoid(torch.autograd.Function):
+    """``torch.sigmoid`` with the same care."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        y = 1 / (1 + _exp(-x.detach()))
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Tensor:
+        (y,) = ctx.saved_tensors
+        return grads[0] * (1 - y) * y
+
+
+def _exp(x: Tensor) -> Tensor:
+    # Torch may take another code path at the end of each thread's share of the rows; NumPy makes
+    # one pass. Products and quotients of float32 are exact to the bit wherever they are done.
+    if x.is_cuda:
+        return x.exp()
+    with np.errstate(over="ignore"):
+        return torch.from_numpy(np.exp(x.contiguous().numpy()))
+
+
+def scales_of(log_scales: Tensor) -> Tensor:
+    """Standard deviations in units of the training frame. [N, 3]"""
+    result: Tensor = _Exp.apply(log_scales)
+    return result
+
+
+def opacities_of(logit_opacities: Tensor) -> Tensor:
+    """Opacities 0..1. [N]"""
+    result: Tensor = _Sigmoid.apply(logit_opacities)
+    return result

@@ -1,0 +1,165 @@
+"""One training step of explicit Gaussians, and what is due at which step.
+
+Source: Kerbl et al. 2023 (3D Gaussian Splatting), with the schedule of the released code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chronoscene.gaussians.config import GaussianConfig
+from chronoscene.gaussians.density import GradientStatistics, densify, reset_opacities
+from chronoscene.gaussians.model import GaussianModel
+from chronoscene.methods import StepReport, TrainingSet
+from chronoscene.rasterizer import Rasterization
+from chronoscene.training.losses import photometric_loss
+from chronoscene.training.optimizer import Adam
+from chronoscene.training.rendering import draw
+from chronoscene.training.schedule import ViewSampler, log_linear
+
+_SPLIT_STREAM = 1
+"""Keeps the samples of splits apart from other draws of the same seed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Due:
+    """What one training step has to do."""
+
+    moment: int
+    """Iteration of the schedule, from 1."""
+    sh_degree: int
+    position_lr: float
+    """Before it is multiplied by the extent of the cameras."""
+    collect: bool
+    """Whether the gradients of this step count for the next round of densification."""
+    densify: bool
+    prune_large: bool
+    reset: bool
+
+
+class Timeline:
+    """Turns steps and progress into what is due, each event once."""
+
+    def __init__(self, config: GaussianConfig) -> None:
+        self.config = config
+        self._last_moment = 0
+
+    def at(self, index: int, progress: float) -> Due:
+        """What is due at a step.
+
+        Args:
+            index: Steps done before.
+            progress: Share of the training done before, 0..1.
+        """
+        config = self.config
+        length = config.schedule_length if config.stretch else config.iterations
+        moment = round(progress * length) + 1
+        # A squeezed schedule jumps over moments, so what counts is that a multiple was passed.
+        passed_reset = moment // config.reset_interval > self._last_moment // config.reset_interval
+        growing = moment < config.densify_until
+        self._last_moment = moment
+        return Due(
+            moment=moment,
+            sh_degree=min(config.sh_degree, moment // config.sh_interval),
+            position_lr=log_linear(
+                moment / config.schedule_length,
+                config.position_lr_initial,
+                config.position_lr_final,
+            ),
+            collect=growing,
+            densify=growing
+            and moment > config.densify_from
+            and (index + 1) % config.densify_interval == 0,
+            prune_large=moment > config.prune_large_from,
+            reset=growing and passed_reset,
+        )
+
+
+class GaussianTrainer:
+    """Trains a model on the views of a training set.
+
+    Args:
+        config: Options.
+        model: Trained in place.
+        train: Views and images.
+        seed: All random choices follow from it.
+        background: [3]
+        learning_rates: Gives the learning rate of each tensor of the model at a step.
+    """
+
+    def __init__(
+        self,
+        config: GaussianConfig,
+        model: GaussianModel,
+        train: TrainingSet,
+        *,
+        seed: int,
+        background: Tensor,
+        learning_rates: Callable[[Due], Mapping[str, float]],
+    ) -> None:
+        self.config = config
+        self.model = model
+        self.train = train
+        self.seed = seed
+        self.background = background
+        self.learning_rates = learning_rates
+        self.timeline = Timeline(config)
+        self.sampler = ViewSampler(len(train.views), seed)
+        self.optimizer = Adam({n: t.requires_grad_() for n, t in model.tensors().items()})
+        self.statistics = GradientStatistics(len(model), background.device)
+
+    def step(self, index: int, progress: float) -> StepReport:
+        """Render one training view, learn from it, and change the set of Gaussians where due."""
+        due = self.timeline.at(index, progress)
+        self.model.sh_degree = due.sh_degree
+        number = self.sampler.next()
+        view = self.train.views[number]
+        splats = self.model.splats(view, view.period)
+        raster = draw(splats, view, self.background, near_plane=self.config.near_plane)
+        loss = self.loss(raster, number)
+        self.optimizer.zero_grad()
+        loss.backward()
+        if due.collect:
+            self.statistics.add(raster.info, view.width, view.height)
+        if due.densify:
+            self._densify(index, prune_large=due.prune_large)
+        self._update(due)
+        return StepReport(loss=float(loss.detach()), primitives=len(self.model))
+
+    def loss(self, raster: Rasterization, number: int) -> Tensor:
+        """Photometric loss against the photo of view ``number``; methods may add terms."""
+        # A copy, as cached images are not ours to write to, which torch cannot promise.
+        photo = torch.from_numpy(self.train.load_image(number).copy()).to(raster.image.device)
+        return photometric_loss(raster.image[0], photo, ssim_weight=self.config.ssim_weight)
+
+    @torch.no_grad()
+    def _densify(self, index: int, *, prune_large: bool) -> None:
+        """Change the set of Gaussians; their gradients of this step are dropped."""
+        result = densify(
+            self.model.parameters,
+            self.statistics.mean(),
+            extent=self.train.camera_extent,
+            prune_large=prune_large,
+            config=self.config,
+            generator=np.random.default_rng((self.seed, _SPLIT_STREAM, index)),
+        )
+        for name, rows in result.new.items():
+            self.optimizer.keep(name, result.keep)
+            self.model.parameters[name] = self.optimizer.extend(name, rows)
+        self.statistics = GradientStatistics(len(self.model), self.background.device)
+
+    @torch.no_grad()
+    def _update(self, due: Due) -> None:
+        """Adam's step for every tensor that has a gradient, and the opacity reset."""
+        skip: tuple[str, ...] = ()
+        if due.reset:
+            logits = self.model.parameters["logit_opacities"]
+            logits.copy_(reset_opacities(logits, self.config.reset_opacity))
+            self.optimizer.reset_moments("logit_opacities")
+            skip = ("logit_opacities",)
+        self.optimizer.step(self.learning_rates(due), skip=skip)

@@ -1,0 +1,98 @@
+"""Saving and loading; what a method with a deformation field reuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_scene import HEIGHT, SHORT, WIDTH, mean_squared_error, toy_scene, train
+
+from baselines.gaussian_splatting.config import GaussianSplattingConfig
+from baselines.gaussian_splatting.method import GaussianSplatting
+from chronoscene.errors import CheckpointError
+from chronoscene.gaussians.method import GaussianMethod
+from chronoscene.gaussians.model import GaussianModel
+
+
+def test_saved_models_render_the_same(tmp_path):
+    scene = toy_scene()
+    method = train(scene, replace(SHORT, iterations=40))
+    assert method.model.sh_degree == 3
+    method.save(tmp_path)
+    loaded = GaussianSplatting(GaussianSplattingConfig())
+    loaded.load(tmp_path, device="cpu")
+    assert loaded.config == method.config and loaded.size() == method.size()
+    for view in scene.views[:3]:
+        mine, theirs = method.render(view, 0), loaded.render(view, 0)
+        assert np.array_equal(mine.rgb, theirs.rgb)
+        assert np.array_equal(mine.alpha, theirs.alpha)
+        assert np.array_equal(mine.depth, theirs.depth)
+        assert mine.rgb.shape == (HEIGHT, WIDTH, 3) and mine.rgb.dtype == np.float32
+
+
+def test_a_model_with_a_missing_group_is_refused(tmp_path):
+    method = train(toy_scene(), replace(SHORT, iterations=1))
+    del method.model.parameters["quats"]
+    method.save(tmp_path)
+    with pytest.raises(CheckpointError, match="parameter groups"):
+        GaussianSplatting(GaussianSplattingConfig()).load(tmp_path, device="cpu")
+
+
+def test_a_near_plane_is_trained_stored_and_rendered_with(tmp_path):
+    scene = toy_scene()
+    method = train(scene, replace(SHORT, iterations=3, near_plane=1.0))
+    method.save(tmp_path)
+    loaded = GaussianSplatting(GaussianSplattingConfig())
+    loaded.load(tmp_path, device="cpu")
+    mine, theirs = method.render(scene.views[0], 0), loaded.render(scene.views[0], 0)
+    assert np.array_equal(mine.rgb, theirs.rgb) and np.array_equal(mine.depth, theirs.depth)
+    # About half of the Gaussians are nearer than 1, and the rest is farther.
+    assert mine.depth[mine.alpha > 0].min() >= 1.0
+    usual = train(scene, replace(SHORT, iterations=3)).render(scene.views[0], 0)
+    assert usual.depth[usual.alpha > 0].min() < 1.0
+
+
+class PaintedModel(GaussianModel):
+    """The simplest field: what each period adds to the colours of all Gaussians."""
+
+    def at_period(self, period):
+        added = self.shared["added_color"][round(period)]
+        return self.parameters | {"sh_dc": self.parameters["sh_dc"] + added}
+
+
+class Painted(GaussianMethod):
+    """What a method with a field has to write."""
+
+    name = "painted"
+    config_class = GaussianSplattingConfig
+
+    def make_model(self, parameters, train):
+        periods = 1 + max(view.period for view in train.views)
+        return PaintedModel(parameters, {"added_color": torch.zeros(periods, 3)})
+
+    def restore_model(self, tensors):
+        parameters = dict(tensors)
+        shared = {"added_color": parameters.pop("added_color")}
+        return PaintedModel(parameters, shared, sh_degree=self.meta["sh_degree"])
+
+    def learning_rates(self, due):
+        return {**super().learning_rates(due), "added_color": 0.01}
+
+
+def test_a_field_needs_no_trainer_of_its_own(tmp_path):
+    """Density control, optimiser and checkpoints take what `at_period` draws."""
+    scene = toy_scene(colors_per_period=2)
+    dark = [scene.load_image(i) // (1 + view.period) for i, view in enumerate(scene.views)]
+    scene = replace(scene, load_image=dark.__getitem__)
+    config = replace(SHORT, gradient_threshold=1e-5)
+    method = train(scene, config, method_class=Painted)
+    assert len(method.model) > 60, "Gaussians were meant to be added on the way"
+    static = train(scene, config)
+    assert mean_squared_error(method, scene) < 0.8 * mean_squared_error(static, scene)
+    method.save(tmp_path)
+    loaded = Painted(config)
+    loaded.load(tmp_path, device="cpu")
+    for period in (0, 1):
+        mine, theirs = (m.render(scene.views[0], period).rgb for m in (method, loaded))
+        assert np.array_equal(mine, theirs)
+    assert loaded.size() == method.size()

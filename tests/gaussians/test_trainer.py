@@ -1,0 +1,99 @@
+"""Schedule, and the bookkeeping of rows in training."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from toy_scene import SHORT, toy_scene
+
+from baselines.gaussian_splatting.method import GaussianSplatting
+from chronoscene.gaussians.config import GaussianConfig
+from chronoscene.gaussians.model import SHAPES, logit
+from chronoscene.gaussians.trainer import Timeline
+
+
+def test_the_published_schedule():
+    timeline = Timeline(GaussianConfig())
+    due = [timeline.at(i, i / 30_000) for i in range(30_000)]
+    assert [d.moment for d in due] == list(range(1, 30_001))
+    assert [d.moment for d in due if d.densify] == list(range(600, 15_000, 100))
+    assert [d.moment for d in due if d.reset] == [3_000, 6_000, 9_000, 12_000]
+    assert [d.moment for d in due if d.collect] == list(range(1, 15_000))
+    assert next(d.moment for d in due if d.prune_large) == 3_001
+    degrees = [d.sh_degree for d in due]
+    assert [degrees.index(k) + 1 for k in range(4)] == [1, 1_000, 2_000, 3_000]
+    assert due[14_999].position_lr == pytest.approx(1.6e-5, rel=1e-3)
+    assert due[29_999].position_lr == 1.6e-6
+
+
+def test_longer_training_is_not_stretched_unless_asked():
+    plain = Timeline(GaussianConfig(iterations=40_000))
+    late = plain.at(30_000, 0.75)
+    assert late.moment == 30_001 and late.position_lr == 1.6e-6 and not late.collect
+    stretched = Timeline(GaussianConfig(iterations=40_000, stretch=True))
+    assert stretched.at(30_000, 0.75).moment == 22_501
+
+
+def test_a_squeezed_schedule_passes_the_same_phases():
+    config = GaussianConfig(iterations=3_000, stretch=True, reset_interval=7_500)
+    timeline = Timeline(config)
+    due = [timeline.at(i, i / 3_000) for i in range(3_000)]
+    assert [i for i, d in enumerate(due) if d.reset] == [750]
+    assert [i + 1 for i, d in enumerate(due) if d.densify] == list(range(100, 1_501, 100))
+    assert due[-1].sh_degree == 3 and due[50].sh_degree == 0 and due[100].sh_degree == 1
+
+
+def test_a_run_that_ends_by_the_clock_follows_progress():
+    # Ten times faster than its iterations would say: 300 steps go through everything.
+    timeline = Timeline(GaussianConfig(iterations=3_000, stretch=True))
+    due = [timeline.at(i, i / 300) for i in range(300)]
+    assert sum(d.reset for d in due) == 4
+    assert due[-1].sh_degree == 3 and not due[-1].collect
+
+
+def test_moments_of_survivors_stay_and_new_rows_have_none():
+    method = GaussianSplatting(replace(SHORT, gradient_threshold=0.0, max_gaussians=90))
+    method.setup(toy_scene(), seed=0, device="cpu")
+    for i in range(24):
+        method.step(i, i / 250)
+    before = {name: values.detach().clone() for name, values in method.model.parameters.items()}
+    moments = {name: values.clone() for name, values in method.trainer.optimizer.state().items()}
+    method.step(24, 24 / 250)
+    after = method.trainer.optimizer.state()
+    count = len(method.model.parameters["means"])
+    assert 60 < count <= 90
+    # Which old rows are still there, found by their values: nothing was stepped.
+    kept = torch.tensor([bool((row == method.model.parameters["means"][:60]).all(1).any())
+                         for row in before["means"]])  # fmt: skip
+    survivors = int(kept.sum())
+    assert 0 < survivors < count
+    for name in SHAPES:
+        assert torch.equal(method.model.parameters[name][:survivors], before[name][kept])
+        for part in ("mean", "square"):
+            assert torch.equal(after[f"{name}.{part}"][:survivors], moments[f"{name}.{part}"][kept])
+            assert not after[f"{name}.{part}"][survivors:].any()
+
+
+def test_a_reset_leaves_the_opacities_alone_otherwise():
+    config = replace(SHORT, reset_interval=3_000, densify_from=30_000)
+    method = GaussianSplatting(config)
+    method.setup(toy_scene(), seed=0, device="cpu")
+    for i in range(25):
+        method.step(i, i / 250)
+    before = method.model.parameters["logit_opacities"].detach().clone()
+    means = method.model.parameters["means"].detach().clone()
+    method.step(25, 0.1)
+    assert torch.equal(method.model.parameters["logit_opacities"], before.clamp_max(logit(0.01)))
+    assert not method.trainer.optimizer.state()["logit_opacities.mean"].any()
+    assert not torch.equal(method.model.parameters["means"], means)
+
+
+def test_a_set_that_died_out_still_trains_and_renders():
+    scene = toy_scene(views=2)
+    method = GaussianSplatting(replace(SHORT, min_opacity=2.0, densify_interval=2))
+    method.setup(scene, seed=0, device="cpu")
+    for i in range(20):
+        report = method.step(i, i / 250)
+    assert report.primitives == 0 and np.isfinite(report.loss)
+    assert not method.render(scene.views[0], 0).rgb.any()
