@@ -33,8 +33,8 @@ from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.anchors.decode.heads import HeadWeights
 from chronoscene.anchors.model import HEADS
-from chronoscene.bench.identity import code_version, processor_name
-from chronoscene.bench.protocol import make_parts
+from chronoscene.bench.provenance import code_version, processor_name
+from chronoscene.bench.strategies import make_parts
 from chronoscene.bench.training_loop import render_bytes
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore

@@ -28,7 +28,7 @@ import torch
 from peers import UnavailableError, cpu, cuda, gsplat_torch, scalar, torch_tiles
 from scenes import SIZES, Scene, surfaces
 
-from chronoscene.bench.identity import code_version, processor_name
+from chronoscene.bench.provenance import code_version, processor_name
 from chronoscene.io.files import write_text_atomic
 from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.kernels.threads import available_threads, set_threads

@@ -31,7 +31,7 @@ from registration_images import run_images
 from registration_outcomes import REFUSED, Outcome, judged
 from registration_photos import run_photos
 
-from chronoscene.bench.identity import processor_name
+from chronoscene.bench.provenance import processor_name
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.verdict import LEVELS, judge
 

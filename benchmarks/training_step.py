@@ -37,8 +37,8 @@ from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.anchors.model import AnchorModel
 from chronoscene.anchors.trainer import AnchorTrainer
-from chronoscene.bench.identity import code_version, processor_name
-from chronoscene.bench.protocol import Part, make_parts
+from chronoscene.bench.provenance import code_version, processor_name
+from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
 from chronoscene.kernels.allocator import keep_freed_memory

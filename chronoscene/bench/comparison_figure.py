@@ -11,8 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench.ground_truth import ground_truth_folder
-from chronoscene.bench.image_store import ImageEntry, load_image, read_manifest, safe_name
+from chronoscene.bench.predictions import (
+    ImageEntry,
+    ground_truth_folder,
+    load_image,
+    read_manifest,
+    safe_name,
+)
 from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord, read_run, run_folders
 from chronoscene.io.files import replacing
 from chronoscene.metrics.psnr_ssim import psnr

@@ -8,7 +8,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from chronoscene.bench.stopping import StopRule
+from chronoscene.bench.job import StopRule
 from chronoscene.methods import StepReport
 
 REFRESH = 0.1

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from chronoscene.bench.run_folders import csv_text
 from chronoscene.errors import CheckpointError
 from chronoscene.io.files import write_text_atomic
+from chronoscene.io.tables import csv_text
 
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.json"

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import mean, stdev
+from typing import TYPE_CHECKING, Any
 
 from chronoscene.bench.results import Failure, RunRecord, read_failures, read_run, run_folders
 from chronoscene.errors import CheckpointError
-from chronoscene.metrics.names import METRICS, metric_info
+from chronoscene.io import tables
+from chronoscene.io.tables import Table
+from chronoscene.metrics.names import METRICS, MetricInfo, metric_info
 
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
+
+FORMATS = ("table", "csv", "markdown", "latex", "json")
 AGGREGATES = ("macro", "micro", "worst")
 
 
@@ -35,72 +43,17 @@ COSTS = (
     Cost("peak_device_memory_bytes", "peak GPU memory [MB]", 1e-6, 0),
 )
 
+DISPLAY = {name: (1.0, info.decimals) for name, info in METRICS.items()}
+DISPLAY |= {cost.name: (cost.factor, cost.decimals) for cost in COSTS}
+"""Quantity to its factor from the stored to the shown unit, and to its decimals."""
 
-@dataclass(frozen=True, slots=True)
-class Group:
-    """Runs that differ in the seed only."""
-
-    label: str
-    runs: tuple[RunRecord, ...]
-
-    @property
-    def first(self) -> RunRecord:
-        return self.runs[0]
-
-
-@dataclass(frozen=True, slots=True)
-class Statistic:
-    """Mean and spread over seeds."""
-
-    mean: float
-    sd: float | None
-    """Sample standard deviation (n - 1); None for one seed."""
-    n: int
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> Statistic:
-        spread = None
-        if len(values) > 1:
-            spread = stdev(values) if all(map(math.isfinite, values)) else math.nan
-        return cls(mean(values), spread, len(values))
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One number of a table in long form."""
-
-    scene: str
-    method: str
-    strategy: str
-    preset: str
-    config_hash: str
-    quantity: str
-    """Name of a metric, or of a cost in the unit of `RunRecord`."""
-    column: str
-    """``macro``, ``micro``, ``worst``, ``period <id>``, or empty for costs."""
-    mean: float
-    sd: float | None
-    n: int
-    seeds: str
-    device: str
-    commit: str
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """A number as text, and whether it is the best of its column."""
-
-    text: str
-    best: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """A table to be printed."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+ENTRY_COLUMNS = (
+    *("scene", "method", "strategy", "preset", "config_hash"),
+    *("quantity", "column", "mean", "sd", "n", "seeds", "device", "commit"),
+)
+"""Columns of CSV and JSON. ``quantity`` is a metric, or a cost in the unit of `RunRecord`;
+``column`` is ``macro``, ``micro``, ``worst``, ``period <id>``, or empty for costs; ``sd`` is the
+sample standard deviation over ``n`` seeds, empty for one seed."""
 
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
@@ -123,30 +76,135 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
     return records, failures
 
 
-def group_runs(records: Iterable[RunRecord]) -> dict[str, list[Group]]:
-    """Groups of runs by scene; equal names with other scenes, configs or devices stay apart."""
-    by_key: dict[tuple[str, ...], list[RunRecord]] = {}
-    for run in records:
-        key = (run.scene, _label(run), *_distinctions(run))
-        by_key.setdefault(key, []).append(run)
-    scenes: dict[str, list[Group]] = {}
-    for key, runs in by_key.items():
-        alike = [other[2:] for other in by_key if other[:2] == key[:2]]
-        differing = [text for i, text in enumerate(key[2:]) if len({a[i] for a in alike}) > 1]
-        label = f"{key[1]} [{', '.join(differing)}]" if differing else key[1]
-        runs.sort(key=lambda run: run.seed)
-        scenes.setdefault(runs[0].scene, []).append(Group(label, tuple(runs)))
-    return scenes
+def format_runs(
+    records: Sequence[RunRecord],
+    failures: Sequence[Failure],
+    style: str,
+    metrics: Sequence[str] = (),
+) -> str:
+    """All tables of some runs in one of `FORMATS`."""
+    entries = summarise(records, metrics)
+    if style == "csv":
+        # NaN is a spread that is not defined, an empty cell that there is none.
+        entries["sd"] = [
+            "" if n == 1 else repr(sd) for n, sd in zip(entries.n, entries.sd, strict=True)
+        ]
+        return str(entries.to_csv(columns=ENTRY_COLUMNS, index=False, lineterminator="\n"))
+    notes = footnotes(entries, records, failures, metrics)
+    if style == "json":
+        found = [_json_entry(entry) for entry in entries[[*ENTRY_COLUMNS]].to_dict("records")]
+        return json.dumps({"entries": found, "notes": notes}, indent=1, allow_nan=False) + "\n"
+    made = readable_tables(entries, records, metrics)
+    if style == "markdown":
+        texts, bullet = [tables.markdown(t, special=r"\`*<>|_") for t in made], "- "
+    elif style == "latex":
+        texts, bullet = [tables.latex(table) for table in made], "% "
+    else:
+        texts, bullet = [tables.plain_text(table) for table in made], ""
+    return "\n".join([*texts, "".join(f"{bullet}{note}\n" for note in notes)])
 
 
-def _label(run: RunRecord) -> str:
-    return f"{run.title} ({run.strategy}, {run.preset})"
+def _json_entry(entry: dict[str, Any]) -> dict[str, Any]:
+    """Numbers that JSON lacks become the strings ``Infinity`` and ``NaN``."""
+    entry["sd"] = None if entry["n"] == 1 else entry["sd"]
+    for key in ("mean", "sd"):
+        if entry[key] is not None and not math.isfinite(entry[key]):
+            names = {math.inf: "Infinity", -math.inf: "-Infinity"}
+            entry[key] = names.get(entry[key], "NaN")
+    return entry
 
 
-def _distinctions(run: RunRecord) -> tuple[str, ...]:
-    """What keeps runs with one label apart, in words."""
-    hashes = f"scene {run.scene_hash[:6]}", f"config {run.config_hash[:6]}"
-    return (run.method, *hashes, run.device)
+def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> DataFrame:
+    """Mean and spread over seeds of everything that was measured.
+
+    Runs that differ in the seed only are a group. Equal names with other scenes, configs or devices
+    stay apart: their ``label`` says in what they differ.
+
+    Args:
+        records: Runs of any scenes.
+        metrics: Names of those wanted; none for all.
+
+    Returns:
+        `ENTRY_COLUMNS` and ``label``, one row per group, quantity and column. What a run of a group
+        lacks is left out.
+    """
+    import pandas as pd
+
+    if not records:
+        return pd.DataFrame(columns=[*ENTRY_COLUMNS, "label"])
+    runs = _labelled(records).sort_values("seed", kind="stable")
+    in_group = runs.groupby(["scene", "label"], sort=False)
+    groups = in_group[["method", "strategy", "preset", "config_hash", "device"]].first()
+    groups["runs"] = in_group.size()
+    groups["seeds"] = in_group.seed.agg(lambda seeds: " ".join(map(str, seeds)))
+    groups["commit"] = in_group.commit.agg(lambda commits: " ".join(commits.unique()))
+
+    numbers = [
+        (run.scene, label, *number)
+        for run, label in zip(records, runs.label.sort_index(), strict=True)
+        for number in _numbers(run, metric_names([run], metrics))
+    ]
+    columns = ["scene", "label", "quantity", "column", "value"]
+    values = pd.DataFrame(numbers, columns=columns).groupby(columns[:-1], sort=False).value
+    entries = values.agg(mean=mean, sd=_spread, n="size").reset_index()
+    entries = entries.join(groups, on=["scene", "label"])
+    order = {scene: i for i, scene in enumerate(dict.fromkeys(run.scene for run in records))}
+    entries = entries[entries.n == entries.runs]
+    return _with_text(entries).sort_values(
+        "scene", key=lambda scenes: scenes.map(order), kind="stable", ignore_index=True
+    )
+
+
+def _with_text(entries: DataFrame) -> DataFrame:
+    """Entries with ``text``, ``mean`` or ``mean ± sd``, and ``shown``, the mean as it reads."""
+    texts, shown = [], []
+    for quantity, value, sd, n in entries[["quantity", "mean", "sd", "n"]].itertuples(index=False):
+        factor, decimals = DISPLAY[quantity]
+        spread = "" if n == 1 else f" ± {sd * factor:.{decimals}f}"
+        texts.append(f"{value * factor:.{decimals}f}{spread}")
+        shown.append(round(value * factor, decimals))
+    return entries.assign(text=texts, shown=shown)
+
+
+def _labelled(records: Sequence[RunRecord]) -> DataFrame:
+    """What tells runs apart, one row per record."""
+    import pandas as pd
+
+    fields = ("scene", "method", "strategy", "preset", "config_hash", "seed", "device", "commit")
+    runs = pd.DataFrame([{name: getattr(run, name) for name in fields} for run in records])
+    runs["label"] = [f"{run.title} ({run.strategy}, {run.preset})" for run in records]
+    differences = pd.DataFrame(
+        {
+            "method": runs.method,
+            "scene": [f"scene {run.scene_hash[:6]}" for run in records],
+            "config": [f"config {run.config_hash[:6]}" for run in records],
+            "device": runs.device,
+        }
+    )
+    differ = differences.groupby([runs.scene, runs.label]).transform("nunique") > 1
+    for i, columns in enumerate(differ.to_numpy()):
+        if columns.any():
+            told = ", ".join(differences.loc[i, columns])
+            runs.loc[i, "label"] += f" [{told}]"
+    return runs
+
+
+def _numbers(run: RunRecord, metrics: Sequence[str]) -> Iterable[tuple[str, str, float]]:
+    """Quantity, column and value of everything that a run gave, in the order of the tables."""
+    sources = {f"period {i}": run.periods[i] for i in sorted(run.periods, key=int)}
+    sources |= {name: run.aggregates[name] for name in AGGREGATES}
+    for metric in metrics:
+        for column, values in sources.items():
+            if metric in values:
+                yield metric, column, values[metric]
+    for cost in COSTS:
+        if (value := getattr(run, cost.name)) is not None:
+            yield cost.name, "", float(value)
+
+
+def _spread(values: Series) -> float:
+    """Sample standard deviation (n - 1); NaN for one value, or where one is infinite."""
+    return stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else math.nan
 
 
 def metric_names(records: Iterable[RunRecord], wanted: Sequence[str] = ()) -> list[str]:
@@ -156,86 +214,38 @@ def metric_names(records: Iterable[RunRecord], wanted: Sequence[str] = ()) -> li
     return [name for name in METRICS if name in there and (not known or name in known)]
 
 
-def period_ids(groups: Iterable[Group]) -> list[str]:
-    """Ids of all periods of a scene, in order."""
-    return sorted({i for g in groups for run in g.runs for i in run.periods}, key=int)
+def readable_tables(
+    entries: DataFrame, records: Sequence[RunRecord], metrics: Sequence[str] = ()
+) -> list[Table]:
+    """Per scene a table of each metric and one of costs; a summary if there are several scenes.
 
-
-def statistic(group: Group, metric: str, column: str) -> Statistic | None:
-    """Mean over seeds of an aggregate or a period; None where a run lacks the metric."""
-    values = []
-    for run in group.runs:
-        source = run.aggregates.get(column)
-        if source is None:
-            source = run.periods.get(column.removeprefix("period "), {})
-        if metric in source:
-            values.append(source[metric])
-    return Statistic.of(values) if len(values) == len(group.runs) else None
-
-
-def cost(group: Group, name: str) -> Statistic | None:
-    """Mean over seeds of a cost; None where a run does not know it."""
-    values = [getattr(run, name) for run in group.runs]
-    return None if None in values else Statistic.of([float(value) for value in values])
-
-
-def entries(records: Sequence[RunRecord], wanted: Sequence[str] = ()) -> list[Entry]:
-    """All numbers in long form: what CSV and JSON hold."""
-    found = []
-    for groups in group_runs(records).values():
-        columns = [f"period {i}" for i in period_ids(groups)] + list(AGGREGATES)
-        for group in groups:
-            for metric in metric_names(group.runs, wanted):
-                values = [(column, statistic(group, metric, column)) for column in columns]
-                found += [_entry(group, metric, c, v) for c, v in values if v is not None]
-            costs = [(c.name, cost(group, c.name)) for c in COSTS]
-            found += [_entry(group, name, "", v) for name, v in costs if v is not None]
-    return found
-
-
-def _entry(group: Group, quantity: str, column: str, value: Statistic) -> Entry:
-    run = group.first
-    return Entry(
-        scene=run.scene,
-        method=run.method,
-        strategy=run.strategy,
-        preset=run.preset,
-        config_hash=run.config_hash,
-        quantity=quantity,
-        column=column,
-        mean=value.mean,
-        sd=value.sd,
-        n=value.n,
-        seeds=" ".join(str(r.seed) for r in group.runs),
-        device=run.device,
-        commit=" ".join(dict.fromkeys(r.commit for r in group.runs)),
-    )
-
-
-def grids(records: Sequence[RunRecord], wanted: Sequence[str] = ()) -> list[Grid]:
-    """Per scene a table of each metric and one of costs; a summary where there are more scenes."""
-    scenes = group_runs(records)
+    Args:
+        entries: What `summarise` returns for the records.
+        records: The runs.
+        metrics: Names of those wanted; none for all.
+    """
+    names = metric_names(records, metrics)
     made = []
-    for scene, groups in scenes.items():
-        made += [quality_grid(scene, groups, name) for name in metric_names(records, wanted)]
-        made.append(cost_grid(scene, groups))
-    if len(scenes) > 1:
-        made += [summary_grid(scenes, name) for name in metric_names(records, wanted)]
+    for scene, part in entries.groupby("scene", sort=False):
+        runs = [run for run in records if run.scene == scene]
+        made += [_quality_table(part, name, runs) for name in names]
+        made.append(_cost_table(part, str(scene)))
+    if entries.scene.nunique() > 1:
+        made += [_summary_table(entries, name) for name in names]
     return made
 
 
-def quality_grid(scene: str, groups: Sequence[Group], metric: str) -> Grid:
+def _quality_table(part: DataFrame, metric: str, runs: Sequence[RunRecord]) -> Table:
     """One metric on one scene: methods by periods and aggregates."""
-    info, ids = metric_info(metric), period_ids(groups)
-    labels = groups[0].first.period_labels
-    columns = [f"period {i}" for i in ids] + list(AGGREGATES)
-    values = [[statistic(group, metric, column) for column in columns] for group in groups]
-    header = ("method", *(_period_title(i, labels) for i in ids), *AGGREGATES, "n")
+    info = metric_info(metric)
+    ids = sorted({i for run in runs for i in run.periods}, key=int)
+    columns = [*(f"period {i}" for i in ids), *AGGREGATES]
+    rows, best = _cells(part[part.quantity == metric], "column", columns, part, info)
+    rows = [[*row, str(n)] for row, n in zip(rows, _of_groups(part, "runs"), strict=True)]
+    titles = [_period_title(i, runs[0].period_labels) for i in ids]
     arrow = "higher" if info.higher_is_better else "lower"
-    title = f"{scene}: {info.title} ({metric}), {arrow} is better"
-    cells = format_columns(values, info.decimals, info.higher_is_better)
-    cells = [[*row, Cell(str(len(g.runs)))] for row, g in zip(cells, groups, strict=True)]
-    return Grid(title, header, _with_labels([g.label for g in groups], cells))
+    title = f"{runs[0].scene}: {info.title} ({metric}), {arrow} is better"
+    return Table(_heads("method", *titles, *AGGREGATES, "n"), rows, title=title, best=best)
 
 
 def _period_title(period: str, labels: dict[str, str]) -> str:
@@ -243,80 +253,79 @@ def _period_title(period: str, labels: dict[str, str]) -> str:
     return f"period {period}" if label == period else f"{period}: {label}"
 
 
-def cost_grid(scene: str, groups: Sequence[Group]) -> Grid:
+def _cost_table(part: DataFrame, scene: str) -> Table:
     """What the runs on one scene cost."""
-    shown = [c for c in COSTS if any(cost(group, c.name) is not None for group in groups)]
-    cells = [
-        [Cell(format_statistic(cost(group, c.name), c.decimals, c.factor)) for c in shown]
-        + [Cell(" ".join(str(run.seed) for run in group.runs))]
-        for group in groups
-    ]
-    header = ("method", *(c.title for c in shown), "seeds")
-    return Grid(f"{scene}: cost", header, _with_labels([g.label for g in groups], cells))
+    shown = [cost for cost in COSTS if (part.quantity == cost.name).any()]
+    rows, _ = _cells(part[part.column == ""], "quantity", [cost.name for cost in shown], part)
+    rows = [[*row, seeds] for row, seeds in zip(rows, _of_groups(part, "seeds"), strict=True)]
+    heads = _heads("method", *(cost.title for cost in shown), "seeds")
+    return Table(heads, rows, title=f"{scene}: cost")
 
 
-def summary_grid(scenes: dict[str, list[Group]], metric: str) -> Grid:
+def _summary_table(entries: DataFrame, metric: str) -> Table:
     """Macro means of one metric: methods by scenes, and their mean where no scene is missing."""
+    import pandas as pd
+
     info = metric_info(metric)
-    labels = list(dict.fromkeys(g.label for groups in scenes.values() for g in groups))
-    values: list[list[Statistic | None]] = []
-    for label in labels:
-        row = [
-            next((statistic(g, metric, "macro") for g in groups if g.label == label), None)
-            for groups in scenes.values()
-        ]
-        known = [value.mean for value in row if value is not None]
-        complete = len(known) == len(scenes)
-        values.append([*row, Statistic(mean(known), None, 1) if complete else None])
-    header = ("method", *scenes, "mean of scenes")
-    cells = format_columns(values, info.decimals, info.higher_is_better)
-    return Grid(f"all scenes: {info.title} ({metric}), macro", header, _with_labels(labels, cells))
+    macro = entries[(entries.quantity == metric) & (entries.column == "macro")]
+    scenes = list(entries.scene.unique())
+    whole = macro.groupby("label").filter(lambda group: len(group) == len(scenes))
+    overall = whole.groupby("label", sort=False)["mean"].agg(mean).reset_index()
+    overall = overall.assign(scene="mean of scenes", quantity=metric, sd=math.nan, n=1)
+    columns = [*scenes, "mean of scenes"]
+    both = pd.concat([macro, _with_text(overall)])
+    rows, best = _cells(both, "scene", columns, entries, info)
+    title = f"all scenes: {info.title} ({metric}), macro"
+    return Table(_heads("method", *columns), rows, title=title, best=best)
 
 
-def _with_labels(labels: Sequence[str], cells: list[list[Cell]]) -> tuple[tuple[Cell, ...], ...]:
-    return tuple((Cell(label), *row) for label, row in zip(labels, cells, strict=True))
+def _heads(*names: str) -> list[tables.Head]:
+    return [(name, "") for name in names]
 
 
-def format_columns(
-    values: Sequence[Sequence[Statistic | None]],
-    decimals: int,
-    higher_is_better: bool,
-) -> list[list[Cell]]:
-    """Format rows of numbers and mark the best of each column, if there is a choice."""
-    best: list[float | None] = [None] * len(values[0])
-    if len(values) > 1:
-        pick = max if higher_is_better else min
-        for i in range(len(best)):
-            known = (row[i] for row in values)
-            best[i] = pick((round(v.mean, decimals) for v in known if v is not None), default=None)
-    return [
-        [
-            # What reads the same in the table is marked alike.
-            Cell(
-                format_statistic(v, decimals), v is not None and round(v.mean, decimals) == best[i]
-            )
-            for i, v in enumerate(row)
-        ]
-        for row in values
-    ]
+def _of_groups(part: DataFrame, column: str) -> Series:
+    """What all entries of a group have in common, one value per label."""
+    return part.groupby("label", sort=False)[column].first()
 
 
-def format_statistic(value: Statistic | None, decimals: int, factor: float = 1.0) -> str:
-    """``mean`` or ``mean ± sd``; a dash where there is no number."""
-    if value is None:
-        return "-"
-    text = f"{value.mean * factor:.{decimals}f}"
-    if value.sd is None:
-        return text
-    return f"{text} ± {value.sd * factor:.{decimals}f}"
+def _cells(
+    entries: DataFrame,
+    by: str,
+    columns: Sequence[str],
+    whole: DataFrame,
+    metric: MetricInfo | None = None,
+) -> tuple[list[list[str]], set[tuple[int, int]]]:
+    """Label and texts of each row, and the places of the best of each column.
+
+    Args:
+        entries: At most one for each label and column.
+        by: Column of ``entries`` that says where in a row it belongs.
+        columns: Values of ``by`` in the order of the table.
+        whole: Entries with all labels, in the order of the table.
+        metric: Says what is better; None if nothing is.
+    """
+    labels = whole.label.unique()
+    texts = entries.pivot(index="label", columns=by, values="text")
+    texts = texts.reindex(index=labels, columns=columns).astype(object).fillna("-")
+    rows = [[label, *row] for label, row in zip(labels, texts.to_numpy(), strict=True)]
+    if metric is None or len(labels) < 2:
+        return rows, set()
+    # What reads the same in the table is marked alike.
+    shown = entries.pivot(index="label", columns=by, values="shown")
+    shown = shown.reindex(index=labels, columns=columns)
+    best = shown.max() if metric.higher_is_better else shown.min()
+    return rows, {(i, 1 + j) for i, j in zip(*shown.eq(best).to_numpy().nonzero(), strict=True)}
 
 
 def footnotes(
-    records: Sequence[RunRecord], failures: Sequence[Failure], wanted: Sequence[str] = ()
+    entries: DataFrame,
+    records: Sequence[RunRecord],
+    failures: Sequence[Failure],
+    wanted: Sequence[str] = (),
 ) -> list[str]:
     """What a reader must know: aggregates, spread, device, code, what is absent and why."""
     notes = ["macro: mean over periods; micro: mean over test views; worst: the worst period"]
-    if any(len(g.runs) > 1 for groups in group_runs(records).values() for g in groups):
+    if (entries.n > 1).any():
         notes.append("±: sample standard deviation over n seeds")
     for name, title in (("device", "device"), ("commit", "code")):
         values = dict.fromkeys(str(getattr(run, name)) for run in records)

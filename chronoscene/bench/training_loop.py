@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import math
-import os
 import random
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench.image_store import to_bytes
-from chronoscene.bench.protocol import Part
-from chronoscene.bench.stopping import StopRule, Stopwatch
+from chronoscene.bench.job import StopRule
+from chronoscene.bench.predictions import to_bytes
+from chronoscene.bench.strategies import Part
 from chronoscene.errors import ChronoSceneError
-from chronoscene.methods import Method, StepReport
+from chronoscene.methods import (
+    Method,
+    MethodSpec,
+    StepReport,
+    TrainingSet,
+    TrainingView,
+    import_object,
+)
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame
+from chronoscene.scene.geometry import Sim3, camera_centre
 
 PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 """Shares of the training at which the probe views are rendered."""
@@ -38,6 +49,26 @@ class CurvePoint:
     """Mean over the probe views, in dB."""
     parameters: int
     model: str
+
+
+class Stopwatch:
+    """Adds up the time spent inside ``with``: training runs inside, evaluation outside."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._started = 0.0
+
+    def __enter__(self) -> Stopwatch:
+        self._started = time.perf_counter()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.seconds += time.perf_counter() - self._started
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +191,69 @@ def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:
     return to_bytes(rgb)
 
 
-def stop_if_orphaned(parent: int | None) -> None:
-    """End silently when the bench that started this process is gone: it may run again already."""
-    if parent is not None and os.getppid() != parent:
-        raise SystemExit("the bench that this run belongs to has ended")
+WARM_UP_SIZE = 32
+"""Pixels per axis of the made-up images."""
+WARM_UP_STEPS = 120
+"""Enough for the first rounds of densification of the methods here."""
+WARM_UP_SECONDS = 3.0
+"""Limit on the time for the steps after the first three."""
+
+
+def warm_up(spec: MethodSpec, config: Any, *, num_periods: int, device: str) -> str | None:
+    """Use a method once; returns why that went wrong, if it did."""
+    try:
+        seed_everything(0)
+        method: Method = import_object(spec.method)(config)
+        train = made_up_set(num_periods)
+        method.setup(train, seed=0, device=device)
+        started = time.perf_counter()
+        for index in range(WARM_UP_STEPS):
+            method.step(index, index / WARM_UP_STEPS)
+            if index < 2:
+                started = time.perf_counter()
+            elif time.perf_counter() - started > WARM_UP_SECONDS:
+                break
+        method.render(train.views[0], 0.0)
+    except Exception as error:  # what is wrong shows in the run itself; here it only costs time
+        return f"warm-up failed ({type(error).__name__}), compilation is on the training clock"
+    return None
+
+
+def made_up_set(num_periods: int) -> TrainingSet:
+    """Noise seen by three cameras per period around a cloud of points."""
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (3 * num_periods, WARM_UP_SIZE, WARM_UP_SIZE, 3), dtype=np.uint8)
+    views = tuple(_made_up_view(i, i // 3) for i in range(len(images)))
+    centres = camera_centre(np.stack([v.cam_from_world for v in views]))
+    radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    count = 200
+    return TrainingSet(
+        views=views,
+        num_periods=num_periods,
+        points=rng.uniform(-0.5, 0.5, (count, 3)).astype(np.float32),
+        colors=rng.integers(0, 256, (count, 3), dtype=np.uint8),
+        point_periods=np.ones((count, num_periods), bool),
+        training_from_world=Sim3.identity(),
+        camera_extent=1.1 * radius,
+        background=np.zeros(3, np.float32),
+        load_image=lambda i: images[i],
+    )
+
+
+def _made_up_view(number: int, period: int) -> TrainingView:
+    """A camera one and a half units from the origin, looking at it."""
+    angle = 0.4 * number
+    cosine, sine = np.cos(angle), np.sin(angle)
+    pose = np.eye(4)
+    pose[:3, :3] = [[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]]
+    pose[2, 3] = 1.5
+    K = np.array([[30.0, 0.0, WARM_UP_SIZE / 2], [0.0, 30.0, WARM_UP_SIZE / 2], [0.0, 0.0, 1.0]])
+    return TrainingView(K, WARM_UP_SIZE, WARM_UP_SIZE, pose, f"{number}.png", period)
+
+
+def forget_peak_memory() -> None:
+    """Start the peak of resident memory anew, where the system can; compilers are greedy."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return

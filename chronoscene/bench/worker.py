@@ -1,6 +1,7 @@
-"""One run in a process of its own: ``python -m chronoscene.bench.worker JOB.json [PARENT]``.
+"""One run: train, save, render, score. Its own process keeps a crash away from the other runs.
 
-The process makes a crash harmless to the other runs and its peak memory that of this run alone.
+The peak memory is then that of this run alone, too. `execute` is what the process calls;
+`chronoscene.io.processes` starts the process and watches it.
 """
 
 from __future__ import annotations
@@ -18,40 +19,41 @@ from typing import Any
 
 from chronoscene.bench import results
 from chronoscene.bench.display import ProgressDisplay
-from chronoscene.bench.ground_truth import ground_truth_folder
-from chronoscene.bench.identity import (
+from chronoscene.bench.job import Job, StopRule
+from chronoscene.bench.predictions import (
+    ImageWriter,
+    ground_truth_folder,
+    load_image,
+    read_manifest,
+)
+from chronoscene.bench.provenance import (
     describe_device,
     library_versions,
     method_version,
     peak_memory_bytes,
 )
-from chronoscene.bench.image_store import ImageWriter, load_image, read_manifest
-from chronoscene.bench.jobs import Job, read_job
-from chronoscene.bench.protocol import Part, make_parts
-from chronoscene.bench.run_folders import csv_text, folder_bytes
 from chronoscene.bench.scoring import aggregate, score_folder
-from chronoscene.bench.stopping import StopRule
+from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.bench.training_loop import (
     CurvePoint,
     Trained,
+    forget_peak_memory,
     probe_frames,
     render_bytes,
-    stop_if_orphaned,
     train,
+    warm_up,
 )
-from chronoscene.bench.warmup import forget_peak_memory, warm_up
 from chronoscene.errors import BackendError, ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
 from chronoscene.io.files import write_text_atomic
+from chronoscene.io.processes import Report
+from chronoscene.io.tables import csv_text
 from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.kernels.threads import set_threads
 from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
 from chronoscene.metrics.scorers import make_scorers
 from chronoscene.scene import Scene
-
-FAILED = 1
-"""Exit status after a failure that is written down in ``failed.json``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,7 @@ class Machine:
     threads: int
 
 
-def run_job(job: Job, *, parent: int | None = None) -> None:
+def run_job(job: Job) -> None:
     """Train, save, render and score; writes into ``job.staging`` only."""
     started = datetime.now(UTC).isoformat(timespec="seconds")
     keep_freed_memory()
@@ -92,7 +94,7 @@ def run_job(job: Job, *, parent: int | None = None) -> None:
     with ProgressDisplay(job.label) as display:
         for part, stop in zip(parts, job.stop_rules(spec, len(parts)), strict=True):
             display.begin(part.name, stop)
-            outcomes.append(_run_part(job, spec, part, stop, machine, writer, display, parent))
+            outcomes.append(_run_part(job, spec, part, stop, machine, writer, display))
     peaks = peak_memory_bytes(), _peak_device_memory(machine.device)
     writer.close(
         kind="predictions",
@@ -142,13 +144,8 @@ def _run_part(
     machine: Machine,
     writer: ImageWriter,
     display: ProgressDisplay,
-    parent: int | None,
 ) -> PartOutcome:
     """Train one model, save it, and render the test views that it answers for."""
-
-    def observe(iteration: int, seconds: float, *rest: Any) -> None:
-        stop_if_orphaned(parent)
-        display.update(iteration, seconds, *rest)
 
     method: Method = import_object(spec.method)(job.method_config(spec))
     trained = train(
@@ -158,12 +155,11 @@ def _run_part(
         _probe_truth(job, part),
         seed=job.seed,
         device=machine.device,
-        observer=observe,
+        observer=display.update,
     )
     _save(method, Path(job.staging) / results.CHECKPOINT, part)
     before = time.perf_counter()
     for frame in part.test:
-        stop_if_orphaned(parent)
         image = render_bytes(method, part, frame)
         writer.add(frame.name, image, camera_period=frame.period, rendered_period=frame.period)
     return PartOutcome(trained, method.size(), time.perf_counter() - before)
@@ -190,6 +186,10 @@ def _write_curve(folder: Path, outcomes: list[PartOutcome]) -> None:
     columns = [f.name for f in fields(CurvePoint)]
     points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
     write_text_atomic(folder / results.CURVE_FILE, csv_text(columns, points))
+
+
+def _folder_bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def _peak_device_memory(device: str) -> int | None:
@@ -221,7 +221,7 @@ def _record(
         seconds=sum(o.trained.seconds for o in outcomes),
         iterations=sum(o.trained.iterations for o in outcomes),
         primitives=sum(o.size.primitives for o in outcomes),
-        checkpoint_bytes=folder_bytes(Path(job.staging) / results.CHECKPOINT),
+        checkpoint_bytes=_folder_bytes(Path(job.staging) / results.CHECKPOINT),
         peak_memory_bytes=peaks[0],
         device=describe_device(machine.device, machine.threads),
         commit=job.commit,
@@ -246,27 +246,17 @@ def _record(
     )
 
 
-def main(arguments: list[str]) -> int:
-    """Run one job; every failure ends in ``failed.json`` and status 1."""
-    job = read_job(Path(arguments[0]))
-    parent = int(arguments[1]) if len(arguments) > 1 else None
+def execute(document: dict[str, Any], _: Report) -> None:
+    """Run the job in ``document``; every failure ends in ``failed.json``."""
+    job = Job(**document)
     staging = Path(job.staging)
     if job.plugin_path is not None:
         sys.path.append(job.plugin_path)
     try:
-        run_job(job, parent=parent)
+        run_job(job)
     except ChronoSceneError as error:
         results.write_failure(staging, job.failure(str(error)))
-        return FAILED
     except Exception as error:  # a fault in a method must not end the other runs
         (staging / "error.log").write_text(traceback.format_exc(), encoding="utf-8")
         reason = f"{type(error).__name__}: {error} (see error.log)"
         results.write_failure(staging, job.failure(reason))
-        return FAILED
-    except KeyboardInterrupt:
-        return 130
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

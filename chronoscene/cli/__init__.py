@@ -9,7 +9,7 @@ import click
 
 from chronoscene import __version__
 from chronoscene.errors import ChronoSceneError
-from chronoscene.io.files import stoppable
+from chronoscene.io.processes import stoppable
 
 COMMANDS = {
     "bench": "chronoscene.cli.bench:command",

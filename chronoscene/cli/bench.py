@@ -7,9 +7,9 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.protocol import STRATEGIES
+from chronoscene.bench.job import parse_duration
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
-from chronoscene.bench.stopping import parse_duration
+from chronoscene.bench.strategies import STRATEGIES
 from chronoscene.checks import check_choice
 from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.table import split_list
@@ -132,8 +132,7 @@ def report(outcome: BenchOutcome, out: Path) -> None:
     """Print the tables of all runs in the folder and the files that were written."""
     from chronoscene.bench.comparison_figure import draw_figures
     from chronoscene.bench.results import RESULTS_FILE, ROWS_FILE, read_failures
-    from chronoscene.bench.table_formats import format_runs
-    from chronoscene.bench.tables import read_runs
+    from chronoscene.bench.tables import format_runs, read_runs
 
     if outcome.finished:
         records, failures = read_runs([out])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.rescore import rescore
+from chronoscene.bench.scoring import rescore
 from chronoscene.cli.progress import progress_bar
 from chronoscene.metrics.scorers import make_scorers
 

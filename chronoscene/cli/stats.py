@@ -16,7 +16,7 @@ from chronoscene.cli.output import check_file, check_outside, check_place, emit,
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import find_scenes, format_names, read_scene
-from chronoscene.io.parallel import map_parallel
+from chronoscene.io.processes import map_parallel
 from chronoscene.io.wording import printable
 from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.stats import (

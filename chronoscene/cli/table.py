@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.table_formats import FORMATS, format_runs
-from chronoscene.bench.tables import read_runs
+from chronoscene.bench.tables import FORMATS, format_runs, read_runs
 from chronoscene.cli.output import emit
 from chronoscene.errors import ConfigError
 from chronoscene.metrics.names import metric_info

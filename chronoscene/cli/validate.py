@@ -10,7 +10,7 @@ import click
 
 from chronoscene.cli.output import check_file, check_outside, emit
 from chronoscene.cli.progress import tracked
-from chronoscene.io.parallel import map_parallel
+from chronoscene.io.processes import map_parallel
 from chronoscene.io.wording import counted, printable
 from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.validation.repair.fix import fix_scene

@@ -7,11 +7,17 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
-from chronoscene.figures.canvas import GREY, GRID, new_figure, plain, quiet_axes, save
-from chronoscene.figures.colors import period_colors
+from chronoscene.figures.canvas import (
+    GREY,
+    GRID,
+    new_figure,
+    period_colors,
+    plain,
+    quiet_axes,
+    save,
+)
 from chronoscene.io.wording import printable
-from chronoscene.stats.counts import PeriodCount, SceneCount
-from chronoscene.stats.titles import period_title
+from chronoscene.stats.counts import PeriodCount, SceneCount, period_title
 
 BAR = 0.3
 """Inches per scene."""

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from chronoscene.io.wording import printable
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.stats.counts import assign_points
-from chronoscene.stats.extent import robust_range
-from chronoscene.stats.titles import period_name
+from chronoscene.stats.counts import assign_points, period_name
+from chronoscene.stats.measures import robust_range
 
 Array = NDArray[np.float64]
 

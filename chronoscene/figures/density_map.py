@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.figures.colors import rgb_of
+from chronoscene.figures.canvas import rgb_of
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.float32]

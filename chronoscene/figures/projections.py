@@ -15,9 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.figures.canvas import DPI, GREY, GRID, new_figure, plain, quiet_axes, save
+from chronoscene.figures.canvas import (
+    DPI,
+    GREY,
+    GRID,
+    new_figure,
+    period_colors,
+    plain,
+    quiet_axes,
+    save,
+)
 from chronoscene.figures.cloud import Box, Cloud, cloud_of, shown_box
-from chronoscene.figures.colors import period_colors
 from chronoscene.figures.density_map import Window, count_points, dot_radius, grow_dots, shade
 from chronoscene.scene import Scene
 

@@ -11,8 +11,8 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from chronoscene.figures.canvas import period_colors
 from chronoscene.figures.cloud import Cloud, cloud_of, shown_box
-from chronoscene.figures.colors import period_colors
 from chronoscene.io.files import write_text_atomic
 from chronoscene.io.pages import render_page
 from chronoscene.scene import Scene

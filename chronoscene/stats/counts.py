@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -13,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene import __version__
+from chronoscene.io import tables
+from chronoscene.io.tables import Table
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
 from chronoscene.stats.published import published
-from chronoscene.stats.text import latex_row, markdown_table, text_table
 
 SCHEMA_VERSION = 1
 CountRule = Literal["assigned", "seen"]
@@ -61,6 +60,20 @@ class Unreadable:
 
     path: str
     error: str
+
+
+def period_name(period: int, label: str, date: str | None) -> str:
+    """Its label, and its date where the label lacks the year; the number if there is neither."""
+    names = [label] if label != str(period) else []
+    if date is not None and date[:4] not in label:
+        names.append(date)
+    return ", ".join(names) or str(period)
+
+
+def period_title(period: int, label: str, date: str | None) -> str:
+    """Its number, and its name where that is more than the number."""
+    name = period_name(period, label, date)
+    return name if name == str(period) else f"{period}: {name}"
 
 
 def assign_points(scene: Scene) -> NDArray[np.int64]:
@@ -133,7 +146,7 @@ def _period_names(counts: Sequence[SceneCount]) -> list[str]:
     return [*(f"Period {i}" for i in range(periods)), "Total"]
 
 
-def _cells(counts: Sequence[SceneCount]) -> list[list[str]]:
+def _table(counts: Sequence[SceneCount], images: str = "images", points: str = "points") -> Table:
     """The table as it is read."""
 
     def text(cell: int | str | None) -> str:
@@ -141,46 +154,28 @@ def _cells(counts: Sequence[SceneCount]) -> list[list[str]]:
             return "-"
         return cell if isinstance(cell, str) else f"{cell:,}"
 
-    return [list(map(text, row)) for row in count_table(counts)]
+    heads = [("Scene", "")]
+    for name in _period_names(counts):
+        heads += [(name, images), ("", points)]
+    rows = [list(map(text, row)) for row in count_table(counts)]
+    return Table(heads, rows, breaks={len(counts) - 1})
 
 
 def to_csv(counts: Sequence[SceneCount]) -> str:
     """Wide table; empty cells where a scene has no such period."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
     heads = [name.lower().replace(" ", "_") for name in _period_names(counts)]
-    writer.writerow(["scene", *(f"{h}_{what}" for h in heads for what in ("images", "points"))])
-    writer.writerows(count_table(counts))
-    return out.getvalue()
+    columns = ["scene", *(f"{h}_{what}" for h in heads for what in ("images", "points"))]
+    return tables.csv_text(columns, count_table(counts))
 
 
 def to_markdown(counts: Sequence[SceneCount]) -> str:
     """Pipe table with one head row."""
-    heads = ["Scene"]
-    for name in _period_names(counts):
-        heads += [f"{name} images", f"{name} points"]
-    return markdown_table(heads, _cells(counts), named=1)
+    return tables.markdown(_table(counts))
 
 
 def to_latex(counts: Sequence[SceneCount]) -> str:
     """A ``tabular`` for the booktabs package."""
-    names = _period_names(counts)
-    *rows, total = map(latex_row, _cells(counts))
-    rules = "".join(rf"\cmidrule(lr){{{2 * i + 2}-{2 * i + 3}}}" for i in range(len(names)))
-    lines = [
-        r"\begin{tabular}{l" + "rr" * len(names) + "}",
-        r"\toprule",
-        "Scene & " + " & ".join(rf"\multicolumn{{2}}{{c}}{{{name}}}" for name in names) + r" \\",
-        rules,
-        " & " + " & ".join(["Images & Points"] * len(names)) + r" \\",
-        r"\midrule",
-        *rows,
-        r"\midrule",
-        total,
-        r"\bottomrule",
-        r"\end{tabular}",
-    ]
-    return "\n".join(lines) + "\n"
+    return tables.latex(_table(counts, "Images", "Points"), cmidrules=True)
 
 
 def to_json(counts: Sequence[SceneCount], *, unreadable: Sequence[Unreadable] = ()) -> str:
@@ -227,10 +222,7 @@ def totals(counts: Sequence[SceneCount]) -> dict[str, Any]:
 
 def to_text(counts: Sequence[SceneCount], *, width: int | None = None) -> str:
     """Table for a terminal of this width, without colours; None for as wide as it is."""
-    heads = [("Scene", "")]
-    for name in _period_names(counts):
-        heads += [(name, "images"), ("", "points")]
-    return text_table(heads, _cells(counts), named=1, ends={len(counts) - 1}, width=width)
+    return tables.boxed_text(_table(counts), width=width)
 
 
 WRITERS: dict[str, Callable[..., str]] = {

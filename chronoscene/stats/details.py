@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from chronoscene.stats.counts import Unreadable, compared, document
+from chronoscene.io import tables
+from chronoscene.io.tables import Head, Table
+from chronoscene.stats.counts import Unreadable, compared, document, period_title
 from chronoscene.stats.measures import Measures, SceneStatistics
-from chronoscene.stats.text import Head, latex_heads, latex_row, markdown_table, text_table
-from chronoscene.stats.titles import period_title
 
-MOST_SHOWN = 8
+MAX_SHOWN = 8
 """Periods up to which the overlaps fit into a table for reading; CSV and JSON have them all."""
 
 
@@ -85,7 +83,7 @@ def _values(images: int, test: int, points: int, measures: Measures) -> dict[str
     return {"images": images, "test": test, "points": points, **asdict(measures)}
 
 
-def _most_periods(statistics: Sequence[SceneStatistics]) -> int:
+def _max_periods(statistics: Sequence[SceneStatistics]) -> int:
     return max((len(s.periods) for s in statistics), default=0)
 
 
@@ -94,18 +92,16 @@ def details_csv(statistics: Sequence[SceneStatistics]) -> str:
 
     The number of the period is empty for a whole scene, so that the column is of numbers.
     """
-    periods = _most_periods(statistics)
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    periods = _max_periods(statistics)
     shares = [f"{what}_{i}" for what in ("overlap", "in_view") for i in range(periods)]
-    writer.writerow(["scene", "period", "label", "date", *(c.name for c in COLUMNS), *shares])
-    for scene in statistics:
-        for row in rows_of(scene):
-            cells = [row.values[c.name] for c in COLUMNS]
-            for known in (row.overlap, row.in_view):
-                cells += [*known, *[None] * (periods - len(known))]
-            writer.writerow([row.scene, row.period, row.label, row.date, *cells])
-    return out.getvalue()
+    lines = []
+    for row in (row for scene in statistics for row in rows_of(scene)):
+        cells = [row.values[c.name] for c in COLUMNS]
+        for known in (row.overlap, row.in_view):
+            cells += [*known, *[None] * (periods - len(known))]
+        lines.append([row.scene, row.period, row.label, row.date, *cells])
+    columns = ["scene", "period", "label", "date", *(c.name for c in COLUMNS), *shares]
+    return tables.csv_text(columns, lines)
 
 
 def details_json(
@@ -132,25 +128,28 @@ def _scene_item(statistics: SceneStatistics) -> dict[str, Any]:
     return item | {"unit": statistics.unit, "paper": compared(statistics.counts)}
 
 
-def _grid(statistics: Sequence[SceneStatistics]) -> tuple[list[Head], list[list[str]]]:
-    """Heads in two lines, and cells as text."""
-    periods = _most_periods(statistics)
-    shown = periods if 1 < periods <= MOST_SHOWN else 0
+def _table(statistics: Sequence[SceneStatistics]) -> Table:
+    """The table as it is read, with a rule after each scene but the last."""
+    periods = _max_periods(statistics)
+    shown = periods if 1 < periods <= MAX_SHOWN else 0
     titles = [
         (title if i == 0 else "", f"{i} [%]")
         for title in ("Also seen by", "In view of")
         for i in range(shown)
     ]
     heads = [("Scene", ""), ("Period", ""), *(c.head for c in COLUMNS), *titles]
-    lines = []
+    lines: list[list[str]] = []
+    breaks = set()
     for scene in statistics:
+        if lines:
+            breaks.add(len(lines) - 1)
         for row in rows_of(scene):
             name = row.scene if row.period == 0 else ""
             cells = [c.show(row.values[c.name]) for c in COLUMNS]
             for shares in (row.overlap, row.in_view):
                 cells += [_percent(row, shares, i) for i in range(shown)]
             lines.append([name, row.title, *cells])
-    return heads, lines
+    return Table(heads, lines, labels=2, breaks=breaks)
 
 
 def _percent(row: Row, shares: tuple[float | None, ...], other: int) -> str:
@@ -162,46 +161,17 @@ def _percent(row: Row, shares: tuple[float | None, ...], other: int) -> str:
 
 def details_text(statistics: Sequence[SceneStatistics], *, width: int | None = None) -> str:
     """Table for a terminal of this width, without colours; None for as wide as it is."""
-    heads, lines = _grid(statistics)
-    ends = {i for i, line in enumerate(lines) if i + 1 < len(lines) and lines[i + 1][0]}
-    return text_table(heads, lines, named=2, ends=ends, width=width)
+    return tables.boxed_text(_table(statistics), width=width)
 
 
 def details_markdown(statistics: Sequence[SceneStatistics]) -> str:
     """Pipe table."""
-    heads, lines = _grid(statistics)
-    return markdown_table(_whole_heads(heads), lines, named=2)
-
-
-def _whole_heads(heads: Sequence[Head]) -> list[str]:
-    """Heads in one line, each of which says everything."""
-    whole, first = [], ""
-    for head in heads:
-        first = head[0] or first
-        whole.append(" ".join(filter(None, (first, head[1]))))
-    return whole
+    return tables.markdown(_table(statistics))
 
 
 def details_latex(statistics: Sequence[SceneStatistics]) -> str:
     """A ``tabular`` for the booktabs package."""
-    heads, lines = _grid(statistics)
-    body = []
-    for i, line in enumerate(lines):
-        if i and line[0]:
-            body.append(r"\midrule")
-        body.append(latex_row(line))
-    return "\n".join(
-        [
-            r"\begin{tabular}{ll" + "r" * (len(heads) - 2) + "}",
-            r"\toprule",
-            *latex_heads(heads),
-            r"\midrule",
-            *body,
-            r"\bottomrule",
-            r"\end{tabular}",
-            "",
-        ]
-    )
+    return tables.latex(_table(statistics))
 
 
 DETAIL_WRITERS: dict[str, Callable[..., str]] = {

@@ -10,8 +10,7 @@ from chronoscene.bench.comparison_figure import (
     mean_error,
     period_title,
 )
-from chronoscene.bench.ground_truth import ground_truth_folder
-from chronoscene.bench.image_store import load_image, read_manifest
+from chronoscene.bench.predictions import ground_truth_folder, load_image, read_manifest
 from chronoscene.bench.results import read_run
 
 JOINT = "ring/mean-joint-balanced/seed0"

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from chronoscene.bench.display import ProgressDisplay, format_time
-from chronoscene.bench.stopping import StopRule
+from chronoscene.bench.job import StopRule
 from chronoscene.methods import StepReport
 
 

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from chronoscene.bench import results
-from chronoscene.bench.image_store import read_manifest
+from chronoscene.bench.predictions import read_manifest
 from chronoscene.bench.results import read_rows, read_run, run_folders
-from chronoscene.bench.runner import BenchSettings, first_difference, split_overrides
 from chronoscene.errors import ConfigError, MetricUnavailableError, SceneError
-from chronoscene.methods import load_spec
 
 FIELDS = {
     "method",
@@ -97,7 +95,7 @@ def test_failures_stop_nobody_else(finished_bench):
     reasons = {f.method: f.reason for f in outcome.failures}
     assert reasons["raises"] == "RuntimeError: the toy is broken (see error.log)"
     assert "iteration 6: expected a finite loss, found nan" in reasons["not-finite"]
-    assert reasons["killed"] == "the process was ended by SIGKILL (out of memory?)"
+    assert reasons["killed"] == "the process ended with signal SIGKILL (out of memory?)"
     assert "the toy is broken" in (runs / "ring/raises-joint-balanced/seed0/error.log").read_text()
     assert any("blind takes no period" in line for line in said)
     assert len(results.read_failures(runs)) == 3
@@ -222,15 +220,3 @@ def test_memory_is_that_of_the_run_alone(bench, finished_bench):
     high = read_run(outcome.finished[0]).peak_memory_bytes
     assert parent.all()
     assert 290e6 < high - low < 400e6
-
-
-def test_differences_are_named():
-    old = {"config": {"a": 1, "b": {"c": 2}}, "seed": 0}
-    new = {"config": {"a": 1, "b": {"c": 3}}, "seed": 0}
-    assert first_difference(old, new) == ("c 2", "c 3")
-
-
-def test_overrides_with_a_prefix_are_for_one_method(tmp_path):
-    settings = BenchSettings((), (), tmp_path, overrides={"blind.rate": "1", "rate": "2"})
-    specs = [load_spec("toy_methods:MEAN"), load_spec("toy_methods:BLIND")]
-    assert split_overrides(settings, specs) == {"mean": {"rate": "2"}, "blind": {"rate": "1"}}

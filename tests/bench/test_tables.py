@@ -6,19 +6,16 @@ import json
 import re
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from chronoscene.bench.results import Failure, RunRecord
-from chronoscene.bench.table_formats import FORMATS, format_runs, latex_text
 from chronoscene.bench.tables import (
-    Statistic,
-    entries,
+    ENTRY_COLUMNS,
+    FORMATS,
     footnotes,
-    format_statistic,
-    grids,
-    group_runs,
+    format_runs,
     read_runs,
+    readable_tables,
+    summarise,
 )
 from chronoscene.errors import CheckpointError, ConfigError
 
@@ -78,33 +75,42 @@ FAILURES = [
 ]
 
 
+def grids(records, metrics=()):
+    return readable_tables(summarise(records, metrics), records, metrics)
+
+
+def notes(records, failures, metrics=()):
+    return footnotes(summarise(records, metrics), records, failures, metrics)
+
+
 def test_statistics_by_hand():
-    value = Statistic.of([1.0, 2.0, 4.0])
+    runs = [record(seed=i, psnr=(value,)) for i, value in enumerate((1.0, 2.0, 4.0))]
+    (value,) = summarise(runs).query("quantity == 'psnr' and column == 'macro'").itertuples()
     assert value.mean == pytest.approx(7 / 3) and value.n == 3
     assert value.sd == pytest.approx(1.5275252316519468)
-    assert Statistic.of([3.0]) == Statistic(3.0, None, 1)
-    assert format_statistic(value, 2) == "2.33 ± 1.53"
-    assert format_statistic(Statistic.of([3.0]), 1, 10.0) == "30.0"
-    assert format_statistic(None, 1) == "-"
-    assert format_statistic(Statistic.of([float("inf"), 1.0]), 1) == "inf ± nan"
+    assert value.text == "2.33 ± 1.53"
+    (value,) = summarise(runs[:1]).query("quantity == 'checkpoint_bytes'").itertuples()
+    assert (value.mean, value.n, value.text) == (1_234_000.0, 1, "1.234")
+    runs = [record(psnr=(float("inf"),)), record(seed=1, psnr=(1.0,))]
+    assert summarise(runs).text[0] == "inf ± nan"
 
 
 def test_entries_by_hand():
-    found = {(e.method, e.quantity, e.column): e for e in entries(RUNS)}
+    found = {(e.method, e.quantity, e.column): e for e in summarise(RUNS).itertuples()}
     mine = found["chronogs", "psnr", "period 0"]
     assert (mine.mean, mine.n, mine.seeds) == (21.0, 2, "0 1")
     assert mine.sd == pytest.approx(2**0.5)
     assert found["chronogs", "psnr", "macro"].mean == 25.75
     assert found["chronogs", "psnr", "worst"].mean == 21.0
-    assert found["3dgs", "psnr", "worst"].mean == 10.0 and found["3dgs", "psnr", "worst"].sd is None
+    assert found["3dgs", "psnr", "worst"].mean == 10.0 and found["3dgs", "psnr", "worst"].n == 1
     assert found["3dgs", "checkpoint_bytes", ""].mean == 1_234_000
     assert ("3dgs", "peak_device_memory_bytes", "") not in found
 
 
-def test_grids_mark_the_best_of_each_column():
+def test_tables_mark_the_best_of_each_column():
     quality = grids(RUNS, ["psnr"])[0]
     assert quality.title == "plaza: PSNR [dB] (psnr), higher is better"
-    assert quality.header == (
+    assert quality.flat_heads == [
         "method",
         "0: May_2016 & before",
         "period 1",
@@ -112,14 +118,10 @@ def test_grids_mark_the_best_of_each_column():
         "micro",
         "worst",
         "n",
-    )
-    marked = [[cell.best for cell in row] for row in quality.rows]
-    # chronogs: 21, 30.5, 25.75, 25.75, 21; 3dgs: 10, 40, 25, 25, 10.
-    assert marked == [
-        [False, True, False, True, True, True, False],
-        [False, False, True, False, False, False, False],
     ]
-    assert [row[-1].text for row in quality.rows] == ["2", "1"]
+    # chronogs: 21, 30.5, 25.75, 25.75, 21; 3dgs: 10, 40, 25, 25, 10.
+    assert quality.best == {(0, 1), (0, 3), (0, 4), (0, 5), (1, 2)}
+    assert [row[-1] for row in quality.rows] == ["2", "1"]
 
 
 def test_lower_is_better_where_it_is():
@@ -128,17 +130,24 @@ def test_lower_is_better_where_it_is():
         for values in (*run.aggregates.values(), *run.periods.values()):
             values["lpips_vgg"] = value
     grid = grids(runs, ["lpips_vgg"])[0]
-    assert [row[1].best for row in grid.rows] == [False, True]
+    assert {place for place in grid.best if place[1] == 1} == {(1, 1)}
     ties = grids(runs, ["psnr"])[0]
-    assert [row[1].best for row in ties.rows] == [True, True]
+    assert {place for place in ties.best if place[1] == 1} == {(0, 1), (1, 1)}
 
 
 def test_csv_parses_back():
     lines = list(csv.DictReader(io.StringIO(format_runs(RUNS, FAILURES, "csv"))))
-    assert len(lines) == len(entries(RUNS))
-    for line, entry in zip(lines, entries(RUNS), strict=True):
+    assert tuple(lines[0]) == ENTRY_COLUMNS
+    for line, entry in zip(lines, summarise(RUNS).itertuples(), strict=True):
         assert float(line["mean"]) == entry.mean and line["column"] == entry.column
-        assert line["sd"] == ("" if entry.sd is None else repr(entry.sd))
+        assert line["sd"] == ("" if entry.n == 1 else repr(entry.sd))
+
+
+def test_a_spread_that_is_not_defined_is_not_empty():
+    runs = [record(psnr=(float("inf"),)), record(seed=1, psnr=(1.0,))]
+    first = next(csv.DictReader(io.StringIO(format_runs(runs, [], "csv"))))
+    assert (first["mean"], first["sd"]) == ("inf", "nan")
+    assert json.loads(format_runs(runs, [], "json"))["entries"][0]["sd"] == "NaN"
 
 
 def test_json_parses_back():
@@ -148,7 +157,7 @@ def test_json_parses_back():
     found = {(e["method"], e["quantity"], e["column"]): e["mean"] for e in document["entries"]}
     assert found["chronogs", "psnr", "period 0"] == "Infinity"
     assert found["3dgs", "psnr", "macro"] == 25.0
-    assert document["notes"] == footnotes(runs, FAILURES)
+    assert document["notes"] == notes(runs, FAILURES)
 
 
 def parse_markdown(text):
@@ -178,11 +187,7 @@ def parse_plain(text):
     [("markdown", parse_markdown), ("latex", parse_latex), ("table", parse_plain)],
 )
 def test_texts_parse_back(style, parse):
-    expected = [
-        row
-        for grid in grids(RUNS)
-        for row in (list(grid.header), *([cell.text for cell in row] for row in grid.rows))
-    ]
+    expected = [row for grid in grids(RUNS) for row in (grid.flat_heads, *grid.rows)]
     assert parse(format_runs(RUNS, FAILURES, style)) == expected
 
 
@@ -199,9 +204,8 @@ def test_scenes_are_summed_up():
         record("b", psnr=(12.0, 14.0)),
     ]
     summary = grids(runs)[-1]
-    assert summary.header == ("method", "plaza", "quay", "mean of scenes")
-    texts = [[cell.text for cell in row] for row in summary.rows]
-    assert texts == [
+    assert summary.flat_heads == ["method", "plaza", "quay", "mean of scenes"]
+    assert summary.rows == [
         ["A (joint, fast)", "15.00", "30.00", "22.50"],
         ["B (joint, fast)", "13.00", "-", "-"],
     ]
@@ -209,8 +213,7 @@ def test_scenes_are_summed_up():
 
 def test_runs_with_other_configs_stay_apart():
     other = record(config_hash="another", seed=0, psnr=(1.0, 2.0))
-    labels = [g.label for g in group_runs([*RUNS[:2], other])["plaza"]]
-    assert labels == [
+    assert summarise([*RUNS[:2], other]).label.unique().tolist() == [
         "CHRONOGS (joint, fast) [config hash-o]",
         "CHRONOGS (joint, fast) [config anothe]",
     ]
@@ -218,23 +221,22 @@ def test_runs_with_other_configs_stay_apart():
 
 def test_a_metric_that_a_seed_lacks_has_no_mean():
     runs = [RUNS[0], record(seed=1, psnr=(22.0, 31.0))]
-    assert [row[1].text for row in grids(runs, ["ssim"])[0].rows] == ["-"]
+    assert [row[1] for row in grids(runs, ["ssim"])[0].rows] == ["-"]
 
 
 def test_footnotes():
-    notes = footnotes(RUNS, FAILURES)
-    assert "device: cpu (Test, 2 threads)" in notes and "code: abc" in notes
-    assert "absent: lpips_vgg: no weights" in notes
-    assert "failed: plaza, 3dgs (joint, fast), seed 0, 1: why" in notes
-    assert any("sample standard deviation" in note for note in notes)
-    assert not any("absent" in note for note in footnotes(RUNS, [], ["psnr"]))
-    assert not any("standard deviation" in note for note in footnotes(RUNS[:1], []))
+    found = notes(RUNS, FAILURES)
+    assert "device: cpu (Test, 2 threads)" in found and "code: abc" in found
+    assert "absent: lpips_vgg: no weights" in found
+    assert "failed: plaza, 3dgs (joint, fast), seed 0, 1: why" in found
+    assert any("sample standard deviation" in note for note in found)
+    assert not any("absent" in note for note in notes(RUNS, [], ["psnr"]))
+    assert not any("standard deviation" in note for note in notes(RUNS[:1], []))
 
 
-@given(st.text(alphabet="a\\&%$#_{}~^± ", max_size=20))
-def test_latex_text_has_no_bare_special_character(text):
-    rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\$\\pm\$", "", latex_text(text))
-    assert not set(rest) & set("\\&%$#_{}~^±")
+def test_without_a_finished_run_there_are_notes_only():
+    assert format_runs([], FAILURES, "table").count("failed: plaza") == 1
+    assert format_runs([], FAILURES, "csv") == ",".join(ENTRY_COLUMNS) + "\n"
 
 
 def test_unknown_metrics_are_refused():

@@ -7,20 +7,24 @@ import numpy as np
 import pytest
 import torch
 
-from chronoscene.bench.protocol import make_parts
-from chronoscene.bench.stopping import StopRule
+from chronoscene.bench.job import StopRule
+from chronoscene.bench.strategies import EXTENT_MARGIN, make_parts
 from chronoscene.bench.training_loop import (
     PROBE_SHARES,
+    WARM_UP_STEPS,
+    Stopwatch,
     TrainingError,
+    made_up_set,
     probe_frames,
     render_bytes,
     seed_everything,
-    stop_if_orphaned,
     train,
+    warm_up,
 )
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import import_object, load_spec
 from chronoscene.metrics.psnr_ssim import psnr
+from chronoscene.scene.geometry import camera_centre
 
 
 @pytest.fixture
@@ -149,11 +153,56 @@ def test_the_observer_sees_each_step(part):
     assert all(step[3] is not None for step in seen)
 
 
-def test_workers_without_their_bench_end():
-    stop_if_orphaned(None)
-    with pytest.raises(SystemExit, match="has ended"):
-        stop_if_orphaned(-1)
-
-
 def test_the_toys_are_specs():
     assert load_spec("toy_methods:MEAN").period_input == "label"
+
+
+def test_a_method_is_set_up_stepped_and_rendered(monkeypatch):
+    calls = []
+    cls = import_object("toy_methods:MeanColour")
+    step, render = cls.step, cls.render
+    monkeypatch.setattr(cls, "step", lambda *a: (calls.append(a[1]), step(*a))[1])
+    monkeypatch.setattr(cls, "render", lambda *a: (calls.append("render"), render(*a))[1])
+    config = import_object("toy_methods:Config")()
+    assert warm_up(load_spec("toy_methods:MEAN"), config, num_periods=3, device="cpu") is None
+    assert calls == [*range(WARM_UP_STEPS), "render"]
+
+
+def test_slow_methods_are_cut_short(monkeypatch):
+    monkeypatch.setattr("chronoscene.bench.training_loop.WARM_UP_SECONDS", 0.05)
+    steps = []
+    cls = import_object("toy_methods:MeanColour")
+    step = cls.step
+    monkeypatch.setattr(cls, "step", lambda *a: (steps.append(1), step(*a))[1])
+    config = import_object("toy_methods:Config")(sleep=0.03)
+    assert warm_up(load_spec("toy_methods:MEAN"), config, num_periods=1, device="cpu") is None
+    assert 3 <= len(steps) <= 6
+
+
+def test_what_goes_wrong_is_a_notice():
+    config = import_object("toy_methods:Config")()
+    notice = warm_up(load_spec("toy_methods:RAISES"), config, num_periods=1, device="cpu")
+    assert "RuntimeError" in notice and "training clock" in notice
+
+
+@pytest.mark.parametrize("periods", [1, 2, 50])
+def test_the_made_up_set_is_a_training_set(periods):
+    train = made_up_set(periods)
+    assert [v.period for v in train.views] == [i // 3 for i in range(3 * periods)]
+    centres = camera_centre(np.stack([v.cam_from_world for v in train.views]))
+    radius = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+    assert train.camera_extent == pytest.approx(EXTENT_MARGIN * radius)
+    for i, view in enumerate(train.views):
+        assert train.load_image(i).shape == (view.height, view.width, 3)
+        inside = train.points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+        assert inside[:, 2].min() > 0.5
+
+
+def test_the_stopwatch_counts_inside_only():
+    watch = Stopwatch()
+    with watch:
+        time.sleep(0.02)
+    time.sleep(0.05)
+    with watch:
+        time.sleep(0.02)
+    assert 0.04 <= watch.seconds < 0.065

@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 import chronoscene.cli.score as score_module
-from chronoscene.bench.rescore import Rescored
+from chronoscene.bench.scoring import Rescored
 from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError, MetricUnavailableError
 from chronoscene.metrics.scorers import Scorers

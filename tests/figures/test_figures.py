@@ -11,8 +11,8 @@ from PIL import Image
 
 from chronoscene.figures import projections
 from chronoscene.figures.bars import _period_names, draw_bars
+from chronoscene.figures.canvas import EIGHT, FOUR, period_colors, rgb_of
 from chronoscene.figures.cloud import Cloud, shown_box
-from chronoscene.figures.colors import EIGHT, FOUR, period_colors, rgb_of
 from chronoscene.figures.density_map import (
     FAINTEST,
     Window,

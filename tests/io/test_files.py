@@ -1,11 +1,8 @@
 """Files appear complete or not at all."""
 
-import os
-import signal
-
 import pytest
 
-from chronoscene.io.files import replacing, stoppable, write_text_atomic
+from chronoscene.io.files import replacing, write_text_atomic
 
 
 def test_text_is_utf8_with_plain_line_ends(tmp_path):
@@ -36,13 +33,3 @@ def test_a_file_that_cannot_be_put_in_place_leaves_nothing(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
     with pytest.raises(FileNotFoundError):
         write_text_atomic(tmp_path / "absent" / "a.txt", "text")
-
-
-def test_a_request_to_end_cleans_up(tmp_path):
-    before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(SystemExit) as end, stoppable(), replacing(tmp_path / "a.txt") as partial:
-        partial.write_text("half")
-        os.kill(os.getpid(), signal.SIGTERM)
-    assert end.value.code == 128 + signal.SIGTERM
-    assert list(tmp_path.iterdir()) == []
-    assert signal.getsignal(signal.SIGTERM) == before

@@ -1,5 +1,6 @@
 """Stages that are done once, and steps in a process of their own."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -102,7 +103,7 @@ def sleeps(arguments, report):
 def odd_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps that only this test has, in a module that the child process finds."""
     (tmp_path / "odd_steps.py").write_text(STEPS)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     for name in ("good", "aborts", "refuses", "breaks", "sleeps"):
         monkeypatch.setitem(worker.STEPS, name, f"odd_steps:{name}")
 

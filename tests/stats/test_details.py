@@ -11,9 +11,8 @@ import pytest
 
 from chronoscene.formats import read_scene
 from chronoscene.stats import DETAIL_WRITERS, SceneStatistics, measure_scene
-from chronoscene.stats.counts import SCHEMA_VERSION
-from chronoscene.stats.details import COLUMNS, MOST_SHOWN, rows_of
-from chronoscene.stats.titles import period_title
+from chronoscene.stats.counts import SCHEMA_VERSION, period_title
+from chronoscene.stats.details import COLUMNS, MAX_SHOWN, rows_of
 
 
 @pytest.fixture
@@ -91,7 +90,7 @@ def test_one_period_has_no_overlap_columns(make_scene_folder):
 
 
 def test_many_periods_keep_the_table_narrow(make_scene_folder):
-    count = MOST_SHOWN + 1
+    count = MAX_SHOWN + 1
     many = measure_scene(read_scene(make_scene_folder({f"{i}.png": i for i in range(count)})))
     assert "Also seen by" not in DETAIL_WRITERS["table"]([many])
     assert f"overlap_{count - 1}" in DETAIL_WRITERS["csv"]([many]).splitlines()[0]

@@ -15,7 +15,7 @@ from PIL import Image
 from chronoscene.colmap.raw_model import read_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
-from chronoscene.io.files import stoppable
+from chronoscene.io.processes import stoppable
 from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.repair.orientation import set_upright
 from chronoscene.validation.run import validate_scene

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chronoscene.bench.protocol import (
+from chronoscene.bench.strategies import (
     STRATEGIES,
     effective_strategy,
     make_parts,

@@ -1,12 +1,10 @@
-"""Budgets are parsed, progress never leaves 0..1, shares add up, the clock can be held."""
-
-import time
+"""Budgets are parsed, progress never leaves 0..1, shares add up."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.bench.stopping import StopRule, Stopwatch, parse_duration
+from chronoscene.bench.job import StopRule, parse_duration
 from chronoscene.errors import ConfigError
 
 
@@ -61,13 +59,3 @@ def test_time_left_follows_the_pace():
     assert StopRule(100, None).seconds_left(25, 5.0) == pytest.approx(15.0)
     assert StopRule(None, 60.0).seconds_left(3, 20.0) == pytest.approx(40.0)
     assert StopRule(100, None).seconds_left(0, 0.0) is None
-
-
-def test_the_stopwatch_counts_inside_only():
-    watch = Stopwatch()
-    with watch:
-        time.sleep(0.02)
-    time.sleep(0.05)
-    with watch:
-        time.sleep(0.02)
-    assert 0.04 <= watch.seconds < 0.065

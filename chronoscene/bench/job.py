@@ -4,18 +4,69 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from dataclasses import dataclass, field
+import re
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
-from chronoscene.bench.identity import config_hash
-from chronoscene.bench.image_store import safe_name
+from chronoscene.bench.predictions import safe_name
+from chronoscene.bench.provenance import config_hash
 from chronoscene.bench.results import Failure
-from chronoscene.bench.stopping import StopRule
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.methods import MethodSpec, build_config
+
+_UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
+
+
+def parse_duration(text: str) -> float:
+    """Seconds of ``90s``, ``5m``, ``1.5h`` or ``1h30m``.
+
+    Raises:
+        ConfigError: If the text is none of these or not positive.
+    """
+    pieces = re.findall(r"(\d+(?:\.\d+)?)([hms])", text)
+    seconds = sum(float(number) * _UNITS[unit] for number, unit in pieces)
+    if "".join(number + unit for number, unit in pieces) != text or not seconds:
+        raise ConfigError(
+            "--budget",
+            expected="a positive time such as 90s, 5m or 1h30m",
+            found=repr(text),
+            todo="write numbers with the units h, m and s",
+        )
+    return seconds
+
+
+@dataclass(frozen=True, slots=True)
+class StopRule:
+    """A training ends after a number of iterations, by the training clock, or by what is first."""
+
+    iterations: int | None
+    seconds: float | None
+
+    def progress(self, iterations: int, seconds: float) -> float:
+        """Share of the training that is over, 0..1."""
+        shares = [0.0]
+        if self.iterations is not None:
+            shares.append(iterations / self.iterations if self.iterations else 1.0)
+        if self.seconds is not None:
+            shares.append(seconds / self.seconds)
+        return min(1.0, max(shares))
+
+    def seconds_left(self, iterations: int, seconds: float) -> float | None:
+        """Estimate of the training time still needed; None before there is anything to go by."""
+        progress = self.progress(iterations, seconds)
+        return seconds * (1.0 - progress) / progress if progress > 0 else None
+
+    def split(self, parts: int) -> tuple[StopRule, ...]:
+        """Equal shares for several models; what does not divide goes to the first ones."""
+        seconds = None if self.seconds is None else self.seconds / parts
+        if self.iterations is None:
+            return (replace(self, seconds=seconds),) * parts
+        base, extra = divmod(self.iterations, parts)
+        return tuple(StopRule(base + (i < extra), seconds) for i in range(parts))
+
 
 SHARING = ("total", "each")
 """Under the strategy separate: all models share the iterations and the time, or get them each."""
@@ -133,11 +184,3 @@ def check_job(job: Job, spec: MethodSpec) -> None:
             found=repr(getattr(config, "iterations", None)),
             todo="correct --iterations",
         )
-
-
-def write_job(path: Path, job: Job) -> None:
-    path.write_text(json.dumps(dataclasses.asdict(job)), encoding="utf-8")
-
-
-def read_job(path: Path) -> Job:
-    return Job(**json.loads(path.read_text(encoding="utf-8")))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import chronoscene
-from chronoscene.bench import identity
+from chronoscene.bench import provenance
 from chronoscene.errors import ImageError
 from chronoscene.formats import read_scene
 
@@ -21,8 +21,8 @@ def scene(scene_folder, tmp_path):
 
 
 def test_a_copy_has_the_same_hash(scene, scene_folder):
-    assert identity.scene_hash(scene) == identity.scene_hash(read_scene(scene_folder))
-    assert re.fullmatch("[0-9a-f]{64}", identity.scene_hash(scene))
+    assert provenance.scene_hash(scene) == provenance.scene_hash(read_scene(scene_folder))
+    assert re.fullmatch("[0-9a-f]{64}", provenance.scene_hash(scene))
 
 
 @pytest.mark.parametrize("field", ["period", "split", "cam_from_world", "camera"])
@@ -37,37 +37,37 @@ def test_changes_of_a_frame_change_the_hash(scene, field):
         "camera": replace(frame.camera, params=(20.0, 21.0, 11.5, 8.26)),
     }
     changed = scene.with_frames([replace(frame, **{field: values[field]}), *scene.frames[1:]])
-    assert identity.scene_hash(changed) != identity.scene_hash(scene)
+    assert provenance.scene_hash(changed) != provenance.scene_hash(scene)
 
 
 def test_changes_of_points_and_pixels_change_the_hash(scene):
-    before = identity.scene_hash(scene)
+    before = provenance.scene_hash(scene)
     xyz = scene.points.xyz.copy()
     xyz[0, 0] += 1e-3
-    assert identity.scene_hash(replace(scene, points=replace(scene.points, xyz=xyz))) != before
+    assert provenance.scene_hash(replace(scene, points=replace(scene.points, xyz=xyz))) != before
     path = scene.image_path(scene.frames[0])
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(data)
-    assert identity.scene_hash(scene) != before
+    assert provenance.scene_hash(scene) != before
 
 
 def test_the_last_digit_of_a_pose_does_not_count(scene):
     frame = scene.frames[0]
     pose = np.nextafter(frame.cam_from_world, 10.0)
     changed = scene.with_frames([replace(frame, cam_from_world=pose), *scene.frames[1:]])
-    assert identity.scene_hash(changed) == identity.scene_hash(scene)
+    assert provenance.scene_hash(changed) == provenance.scene_hash(scene)
 
 
 def test_a_missing_image_is_named(scene):
     scene.image_path(scene.frames[0]).unlink()
     with pytest.raises(ImageError, match=r"a/0\.png: expected an image, found No such file"):
-        identity.scene_hash(scene)
+        provenance.scene_hash(scene)
 
 
 def test_config_hashes_ignore_the_order_of_keys():
-    assert identity.config_hash({"a": 1, "b": [2]}) == identity.config_hash({"b": [2], "a": 1})
-    assert identity.config_hash({"a": 1}) != identity.config_hash({"a": 2})
+    assert provenance.config_hash({"a": 1, "b": [2]}) == provenance.config_hash({"b": [2], "a": 1})
+    assert provenance.config_hash({"a": 1}) != provenance.config_hash({"a": 2})
 
 
 def git(folder, *arguments):
@@ -90,28 +90,28 @@ def package(tmp_path, monkeypatch):
 def test_the_commit_with_a_mark_for_changes(package):
     git(package.parent, "add", ".")
     git(package.parent, "commit", "-q", "-m", "first")
-    assert re.fullmatch("[0-9a-f]{40}", identity.code_version())
+    assert re.fullmatch("[0-9a-f]{40}", provenance.code_version())
     (package / "__init__.py").write_text("changed = 1\n")
-    assert re.fullmatch("[0-9a-f]{40}-dirty", identity.code_version())
+    assert re.fullmatch("[0-9a-f]{40}-dirty", provenance.code_version())
 
 
 def test_the_commit_of_another_repository_is_not_ours(package):
     git(package.parent, "add", "other.txt")
     git(package.parent, "commit", "-q", "-m", "first")
-    assert identity.code_version() == f"version {chronoscene.__version__}"
+    assert provenance.code_version() == f"version {chronoscene.__version__}"
 
 
 def test_versions_and_machine():
-    assert identity.method_version("chronogs").startswith("chronoscene ")
-    assert identity.method_version("toy_methods:MEAN") == "unpackaged"
-    assert {"python", "numpy", "torch"} <= identity.library_versions().keys()
-    assert identity.describe_device("cpu", 1).endswith(", 1 thread)")
-    assert identity.processor_name()
+    assert provenance.method_version("chronogs").startswith("chronoscene ")
+    assert provenance.method_version("toy_methods:MEAN") == "unpackaged"
+    assert {"python", "numpy", "torch"} <= provenance.library_versions().keys()
+    assert provenance.describe_device("cpu", 1).endswith(", 1 thread)")
+    assert provenance.processor_name()
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs /proc")
 def test_peak_memory_follows_allocations():
-    before = identity.peak_memory_bytes()
+    before = provenance.peak_memory_bytes()
     block = np.ones(before + 200_000_000, np.uint8)
-    assert identity.peak_memory_bytes() > before + 150_000_000
+    assert provenance.peak_memory_bytes() > before + 150_000_000
     del block

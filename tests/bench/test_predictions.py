@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.bench.image_store import (
+from chronoscene.bench.predictions import (
     ImageWriter,
     image_file,
     load_image,

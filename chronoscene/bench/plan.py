@@ -1,0 +1,196 @@
+"""What a bench runs: every scene, method, strategy and seed that was asked for, checked first."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from chronoscene.bench import results
+from chronoscene.bench.job import Job, check_job
+from chronoscene.bench.predictions import freeze_ground_truth
+from chronoscene.bench.provenance import code_version, scene_hash
+from chronoscene.bench.strategies import check_scene, effective_strategy
+from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.formats import read_scene
+from chronoscene.images.store import MAX_WIDTH, ImageStore
+from chronoscene.methods import MethodSpec, load_spec
+from chronoscene.metrics.lpips_weights import check_available
+from chronoscene.scene import Scene
+from chronoscene.scene.splits import split_hash
+
+Say = Callable[[str], None]
+"""Takes one line for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchSettings:
+    """Everything that the user asked for."""
+
+    scenes: tuple[Path, ...]
+    methods: tuple[str, ...]
+    """Names, or ``module:SPEC``."""
+    runs: Path
+    strategies: tuple[str, ...] = ("joint",)
+    preset: str = "balanced"
+    overrides: Mapping[str, str] | None = None
+    """``key`` for all methods that are run, or ``method.key`` for one."""
+    iterations: int | None = None
+    budget_seconds: float | None = None
+    separate_iterations: str = "total"
+    seeds: tuple[int, ...] = (0,)
+    max_width: int = MAX_WIDTH
+    threads: int | None = None
+    device: str = "auto"
+    lpips_weights: Path | None = None
+    overwrite: bool = False
+    """Whether finished runs with other settings may be replaced."""
+
+
+def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]:
+    """All runs asked for, checked; freezes the ground truth of the scenes."""
+    specs = [(name, load_spec(name)) for name in settings.methods]
+    split_overrides(settings, [spec for _, spec in specs])
+    if settings.lpips_weights is not None:
+        check_available(settings.lpips_weights)
+    scenes = [read_scene(path) for path in settings.scenes]
+    _check_names(scenes)
+    commit = code_version()
+    plan: dict[Path, tuple[Job, MethodSpec]] = {}
+    notices: dict[str, None] = {}
+    for scene in scenes:
+        check_scene(scene)
+        template = _template(settings, scene, commit)
+        for job, spec in _scene_jobs(settings, template, specs):
+            check_job(job, spec)
+            plan.setdefault(job.folder, (job, spec))
+            notices.update(dict.fromkeys(job.notices))
+        store = ImageStore(scene, max_width=settings.max_width)
+        freeze_ground_truth(settings.runs, scene, template.scene_hash, store, settings.max_width)
+    for notice in notices:
+        say(f"note: {notice}")
+    return list(plan.values())
+
+
+def split_overrides(settings: BenchSettings, specs: list[MethodSpec]) -> dict[str, dict[str, str]]:
+    """Overrides of each method: those without a prefix, then those with its name before a dot.
+
+    Raises:
+        ConfigError: If a prefix names a method that is not run.
+    """
+    names = [spec.name for spec in specs]
+    chosen: dict[str, dict[str, str]] = {name: {} for name in names}
+    items = (settings.overrides or {}).items()
+    for key, value in sorted(items, key=lambda item: "." in item[0]):
+        method, dot, rest = key.rpartition(".")
+        if dot and method not in names:
+            raise ConfigError(
+                f"--set {key}",
+                expected=f"a key, or one after {', '.join(f'{n}.' for n in names)}",
+                found=repr(method),
+                todo="name a method that is run",
+            )
+        for name in [method] if dot else names:
+            chosen[name][rest] = value
+    return chosen
+
+
+def _check_names(scenes: list[Scene]) -> None:
+    by_name: dict[str, Scene] = {}
+    for scene in scenes:
+        other = by_name.setdefault(scene.name, scene)
+        if other is not scene:
+            raise ConfigError(
+                scene.root,
+                expected="a scene with a name of its own",
+                found=f"{scene.name!r}, the name of {other.root} too",
+                todo="rename a folder, or run them with different --out",
+            )
+
+
+def _template(settings: BenchSettings, scene: Scene, commit: str) -> Job:
+    """What all jobs of a scene have in common."""
+    return Job(
+        scene_root=str(scene.root.resolve()),
+        scene=scene.name,
+        scene_hash=scene_hash(scene),
+        split_hash=split_hash(scene),
+        method="",
+        method_name="",
+        strategy="",
+        preset=settings.preset,
+        overrides={},
+        iterations=settings.iterations,
+        budget_seconds=settings.budget_seconds,
+        separate_iterations=settings.separate_iterations,
+        seed=0,
+        max_width=settings.max_width,
+        threads=settings.threads,
+        device=settings.device,
+        runs=str(settings.runs.resolve()),
+        lpips_weights=str(settings.lpips_weights.resolve()) if settings.lpips_weights else None,
+        commit=commit,
+    )
+
+
+def _scene_jobs(
+    settings: BenchSettings, template: Job, specs: list[tuple[str, MethodSpec]]
+) -> Iterator[tuple[Job, MethodSpec]]:
+    """Every method, strategy and seed on one scene."""
+    overrides = split_overrides(settings, [spec for _, spec in specs])
+    for reference, spec in specs:
+        for wanted in settings.strategies:
+            strategy, notice = effective_strategy(spec, wanted)
+            for seed in settings.seeds:
+                job = replace(
+                    template,
+                    method=reference,
+                    method_name=spec.name,
+                    strategy=strategy,
+                    overrides=overrides[spec.name],
+                    seed=seed,
+                    notices=[notice] if notice else [],
+                    plugin_path=str(Path.cwd()) if ":" in reference else None,
+                )
+                yield job, spec
+
+
+def is_finished(job: Job, spec: MethodSpec, overwrite: bool = False) -> bool:
+    """Whether the result is there already, made with the same settings from the same scene.
+
+    Raises:
+        ConfigError: If there is one made with other settings, unless it may be replaced.
+    """
+    if not (job.folder / results.RUN_FILE).is_file():
+        return False
+    results.read_run(job.folder)
+    path = job.folder / results.CONFIG_FILE
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise CheckpointError(
+            path, expected="the config of the run", found=str(error), todo="delete the run"
+        ) from error
+    wanted = job.document(spec)
+    if stored == wanted:
+        return True
+    if overwrite:
+        return False
+    old, new = first_difference(stored, wanted)
+    raise ConfigError(
+        job.folder,
+        expected=f"a run with {new}",
+        found=f"a finished one with {old}",
+        todo="choose another folder with --out, or pass --overwrite",
+    )
+
+
+def first_difference(old: Any, new: Any, key: str = "settings") -> tuple[str, str]:
+    """Where two documents differ first, as ``key value`` of both."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for name in [*new, *(k for k in old if k not in new)]:
+            if old.get(name) != new.get(name):
+                return first_difference(old.get(name), new.get(name), name)
+    return f"{key} {old}", f"{key} {new}"

@@ -1,0 +1,272 @@
+"""Work in other processes: one worker for a long job, or a pool for the same task on many items.
+
+`run_worker` calls a function in a fresh interpreter. The job goes in as JSON, progress and the
+result come back as lines of JSON, and large results stay in files. The worker ends when its parent
+does, even if the parent is killed; a crash of the worker is reported and harms nothing else. Runs
+of a bench and steps of a registration go through it.
+
+`map_parallel` maps a function over items in a pool. The commands use it for folders of scenes.
+
+To run benches somewhere else, on a cluster say, write a function with the signature of
+`chronoscene.bench.runner.run_in_process` that ships the job, calls
+`chronoscene.bench.worker.run_job` there, and brings the staging folder back; pass it to
+`chronoscene.bench.runner.run_bench` as ``execute``.
+
+Modules that are needed only once work starts are imported inside functions: ``chronoscene --help``
+loads this module.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import IO, TYPE_CHECKING, Any, TypeVar
+
+from chronoscene.errors import ChronoSceneError
+from chronoscene.kernels.threads import available_threads
+
+if TYPE_CHECKING:
+    from subprocess import Popen
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+Report = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is done, and its total."""
+
+POLL_SECONDS = 0.5
+"""How often a worker checks that its parent is still there."""
+
+
+@contextmanager
+def stoppable() -> Iterator[None]:
+    """Turn SIGTERM, which batch systems send, into an exit that cleans up unfinished work."""
+
+    def stop(number: int, frame: object) -> None:
+        raise SystemExit(128 + number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        # None stands for a handler that was not set in Python, which cannot be put back.
+        signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
+# One worker, one job
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a worker ended."""
+
+    status: int
+    """Exit status; the negative number of a signal if one ended the process."""
+    message: Mapping[str, Any] | None
+    """The last message of the worker, ``{"result": ...}`` or ``{"error": {...}}`` with the
+    arguments of a `ChronoSceneError`; None if the process died before it could send one."""
+
+    @property
+    def cause(self) -> str:
+        """``exit status 1``, ``signal SIGABRT``."""
+        if self.status >= 0:
+            return f"exit status {self.status}"
+        if -self.status == signal.SIGKILL:
+            return "signal SIGKILL (out of memory?)"
+        known = -self.status in set(signal.Signals)
+        return f"signal {signal.Signals(-self.status).name if known else -self.status}"
+
+
+def run_worker(
+    function: str,
+    job: Any,
+    *,
+    report: Report | None = None,
+    log: IO[bytes] | None = None,
+    inherited: Sequence[int] = (),
+) -> Outcome:
+    """Call a function in a process of its own and wait for its end.
+
+    If waiting is interrupted, the worker is killed: it must leave nothing behind that its caller
+    does not clean up.
+
+    Args:
+        function: ``module:name``. Takes the job and a `Report`; returns what JSON can hold.
+        job: What JSON can hold.
+        report: Called with the progress that the worker reports.
+        log: File for everything that the worker and its libraries print; None for our stderr.
+        inherited: File descriptors that stay open in the worker.
+    """
+    from subprocess import PIPE, Popen
+
+    # -P: a file in the current folder must not shadow a module of the standard library.
+    command = [sys.executable, "-P", "-m", "chronoscene.io.processes", function, str(os.getpid())]
+    process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=log, text=True, pass_fds=inherited)
+    try:
+        assert process.stdin is not None
+        with suppress(BrokenPipeError):  # it died already
+            process.stdin.write(json.dumps(job))
+            process.stdin.close()
+        message = _listen(process, report)
+        return Outcome(process.wait(), message)
+    except BaseException:
+        process.kill()  # not SIGTERM: a library's handler might take its time
+        process.wait()
+        raise
+
+
+def _listen(process: Popen[str], report: Report | None) -> dict[str, Any] | None:
+    """Pass progress on until the last message, which is returned."""
+    assert process.stdout is not None
+    last = None
+    for line in process.stdout:
+        try:
+            message = json.loads(line)
+        except ValueError:
+            continue  # cut off by the death of the process
+        if "progress" not in message:
+            last = message
+        elif report is not None:
+            report(*message["progress"])
+    return last
+
+
+def _end_with(parent: int) -> None:
+    """End this process when its parent is gone: another one may already write to its folder."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(POLL_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def main() -> None:
+    """The worker: read the job from stdin, call the function, send progress and its result."""
+    import importlib
+
+    _end_with(int(sys.argv[2]))
+    channel = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # libraries print to stdout, which is ours alone
+
+    def send(message: Mapping[str, Any]) -> None:
+        channel.write(json.dumps(message) + "\n")
+
+    def report(what: str, done: int, total: int) -> None:
+        send({"progress": [what, done, total]})
+
+    job = json.load(sys.stdin)
+    module, _, name = sys.argv[1].partition(":")
+    try:
+        send({"result": getattr(importlib.import_module(module), name)(job, report)})
+    except ChronoSceneError as error:
+        send({"error": error_fields(error)})
+    except KeyboardInterrupt:  # the parent has it, too
+        sys.exit(130)
+
+
+def error_fields(error: ChronoSceneError) -> dict[str, str]:
+    """The keyword arguments, and the place, of an error: exceptions with these cannot travel."""
+    return {key: getattr(error, key) for key in ("place", "expected", "found", "todo")}
+
+
+# A pool, many items
+
+
+@dataclass(frozen=True, slots=True)
+class _Failure:
+    """An error on its way between processes."""
+
+    kind: type[ChronoSceneError]
+    fields: dict[str, str]
+
+
+def map_parallel(
+    function: Callable[[Item], Result],
+    items: Sequence[Item],
+    *,
+    workers: int | None = None,
+    lost: Callable[[Item], Result] | None = None,
+) -> Iterator[Result]:
+    """Results in the order of the items, each as soon as it and those before it are there.
+
+    A process that dies (killed for its memory, or by a fault in a library) ends the whole pool.
+    Each item that is left then gets a process of its own, so only the one at fault is lost.
+
+    Args:
+        function: At the top level of a module, or a ``partial`` of such a function.
+        items: Its arguments.
+        workers: Processes; None for one per processor. With one, or one item, none is started.
+        lost: The result for an item whose process died; None to raise an error.
+
+    Raises:
+        ChronoSceneError: What the function raised on the first item that it failed on.
+    """
+    from concurrent.futures.process import BrokenProcessPool
+
+    workers = min(workers or available_threads(), len(items))
+    if workers <= 1:
+        yield from map(function, items)
+        return
+    done = 0
+    try:
+        for result in _pooled(function, items, workers):
+            yield result
+            done += 1
+    except BrokenProcessPool:
+        for item in items[done:]:
+            try:
+                yield from _pooled(function, [item], 1)
+            except BrokenProcessPool as error:
+                if lost is None:
+                    raise _died(item) from error
+                yield lost(item)
+
+
+def _pooled(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int
+) -> Iterator[Result]:
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        try:
+            for outcome in pool.map(partial(_attempt, function), items):
+                if isinstance(outcome, _Failure):
+                    raise outcome.kind(**outcome.fields)
+                yield outcome
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _attempt(function: Callable[[Item], Result], item: Item) -> Result | _Failure:
+    try:
+        with stoppable():  # temporary files go when the process is asked to end
+            return function(item)
+    except ChronoSceneError as error:
+        return _Failure(type(error), error_fields(error))
+
+
+def _died(item: object) -> ChronoSceneError:
+    return ChronoSceneError(
+        item,
+        expected="the process to finish",
+        found="a process that died",
+        todo="it may have run out of memory: close other programs, or pass fewer at a time",
+    )
+
+
+if __name__ == "__main__":
+    main()

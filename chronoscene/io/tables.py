@@ -1,0 +1,228 @@
+"""Tables as text for a terminal, Markdown, LaTeX and CSV; names are only text in each of them.
+
+A `Table` holds cells as they are read. It does not need pandas: importing pandas takes half as long
+as ``chronoscene stats`` on a scene, so only the tables of runs, `chronoscene.bench.tables`, group
+and average with it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from chronoscene.io.wording import printable
+
+Head = tuple[str, str]
+"""Two lines; a column whose first line is empty shares that of the column before."""
+GAP = 2
+"""Blanks between columns."""
+MIN_NAME_WIDTH = 12
+"""Characters of a name that are shown even on narrow terminals."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """What is written."""
+
+    heads: Sequence[Head]
+    """One per column."""
+    rows: Sequence[Sequence[str]]
+    labels: int = 1
+    """Number of leading columns that say what a row is about; they are aligned on the left."""
+    title: str = ""
+    best: Collection[tuple[int, int]] = ()
+    """Row and column of the cells that are emphasised."""
+    breaks: Collection[int] = ()
+    """Rows that are followed by a rule or a gap."""
+
+    @property
+    def flat_heads(self) -> list[str]:
+        """Heads on one line, each complete in itself."""
+        flat, first = [], ""
+        for head in self.heads:
+            first = head[0] or first
+            flat.append(" ".join(filter(None, (first, head[1]))))
+        return flat
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A CSV document with a header; None becomes an empty cell."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return buffer.getvalue()
+
+
+def plain_text(table: Table) -> str:
+    """Title and aligned columns; ``*`` marks the best cells."""
+    starred = [
+        [f"{cell} *" if (i, j) in table.best else cell for j, cell in enumerate(row)]
+        for i, row in enumerate(table.rows)
+    ]
+    lines = [table.flat_heads, *starred]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    lines.insert(1, ["-" * width for width in widths])
+    aligned = (
+        "  ".join(
+            cell.ljust(width) if j < table.labels else cell.rjust(width)
+            for j, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+    return "\n".join([table.title, *aligned]) + "\n"
+
+
+def boxed_text(table: Table, *, width: int | None = None) -> str:
+    """A table with rules for a terminal, without colours.
+
+    Args:
+        table: What to write.
+        width: Of the terminal in characters. A wider table is cut into blocks of columns, each with
+            the labels of the rows. None for one block.
+    """
+    from rich.cells import cell_len
+
+    rows = [[printable(cell) for cell in row] for row in table.rows]
+    columns = zip(*(zip(*table.heads, strict=True)), *rows, strict=True)
+    sizes = [GAP + max(map(cell_len, column)) for column in columns]
+    if width is None or 1 + sum(sizes) <= width:
+        return _block(table, rows, range(len(sizes)))
+    longest = max(MIN_NAME_WIDTH, width // 5)
+    sizes = [min(size, GAP + longest) if i < table.labels else size for i, size in enumerate(sizes)]
+    return "".join(_block(table, rows, b, longest) for b in _fitting(table, sizes, width))
+
+
+def _fitting(table: Table, sizes: Sequence[int], width: int) -> list[list[int]]:
+    """Columns of each block; what has a common head stays together."""
+    groups: list[list[int]] = []
+    for i in range(table.labels, len(sizes)):
+        if groups and not table.heads[i][0]:
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    blocks = [list(range(table.labels))]
+    for group in groups:
+        taken = 1 + sum(sizes[i] for i in (*blocks[-1], *group))
+        if taken > width and len(blocks[-1]) > table.labels:
+            blocks.append(list(range(table.labels)))
+        blocks[-1] += group
+    return blocks
+
+
+def _block(
+    table: Table, rows: Sequence[Sequence[str]], columns: Sequence[int], longest: int | None = None
+) -> str:
+    """Some columns of a table; labels longer than ``longest`` are cut. Markup is only text."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table as RichTable
+
+    drawn = RichTable(box=box.SIMPLE_HEAD, padding=(0, GAP - 1, 0, 0), collapse_padding=True)
+    for i in columns:
+        head = "\n".join(table.heads[i])
+        if i < table.labels:
+            drawn.add_column(head, no_wrap=True, max_width=longest, overflow="ellipsis")
+        else:
+            drawn.add_column(head, no_wrap=True, justify="right")
+    for number, row in enumerate(rows):
+        drawn.add_row(*(row[i] for i in columns), end_section=number in table.breaks)
+    out = io.StringIO()
+    console = Console(file=out, width=10_000, color_system=None, markup=False, emoji=False)
+    console.print(drawn)
+    return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
+
+
+def markdown(table: Table, *, special: str = r"\`*<>|[]") -> str:
+    """A pipe table, under its title if it has one; the best cells are bold.
+
+    Args:
+        table: What to write.
+        special: Characters that are escaped in cells.
+    """
+    lines = []
+    if table.title:
+        lines += [f"**{escape_markdown(table.title)}**", ""]
+    lines.append(_piped([escape_markdown(head) for head in table.flat_heads]))
+    rule = ["---"] * table.labels + ["---:"] * (len(table.heads) - table.labels)
+    lines.append(_piped(rule))
+    for i, row in enumerate(table.rows):
+        cells = [escape_markdown(printable(cell), special) for cell in row]
+        bold = [f"**{c}**" if (i, j) in table.best else c for j, c in enumerate(cells)]
+        lines.append(_piped(bold))
+    return "\n".join(lines) + "\n"
+
+
+def _piped(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def escape_markdown(text: str, special: str = r"\`*<>|_") -> str:
+    """Text with a backslash before each special character."""
+    return re.sub(f"([{re.escape(special)}])", r"\\\1", text)
+
+
+def latex(table: Table, *, cmidrules: bool = False) -> str:
+    """A ``tabular`` for the booktabs package, its title in a comment; the best cells are bold.
+
+    Args:
+        table: What to write.
+        cmidrules: Whether to draw rules under heads of several columns.
+    """
+    lines = [f"% {table.title}"] if table.title else []
+    lines += [
+        rf"\begin{{tabular}}{{{'l' * table.labels}{'r' * (len(table.heads) - table.labels)}}}",
+        r"\toprule",
+        *_latex_heads(table.heads, cmidrules),
+        r"\midrule",
+    ]
+    for i, row in enumerate(table.rows):
+        cells = [escape_latex(cell) for cell in row]
+        bold = [rf"\textbf{{{c}}}" if (i, j) in table.best else c for j, c in enumerate(cells)]
+        lines.append(_latex_row(bold))
+        if i in table.breaks:
+            lines.append(r"\midrule")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def _latex_heads(heads: Sequence[Head], cmidrules: bool) -> list[str]:
+    """One row of heads, or two, where what belongs to several columns stands above all of them."""
+    if not any(second for _, second in heads):
+        return [_latex_row([escape_latex(first) for first, _ in heads])]
+    starts = [i for i, head in enumerate(heads) if head[0] or i == 0]
+    first, rules = [], ""
+    for start, end in zip(starts, [*starts[1:], len(heads)], strict=True):
+        text = escape_latex(heads[start][0])
+        first.append(text if end - start == 1 else rf"\multicolumn{{{end - start}}}{{c}}{{{text}}}")
+        rules += rf"\cmidrule(lr){{{start + 1}-{end}}}" if end - start > 1 else ""
+    second = _latex_row([escape_latex(text) for _, text in heads])
+    return [_latex_row(first), *([rules] if cmidrules else []), second]
+
+
+def _latex_row(cells: Iterable[str]) -> str:
+    row = " & ".join(cells) + r" \\"
+    # After the end of the row before, a bracket or a star would be an option of it.
+    return "{}" + row if row.startswith(("[", "*")) else row
+
+
+_LATEX = str.maketrans(
+    {c: f"\\{c}" for c in "&%$#_{}"}
+    | {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        "±": r"$\pm$",
+    }
+)
+
+
+def escape_latex(text: str) -> str:
+    """Text as LaTeX prints it."""
+    return printable(text).translate(_LATEX)

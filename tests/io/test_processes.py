@@ -1,0 +1,155 @@
+"""Workers and pools: results, progress, errors, and processes that die."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from chronoscene.errors import ChronoSceneError, SceneError
+from chronoscene.io.files import replacing
+from chronoscene.io.processes import Outcome, map_parallel, run_worker, stoppable
+
+
+def process_of(item: int) -> tuple[int, int]:
+    return item, os.getpid()
+
+
+def fail_on_two(item: int) -> int:
+    if item == 2:
+        raise SceneError("place", expected="one", found="two", todo="count again")
+    return item
+
+
+def test_results_come_in_order_from_other_processes():
+    results = list(map_parallel(process_of, [3, 1, 2], workers=2))
+    assert [item for item, _ in results] == [3, 1, 2]
+    assert os.getpid() not in {pid for _, pid in results}
+
+
+def test_one_item_stays_in_this_process():
+    assert list(map_parallel(process_of, [5], workers=4)) == [(5, os.getpid())]
+    assert list(map_parallel(process_of, [])) == []
+
+
+def test_an_error_keeps_its_kind_and_words_on_its_way():
+    with pytest.raises(SceneError, match="place: expected one, found two; count again") as caught:
+        list(map_parallel(fail_on_two, [1, 2, 3], workers=2))
+    assert (caught.value.place, caught.value.todo) == ("place", "count again")
+
+
+def die_on_two(item: int) -> int:
+    if item == 2:
+        os.kill(os.getpid(), signal.SIGKILL)  # as a system does that is out of memory
+    return 10 * item
+
+
+def test_a_process_that_dies_loses_its_item_only():
+    found = list(map_parallel(die_on_two, [1, 2, 3, 4], workers=2, lost=lambda item: -item))
+    assert found == [10, -2, 30, 40]
+
+
+def test_a_process_that_dies_is_an_error_in_one_line():
+    with pytest.raises(
+        ChronoSceneError, match="2: expected the process to finish, found a process that"
+    ):
+        list(map_parallel(die_on_two, [1, 2, 3], workers=2))
+
+
+def test_a_request_to_end_cleans_up(tmp_path):
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as end, stoppable(), replacing(tmp_path / "a.txt") as partial:
+        partial.write_text("half")
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert end.value.code == 128 + signal.SIGTERM
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+JOBS = """
+import os, sys, time
+
+def twice(job, report):
+    report("counting", 1, 2)
+    print("a library prints this")
+    return 2 * job["x"]
+
+def dies(job, report):
+    os.abort()
+
+def kills(job, report):
+    os.kill(os.getpid(), 9)
+
+def sleeps(job, report):
+    with open(job["mark"], "w") as file:
+        file.write(str(os.getpid()))
+    time.sleep(60)
+
+def refuses(job, report):
+    from chronoscene.errors import SceneError
+    raise SceneError("here", expected="this", found="that", todo="do it")
+"""
+
+
+@pytest.fixture
+def jobs(tmp_path, monkeypatch):
+    (tmp_path / "some_jobs.py").write_text(JOBS)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+
+
+def test_a_worker_returns_its_result_and_reports_progress(jobs, tmp_path):
+    told = []
+    with (tmp_path / "log").open("wb") as log:
+        outcome = run_worker(
+            "some_jobs:twice", {"x": 21}, report=lambda *p: told.append(p), log=log
+        )
+    assert outcome == Outcome(0, {"result": 42})
+    assert told == [("counting", 1, 2)]
+    assert (tmp_path / "log").read_text() == "a library prints this\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "cause"),
+    [
+        ("dies", "signal SIGABRT"),
+        ("kills", "signal SIGKILL (out of memory?)"),
+        ("absent", "exit status 1"),
+    ],
+)
+def test_a_worker_that_dies_says_how(jobs, tmp_path, name, cause):
+    with (tmp_path / "log").open("wb") as log:
+        outcome = run_worker(f"some_jobs:{name}", {}, log=log)
+    assert outcome.message is None and outcome.cause == cause
+
+
+def test_an_error_of_a_worker_comes_back_in_its_words(jobs):
+    words = {"place": "here", "expected": "this", "found": "that", "todo": "do it"}
+    message = run_worker("some_jobs:refuses", {}).message
+    assert message == {"error": words}
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+def test_a_worker_ends_with_its_parent_even_if_that_is_killed(jobs, tmp_path):
+    mark = tmp_path / "mark"
+    code = (
+        "from chronoscene.io.processes import run_worker\n"
+        f"run_worker('some_jobs:sleeps', {{'mark': {str(mark)!r}}})\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code])
+    wait_until(lambda: mark.exists() and mark.read_text() != "")
+    worker = int(mark.read_text())
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    wait_until(lambda: not Path(f"/proc/{worker}").exists())
+
+
+def wait_until(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)

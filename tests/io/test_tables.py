@@ -1,0 +1,86 @@
+"""Tables as text: special characters are escaped, rows keep their cells."""
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chronoscene.io.tables import (
+    Table,
+    boxed_text,
+    csv_text,
+    escape_latex,
+    latex,
+    markdown,
+    plain_text,
+)
+
+HEADS = [("name", ""), ("size", "[m]"), ("", "[px]")]
+TABLE = Table(
+    HEADS, [["a_b", "1.0", "2"], ["[c", "30.5", "4"]], title="Sizes", best={(1, 1)}, breaks={0}
+)
+
+
+def test_heads_on_one_line_are_complete():
+    assert TABLE.flat_heads == ["name", "size [m]", "size [px]"]
+
+
+def test_plain():
+    assert plain_text(TABLE).splitlines() == [
+        "Sizes",
+        "name  size [m]  size [px]",
+        "----  --------  ---------",
+        "a_b        1.0          2",
+        "[c      30.5 *          4",
+    ]
+
+
+def test_markdown():
+    assert markdown(TABLE).splitlines() == [
+        "**Sizes**",
+        "",
+        "| name | size [m] | size [px] |",
+        "| --- | ---: | ---: |",
+        "| a_b | 1.0 | 2 |",
+        r"| \[c | **30.5** | 4 |",
+    ]
+    assert r"a\_b" in markdown(TABLE, special="_")
+
+
+@pytest.mark.parametrize("cmidrules", [False, True])
+def test_latex(cmidrules):
+    lines = latex(TABLE, cmidrules=cmidrules).splitlines()
+    rules = [r"\cmidrule(lr){2-3}"] if cmidrules else []
+    assert lines == [
+        "% Sizes",
+        r"\begin{tabular}{lrr}",
+        r"\toprule",
+        r"name & \multicolumn{2}{c}{size} \\",
+        *rules,
+        r" & [m] & [px] \\",
+        r"\midrule",
+        r"a\_b & 1.0 & 2 \\",
+        r"\midrule",
+        r"{}[c & \textbf{30.5} & 4 \\",  # a bracket after the end of a row would be its option
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+
+
+def test_csv():
+    assert csv_text(["a", "b"], [[1, None], ["x,y", 0.5]]) == 'a,b\n1,\n"x,y",0.5\n'
+
+
+def test_wide_tables_are_cut_into_blocks_with_their_labels():
+    assert boxed_text(TABLE).count("name") == 1
+    heads = [*HEADS, ("other", "")]
+    wide = Table(heads, [[*row, "x" * 8] for row in TABLE.rows])
+    text = boxed_text(wide, width=20)
+    assert text.count("name") == 2 and max(map(len, text.splitlines())) <= 20
+
+
+@given(st.text(alphabet="a\\&%$#_{}~^±<>| ", max_size=20))
+def test_latex_text_has_no_bare_special_character(text):
+    rest = re.sub(r"\\text\w+\{\}|\\[&%$#_{}]|\$\\pm\$", "", escape_latex(text))
+    assert not set(rest) & set("\\&%$#_{}~^±<>|")
