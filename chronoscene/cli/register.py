@@ -13,7 +13,7 @@ from chronoscene.formats import read_scene
 from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.photos.camera_sharing import (
     CALIBRATIONS,
-    LEAST_OF_ITS_OWN,
+    MIN_PHOTOS,
     Calibration,
 )
 from chronoscene.registration.photos.captures import read_captures
@@ -90,7 +90,7 @@ FAILED = 1
     default=DEFAULTS.calibration,
     show_default=True,
     help="Whether a camera that took photos of several periods is calibrated for each; auto: where "
-    f"they are more than a day apart and have {LEAST_OF_ITS_OWN} of them or more.",
+    f"they are more than a day apart and have {MIN_PHOTOS} of them or more.",
 )
 @click.option(
     "--threads",

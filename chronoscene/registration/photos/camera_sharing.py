@@ -12,7 +12,7 @@ Calibration = Literal["auto", "per-period", "shared"]
 
 CALIBRATIONS: tuple[Calibration, ...] = get_args(Calibration)
 
-LEAST_OF_ITS_OWN = 20
+MIN_PHOTOS = 20
 """Photos with which a camera is calibrated for each date alone. Lenses are refocused and dropped
 between dates; but few photos, of flat ground from one height above all, leave the focal length
 open, and calibrate worse than last year's lens fits."""
@@ -27,7 +27,7 @@ def camera_groups(
     """Lists of names that share a camera, for `chronoscene.registration.features.database.extract`.
 
     Photos share one if make, model, size and focal length agree. With ``auto``, photos of different
-    visits do not, where each has enough of them (`LEAST_OF_ITS_OWN`). Initial focal lengths are
+    visits do not, where each has enough of them (`MIN_PHOTOS`). Initial focal lengths are
     left to COLMAP, which knows the sensors of many cameras.
     """
     by_lens: dict[tuple[Any, ...], list[Capture]] = {}
@@ -71,8 +71,8 @@ def _visits(captures: Sequence[Capture]) -> list[list[Capture]]:
             visits.append(list(members))
         end = last if end is None else max(end, last)
     visits += undated
-    few = [c for members in visits if len(members) < LEAST_OF_ITS_OWN for c in members]
-    return [m for m in visits if len(m) >= LEAST_OF_ITS_OWN] + ([few] if few else [])
+    few = [c for members in visits if len(members) < MIN_PHOTOS for c in members]
+    return [m for m in visits if len(m) >= MIN_PHOTOS] + ([few] if few else [])
 
 
 _SPLITTERS: dict[Calibration, Callable[[Sequence[Capture]], list[list[Capture]]]] = {

@@ -14,13 +14,13 @@ from chronoscene.images.exif import ExifData, read_exif
 GPS_SIGMA = (5.0, 5.0, 10.0)
 """Metres east, north, up, where the photo states none: a consumer receiver under open sky."""
 
-LEAST_SIDE = 64
+MIN_SIDE = 64
 """Pixels; smaller pictures are icons and previews."""
 
 HEAD_BYTES = 200_000
 """Of a file that are searched for metadata on panoramas."""
 
-LARGEST_ASPECT = 3.0
+MAX_ASPECT = 3.0
 """Wider pictures are panoramas, which no perspective camera describes."""
 
 
@@ -65,9 +65,9 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
             image.load()
     except Exception as error:  # Pillow raises almost anything for damaged files
         return f"cannot be decoded: {str(error) or type(error).__name__}"
-    if min(width, height) < LEAST_SIDE:
+    if min(width, height) < MIN_SIDE:
         return f"{width} x {height} pixels: too small"
-    if is_panorama(path) or max(width, height) > LARGEST_ASPECT * min(width, height):
+    if is_panorama(path) or max(width, height) > MAX_ASPECT * min(width, height):
         return f"{width} x {height} pixels: a panorama, which no perspective camera describes"
     exif = read_exif(path)
     return Capture(

@@ -1,1 +1,5 @@
-"""How well a registration fits: measurements, certificate, verdict."""
+"""How well a registration fits: a `Registered` comes in, a certificate and a verdict go out.
+
+`rays` gathers the observations once; the other modules measure; `certificate` collects their
+figures, `verdict` judges them.
+"""

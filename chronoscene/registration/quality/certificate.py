@@ -11,11 +11,10 @@ from itertools import combinations
 
 import numpy as np
 
-from chronoscene.registration.quality.evidence import MAX_OBSERVATIONS, Evidence, gather
 from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
-    FEWEST_TRACKS,
+    MIN_TRACKS,
     Misalignment,
     Transfers,
     measure,
@@ -24,8 +23,17 @@ from chronoscene.registration.quality.misalignment import (
     transfers,
 )
 from chronoscene.registration.quality.overlap import TieSpread, ground_plan, tie_spread
-from chronoscene.registration.quality.rays import Array, Mask, Placed, Rays, project
-from chronoscene.registration.quality.surface_distance import CloudDistance, cloud_distance
+from chronoscene.registration.quality.rays import (
+    MAX_OBSERVATIONS,
+    Array,
+    Evidence,
+    Mask,
+    Placed,
+    Rays,
+    gather,
+    project,
+)
+from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
 
@@ -91,7 +99,7 @@ class PairFigures:
     localised_b: Localisation | str
     """Images of b by the points of a."""
     localised_a: Localisation | str
-    clouds: CloudDistance | str
+    surfaces: SurfaceDistance | str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,7 +197,7 @@ def _pair(
         figures = _held_out(moved, good, (placed_a, placed_b), _epipolar(model, evidence, periods))
         measured = measure(moved, placed_a, placed_b, centres)
         misalignment = measured or (
-            f"{figures.tracks} held-out tracks: fewer than {FEWEST_TRACKS}, or all in one spot"
+            f"{figures.tracks} held-out tracks: fewer than {MIN_TRACKS}, or all in one spot"
         )
     by_all = measure(*_all_transfers(model, evidence, a, b), centres)
     of_a, of_b = (evidence.ties.where(model.periods[evidence.ties.image] == p) for p in periods)
@@ -204,7 +212,7 @@ def _pair(
         by_all=by_all or "too few tracks are seen by two images of one period, or all in one spot",
         localised_b=localise(of_b, evidence.ties_placed[a]),
         localised_a=localise(of_a, evidence.ties_placed[b]),
-        clouds=cloud_distance(evidence.clouds[a], evidence.clouds[b], middle, sigma),
+        surfaces=surface_distance(evidence.clouds[a], evidence.clouds[b], middle, sigma),
     )
 
 

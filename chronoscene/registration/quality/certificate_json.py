@@ -22,7 +22,7 @@ from chronoscene.registration.quality.certificate import (
 from chronoscene.registration.quality.gps_fit import GpsFit
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Interval, Misalignment, rotation_angle
-from chronoscene.registration.quality.surface_distance import CloudDistance
+from chronoscene.registration.quality.surface_distance import SurfaceDistance
 from chronoscene.registration.quality.verdict import THRESHOLDS, Verdict
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 
@@ -114,7 +114,7 @@ def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure
         over = f"{local.images} of {local.tried} images"
         yield Figure(f"{what}: rotation, median", local.rotation, "degrees", over)
         yield Figure(f"{what}: centre, median", local.centre, unit, over)
-    yield from _cloud_figures(pair.clouds, unit)
+    yield from _surface_figures(pair.surfaces, unit)
 
 
 def _held_out_figures(held: HeldOut | str, unit: str) -> Iterator[Figure]:
@@ -148,15 +148,15 @@ def _misalignment_figures(
     yield Figure(f"scale ratio {name}", found.similarity.scale, "", over)
 
 
-def _cloud_figures(clouds: CloudDistance | str, unit: str) -> Iterator[Figure]:
-    if not isinstance(clouds, CloudDistance):
-        yield Figure("distance between surfaces", None, unit, "", clouds)
+def _surface_figures(surfaces: SurfaceDistance | str, unit: str) -> Iterator[Figure]:
+    if not isinstance(surfaces, SurfaceDistance):
+        yield Figure("distance between surfaces", None, unit, "", surfaces)
         return
-    over = f"{clouds.stable:,} of {clouds.cores:,} core points on stable structure"
-    yield Figure("point-to-plane distance, median", clouds.median, unit, over)
-    yield Figure("level of detection, median", clouds.level, unit, over)
-    yield Figure("beyond the level of detection", 100 * clouds.beyond, "%", over)
-    yield _interval("shift between the surfaces", clouds.shift, unit, over)
+    over = f"{surfaces.stable:,} of {surfaces.cores:,} core points on stable structure"
+    yield Figure("point-to-plane distance, median", surfaces.median, unit, over)
+    yield Figure("level of detection, median", surfaces.level, unit, over)
+    yield Figure("beyond the level of detection", 100 * surfaces.beyond, "%", over)
+    yield _interval("shift between the surfaces", surfaces.shift, unit, over)
 
 
 def _interval(name: str, size: Interval, unit: str, over: str, factor: float = 1.0) -> Figure:

@@ -1,4 +1,4 @@
-"""Each period against its own GPS: the only witness that sees no image."""
+"""Each period against its own GPS, the only measurement that does not depend on images."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 from chronoscene.registration.quality.rays import Array
 from chronoscene.scene.similarity import SIGMA, fit_robustly
 
-FEWEST = 4
+MIN_POSITIONS = 4
 """Positions that a period needs."""
 
 SPREAD_FACTOR = 3.0
-"""The positions of a period must spread this many times wider than the receiver errs."""
+"""The positions of a period must spread over this many times the error of the receiver."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +25,7 @@ class GpsFit:
     """Distance after the similarity that fits this period best."""
     largest: float
     outliers: int
-    """Positions farther off than three robust deviations."""
+    """Positions off by more than three robust standard deviations."""
     scale: float | None
     """Of that similarity: the period's own GPS against the model. None where the path is short."""
     scale_error: float | None
@@ -47,8 +47,8 @@ def fit_gps(centres: Array, gps: Array) -> GpsFit | str:
         gps: NaN where there is none, whether it was believed or not. [N, 3]
     """
     has = np.isfinite(gps).all(axis=1)
-    if has.sum() < FEWEST:
-        return f"{int(has.sum())} images have a GPS position"
+    if has.sum() < MIN_POSITIONS:
+        return f"only {int(has.sum())} images have a GPS position"
     source, target = centres[has], gps[has]
     fitted = fit_robustly(source, target)
     difference = target - source

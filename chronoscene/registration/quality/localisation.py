@@ -1,4 +1,4 @@
-"""Symmetric check: images of one period are localised anew, from points of the other alone."""
+"""Symmetric check: images of one period are localised from points of the other alone."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from chronoscene.registration.quality.rays import Array, Placed, Rays, project
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.similarity import SIGMA
 
-FEWEST_POINTS = 12
+MIN_POINTS = 12
 """Points of the other period that an image must see."""
 
-MOST_POINTS = 400
-MOST_IMAGES = 60
+MAX_POINTS = 400
+MAX_IMAGES = 60
 
 INLIER_PIXELS = 6.0
 
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """What is left of differences when those that noise explains are taken off; 0 if it is all."""
+    """What noise does not explain of differences; 0 if it explains them all."""
 
     value: float
     low: float
-    """At least so much, by the spread of the images."""
+    """Lower bound, from the spread over the images."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,18 +44,16 @@ class Localisation:
     """Images that see enough points of the other period."""
     rotation: float
     """Median, degrees."""
-    largest_rotation: float
     centre: float
     """Median, world units."""
-    largest_centre: float
     rotation_excess: Excess
-    """Degrees beyond what the noise of the points makes of it."""
+    """Degrees beyond the effect of the noise of the points."""
     centre_excess: Excess
     """World units."""
 
 
 def localise(rays: Rays, placed: Placed) -> Localisation | str:
-    """Pose of each image by the points that the other period placed, against its pose in the model.
+    """Compare the pose of each image by the points of the other period with its pose in the model.
 
     Args:
         rays: Observations by the images of the period that is localised.
@@ -64,10 +62,10 @@ def localise(rays: Rays, placed: Placed) -> Localisation | str:
     found, slot = placed.find(rays.track)
     rays, xyz = rays.where(found), placed.xyz[slot]
     images, count = np.unique(rays.image, return_counts=True)
-    images = images[count >= FEWEST_POINTS]
+    images = images[count >= MIN_POINTS]
     if not len(images):
-        return f"no image sees {FEWEST_POINTS} points that the other period places"
-    images = images[:: len(images) // MOST_IMAGES + 1]
+        return f"no image sees {MIN_POINTS} points that the other period places"
+    images = images[:: len(images) // MAX_IMAGES + 1]
     found_poses = [_localise_one(rays.where(rays.image == i), xyz[rays.image == i]) for i in images]
     spread = placed.covariance[slot]
     poses, differences = [], []
@@ -87,16 +85,14 @@ def localise(rays: Rays, placed: Placed) -> Localisation | str:
         images=len(poses),
         tried=len(images),
         rotation=float(np.median(angle)),
-        largest_rotation=float(angle.max()),
         centre=float(np.median(moved)),
-        largest_centre=float(moved.max()),
         rotation_excess=_excess(angle, noise[:, 0]),
         centre_excess=_excess(moved, noise[:, 1]),
     )
 
 
 def _excess(size: Array, noise: Array) -> Excess:
-    """What is left of the squares when the expected ones are taken off.
+    """Root of the median square after the expected square is subtracted.
 
     Args:
         size: Differences of the images. [n]
@@ -134,10 +130,10 @@ def _expected(rays: Rays, xyz: Array, spread: Array, pose: Array) -> tuple[float
 
 
 def _localise_one(rays: Rays, xyz: Array) -> Array | None:
-    """Pose by perspective-n-point with RANSAC, refined on its inliers. The pose is not a start."""
+    """Pose by PnP with RANSAC, refined on its inliers; the pose in the model is not used."""
     import cv2
 
-    step = len(rays) // MOST_POINTS + 1
+    step = len(rays) // MAX_POINTS + 1
     middle = xyz.mean(axis=0)
     points = np.ascontiguousarray(xyz[::step] - middle)
     focal = rays.focal[0]
@@ -149,7 +145,7 @@ def _localise_one(rays: Rays, xyz: Array) -> Array | None:
             flags=cv2.SOLVEPNP_SQPNP, reprojectionError=INLIER_PIXELS,
             iterationsCount=300, confidence=0.999,
         )  # fmt: skip
-        if not good or inliers is None or len(inliers) < FEWEST_POINTS // 2:
+        if not good or inliers is None or len(inliers) < MIN_POINTS // 2:
             return None
         rows = inliers.ravel()
         turn, shift = cv2.solvePnPRefineLM(points[rows], pixels[rows], K, None, turn, shift)

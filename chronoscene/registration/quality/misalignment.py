@@ -1,8 +1,8 @@
-"""How far two periods lie apart, by tracks that took no part in the estimation.
+"""How far two periods are misaligned, by tracks that took no part in the estimation.
 
 A track is placed by its images of one period alone and projected into its images of the other, in
 both directions. The similarity that would bring the periods together, and how surely it is known,
-follow from the residuals: a registration is as good as the largest motion that they leave open.
+follow from the residuals: a registration is as good as the largest motion they do not exclude.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from chronoscene.registration.quality.rays import Array, Ints, Placed, Rays, pla
 from chronoscene.scene.geometry import Sim3
 from chronoscene.scene.similarity import fit_robustly
 
-FEWEST_TRACKS = 12
-"""Tracks below which seven unknowns and their spread are not estimated."""
+MIN_TRACKS = 12
+"""Fewer tracks do not determine seven unknowns and their spread."""
 
 STEPS = 12
 DRAWS = 400
-"""Random motions by which the spread of an angle or a distance is found."""
+"""Random motions that give the spread of an angle or a distance."""
 
 GROSS_PIXELS = 20.0
-"""Median residual from which on the search begins with the positions of the points."""
+"""Median residual above which the search starts from the positions of the points."""
 
 NOISE_FLOOR = 0.1
-"""Pixels: no feature is located better, whatever the residuals of a few say."""
+"""Pixels: no feature is located better, even if a few residuals are smaller."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ class Transfers:
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A size that is at least 0, and the 95% interval in which it lies."""
+    """A non-negative size and its 95% interval."""
 
     value: float
     low: float
@@ -58,7 +58,7 @@ class Interval:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Misalignment:
-    """The similarity between two periods that tracks ask for; identity where all is well."""
+    """The similarity between two periods according to tracks; the identity if they are aligned."""
 
     tracks: int
     """Tracks that agree with it."""
@@ -137,11 +137,11 @@ def measure(
         centres: Cameras of the second period, whose motion is reported. [C, 3]
 
     Returns:
-        None with fewer than `FEWEST_TRACKS` tracks, or where they leave the motion open.
+        None with fewer than `MIN_TRACKS` tracks, or if they do not determine the motion.
 
     Source: Huber 1967 (sandwich); Liang and Zeger 1986 (groups).
     """
-    if len(np.unique(moved.rays.track)) < FEWEST_TRACKS:
+    if len(np.unique(moved.rays.track)) < MIN_TRACKS:
         return None
     middle = np.median(moved.xyz, axis=0)
     similarity = _begin(moved, placed_a, placed_b)
@@ -162,12 +162,12 @@ def measure(
 
 
 def _begin(moved: Transfers, placed_a: Placed, placed_b: Placed) -> Sim3:
-    """Identity, or, where the periods are far apart, the similarity between their points."""
+    """Identity, or the similarity between their points if the periods are far apart."""
     error = transfer_errors(moved)[0]
     if np.median(error) < GROSS_PIXELS:
         return Sim3.identity()
     found, slot = placed_b.find(placed_a.track)
-    if found.sum() < FEWEST_TRACKS:
+    if found.sum() < MIN_TRACKS:
         return Sim3.identity()
     fitted = fit_robustly(placed_a.xyz[found], placed_b.xyz[slot])
     if fitted is None:
@@ -268,13 +268,13 @@ def _sandwich(track: Ints, residual: Array, jacobian: Array, weight: Array) -> A
     if groups <= 7 or np.linalg.cond(normal) > 1e16:
         return None
     bread = np.linalg.inv(normal)
-    # What the noise of the pixels alone would give is the least: few tracks can agree by chance.
+    # The noise of the pixels alone is a lower bound: few tracks can agree by chance.
     covariance = bread @ (sums.T @ sums) @ bread * groups / (groups - 7)
     return np.asarray(_ratio(bread, covariance) * covariance)
 
 
 def _ratio(least: Array, covariance: Array) -> float:
-    """Factor, at least 1, that brings a covariance up to the least that is believed."""
+    """Factor, at least 1, that raises a covariance to that of the noise of the pixels alone."""
     size = float(np.trace(covariance / np.maximum(np.diag(least), 1e-300)[:, None])) / 7
     return 1.0 / size if 0 < size < 1 else 1.0
 
@@ -285,7 +285,7 @@ def _interval(
     drawn: Sequence[Sim3],
     noise: Sequence[Sim3],
 ) -> Interval:
-    """A size cannot be negative: the low end is what noise alone would not explain."""
+    """A size cannot be negative: the lower end is what noise alone does not explain."""
     value = size(estimate)
     high = float(np.percentile([size(m) for m in drawn], 97.5))
     chance = float(np.percentile([size(m) for m in noise], 95))

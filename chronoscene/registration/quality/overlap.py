@@ -1,4 +1,4 @@
-"""What two periods have in common: tie points, where they lie, and which images they tie."""
+"""What two periods have in common: tie points, their distribution, and the images they tie."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from chronoscene.registration.result import Registered
 from chronoscene.scene.tracks import select_tracks
 
 CELLS = 150
-"""Cells into which the ground plan of the scene is cut."""
+"""Cells into which the ground plan of the scene is divided."""
 
-FEWEST_IN_CELL = 3
+MIN_POINTS_IN_CELL = 3
 """Points of each period that make a cell part of the overlap."""
 
 TIES_OF_IMAGE = 8
@@ -29,7 +29,7 @@ class TieSpread:
     cells: int
     """Cells of the ground plan with points of both periods."""
     occupied: float
-    """Share of them with a tie point."""
+    """Share of these cells with a tie point."""
     hull: float
     """Area of the convex hull of the tie points against that of the overlap."""
     tied_a: float
@@ -38,7 +38,7 @@ class TieSpread:
     loose: tuple[int, ...]
     """Images without so many."""
     gaps: Array
-    """Middles of overlap cells without a tie point, the fullest first. [G, 3]"""
+    """Centres of overlap cells without a tie point, the fullest first. [G, 3]"""
 
 
 def tie_spread(
@@ -56,7 +56,7 @@ def tie_spread(
     tie = seen[:, a] & seen[:, b]
     plan, cell = ground_plan(model.points) if cells is None else cells
     counts = [np.bincount(cell[mask], minlength=cell.max(initial=0) + 1) for mask in seen.T]
-    overlap = (counts[a] >= FEWEST_IN_CELL) & (counts[b] >= FEWEST_IN_CELL)
+    overlap = (counts[a] >= MIN_POINTS_IN_CELL) & (counts[b] >= MIN_POINTS_IN_CELL)
     tied = np.bincount(cell[tie], minlength=len(overlap)) > 0
     gaps = np.flatnonzero(overlap & ~tied)
     gaps = gaps[np.argsort(-np.minimum(counts[a], counts[b])[gaps], kind="stable")][:20]

@@ -1,4 +1,4 @@
-"""Distance between the surfaces that two periods see, apart from any match between them.
+"""Distance between the surfaces that two periods see, without any match between them.
 
 Every point is placed by the images of one period alone. Around core points of one cloud, both
 clouds are averaged along the local normal; what is left is compared with the level of detection,
@@ -19,18 +19,18 @@ from chronoscene.registration.quality.rays import Array, Mask, Placed
 from chronoscene.scene.similarity import SIGMA
 
 NEIGHBOURS = 16
-"""Points that make up a patch of a cloud."""
+"""Points in a patch of a cloud."""
 
-FEWEST_NEAR = 5
+MIN_NEIGHBOURS = 5
 """Points of the other cloud that a core point needs."""
 
-MOST_CORES = 4000
+MAX_CORES = 4000
 
-FEWEST_CORES = 30
-"""Stable core points below which nothing is concluded."""
+MIN_CORES = 30
+"""Fewer stable core points allow no conclusion."""
 
-LARGEST_ROUGHNESS = 0.25
-"""Of a patch, against its radius: what is rougher is a bush, not a surface."""
+MAX_ROUGHNESS = 0.25
+"""Of a patch, relative to its radius: what is rougher is a bush, not a surface."""
 
 CONFIDENCE = 1.96
 
@@ -38,31 +38,31 @@ TRIALS = 300
 """Triples of core points that are tried as a common shift."""
 
 NOTABLY = 1.1
-"""Times as many core points as no shift must a shift explain."""
+"""A shift must explain so many times the core points that no shift explains."""
 
 
 @dataclass(frozen=True, slots=True)
-class CloudDistance:
+class SurfaceDistance:
     """Point-to-plane distances on stable structure, in world units."""
 
     cores: int
     """Core points where both periods have a surface."""
     stable: int
-    """Those that one common shift explains: where nothing changed, that is all of them."""
+    """Those that one common shift explains: all of them if nothing changed."""
     median: float
     """Of the absolute distance over stable core points."""
     level: float
-    """Median level of detection: less than this is not a difference."""
+    """Median level of detection; smaller distances are not significant."""
     beyond: float
     """Share of the stable core points beyond their level of detection."""
     shift: Interval
     """Translation that would bring the clouds together, with its 95% interval."""
 
 
-def cloud_distance(
+def surface_distance(
     first: Placed, second: Placed, centre: Array, registration: float
-) -> CloudDistance | str:
-    """Compare the clouds of two periods, or say why that is not possible.
+) -> SurfaceDistance | str:
+    """Compare the point clouds of two periods, or say why that is not possible.
 
     Args:
         first: Points placed by the images of one period.
@@ -75,7 +75,7 @@ def cloud_distance(
     if min(len(first.xyz), len(second.xyz)) < NEIGHBOURS:
         return f"{len(first.xyz)} and {len(second.xyz)} points: too few for surfaces"
     trees = cKDTree(first.xyz), cKDTree(second.xyz)
-    step = len(second.xyz) // MOST_CORES + 1
+    step = len(second.xyz) // MAX_CORES + 1
     cores = second.xyz[::step]
     near, patch = trees[0].query(cores, NEIGHBOURS)
     radius = near[:, -1]
@@ -85,12 +85,12 @@ def cloud_distance(
     inside = own <= radius[:, None]
     # Core points off the edge of the first surface have all their neighbours on one side.
     across = mean - cores - ((mean - cores) * normal).sum(axis=1, keepdims=True) * normal
-    usable = spread < LARGEST_ROUGHNESS * radius
+    usable = spread < MAX_ROUGHNESS * radius
     usable &= np.linalg.norm(across, axis=1) < 0.5 * radius
-    usable &= inside.sum(axis=1) >= FEWEST_NEAR
-    usable &= radius < _largest_radius(first.xyz, trees[0])
-    if usable.sum() < FEWEST_CORES:
-        return f"surfaces of both periods meet at {int(usable.sum())} core points only"
+    usable &= inside.sum(axis=1) >= MIN_NEIGHBOURS
+    usable &= radius < _max_radius(first.xyz, trees[0])
+    if usable.sum() < MIN_CORES:
+        return f"both periods have a surface at only {int(usable.sum())} core points"
     along = ((second.xyz[mine] - mean[:, None]) * normal[:, None]).sum(axis=2)
     distance, other, count = _mean_within(along[usable], inside[usable])
     chance = np.sqrt(spread[usable] ** 2 / NEIGHBOURS + other**2 / count)
@@ -105,8 +105,8 @@ def _planes(patches: Array) -> tuple[Array, Array, Array]:
     return mean, vectors[:, :, 0], np.sqrt(np.maximum(values[:, 0], 0.0))
 
 
-def _largest_radius(points: Array, tree: object) -> float:
-    """Patches much wider than the usual one lie where the cloud has holes."""
+def _max_radius(points: Array, tree: object) -> float:
+    """Patches much wider than usual lie where the cloud has holes."""
     some = points[:: len(points) // 1000 + 1]
     near = tree.query(some, NEIGHBOURS)[0][:, -1]  # type: ignore[attr-defined]
     return 3.0 * float(np.median(near))
@@ -122,13 +122,13 @@ def _mean_within(along: Array, inside: Mask) -> tuple[Array, Array, Array]:
 
 def _summary(
     distance: Array, normal: Array, chance: Array, registration: float
-) -> CloudDistance | str:
+) -> SurfaceDistance | str:
     stable = _stable(distance, normal, chance)
-    if stable.sum() < FEWEST_CORES:
-        return f"{int(stable.sum())} core points on structure that did not change"
+    if stable.sum() < MIN_CORES:
+        return f"only {int(stable.sum())} core points on structure that did not change"
     level = CONFIDENCE * chance + registration
     size = np.abs(distance[stable])
-    return CloudDistance(
+    return SurfaceDistance(
         cores=len(distance),
         stable=int(stable.sum()),
         median=float(np.median(size)),

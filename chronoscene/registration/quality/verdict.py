@@ -1,8 +1,8 @@
 """Pass, doubtful or fail: thresholds, each with its reason, and what to do.
 
 A pass promises that the periods lie within 0.1 degrees and 0.2% of the scene's extent of each
-other. It needs positive evidence: what could not be measured is never in favour. A fail is said
-only where something measured contradicts the registration; everything between is doubtful.
+other. It needs positive evidence: what could not be measured never counts in favour. A
+registration fails only where a measurement contradicts it; everything between is doubtful.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 from chronoscene.registration.quality.certificate import Certificate, PairFigures, PeriodFigures
 from chronoscene.registration.quality.gps_fit import GpsFit
 from chronoscene.registration.quality.localisation import Localisation
-from chronoscene.registration.quality.misalignment import FEWEST_TRACKS, Misalignment
+from chronoscene.registration.quality.misalignment import MIN_TRACKS, Misalignment
 from chronoscene.registration.quality.rays import Array
-from chronoscene.registration.quality.surface_distance import CloudDistance
+from chronoscene.registration.quality.surface_distance import SurfaceDistance
 
 Level = Literal["pass", "doubtful", "fail"]
 
@@ -27,7 +27,7 @@ LEVELS: tuple[Level, ...] = ("pass", "doubtful", "fail")
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """One check: from where on a figure is not good, and from where on it is bad."""
+    """One check: the limits beyond which a figure is doubtful, and beyond which it fails."""
 
     key: str
     what: str
@@ -47,126 +47,131 @@ class Threshold:
         return "doubtful" if sign * value > sign * self.doubtful else "pass"
 
 
-_CLICK = "click tie points on the pairs that the report suggests and run again with --tie-points"
+_CLICK = (
+    "click tie points on the spots that the page (--report) suggests, and run again with "
+    "--tie-points"
+)
+_LOOK = f"look at the comparisons on the page (--report); if they jump, {_CLICK}"
+_CONTROL = "give ground control: --tie-points with world coordinates"
 
 THRESHOLDS: dict[str, Threshold] = {
     t.key: t
     for t in (
         Threshold(
-            "registered", "share of the photos of a period that were registered", "",
+            "registered", "share of the photos of a period that are registered", "",
             0.6, 0.1, True,
-            "a period of which most photos are missing is not covered by what is measured here",
-            "see the reasons for the missing photos; add photos between the dates' viewpoints",
+            "what is measured here does not cover a period of which most photos are missing",
+            "see in registration_log.json why photos are missing; add photos with viewpoints "
+            "between those of the dates",
         ),
         Threshold(
             "images", "registered images of a period", "images", 5, 3, True,
-            "fewer images do not place points by themselves, so nothing can be checked",
+            "fewer images do not determine points by themselves, so nothing can be checked",
             "add photos of this period",
         ),
         Threshold(
-            "rotation", "rotation left between two periods", "degrees",
-            0.1, 0.1, False,
-            "0.1 degrees are 1.7 pixels at a focal length of 1000: twice what matching leaves",
+            "rotation", "remaining rotation between two periods", "degrees", 0.1, 0.1, False,
+            "0.1 degrees is 1.7 pixels at a focal length of 1000: twice the error of matching",
             _CLICK,
         ),
         Threshold(
-            "shift", "displacement left between two periods", "% of extent",
-            0.2, 0.2, False,
-            "0.2% are 20 cm in 100 m: changes smaller than this cannot be told from misalignment",
+            "shift", "remaining displacement between two periods", "% of extent", 0.2, 0.2, False,
+            "0.2% is 20 cm in 100 m: smaller changes cannot be told from misalignment",
             _CLICK,
         ),
         Threshold(
             "held_out", "held-out tracks between two periods", "tracks", 12, None, True,
-            "a similarity has seven unknowns; fewer tracks fit almost any",
+            "a similarity has seven unknowns and fits almost any smaller number of tracks",
             _CLICK,
         ),
         Threshold(
             "agreeing", "share of held-out observations that agree", "", 0.75, 0.15, True,
-            "right registrations reach 0.85 and more; with fewer, part of the matches, or part of "
-            "the poses, is wrong, or matching takes one thing for another",
-            "look at the worst pair in the report; remove the photos that it names",
+            "correct registrations reach 0.85 and more; with fewer, part of the matches or of the "
+            "poses is wrong, or matching is misled by repeated structure",
+            "look at the worst pair on the page (--report); remove its photos if they do not fit",
         ),
         Threshold(
             "excess", "held-out residual beyond the noise of matching, as an angle", "degrees",
             0.1, 0.4, False,
-            "what a similarity cannot explain is a period bent by drift, or a wrong camera",
-            "use one camera per period and drone, or add oblique photos; else control points",
+            "what no similarity explains is a period deformed by drift (doming), or a wrong camera",
+            "calibrate each date (--calibration per-period), or add oblique photos; else "
+            + _CONTROL,
         ),
         Threshold(
             "occupied", "share of the overlap of two periods that has tie points", "", 0.15, None,
             True,
-            "matches in one spot can be of repeated structure, and say little of the rest",
-            "click tie points in the empty spots that the report shows",
-        ),
-        Threshold(
-            "tied", "share of the images of a period that see tie points", "", 0.5, None, True,
-            "images without any hang on their own period alone",
+            "matches in one spot can come from repeated structure, and say little about the rest",
             _CLICK,
         ),
         Threshold(
-            "localised", "pose of images localised from the other period, less its noise",
+            "tied", "share of the images of a period that see tie points", "", 0.5, None, True,
+            "images without any are held by their own period alone",
+            _CLICK,
+        ),
+        Threshold(
+            "localised", "pose of images localised from the other period, beyond its noise",
             "times 0.1 degrees or 0.2%", 0.6, 10.0, False,
-            "the points of either period must put the images of the other where they are",
-            "look at the flicker comparisons; if they jump, " + _CLICK,
+            "the points of each period must place the images of the other correctly",
+            _LOOK,
         ),
         Threshold(
-            "clouds", "shift between the surfaces of two periods, where its interval excludes 0",
+            "clouds", "shift between the surfaces of two periods, if its interval excludes 0",
             "% of extent", 0.15, None, False,
-            "surfaces are compared apart from matches, so repeated structure shows here; but a "
-            "beach or a quarry may really have moved",
-            "look at the flicker comparisons; if they jump, " + _CLICK,
+            "surfaces are compared without matches, so repeated structure shows here; but a beach "
+            "or a quarry may really have moved",
+            _LOOK,
         ),
         Threshold(
-            "surfaces", "share of the surfaces that lie beyond their level of detection", "",
+            "surfaces", "share of the surfaces beyond their level of detection", "",
             0.3, None, False,
-            "right registrations stay below 0.25 even where two thirds of what is seen is new; "
-            "with more, surfaces contradict the matches, as where these took one thing for its "
-            "like",
-            "look at the flicker comparisons; if they jump, " + _CLICK,
+            "correct registrations stay below 0.25 even where two thirds of the scene is new; "
+            "above, surfaces contradict the matches, as with repeated structure",
+            _LOOK,
         ),
         Threshold(
             "gps_offset", "horizontal offset between the GPS of two periods, beyond its spread",
             "m", 5.0, 15.0, False,
-            "receivers are off by up to some 3.5 m as a whole from day to day; heights by more, "
-            "so they are not judged",
-            "if the GPS can be believed, " + _CLICK,
+            "the bias of a receiver is up to about 3.5 m from day to day; that of heights is "
+            "larger, so they are not judged",
+            f"if the GPS is reliable, {_CLICK}",
         ),
         Threshold(
             "gps_residual", "residual of a period's cameras to its own GPS, median", "m",
             12.0, None, False,
-            "receivers are off by 3 to 8 m, so more means that part of the poses is wrong, or that "
-            "the sky was hidden",
-            "look at the map in the report; register the period alone and see which photos bend it",
+            "receivers err by 3 to 8 m; more means that part of the poses is wrong, or that the "
+            "view of the sky was obstructed",
+            "look at the map on the page (--report); register the period alone to see which photos "
+            "deform it",
         ),
         Threshold(
             "gps_scale", "scale of a period against its own GPS, beyond its spread", "%",
             2.0, 10.0, False,
-            "GPS errs in place, hardly in scale",
-            "give ground control, or choose the route with GPS priors",
+            "GPS has errors of position, hardly of scale",
+            _CONTROL,
         ),
         Threshold(
-            "gps_turn", "turn of a period against its own GPS, beyond its spread", "degrees",
+            "gps_turn", "heading of a period against its own GPS, beyond its spread", "degrees",
             2.0, 10.0, False,
-            "GPS errs in place, hardly in direction",
-            "give ground control, or choose the route with GPS priors",
+            "GPS has errors of position, hardly of direction",
+            _CONTROL,
         ),
     )
 }  # fmt: skip
 
 
 FITTED = 1.3
-"""Noise of an observation against the residual that is left of it after fitting, at most."""
+"""Upper limit of the ratio of the noise of an observation to its residual after fitting."""
 
-FEWEST_LINK = 3
-"""Tie points, clicked ones say, without which nothing holds two periods together."""
+MIN_TIES = 3
+"""Tie points, clicked ones for example, that two periods need to be linked."""
 
 LACKING = ("held_out", "rotation", "shift", "occupied", "tied")
-"""Checks whose doubt is a lack of evidence: a way through other periods can make up for it."""
+"""Checks that are doubtful for lack of evidence, which a chain of other periods can supply."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One figure that is not good, or one that is missing and needed."""
+    """A figure beyond its limit, or one that is needed and missing."""
 
     level: Level
     check: str
@@ -186,7 +191,7 @@ class Verdict:
     text: str
     """One or two sentences for people."""
     findings: tuple[Finding, ...]
-    """The worst first."""
+    """The most severe first."""
     pairs: dict[tuple[int, int], Level | None]
     """Of each pair of periods; None where nothing links the two directly."""
 
@@ -204,20 +209,20 @@ def judge(certificate: Certificate) -> Verdict:
     for pair in certificate.pairs:
         mine = list(_of_pair(certificate, pair))
         measured = isinstance(pair.by_all, Misalignment) or not isinstance(pair.held_out, str)
-        linked = measured or pair.ties.points >= FEWEST_LINK
+        linked = measured or pair.ties.points >= MIN_TIES
         pairs[pair.a, pair.b] = _worst(f.level for f in mine) if linked else None
         findings += mine if linked else []
     good = _bounds(certificate, [k for k, level in pairs.items() if level == "pass"])
     if all(good[k] <= 1 or level == "pass" for k, level in pairs.items()):
-        findings = [f for f in findings if not _made_up_for(f)]
+        findings = [f for f in findings if not _is_lack(f)]
     findings += _links(certificate, pairs, good)
     level = _worst(f.level for f in findings)
     findings.sort(key=lambda f: -LEVELS.index(f.level))
     return Verdict(level, _words(certificate, level, findings), tuple(findings), pairs)
 
 
-def _made_up_for(finding: Finding) -> bool:
-    """Whether a finding does not count where every period is linked to every other otherwise."""
+def _is_lack(finding: Finding) -> bool:
+    """Whether a finding does not count if chains of good pairs link all periods."""
     return finding.level == "doubtful" and finding.check in LACKING
 
 
@@ -226,7 +231,7 @@ def _worst(levels: Iterator[Level]) -> Level:
 
 
 def _check(key: str, value: float, place: str, note: str = "") -> Iterator[Finding]:
-    """A finding, unless the figure is good."""
+    """A finding, unless the figure passes."""
     threshold = THRESHOLDS[key]
     level = threshold.level(value)
     if level == "pass":
@@ -234,7 +239,7 @@ def _check(key: str, value: float, place: str, note: str = "") -> Iterator[Findi
     limit = threshold.doubtful if level == "doubtful" or threshold.fail is None else threshold.fail
     side = "at least" if threshold.larger_is_better else "at most"
     unit = f" {threshold.unit}" if threshold.unit else ""
-    found = f"{threshold.what}: {value:.3g}{unit}, {side} {limit:g} expected{note}"
+    found = f"{threshold.what}: {value:.3g}{unit}, expected {side} {limit:g}{note}"
     yield Finding(level, key, place, found, threshold.why, threshold.todo)
 
 
@@ -253,7 +258,7 @@ def _of_period(p: PeriodFigures) -> Iterator[Finding]:
 
 
 def _between_gps(certificate: Certificate) -> Iterator[Finding]:
-    """Offsets of the periods against their common median: which of two is wrong is not known."""
+    """Offsets between every two periods: which of them is wrong is not known."""
     fits = [(p, p.gps) for p in certificate.periods if isinstance(p.gps, GpsFit)]
     for i, (p, one) in enumerate(fits):
         for q, other in fits[i + 1 :]:
@@ -262,14 +267,14 @@ def _between_gps(certificate: Certificate) -> Iterator[Finding]:
             spread = np.hypot(one.offset_error[:2], other.offset_error[:2]).max()
             beyond = distance - 3 * float(spread)
             place = f"periods {p.label} and {q.label}"
-            yield from _check("gps_offset", beyond, place, f"; {distance:.1f} m in all")
+            yield from _check("gps_offset", beyond, place, f"; {distance:.1f} m with it")
 
 
 def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Finding]:
     names = certificate.labels
     place = f"periods {names[pair.a]} and {names[pair.b]}"
     yield from _alignment(certificate, pair, place)
-    if not isinstance(pair.held_out, str) and pair.held_out.tracks >= FEWEST_TRACKS:
+    if not isinstance(pair.held_out, str) and pair.held_out.tracks >= MIN_TRACKS:
         yield from _check("agreeing", pair.held_out.agreeing, place)
         yield from _check("excess", _excess(certificate, pair), place)
     yield from _check("occupied", pair.ties.occupied, place)
@@ -277,15 +282,15 @@ def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Finding]:
     for found in (pair.localised_b, pair.localised_a):
         if isinstance(found, Localisation) and found.images >= 3:
             yield from _check("localised", _localised(found, certificate.extent), place)
-    if isinstance(pair.clouds, CloudDistance):
-        shift = pair.clouds.shift
+    if isinstance(pair.surfaces, SurfaceDistance):
+        shift = pair.surfaces.shift
         if shift.low > 0:
             yield from _check("clouds", 100 * shift.value / certificate.extent, place)
-        yield from _check("surfaces", pair.clouds.beyond, place)
+        yield from _check("surfaces", pair.surfaces.beyond, place)
 
 
 def _localised(found: Localisation, extent: float) -> float:
-    """The larger of both errors against its limit; beyond doubt only as far as it is certain."""
+    """The larger of both errors against its limit; it fails only as far as it is certain."""
     turn, place = found.rotation_excess, found.centre_excess
     likely, certain = (
         max(r / _limit("rotation"), 100 * c / extent / _limit("shift"))
@@ -297,11 +302,12 @@ def _localised(found: Localisation, extent: float) -> float:
 
 
 def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Finding]:
-    """Whether the periods lie together, and whether that is known.
+    """Whether the periods are aligned, and whether that is certain.
 
-    Wrong, if either measurement excludes the limit. Right, if the precise one (all ties) stays
-    below the limit with its whole interval, and the independent one (held out) agrees: its own
-    interval ends below the limit, or its estimate does while its spread reaches to twice.
+    They are not if either interval lies beyond the limit. They are if the interval of the precise
+    measurement (all ties) ends below the limit, and the independent one (held-out tracks) agrees:
+    its interval ends below the limit, or its estimate lies below and its interval ends below twice
+    the limit.
     """
     held, by_all = pair.misalignment, pair.by_all
     if isinstance(held, str) or isinstance(by_all, str):
@@ -323,7 +329,7 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
             bound = max(high, loose)
             found = (
                 f"{THRESHOLDS[key].what}: {estimate:.3g} {unit}, but up to {bound:.3g} cannot be "
-                f"ruled out; at most {limit:g} expected"
+                f"ruled out; expected at most {limit:g}"
             )
             yield Finding("doubtful", key, place, found, THRESHOLDS[key].why, THRESHOLDS[key].todo)
 
@@ -333,10 +339,10 @@ def _limit(key: str) -> float:
 
 
 def _excess(certificate: Certificate, pair: PairFigures) -> float:
-    """Held-out residual beyond what matching noise makes of it, in degrees.
+    """Held-out residual beyond the noise of matching, in degrees.
 
-    The residuals of the model itself show the noise, a little less of it than there is, because
-    the points were fitted to them.
+    The residuals of the model show that noise, slightly underestimated because points were fitted
+    to them (`FITTED`).
     """
     assert not isinstance(pair.held_out, str)
     own = [certificate.periods[p].error or 0.0 for p in (pair.a, pair.b)]
@@ -347,7 +353,7 @@ def _excess(certificate: Certificate, pair: PairFigures) -> float:
 def _links(
     certificate: Certificate, pairs: dict[tuple[int, int], Level | None], good: Array
 ) -> Iterator[Finding]:
-    """Periods without anything in common that are not linked well by a chain of others.
+    """Pairs without a link of their own that no good chain of other periods links.
 
     Args:
         certificate: What was measured.
@@ -360,15 +366,15 @@ def _links(
         place = f"periods {names[a]} and {names[b]}"
         if not np.isfinite(some[a, b]):
             yield Finding(
-                "fail", "link", place, "nothing measured links the two",
-                "without matches between them, their alignment is not known at all", _CLICK,
+                "fail", "link", place, "no measurement links them",
+                "without matches between them, their alignment is unknown", _CLICK,
             )  # fmt: skip
         elif level is None and not good[a, b] <= 1:
             left = (
-                f"a chain of good pairs links the two, but leaves {good[a, b]:.2g} times the "
-                "limits open"
+                f"a chain of good pairs links them, but only to within {good[a, b]:.2g} times the "
+                "limits"
                 if np.isfinite(good[a, b])
-                else "no chain of good pairs links the two"
+                else "no chain of good pairs links them"
             )
             yield Finding("doubtful", "chain", place, left, "the errors of a chain add up", _CLICK)
 
@@ -395,18 +401,16 @@ def _bounds(certificate: Certificate, pairs: list[tuple[int, int]]) -> Array:
 def _words(certificate: Certificate, level: Level, findings: list[Finding]) -> str:
     count = len(certificate.labels)
     if level == "pass" and count == 1:
-        return (
-            "There is one period: nothing had to be aligned, so nothing across periods is judged."
-        )
+        return "There is only one period, so there is no alignment to judge."
     if level == "pass":
         return (
             f"The {count} periods lie in one frame, within 0.1 degrees and 0.2% of the scene's "
-            "extent of each other, by matches that took no part in the estimation."
+            "extent of each other, according to matches that took no part in the estimation."
         )
     first = findings[0]
     start = (
         "The periods do not fit each other; do not use this registration as it is."
         if level == "fail"
-        else "The registration may be right, but what was measured does not prove it."
+        else "The registration may be correct, but the measurements do not prove it."
     )
     return f"{start} {first.place.capitalize()}: {first.found}."

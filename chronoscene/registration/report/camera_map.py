@@ -13,12 +13,12 @@ from chronoscene.scene.geometry import camera_centre
 WIDTH = 720.0
 """Units of the drawing."""
 
-MOST_DOTS = 1500
+MAX_DOTS = 1500
 """Points of the scene that are drawn."""
 
 TICK = 16.0
 
-LONGEST = 0.25
+MAX_GPS_VECTOR = 0.25
 """Share of the width beyond which a GPS vector is cut off and counted as gross."""
 
 
@@ -59,7 +59,7 @@ def camera_map(model: Registered) -> CameraMap:
     centres = camera_centre(model.cam_from_world)
     axes = _axes(model, centres)
     plan = centres @ axes.T
-    points = model.points[:: len(model.points) // MOST_DOTS + 1] @ axes.T
+    points = model.points[:: len(model.points) // MAX_DOTS + 1] @ axes.T
     low, high = _frame(plan, points)
     scale = WIDTH / float((high - low)[0])
     height = float(np.clip(scale * (high - low)[1], 0.3 * WIDTH, 1.3 * WIDTH))
@@ -75,8 +75,8 @@ def camera_map(model: Registered) -> CameraMap:
     for i, name in enumerate(model.names):
         vector = gps[i] - at[i]
         length = float(np.linalg.norm(vector))
-        cut = bool(np.isfinite(length) and length > LONGEST * WIDTH)
-        end = at[i] + vector * (LONGEST * WIDTH / length) if cut else gps[i]
+        cut = bool(np.isfinite(length) and length > MAX_GPS_VECTOR * WIDTH)
+        end = at[i] + vector * (MAX_GPS_VECTOR * WIDTH / length) if cut else gps[i]
         cameras.append(
             MapCamera(
                 name, int(model.periods[i]), *_pair(at[i]), _pair(tips[i]),

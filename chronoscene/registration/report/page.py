@@ -28,7 +28,7 @@ FLICKERS = 8
 CLICKS = 6
 """Spots that are suggested for clicking, for a pair of periods."""
 
-MOST_LINES = 120
+MAX_LINES = 120
 """Matches that are drawn between two photos."""
 
 COLORS = (
@@ -156,7 +156,7 @@ def _draw_pair(model: Registered, photos: Photos, title: str, pair: DrawnPair) -
         return None
     scales = [PHOTO_WIDTH / model.cameras[i].width for i in (pair.a, pair.b)]
     heights = [model.cameras[i].height * s for i, s in zip((pair.a, pair.b), scales, strict=True)]
-    step = len(pair.error) // MOST_LINES + 1
+    step = len(pair.error) // MAX_LINES + 1
     lines = [
         _Line(*_scaled(a, scales[0]), *_scaled(b, scales[1]), _level(e))
         for a, b, e in zip(pair.xy_a[::step], pair.xy_b[::step], pair.error[::step], strict=True)

@@ -8,8 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from chronoscene.registration.quality.certificate import PairFigures
-from chronoscene.registration.quality.evidence import Evidence
-from chronoscene.registration.quality.rays import Array, Ints, Mask, Placed, project, rays_at
+from chronoscene.registration.quality.rays import (
+    Array,
+    Evidence,
+    Ints,
+    Mask,
+    Placed,
+    project,
+    rays_at,
+)
 from chronoscene.registration.result import CrossMatches, Registered
 from chronoscene.scene.cameras import project_points
 from chronoscene.scene.geometry import camera_centre
@@ -17,7 +24,7 @@ from chronoscene.scene.geometry import camera_centre
 MARGIN = 0.06
 """Of the image: spots nearer to its edge are not shown."""
 
-FEWEST_MATCHES = 5
+MIN_MATCHES = 5
 """Matches of a pair of images that is drawn."""
 
 
@@ -171,10 +178,10 @@ def drawn_pairs(model: Registered, evidence: Evidence) -> list[DrawnPair]:
     """All pairs of images with enough held-out matches, the best first."""
     pairs = []
     for matches in model.held_out:
-        if len(matches.xy_a) >= FEWEST_MATCHES:
+        if len(matches.xy_a) >= MIN_MATCHES:
             error = _match_errors(model, matches, evidence.held_out_placed)
             good = np.isfinite(error)
-            if good.sum() >= FEWEST_MATCHES:
+            if good.sum() >= MIN_MATCHES:
                 xy = matches.xy_a[good], matches.xy_b[good]
                 pairs.append(DrawnPair(matches.image_a, matches.image_b, *xy, error[good]))
     return sorted(pairs, key=lambda p: p.median)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from chronoscene.images.exif import ExifData
 from chronoscene.registration.photos.camera_sharing import (
-    LEAST_OF_ITS_OWN,
+    MIN_PHOTOS,
     Calibration,
     camera_groups,
 )
@@ -34,8 +34,8 @@ def test_lens_and_zoom_make_the_camera() -> None:
 
 
 def test_a_period_with_many_photos_has_its_own_calibration() -> None:
-    many = [capture(f"0/{i}", 0) for i in range(LEAST_OF_ITS_OWN)]
-    more = [capture(f"1/{i}", 1) for i in range(LEAST_OF_ITS_OWN)]
+    many = [capture(f"0/{i}", 0) for i in range(MIN_PHOTOS)]
+    more = [capture(f"1/{i}", 1) for i in range(MIN_PHOTOS)]
     assert names(many + more) == [sorted(c.name for c in many), sorted(c.name for c in more)]
 
 
@@ -46,7 +46,7 @@ def test_periods_with_few_photos_share_one() -> None:
 
 
 def test_periods_share_one_where_that_is_asked_for() -> None:
-    many = [capture(f"{p}/{i}", p) for p in (0, 1) for i in range(LEAST_OF_ITS_OWN)]
+    many = [capture(f"{p}/{i}", p) for p in (0, 1) for i in range(MIN_PHOTOS)]
     assert names(many, "shared") == [sorted(c.name for c in many)]
     assert len(names([*many, capture("1/b", 1, model="B")], "shared")) == 2
 
@@ -57,8 +57,7 @@ def test_periods_of_one_visit_share_a_calibration() -> None:
 
     def photos(period: int, start: datetime) -> list[Capture]:
         return [
-            capture(f"{period}/{i:02}", period, taken=start + i * minute)
-            for i in range(LEAST_OF_ITS_OWN)
+            capture(f"{period}/{i:02}", period, taken=start + i * minute) for i in range(MIN_PHOTOS)
         ]
 
     legs = photos(0, noon) + photos(1, noon + 40 * minute)

@@ -13,13 +13,12 @@ from generated_registrations import CaseSettings, generate_case, pose_errors
 
 from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
 from chronoscene.registration.quality.certificate_json import pair_figures, period_figures, to_json
-from chronoscene.registration.quality.evidence import gather
 from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Misalignment
 from chronoscene.registration.quality.overlap import tie_spread
-from chronoscene.registration.quality.rays import Placed
-from chronoscene.registration.quality.surface_distance import CloudDistance, cloud_distance
+from chronoscene.registration.quality.rays import Placed, gather
+from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.quality.verdict import THRESHOLDS, judge
 from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.scene.geometry import Sim3, camera_centre
@@ -55,11 +54,11 @@ def test_every_figure_is_measured(certificate: Certificate) -> None:
     assert isinstance(pair.by_all, Misalignment)
     assert isinstance(pair.localised_a, Localisation)
     assert isinstance(pair.localised_b, Localisation)
-    assert isinstance(pair.clouds, CloudDistance)
+    assert isinstance(pair.surfaces, SurfaceDistance)
     assert all(isinstance(p.gps, GpsFit) for p in certificate.periods)
     assert pair.held_out.median < 1.0
     assert pair.held_out.distance < 0.4
-    assert pair.clouds.median < pair.clouds.level
+    assert pair.surfaces.median < pair.surfaces.level
     assert pair.localised_b.images == 14
 
 
@@ -132,7 +131,7 @@ def test_gross_errors_fail() -> None:
 def test_nothing_in_common_is_a_fail_that_says_so() -> None:
     verdict = judge(certify(generate_case(CaseSettings(ties=0, by_gps=True, seed=33)).model))
     assert verdict.level == "fail"
-    assert "nothing measured links" in verdict.text
+    assert "no measurement links" in verdict.text
     assert verdict.pairs == {(0, 1): None}
 
 
@@ -255,8 +254,8 @@ def test_clouds_find_a_shift_without_matches(shift: tuple[float, float, float]) 
     rng = np.random.default_rng(0)
     first, second = plane(rng, 2000, 0.02), plane(rng, 2000, 0.02) + shift
     second[:600] += [0.0, 0.0, 3.0]  # a part that has changed
-    found = cloud_distance(as_cloud(first), as_cloud(second), np.zeros(3) + 5.0, 0.0)
-    assert isinstance(found, CloudDistance)
+    found = surface_distance(as_cloud(first), as_cloud(second), np.zeros(3) + 5.0, 0.0)
+    assert isinstance(found, SurfaceDistance)
     assert found.shift.low <= np.linalg.norm(shift) <= found.shift.high
     assert found.shift.value == pytest.approx(np.linalg.norm(shift), abs=0.03)
     if any(shift):
@@ -269,10 +268,10 @@ def test_clouds_find_a_shift_without_matches(shift: tuple[float, float, float]) 
 def test_clouds_too_small_or_apart_say_so() -> None:
     rng = np.random.default_rng(0)
     cloud = as_cloud(plane(rng, 200, 0.01))
-    few = cloud_distance(as_cloud(cloud.xyz[:5]), cloud, np.zeros(3), 0.0)
-    apart = cloud_distance(cloud, as_cloud(cloud.xyz + 500), np.zeros(3), 0.0)
+    few = surface_distance(as_cloud(cloud.xyz[:5]), cloud, np.zeros(3), 0.0)
+    apart = surface_distance(cloud, as_cloud(cloud.xyz + 500), np.zeros(3), 0.0)
     assert isinstance(few, str) and "too few" in few
-    assert isinstance(apart, str) and "meet at" in apart
+    assert isinstance(apart, str) and "have a surface at" in apart
 
 
 def test_gps_finds_offset_scale_and_turn() -> None:

@@ -17,7 +17,7 @@ from PIL import Image
 
 from chronoscene.registration.inspection import inspect_registration
 from chronoscene.registration.quality.certificate import certify
-from chronoscene.registration.quality.evidence import gather
+from chronoscene.registration.quality.rays import gather
 from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.report.camera_map import camera_map
 from chronoscene.registration.report.page import render_report
@@ -86,7 +86,7 @@ def test_page_says_what_was_measured(model: Registered, page: str) -> None:
     verdict = judge(certify(model))
     assert verdict.level == "fail"
     assert '<h2 class="badge fail">Fail</h2>' in page
-    assert "rotation left between two periods" in page
+    assert "remaining rotation between two periods" in page
     for heading in (
         "Cameras from above", "The same spot at two dates", "Held-out matches",
         "Where to click next", "Certificate", "Thresholds",

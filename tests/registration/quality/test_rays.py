@@ -9,7 +9,7 @@ import pytest
 from generated_registrations import CaseSettings, generate_case
 
 from chronoscene.registration.inspection import inspect_registration
-from chronoscene.registration.quality import evidence, rays
+from chronoscene.registration.quality import rays
 from chronoscene.registration.quality.rays import Rays, model_rays, place
 
 
@@ -28,7 +28,7 @@ def test_every_point_is_placed_once_in_each_period(
         return before(*arguments)  # type: ignore[arg-type]
 
     before = rays.unproject
-    monkeypatch.setattr(evidence, "place", counted)
+    monkeypatch.setattr(rays, "place", counted)
     monkeypatch.setattr(rays, "unproject", counted_pixels)
     inspect_registration(model, tmp_path)
     assert len(placed) == 2 * 3  # points of the model and held-out tracks, by each period
@@ -38,8 +38,8 @@ def test_every_point_is_placed_once_in_each_period(
 def test_samples_hold_whole_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
     model = generate_case(CaseSettings(seed=6)).model
     every = model_rays(model)
-    monkeypatch.setattr(evidence, "MAX_OBSERVATIONS", 1000)
-    found = evidence.gather(model)
+    monkeypatch.setattr(rays, "MAX_OBSERVATIONS", 1000)
+    found = rays.gather(model)
     for period in range(2):
         alone = place(every.where(model.periods[every.image] == period))
         known, slot = alone.find(found.clouds[period].track)
