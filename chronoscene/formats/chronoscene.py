@@ -10,17 +10,15 @@ import numpy as np
 
 from chronoscene.colmap.model import Model, PosedImage, read_model, write_model
 from chronoscene.errors import SceneError
-from chronoscene.formats.shared.json_values import read_json
-from chronoscene.formats.shared.labels import is_iso_date as is_iso_date  # it was here first
-from chronoscene.formats.shared.labels import (
+from chronoscene.formats.shared.json_values import (
     parse_periods,
     parse_world,
     period_items,
+    read_json,
     world_item,
 )
-from chronoscene.formats.shared.transforms_cameras import LARGEST_SIDE
 from chronoscene.formats.shared.writing import ImageSource, Progress, place_images, staged_folder
-from chronoscene.scene import Camera, Frame, Period, Scene, WorldFrame
+from chronoscene.scene import Frame, Period, Scene, WorldFrame
 from chronoscene.scene.splits import (
     DEFAULT_RULE,
     FATAL,
@@ -45,13 +43,13 @@ MODEL = "sparse/0"
 PERIODS = "sparse/periods.json"
 WORLD = "sparse/world.json"
 
-LARGEST_COORDINATE = 1e100
+MAX_COORDINATE = 1e100
 """Beyond any world; squares and sums of such numbers are still finite."""
 
 NOT_RIGID = 1e-6
 """Deviation from a rotation beyond which a pose is refused; COLMAP's are exact to rounding."""
 
-MOST_PERIODS = 100_000
+MAX_PERIODS = 100_000
 """Far beyond any real scene: more come from a mistaken id, and would fill the memory."""
 
 
@@ -111,7 +109,7 @@ def check_image(place: Path, image: PosedImage) -> None:
     """Refuse an image that no method could use: its name, its pose, its camera."""
     check_name(place, image.name)
     camera, pose = image.camera, image.cam_from_world
-    if not (np.abs(pose) < LARGEST_COORDINATE).all():
+    if not (np.abs(pose) < MAX_COORDINATE).all():
         raise SceneError(
             place,
             expected=f"a finite pose of {image.name!r}",
@@ -125,7 +123,7 @@ def check_image(place: Path, image: PosedImage) -> None:
             found="another matrix, from a quaternion that is too large or too small",
             todo="remove the image from the model, or register it again",
         )
-    if not is_usable(camera):
+    if not camera.is_usable:
         raise SceneError(
             place,
             expected=f"a camera {camera.camera_id} with a plausible size, positive focal lengths "
@@ -133,15 +131,6 @@ def check_image(place: Path, image: PosedImage) -> None:
             found=f"{camera.model} {camera.width} x {camera.height}, {camera.params}",
             todo="correct the camera",
         )
-
-
-def is_usable(camera: Camera) -> bool:
-    """Whether a camera has a size and parameters that a projection can use."""
-    if not (1 <= camera.width <= LARGEST_SIDE and 1 <= camera.height <= LARGEST_SIDE):
-        return False
-    if not np.isfinite(camera.params).all():
-        return False
-    return camera.model == "EQUIRECTANGULAR" or bool((camera.K[[0, 1], [0, 1]] > 0).all())
 
 
 def check_name(place: Path, name: str) -> None:
@@ -185,13 +174,13 @@ def read_periods(path: Path, count: int) -> tuple[Period, ...]:
     """Labels and dates from ``periods.json``, or the ids where the file is absent.
 
     Raises:
-        SceneError: If there are more than `MOST_PERIODS`, or the file is damaged or does not have
+        SceneError: If there are more than `MAX_PERIODS`, or the file is damaged or does not have
             the periods 0 to ``count - 1``.
     """
-    if count > MOST_PERIODS:
+    if count > MAX_PERIODS:
         raise SceneError(
             path / SPLIT,
-            expected=f"at most {MOST_PERIODS} periods",
+            expected=f"at most {MAX_PERIODS} periods",
             found=f"{count}",
             todo="number the periods 0, 1, ...; labels and dates go to sparse/periods.json",
         )

@@ -18,18 +18,22 @@ from dataclasses import replace
 from pathlib import Path
 
 from chronoscene.errors import SceneError
-from chronoscene.formats.shared.colmap_layout import find_model, make_scene, read_images, scan
-from chronoscene.formats.shared.colmap_writing import (
+from chronoscene.formats.shared.colmap_layout import (
     as_pinhole,
+    find_model,
     lost_labels,
     lost_names,
     lost_split,
+    make_scene,
+    read_images,
+    scan,
     write_renamed,
 )
 from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
 from chronoscene.formats.shared.json_values import read_json
 from chronoscene.formats.shared.ply import read_points
 from chronoscene.formats.shared.transforms import (
+    CameraTable,
     Shot,
     check_distinct,
     image_name,
@@ -38,7 +42,6 @@ from chronoscene.formats.shared.transforms import (
     read_frames,
 )
 from chronoscene.formats.shared.transforms import make_scene as scene_from_shots
-from chronoscene.formats.shared.transforms_cameras import CameraTable
 from chronoscene.formats.shared.writing import ImageSource, Progress
 from chronoscene.scene import Camera, Points, Scene
 from chronoscene.scene.cameras import PINHOLE_MODELS

@@ -15,15 +15,13 @@ from chronoscene.formats.chronoscene import TEST, raise_first
 from chronoscene.formats.shared.colmap_layout import (
     find_model,
     layout,
-    make_scene,
-    read_images,
-    scan,
-)
-from chronoscene.formats.shared.colmap_writing import (
     lost_labels,
     lost_names,
+    make_scene,
     new_names,
     period_folders,
+    read_images,
+    scan,
     write_renamed,
 )
 from chronoscene.formats.shared.grouping import (

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats.chronoscene import LARGEST_COORDINATE, MOST_PERIODS
+from chronoscene.formats.chronoscene import MAX_COORDINATE, MAX_PERIODS
 from chronoscene.formats.nerfstudio_writing import FILE
 from chronoscene.formats.nerfstudio_writing import losses as losses  # part of the format
 from chronoscene.formats.nerfstudio_writing import write as write
@@ -37,10 +37,16 @@ from chronoscene.formats.shared.grouping import (
     group_times,
     rule_error,
 )
-from chronoscene.formats.shared.json_values import json_error, number, read_json
-from chronoscene.formats.shared.labels import parse_periods, parse_world
+from chronoscene.formats.shared.json_values import (
+    json_error,
+    number,
+    parse_periods,
+    parse_world,
+    read_json,
+)
 from chronoscene.formats.shared.ply import read_points
 from chronoscene.formats.shared.transforms import (
+    CameraTable,
     Shot,
     file_name,
     head_has,
@@ -51,7 +57,6 @@ from chronoscene.formats.shared.transforms import (
     pose_from_opengl,
     read_frames,
 )
-from chronoscene.formats.shared.transforms_cameras import CameraTable
 from chronoscene.scene import Period, Points, Scene, WorldFrame
 from chronoscene.scene.geometry import Sim3
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
@@ -255,7 +260,7 @@ def _group_by_ids(
 ) -> Grouped:
     ids = {name: frame.get("period") for name, frame in frames.items()}
     for name, value in ids.items():
-        if type(value) is not int or not 0 <= value < MOST_PERIODS:
+        if type(value) is not int or not 0 <= value < MAX_PERIODS:
             raise json_error(f"{place}: {name}", "a period 0, 1, ...", repr(value)[:40])
     used = sorted({value for value in ids.values() if value is not None})
     if used != list(range(len(used))):
@@ -286,7 +291,7 @@ def _to_original(path: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
     if scale is None and applied is None:
         return scene
     scale = 1.0 if scale is None else scale
-    if not 1 / LARGEST_COORDINATE < scale < LARGEST_COORDINATE:
+    if not 1 / MAX_COORDINATE < scale < MAX_COORDINATE:
         raise json_error(place, "a positive applied_scale", f"{scale:g}")
     full = np.eye(4) if applied is None else matrix(f"{place}: applied_transform", applied, (3, 4))
     rotation = nearest_rotation(f"{place}: applied_transform", full[:3, :3])

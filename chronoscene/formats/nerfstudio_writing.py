@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import check_name
-from chronoscene.formats.shared.labels import period_items, world_item
+from chronoscene.formats.shared.json_values import period_items, world_item
 from chronoscene.formats.shared.ply import write_points
-from chronoscene.formats.shared.transforms import opengl_from_pose
-from chronoscene.formats.shared.transforms_cameras import MODEL_KEYS
+from chronoscene.formats.shared.transforms import MODEL_KEYS, opengl_from_pose
 from chronoscene.formats.shared.writing import ImageSource, Progress, place_images, staged_folder
 from chronoscene.scene import Camera, Points, Scene
 

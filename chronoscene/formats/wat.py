@@ -21,14 +21,17 @@ from dataclasses import replace
 from pathlib import Path
 
 from chronoscene.errors import SceneError
-from chronoscene.formats.shared.colmap_layout import find_model, layout, make_scene, read_images
-from chronoscene.formats.shared.colmap_writing import (
+from chronoscene.formats.shared.colmap_layout import (
     as_pinhole,
+    find_model,
+    layout,
     lost_labels,
     lost_names,
     lost_split,
+    make_scene,
     new_names,
     period_folders,
+    read_images,
     write_renamed,
 )
 from chronoscene.formats.shared.grouping import group_labels

@@ -78,6 +78,9 @@ PINHOLE_MODELS = tuple(name for name, m in CAMERA_MODELS.items() if m.kind == "p
 POLYNOMIAL_MODELS = tuple(name for name, m in CAMERA_MODELS.items() if m.kind == "polynomial")
 """Camera models that are a pinhole where all their distortion parameters are zero."""
 
+MAX_SIDE = 1_000_000
+"""Pixels; beyond any image."""
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -109,6 +112,15 @@ class Camera:
         if self.model in POLYNOMIAL_MODELS:
             return not any(self.distortion)
         return self.model in PINHOLE_MODELS
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether size and parameters are plausible and finite, focal lengths positive."""
+        if not (1 <= self.width <= MAX_SIDE and 1 <= self.height <= MAX_SIDE):
+            return False
+        if not np.isfinite(self.params).all():
+            return False
+        return self.model == "EQUIRECTANGULAR" or bool((self.K[[0, 1], [0, 1]] > 0).all())
 
 
 def project_points(camera: Camera, xyz: Array) -> Array:

@@ -25,7 +25,7 @@ from chronoscene.colmap.raw_model import (
     read_raw_model,
 )
 from chronoscene.errors import SceneError
-from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name, is_usable
+from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name
 from chronoscene.scene import Camera
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.splits import (
@@ -184,7 +184,7 @@ class RawScene:
     @cached_property
     def usable_cameras(self) -> dict[int, Camera]:
         """Cameras by id, those with a size and focal lengths that mean something."""
-        usable = (c for c in self.cameras or () if is_usable(c) and c.model != "EQUIRECTANGULAR")
+        usable = (c for c in self.cameras or () if c.is_usable and c.model != "EQUIRECTANGULAR")
         return {camera.camera_id: camera for camera in usable}
 
     @cached_property

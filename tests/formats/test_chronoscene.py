@@ -12,7 +12,8 @@ import pytest
 from chronoscene.colmap.model import PosedImage
 from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
 from chronoscene.formats import detect_format, find_scenes, read_scene
-from chronoscene.formats.chronoscene import check_image, is_iso_date, read_periods, write
+from chronoscene.formats.chronoscene import check_image, read_periods, write
+from chronoscene.formats.shared.json_values import is_iso_date
 from chronoscene.scene import Camera, Period, WorldFrame
 from chronoscene.scene.splits import DEFAULT_RULE
 

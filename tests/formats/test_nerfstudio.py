@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import nerfstudio, read_scene
-from chronoscene.formats.shared.transforms import opengl_from_pose, pose_from_opengl
-from chronoscene.formats.shared.transforms_cameras import CameraTable
+from chronoscene.formats.shared.transforms import CameraTable, opengl_from_pose, pose_from_opengl
 from chronoscene.scene import Camera, Period
 from chronoscene.scene.geometry import (
     Sim3,

@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats.shared.labels import is_iso_date
+from chronoscene.formats.shared.json_values import is_iso_date
 from chronoscene.scene import Period
 from chronoscene.scene.splits import NameIndex, read_text
 

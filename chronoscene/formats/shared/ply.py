@@ -1,7 +1,14 @@
-"""Point clouds in PLY files: the vertices with their colours, nothing else."""
+"""Point clouds in PLY files: the vertices with their colours, nothing else.
+
+plyfile reads headers and writes files. The vertices are read here, because plyfile takes text value
+by value, reads whatever follows the vertices, and reserves memory for all elements that a header
+announces.
+"""
 
 from __future__ import annotations
 
+import io
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -9,21 +16,14 @@ from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from chronoscene.errors import SceneError
 from chronoscene.scene import Points
 
-TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
-    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
-"""Type names of PLY, old and new, as numpy writes them without the byte order."""
+MAX_HEADER_BYTES = 100_000
 
-BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
-
-MOST_HEADER_LINES = 1000
+COLOURS = ("red", "green", "blue")
 
 UNKNOWN_COLOUR = 128
 """Grey for points without a colour, in each channel."""
@@ -40,8 +40,7 @@ def read_points(path: Path) -> Points:
     """
     try:
         with path.open("rb") as file:
-            form, count, dtype = _read_header(path, file)
-            vertices = _read_vertices(path, file, form, count, dtype)
+            vertices = _read_vertices(path, file)
     except OSError as error:
         raise _error(path, "a PLY file", error.strerror or "an error") from error
     return _to_points(path, vertices)
@@ -49,63 +48,60 @@ def read_points(path: Path) -> Points:
 
 def write_points(path: Path, points: Points) -> None:
     """Write positions (double) and colours as a binary PLY file."""
-    vertices = np.empty(
-        len(points),
-        [*((axis, "<f8") for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))],
-    )
-    for i, (axis, colour) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
+    fields = [*((axis, "<f8") for axis in "xyz"), *((colour, "u1") for colour in COLOURS)]
+    vertices = np.empty(len(points), fields)
+    for i, (axis, colour) in enumerate(zip("xyz", COLOURS, strict=True)):
         vertices[axis], vertices[colour] = points.xyz[:, i], points.rgb[:, i]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    lines += [f"property double {axis}" for axis in "xyz"]
-    lines += [f"property uchar {colour}" for colour in ("red", "green", "blue")]
-    header = "\n".join([*lines, "end_header", ""])
-    path.write_bytes(header.encode() + vertices.tobytes())
+    PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(path)
 
 
-def _read_header(path: Path, file: BinaryIO) -> tuple[str, int, np.dtype]:
-    """Format, number of vertices and their record; leaves the file at the first vertex."""
-    if file.readline(100).strip() != b"ply":
+def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, np.dtype]:
+    """Whether the file is text, number of vertices, their record; stops at the first vertex."""
+    start = file.read(MAX_HEADER_BYTES)
+    if not re.match(rb"ply\s*\n", start):
         raise _error(path, 'a PLY file, whose first line is "ply"', "another")
-    form, element, count = "", "", -1
-    fields: list[tuple[str, str]] = []
-    for _ in range(MOST_HEADER_LINES):
-        match file.readline(1000).decode("ascii", "replace").split():
-            case ["end_header"]:
-                return form, count, _record(path, form, count, fields)
-            case ["format", form, _]:
-                pass
-            case ["element", element, number] if number.isdecimal():
-                if element == "vertex":
-                    count = int(number)
-                elif count < 0 and number != "0":
-                    raise _error(path, "vertices as the first element", repr(element))
-            case ["property", kind, name] if element == "vertex" and kind in TYPES:
-                fields.append((name, TYPES[kind]))
-            case ["property", *_] if element == "vertex":
-                raise _error(path, "numbers as properties of vertices", "a list or unknown type")
-    raise _error(path, "a header of PLY", "none that ends")
-
-
-def _record(path: Path, form: str, count: int, fields: list[tuple[str, str]]) -> np.dtype:
-    names = [name for name, _ in fields]
-    if form not in BYTE_ORDERS:
-        raise _error(path, f"a format {', '.join(BYTE_ORDERS)}", repr(form))
-    if count < 0 or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+    found = re.search(rb"\nend_header[ \t\r]*\n", start)
+    if found is None:
+        raise _error(path, "a header of PLY", "none that ends")
+    file.seek(found.end())
+    lines = [line.strip() for line in start[: found.end()].decode("ascii", "replace").split("\n")]
+    counts: dict[str, int] = {}
+    for i, line in enumerate(lines):
+        if line.startswith("element"):
+            element = re.fullmatch(r"element\s+(\S+)\s+([0-9]{1,100})", line)
+            if element is None:
+                raise _error(path, "elements with a name and a number", repr(line[:40]))
+            counts.setdefault(element[1], int(element[2]))
+            lines[i] = f"element {element[1]} 0"  # plyfile gets the header alone
+    try:
+        header = PlyData.read(io.BytesIO("\n".join(lines).encode("ascii", "replace")))
+    except (PlyParseError, ValueError) as error:
+        raise _error(path, "a header of PLY", str(error)) from error
+    if "vertex" not in counts:
+        raise _error(path, "vertices with x, y and z", "none")
+    first = next((name for name, count in counts.items() if count or name == "vertex"))
+    if first != "vertex":
+        raise _error(path, "vertices as the first element", repr(first))
+    properties = header["vertex"].properties
+    names = [p.name for p in properties]
+    if any(isinstance(p, PlyListProperty) for p in properties):
+        raise _error(path, "numbers as properties of vertices", "a list")
+    if not {"x", "y", "z"} <= set(names):
         raise _error(path, "vertices with x, y and z", ", ".join(names[:8]) or "none")
-    return np.dtype([(name, BYTE_ORDERS[form] + kind) for name, kind in fields])
+    order = "=" if header.text else header.byte_order
+    return header.text, counts["vertex"], np.dtype([(p.name, p.dtype(order)) for p in properties])
 
 
-def _read_vertices(
-    path: Path, file: BinaryIO, form: str, count: int, dtype: np.dtype
-) -> NDArray[np.void]:
+def _read_vertices(path: Path, file: BinaryIO) -> NDArray[np.void]:
+    is_text, count, dtype = _read_header(path, file)
+    names = dtype.names or ()
     left = path.stat().st_size - file.tell()
-    least = 2 * len(dtype.names or ()) if form == "ascii" else dtype.itemsize
-    if left + (form == "ascii") < count * least:  # the last line of a text may have no end
+    least = 2 * len(names) if is_text else dtype.itemsize
+    if left + is_text < count * least:  # the last line of a text may have no end
         raise _error(path, f"{count} vertices", f"{left} bytes after the header")
-    if form != "ascii":
+    if not is_text:
         return np.frombuffer(file.read(count * dtype.itemsize), dtype, count)
     vertices = np.zeros(count, dtype)
-    names = dtype.names or ()
     values = _read_table(path, file, count, len(names)) if count else np.zeros((0, len(names)))
     for i, name in enumerate(names):
         kind = dtype[name]
@@ -141,14 +137,13 @@ def _fits(values: NDArray[np.float64], limits: np.iinfo) -> bool:
 
 
 def _to_points(path: Path, vertices: NDArray[np.void]) -> Points:
-    names = vertices.dtype.names or ()
     with np.errstate(invalid="ignore"):  # NaN is refused next
         xyz = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
     if not np.isfinite(xyz).all():
         raise _error(path, "finite positions", "NaN or infinity")
     rgb = np.full((len(xyz), 3), UNKNOWN_COLOUR, np.uint8)
-    if {"red", "green", "blue"} <= set(names):
-        colours = [vertices[c] for c in ("red", "green", "blue")]
+    if set(COLOURS) <= set(vertices.dtype.names or ()):
+        colours = [vertices[c] for c in COLOURS]
         if any(c.dtype != np.uint8 for c in colours):
             raise _error(path, "colours of type uchar, 0..255", str(colours[0].dtype))
         rgb = np.stack(colours, axis=-1)

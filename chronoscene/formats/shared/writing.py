@@ -5,13 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import SceneError
@@ -114,16 +111,3 @@ def place_image(source: Path, target: Path, image_source: ImageSource) -> None:
         except OSError:
             pass  # another disk, or one without links
     shutil.copyfile(source, target)
-
-
-def renamed(scene: Scene, names: Mapping[str, str]) -> Scene:
-    """The same scene with other image names: frames sorted again, tracks following them.
-
-    The files keep their names, so `Scene.image_path` of the result is of no use.
-    """
-    new = [replace(frame, name=names[frame.name]) for frame in scene.frames]
-    order = sorted(range(len(new)), key=lambda i: new[i].name)
-    rank = np.empty(len(new), np.int32)
-    rank[order] = np.arange(len(new), dtype=np.int32)
-    points = replace(scene.points, track_frame=rank[scene.points.track_frame])
-    return replace(scene, frames=tuple(new[i] for i in order), points=points)

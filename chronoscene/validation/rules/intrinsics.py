@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.formats.chronoscene import is_usable
 from chronoscene.scene.cameras import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
 from chronoscene.validation.finding import Hit
 from chronoscene.validation.rule import rule
@@ -37,7 +36,7 @@ DROP = "write the camera as PINHOLE or SIMPLE_PINHOLE; its distortion is below h
 )
 def camera_unusable(scene: RawScene) -> Iterator[Hit]:
     for camera in _cameras(scene):
-        if not is_usable(camera):
+        if not camera.is_usable:
             expected = "a plausible size, positive focal lengths and finite parameters"
             params = ", ".join(f"{p:g}" for p in camera.params)
             found = f"{camera.width} x {camera.height}, parameters {params}"

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import plyfile
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -63,7 +64,6 @@ def test_byte_orders_and_other_properties(tmp_path, form, order):
 
 
 def test_agrees_with_another_reader(tmp_path):
-    plyfile = pytest.importorskip("plyfile")
     xyz = np.random.default_rng(0).normal(size=(20, 3))
     rgb = np.arange(60, dtype=np.uint8).reshape(20, 3)
     points = dataclasses.replace(Points.empty(), xyz=xyz, rgb=rgb, ids=np.arange(20))
@@ -85,9 +85,15 @@ def test_agrees_with_another_reader(tmp_path):
         ({"body": " " * 20 + "\n" * 20}, "1 vertices, found 0 lines|6 numbers for each"),
         ({"body": "1 2 x 4 5 6"}, "6 numbers for each vertex"),
         ({"body": "1 2 3 4 5\n..."}, "6 numbers for each vertex"),
-        ({"body": "", "form": "zip"}, "expected a format ascii|expected a format binary"),
+        (
+            {"body": "", "form": "zip"},
+            "a header of PLY, found line 2: don't understand format 'zip'",
+        ),
         ({"body": "", "properties": "property float x\n"}, "vertices with x, y and z"),
-        ({"body": "", "properties": XYZ + XYZ}, "vertices with x, y and z"),
+        (
+            {"body": "", "properties": XYZ + XYZ},
+            "a header of PLY, found two properties with same name",
+        ),
         ({"body": "", "properties": "property list uchar int i\n"}, "numbers as properties"),
         ({"body": "1 2 3 1 1 1", "properties": XYZ + RGB.replace("uchar", "float")}, "type uchar"),
     ],
@@ -95,6 +101,23 @@ def test_agrees_with_another_reader(tmp_path):
 def test_files_that_are_refused(tmp_path, options, message):
     with pytest.raises(SceneError, match=message):
         read_points(put(tmp_path / "p.ply", options.pop("body"), **options))
+
+
+@pytest.mark.parametrize("count", ["-1", "+9999999999", "9_999_999_999", "9" * 5000, "", "1 1"])
+@pytest.mark.parametrize("element", ["vertex", "face"])
+def test_counts_that_are_refused(tmp_path, element, count):
+    text = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex 0\n{XYZ}element {element} {count}\n"
+    )
+    (tmp_path / "p.ply").write_text(f"{text}end_header\n")
+    with pytest.raises(SceneError, match="expected elements with a name and a number"):
+        read_points(tmp_path / "p.ply")
+
+
+def test_what_follows_the_vertices_is_not_read(tmp_path):
+    faces = "element face 99999999999\nproperty list uchar int i\n"
+    path = put(tmp_path / "p.ply", "1 2 3 4 5 6\n3 0", properties=XYZ + RGB + faces)
+    assert read_points(path).xyz.tolist() == [[1, 2, 3]]
 
 
 @pytest.mark.parametrize("text", ["", "plyx\n", "ply\n", "ply\nformat ascii 1.0\nend_header\n"])
