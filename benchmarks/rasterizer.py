@@ -29,7 +29,7 @@ from peers import UnavailableError, cpu, cuda, gsplat_torch, scalar, torch_tiles
 from scenes import SIZES, Scene, surfaces
 
 from chronoscene.bench.provenance import code_version, processor_name
-from chronoscene.io.files import write_text_atomic
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.kernels.threads import available_threads, set_threads
 
@@ -177,7 +177,7 @@ def draw(panels: tuple[list[Row], list[Row]], path: Path) -> None:
     matplotlib.use("agg")
     import matplotlib.pyplot as plt
 
-    from chronoscene.io.files import replacing
+    from chronoscene.io.staging import replacing
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
     titles = ("Gaussians (400x300 pixels)", "pixels (100,000 Gaussians)")

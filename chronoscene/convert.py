@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene.checks import check_choice
-from chronoscene.errors import ConfigError
 from chronoscene.formats import load_format, read_scene, writable_formats
 from chronoscene.formats.shared.writing import ImageSource, Progress
+from chronoscene.io.staging import check_outside
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
@@ -55,36 +55,11 @@ def convert(
         ConfigError: If a format or grouping does not exist, or ``out`` is inside of ``source``.
     """
     check_choice("--to", target, writable_formats())
-    check_outside(source, out)
+    check_outside(out, [source])
     scene = read_scene(source, format=source_format, period_by=period_by)
     warnings = (*remarks_on(scene), *losses(scene, target), *obstacles(scene))
     load_format(target).write(scene, out, image_source=image_source, progress=progress)
     return Conversion(scene, out, target, warnings)
-
-
-def check_outside(source: Path, out: Path) -> None:
-    """Refuse to write into the folder of a scene, also where parts of it are links to folders.
-
-    Raises:
-        ConfigError: If ``out`` is ``source`` or below it, or below what a folder in it links to.
-    """
-    linked = [path for path in _entries(source) if path.is_symlink() and path.is_dir()]
-    for folder in (source, *linked):
-        if out.resolve().is_relative_to(folder.resolve()):
-            raise ConfigError(
-                out,
-                expected="a place outside of the source",
-                found=f"one in {folder}",
-                todo="choose another; scenes are never written into",
-            )
-
-
-def _entries(folder: Path) -> list[Path]:
-    """What is in a folder; nothing where it cannot be looked into."""
-    try:
-        return sorted(folder.iterdir())
-    except OSError:
-        return []
 
 
 def remarks_on(scene: Scene) -> list[str]:

@@ -18,7 +18,7 @@ from PIL import Image
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats.shared.writing import ImageSource, Progress, place_image, staged_folder
+from chronoscene.formats.shared.writing import ImageSource, Progress, place_image
 from chronoscene.images.resampling import warp
 from chronoscene.images.store import load_rgb
 from chronoscene.images.undistortion import (
@@ -27,6 +27,7 @@ from chronoscene.images.undistortion import (
     plan_cameras,
     sampling_map,
 )
+from chronoscene.io.staging import staged_folder
 from chronoscene.kernels.threads import available_threads
 from chronoscene.scene import Scene
 

@@ -71,7 +71,7 @@ def test_equal_file_names_stay_apart(make_scene_folder, tmp_path):
 def test_never_into_the_source(make_scene_folder, out):
     folder = make_scene_folder()
     before = snapshot(folder)
-    with pytest.raises(ConfigError, match="a place outside of the source"):
+    with pytest.raises(ConfigError, match="a place outside of the scene"):
         convert(folder, folder / out)
     assert snapshot(folder) == before
 
@@ -79,7 +79,7 @@ def test_never_into_the_source(make_scene_folder, out):
 def test_never_into_the_source_through_a_link(make_scene_folder, tmp_path):
     folder = make_scene_folder()
     (tmp_path / "link").symlink_to(folder)
-    with pytest.raises(ConfigError, match="a place outside of the source"):
+    with pytest.raises(ConfigError, match="a place outside of the scene"):
         convert(folder, tmp_path / "link" / "new")
 
 

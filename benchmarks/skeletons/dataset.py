@@ -19,7 +19,7 @@ from chronoscene.colmap.arrays import RawPoints
 from chronoscene.colmap.write import posed_images, write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as scene_format
-from chronoscene.formats.shared.writing import staged_folder
+from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, WorldFrame
 from chronoscene.scene.splits import TEST_EVERY, format_split_text
 from chronoscene.stats.published import PAPER_COUNTS

@@ -19,7 +19,7 @@ from chronoscene.bench.predictions import (
     safe_name,
 )
 from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord, read_run, run_folders
-from chronoscene.io.files import replacing
+from chronoscene.io.staging import replacing
 from chronoscene.metrics.psnr_ssim import psnr
 
 CELL_WIDTH = 2.6

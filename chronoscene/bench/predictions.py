@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from chronoscene.bench.results import GROUND_TRUTH
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.images.store import ImageStore
-from chronoscene.io.files import write_text_atomic
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.scene import Scene
 
 MANIFEST = "manifest.json"

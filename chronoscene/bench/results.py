@@ -16,7 +16,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from chronoscene.errors import CheckpointError
-from chronoscene.io.files import write_text_atomic
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import csv_text
 
 RUN_FILE = "run.json"

@@ -46,8 +46,8 @@ from chronoscene.bench.training_loop import (
 from chronoscene.errors import BackendError, ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
-from chronoscene.io.files import write_text_atomic
 from chronoscene.io.processes import Report
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.kernels.threads import set_threads

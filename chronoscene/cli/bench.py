@@ -15,6 +15,7 @@ from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.table import split_list
 from chronoscene.errors import ConfigError
 from chronoscene.images.store import MAX_WIDTH
+from chronoscene.io.staging import check_outside
 
 SOME_FAILED = 1
 """Exit status when a run failed; the others have their results."""
@@ -84,6 +85,7 @@ def command(
     predictions and its scores. Finished runs are kept, so the same command goes on after an
     interruption.
     """
+    check_outside(out, scenes, option="--out")
     check_place("--out", out)
     names = split_list("--method", methods)
     if any(":" in name for name in names) and str(Path.cwd()) not in sys.path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from errno import EISDIR
 from os import strerror
@@ -13,7 +13,7 @@ from tempfile import TemporaryFile
 import click
 
 from chronoscene.errors import ConfigError
-from chronoscene.io.files import write_text_atomic
+from chronoscene.io.staging import write_text_atomic
 
 FILE = "a file that can be written"
 
@@ -89,18 +89,3 @@ def check_file(option: str, file: Path | None) -> None:
             raise IsADirectoryError(EISDIR, strerror(EISDIR))
         with TemporaryFile(dir=file.absolute().parent):
             pass
-
-
-def check_outside(option: str, place: Path | None, scenes: Iterable[Path]) -> None:
-    """See that a place is in none of some scenes: nothing is written into a dataset.
-
-    Raises:
-        ConfigError: If it is.
-    """
-    if place is not None and any(place.resolve().is_relative_to(s.resolve()) for s in scenes):
-        raise ConfigError(
-            f"{option} {place}",
-            expected="a place outside of the scenes",
-            found="one inside",
-            todo="choose another place: nothing is written into a dataset",
-        )

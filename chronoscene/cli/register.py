@@ -8,8 +8,8 @@ import click
 
 from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
-from chronoscene.convert import check_outside
 from chronoscene.formats import read_scene
+from chronoscene.io.staging import check_outside
 from chronoscene.registration.inspection import Inspection
 from chronoscene.registration.photos.camera_sharing import (
     CALIBRATIONS,
@@ -145,7 +145,9 @@ def command(
     """
     for option, place in (("OUT", out), ("--work", work)):
         if place is not None:
-            check_outside(captures if captures.is_dir() else captures.parent, place)
+            check_outside(
+                place, [captures if captures.is_dir() else captures.parent], option=option
+            )
             check_place(option, place)
     found = read_captures(captures, table=table)
     options = Options(
@@ -168,7 +170,7 @@ def command(
         if scene is None:
             registered = run(found, out, options, report=report, inspected=inspections.append)
         else:
-            check_outside(scene, out)
+            check_outside(out, [scene], option="OUT")
             old = read_scene(scene)
             registered = run_into(
                 old, found, out, options, report=report, inspected=inspections.append

@@ -11,11 +11,10 @@ import click
 from chronoscene.cli.convert import describe_period
 from chronoscene.cli.output import check_place, emit, writing_to
 from chronoscene.cli.progress import progress_bar
-from chronoscene.convert import check_outside
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import format_names, read_scene
-from chronoscene.io.files import write_text_atomic
+from chronoscene.io.staging import check_outside, write_text_atomic
 from chronoscene.scene.split_making import (
     FRACTION,
     STRATEGIES,
@@ -124,7 +123,7 @@ def _check_targets(source: Path, out: Path | None, scene_out: Path | None) -> No
         raise click.UsageError("give a file OUT, or --scene-out")
     for target in (out, scene_out):
         if target is not None:
-            check_outside(source, target)
+            check_outside(target, [source])
     if scene_out is not None:
         check_place("--scene-out", scene_out)
     if out is not None and not out.name:

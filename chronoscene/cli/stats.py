@@ -12,11 +12,12 @@ from typing import Any, Literal
 
 import click
 
-from chronoscene.cli.output import check_file, check_outside, check_place, emit, writing_to
+from chronoscene.cli.output import check_file, check_place, emit, writing_to
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import find_scenes, format_names, read_scene
 from chronoscene.io.processes import map_parallel
+from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import printable
 from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.stats import (
@@ -235,11 +236,12 @@ def _file_names(paths: Sequence[Path]) -> list[str]:
 
 def _check_places(request: Request, out: Path | None, paths: Sequence[Path]) -> None:
     """Make the folders for figures and pages; refuse to write into a scene."""
-    check_outside("--out", out, paths)
+    if out is not None:
+        check_outside(out, paths, option="--out")
     check_file("--out", out)
     for option, place in (("--figures", request.figures), ("--pages", request.pages)):
         if place is not None:
-            check_outside(option, place, paths)
+            check_outside(place, paths, option=option)
             with writing_to(option, place, expected="a folder that can be made"):
                 place.mkdir(parents=True, exist_ok=True)
             check_place(option, place)

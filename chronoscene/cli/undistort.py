@@ -10,9 +10,9 @@ import click
 from chronoscene.cli.convert import LINKS, describe
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
-from chronoscene.convert import check_outside
 from chronoscene.formats import format_names, read_scene
 from chronoscene.images.undistortion import CameraChange
+from chronoscene.io.staging import check_outside
 from chronoscene.scene.splits import split_hash
 from chronoscene.undistort import Undistortion, undistort
 
@@ -53,7 +53,7 @@ def command(
     distortion are copied, others become RGB of 8 bits, on black where transparent. SCENE is left
     alone. OUT is in the ChronoScene format.
     """
-    check_outside(source, out)
+    check_outside(out, [source])
     with progress_bar() as bar:
         done = undistort(
             read_scene(source, format=scene_format),

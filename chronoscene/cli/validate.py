@@ -8,9 +8,10 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.output import check_file, check_outside, emit
+from chronoscene.cli.output import check_file, check_place, emit
 from chronoscene.cli.progress import tracked
 from chronoscene.io.processes import map_parallel
+from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted, printable
 from chronoscene.kernels.allocator import keep_freed_memory
 from chronoscene.validation.repair.fix import fix_scene
@@ -99,9 +100,12 @@ def command(
     choose_rules(_codes(select), _codes(ignore))  # whatever is wrong with them is said first
     folders = find_folders(folder)
     for option, file in (("--out", out), ("--sarif", sarif), ("--html", html)):
-        check_outside(option, file, folders)
+        if file is not None:
+            check_outside(file, folders, option=option)
         check_file(option, file)
     if fix is not None:
+        check_outside(fix, folders, option="--fix")
+        check_place("--fix", fix)
         folders = _fix(folder, folders, fix)
     if len(folders) == 1:
         reports = [check(folders[0], track=tracked)]

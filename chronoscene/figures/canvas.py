@@ -9,7 +9,7 @@ from warnings import catch_warnings, filterwarnings
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.io.files import replacing
+from chronoscene.io.staging import replacing
 from chronoscene.io.wording import printable
 
 DPI = 200

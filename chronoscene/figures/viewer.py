@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from chronoscene.figures.canvas import period_colors
 from chronoscene.figures.cloud import Cloud, cloud_of, shown_box
-from chronoscene.io.files import write_text_atomic
 from chronoscene.io.pages import render_page
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.scene import Scene
 
 Array = NDArray[np.float64]

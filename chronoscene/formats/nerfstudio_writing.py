@@ -15,7 +15,8 @@ from chronoscene.formats.chronoscene import check_name
 from chronoscene.formats.shared.json_values import period_items, world_item
 from chronoscene.formats.shared.ply import write_points
 from chronoscene.formats.shared.transforms import MODEL_KEYS, opengl_from_pose
-from chronoscene.formats.shared.writing import ImageSource, Progress, place_images, staged_folder
+from chronoscene.formats.shared.writing import ImageSource, Progress, place_images
+from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Points, Scene
 
 FILE = "transforms.json"

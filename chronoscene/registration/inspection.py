@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from chronoscene.io.files import write_text_atomic
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, certify
 from chronoscene.registration.quality.certificate_json import to_json
 from chronoscene.registration.quality.verdict import Verdict, judge

@@ -15,7 +15,7 @@ import numpy as np
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared.writing import Progress
-from chronoscene.io.files import write_text_atomic
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Frame, Period, Points, Scene, WorldFrame
 from chronoscene.scene.splits import default_tests, split_of

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.errors import RegistrationError
-from chronoscene.io.files import write_text_atomic
+from chronoscene.io.staging import write_text_atomic
 
 VERSION = 1
 """Of what stages store; another version is not read."""

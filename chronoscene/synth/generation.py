@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 import warnings
 from collections.abc import Callable, Sequence
 from datetime import date
@@ -11,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as scene_format
+from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Frame, Period, Points, Scene, WorldFrame
 from chronoscene.synth.city.plan import make_world
 from chronoscene.synth.city.world import World
@@ -31,46 +29,13 @@ FIRST_YEAR = 2016
 def run(out: Path, settings: SynthSettings, progress: Progress | None = None) -> None:
     """Make a scene; see `chronoscene.synth.generate`. The folder appears complete or not at all."""
     load_open3d()
-    _refuse_used(out)
-    _make_parent(out)
-    with (
-        warnings.catch_warnings(),
-        tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary,
-    ):
+    with warnings.catch_warnings(), staged_folder(out) as staged:
         # open3d loads a TBB that Numba finds too old; Numba then takes another layer, and says so.
         warnings.filterwarnings("ignore", message="The TBB threading layer")
-        raw, staged = Path(temporary) / "raw", Path(temporary) / "scene"
+        raw = staged.parent / "raw"
         scene = _make(raw, settings, progress or (lambda done, total, what: None), out.name)
         scene_format.write(scene, staged, image_source="link")
         (raw / "gt").rename(staged / "gt")
-        if out.exists():
-            out.rmdir()
-        staged.rename(out)
-
-
-def _refuse_used(out: Path) -> None:
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise SceneError(
-            out,
-            expected="a new or empty folder",
-            found="a folder with files" if out.is_dir() else "a file",
-            todo="choose another folder, or empty this one",
-        )
-
-
-def _make_parent(out: Path) -> None:
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        writable = os.access(out.parent, os.W_OK)
-    except OSError:
-        writable = False
-    if not writable:
-        raise SceneError(
-            out.parent,
-            expected="a folder that can be written",
-            found="one that cannot",
-            todo="choose another place for the scene",
-        )
 
 
 def _make(raw: Path, settings: SynthSettings, progress: Progress, name: str) -> Scene:

@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from chronoscene.errors import CheckpointError
-from chronoscene.io.files import replacing, write_text_atomic
+from chronoscene.io.staging import replacing, write_text_atomic
 from chronoscene.scene.geometry import Sim3
 
 TENSOR_FILE = "model.safetensors"

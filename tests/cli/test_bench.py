@@ -62,6 +62,18 @@ def test_bench_score_and_table(make_scene_folder, tmp_path):
     assert macro == [record["aggregates"]["macro"]["psnr"]]
 
 
+def test_runs_inside_a_scene_are_refused(make_scene_folder, tmp_path):
+    scene = make_scene_folder(IMAGES, tests=TESTS, name="place")
+    (tmp_path / "link").symlink_to(scene)
+    before = sorted(scene.rglob("*"))
+    for out in (scene / "runs", scene, tmp_path / "link" / "runs"):
+        with pytest.raises(ConfigError, match=r"^--out .*: expected a place outside of the scene"):
+            bench_module.command.main(
+                [str(scene), "--method", "3dgs", "--out", str(out)], standalone_mode=False
+            )
+    assert sorted(scene.rglob("*")) == before
+
+
 def test_a_plug_in_in_the_current_folder(make_scene_folder, tmp_path):
     scene = make_scene_folder(IMAGES, tests=TESTS)
     source = (PLUGINS / "toy_methods.py").read_text().replace("toy_methods:", "my_method:")

@@ -63,7 +63,7 @@ def test_help_lists_formats_and_groupings():
     ("arguments", "message"),
     [
         (["{tmp}/absent", "{tmp}/out"], "expected a scene folder, found nothing"),
-        (["{scene}", "{scene}/out"], "expected a place outside of the source"),
+        (["{scene}", "{scene}/out"], "expected a place outside of the scene"),
         (["{scene}", "{tmp}"], "expected a new or empty folder"),
         (["{scene}", "{tmp}/out", "--period-by", "year"], "--period-by: expected no such option"),
     ],

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from chronoscene.errors import ChronoSceneError, SceneError
-from chronoscene.io.files import replacing
 from chronoscene.io.processes import Outcome, map_parallel, run_worker, stoppable
+from chronoscene.io.staging import replacing
 
 
 def process_of(item: int) -> tuple[int, int]:

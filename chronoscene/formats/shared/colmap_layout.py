@@ -27,7 +27,8 @@ from chronoscene.formats.chronoscene import (
     make_frames,
 )
 from chronoscene.formats.shared.grouping import label_date, natural_key
-from chronoscene.formats.shared.writing import ImageSource, Progress, place_image, staged_folder
+from chronoscene.formats.shared.writing import ImageSource, Progress, place_image
+from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Scene, WorldFrame
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 

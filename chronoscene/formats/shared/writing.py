@@ -1,12 +1,10 @@
-"""What all writers share: folders that appear complete or not at all, and images placed in them."""
+"""What all writers share: images copied or linked into a new folder."""
 
 from __future__ import annotations
 
 import os
 import shutil
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -21,46 +19,6 @@ IMAGE_SOURCES: tuple[ImageSource, ...] = ("copy", "link", "symlink", "none")
 
 Progress = Callable[[int, int], None]
 """Called with the number of images done and their total."""
-
-
-@contextmanager
-def staged_folder(out: Path) -> Iterator[Path]:
-    """A temporary folder beside ``out``, renamed to it if the block ends well, else deleted.
-
-    Raises:
-        SceneError: If ``out`` is a file or has content, or the disk refuses.
-    """
-    try:
-        if out.resolve() == Path.cwd():  # a shell would stay in the folder that is replaced
-            raise SceneError(
-                out,
-                expected="another folder than the one you are in",
-                found="that one",
-                todo="go up and name it, or name a new folder",
-            )
-        out = out.resolve()
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise SceneError(
-                out,
-                expected="a new or empty folder",
-                found="one in use",
-                todo="choose another folder",
-            )
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
-            staged = Path(temporary) / "scene"
-            staged.mkdir()
-            yield staged
-            if out.exists():
-                out.rmdir()
-            staged.rename(out)
-    except OSError as error:
-        raise SceneError(
-            error.filename or out,
-            expected="a place that can be written to",
-            found=error.strerror or str(error),
-            todo="choose another folder, or make room",
-        ) from error
 
 
 def place_images(

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.io.files import write_text_atomic
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.features import feature_reuse
 from chronoscene.registration.worker import Report
 

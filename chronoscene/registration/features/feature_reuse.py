@@ -17,8 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from chronoscene.io.files import write_text_atomic
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.io.staging import write_text_atomic
 
 METHOD = 1
 """Version of extraction and matching; raise it when they change in a way no setting shows."""

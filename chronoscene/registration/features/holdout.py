@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from chronoscene.io.files import replacing
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.io.staging import replacing
 from chronoscene.registration.features.database import keypoints_of, quiet, verified_matches
 from chronoscene.registration.worker import Report
 

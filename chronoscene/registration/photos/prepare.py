@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from PIL import Image
 
 from chronoscene.images.store import load_rgb
-from chronoscene.io.files import replacing
+from chronoscene.io.staging import replacing
 from chronoscene.registration.photos.photo import Capture
 
 _ORIENTATION = 0x0112

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from chronoscene import __version__
-from chronoscene.io.files import write_text_atomic
 from chronoscene.io.pages import render_page
+from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, PairFigures
 from chronoscene.registration.quality.certificate_json import Figure, pair_figures, period_figures
 from chronoscene.registration.quality.rays import Array

@@ -9,7 +9,6 @@ import json
 import os
 import shutil
 import struct
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from chronoscene.colmap.raw_model import FORMS, MODEL_FILES, RawModel
 from chronoscene.colmap.write import write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD
-from chronoscene.io.files import write_text_atomic
+from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
 from chronoscene.validation.checks.spelling import spelling
@@ -43,42 +42,13 @@ def fix_scene(root: Path, out: Path) -> list[Repair]:
         What was done.
 
     Raises:
-        ConfigError: If ``out`` is in use, inside the scene, or cannot be written, or the scene is
-            of another format.
+        ConfigError: If ``out`` is inside the scene, or the scene is of another format.
+        SceneError: If ``out`` is in use or cannot be written.
     """
-    _check_out(root, out)
+    check_outside(out, [root], option="--fix")
     _check_format(root)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
-            staged = Path(temporary) / "scene"
-            staged.mkdir()
-            with quiet_numbers():
-                repairs = _Fix(RawScene(root), staged).run()
-            if out.exists():
-                out.rmdir()
-            staged.rename(out)
-    except OSError as error:
-        raise ConfigError(
-            f"--fix {out}",
-            expected="a folder that can be written",
-            found=error.strerror or "an error",
-            todo="choose another place",
-        ) from error
-    return repairs
-
-
-def _check_out(root: Path, out: Path) -> None:
-    used = out.exists() and (not out.is_dir() or any(out.iterdir()))
-    inside = out.resolve().is_relative_to(root.resolve())
-    if used or inside:
-        found = "one in use" if used else "one inside the scene"
-        raise ConfigError(
-            f"--fix {out}",
-            expected="a new or empty folder beside the scene",
-            found=found,
-            todo="choose another folder",
-        )
+    with staged_folder(out) as staged, quiet_numbers():
+        return _Fix(RawScene(root), staged).run()
 
 
 def _check_format(root: Path) -> None:

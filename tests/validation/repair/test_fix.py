@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from chronoscene.colmap.raw_model import read_raw_model
-from chronoscene.errors import ConfigError
+from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.io.processes import stoppable
 from chronoscene.validation.repair.fix import fix_scene
@@ -306,7 +306,7 @@ def test_where_it_may_not_go(scene, tmp_path, place):
     (tmp_path / "used/file").write_text("x")
     (tmp_path / "file").write_text("x")
     digest = hashlib.sha256(repr(state(scene.root)).encode()).digest()
-    with pytest.raises(ConfigError, match="choose another folder"):
+    with pytest.raises(ChronoSceneError, match="choose another"):
         fix_scene(scene.root, tmp_path / place)
     assert hashlib.sha256(repr(state(scene.root)).encode()).digest() == digest
 
@@ -316,7 +316,7 @@ def test_nothing_is_left_behind_by_a_failure(scene, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("chronoscene.validation.repair.fix._link", full)
-    with pytest.raises(ConfigError, match="No space left"):
+    with pytest.raises(SceneError, match="No space left"):
         fix_scene(scene.root, tmp_path / "fixed")
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 

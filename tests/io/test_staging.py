@@ -2,7 +2,7 @@
 
 import pytest
 
-from chronoscene.io.files import replacing, write_text_atomic
+from chronoscene.io.staging import replacing, write_text_atomic
 
 
 def test_text_is_utf8_with_plain_line_ends(tmp_path):

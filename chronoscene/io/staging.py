@@ -1,0 +1,106 @@
+"""Files and folders that appear complete or not at all, and never inside of a dataset."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from chronoscene.errors import ConfigError, SceneError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside a file, renamed to it if the block ends well, else deleted.
+
+    Args:
+        path: The file to write; its folder must exist. Another file of this name is replaced.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def write_text_atomic(path: Path, text: str) -> None:
+    r"""Write a text file in UTF-8 with ``\n`` at the ends of lines; see `replacing`."""
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8", newline="\n")
+
+
+@contextmanager
+def staged_folder(out: Path) -> Iterator[Path]:
+    """A temporary folder beside ``out``, renamed to it if the block ends well, else deleted.
+
+    Raises:
+        SceneError: If ``out`` is a file or has content, or the disk refuses.
+    """
+    try:
+        if out.resolve() == Path.cwd():  # a shell would stay in the folder that is replaced
+            raise SceneError(
+                out,
+                expected="another folder than the one you are in",
+                found="that one",
+                todo="go up and name it, or name a new folder",
+            )
+        out = out.resolve()
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise SceneError(
+                out,
+                expected="a new or empty folder",
+                found="one in use" if out.is_dir() else "a file",
+                todo="choose another folder",
+            )
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
+            staged = Path(temporary) / "scene"
+            staged.mkdir()
+            yield staged
+            if out.exists():
+                out.rmdir()
+            staged.rename(out)
+    except OSError as error:
+        raise SceneError(
+            error.filename or out,
+            expected="a place that can be written to",
+            found=error.strerror or str(error),
+            todo="choose another folder, or make room",
+        ) from error
+
+
+def check_outside(place: Path, scenes: Iterable[Path], *, option: str = "") -> None:
+    """Refuse a place in the folder of a scene, also where its parts are links to other folders.
+
+    Args:
+        place: Where something is to be written.
+        scenes: Folders of scenes, or of photos.
+        option: What the user named the place with.
+
+    Raises:
+        ConfigError: If the place is one of the folders, or below one or what a folder in it links
+            to.
+    """
+    resolved = place.resolve()
+    for scene in scenes:
+        linked = [path for path in _entries(scene) if path.is_symlink() and path.is_dir()]
+        for folder in (scene, *linked):
+            if resolved.is_relative_to(folder.resolve()):
+                raise ConfigError(
+                    f"{option} {place}".strip(),
+                    expected="a place outside of the scene",
+                    found=f"one in {folder}",
+                    todo="choose another place: nothing is written into a dataset",
+                )
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What is in a folder; nothing where it cannot be looked into."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
