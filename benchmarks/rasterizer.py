@@ -30,8 +30,7 @@ from scenes import SIZES, Scene, surfaces
 
 from chronoscene.bench.provenance import code_version, processor_name
 from chronoscene.io.staging import write_text_atomic
-from chronoscene.kernels.allocator import keep_freed_memory
-from chronoscene.kernels.threads import available_threads, set_threads
+from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
 
 SLOW_LIMIT = 60.0
 """Seconds: a peer whose one run at a size takes longer than its share of this is not run at the

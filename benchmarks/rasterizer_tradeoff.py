@@ -213,7 +213,7 @@ def work(arguments: Sequence[str], inputs: IO[str]) -> None:
     from peers import cpu
     from scenes import surfaces
 
-    from chronoscene.kernels.threads import set_threads
+    from chronoscene.kernels.runtime import set_threads
 
     count, width, threads = map(int, arguments[:3])
     set_threads(threads)
@@ -282,7 +282,7 @@ def main() -> None:
         work(sys.argv[2:], sys.stdin)
         return
     from chronoscene.bench.provenance import code_version, processor_name
-    from chronoscene.kernels.threads import available_threads
+    from chronoscene.kernels.runtime import available_threads
 
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=30)

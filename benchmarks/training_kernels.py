@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.decode.heads import HeadWeights, decode, decode_active, decode_reference
-from chronoscene.kernels.threads import available_threads, set_threads
+from chronoscene.kernels.runtime import available_threads, set_threads
 from chronoscene.training.losses import photometric_loss, photometric_loss_reference
 from chronoscene.training.optimizer import Adam
 from chronoscene.training.row_adam import DenseTable, RowAdam, Table

@@ -41,9 +41,8 @@ from chronoscene.bench.provenance import code_version, processor_name
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
-from chronoscene.kernels.allocator import keep_freed_memory
-from chronoscene.kernels.threads import available_threads, set_threads
-from chronoscene.rasterizer.cpu.function import Render
+from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
+from chronoscene.rasterizer.cpu import Render
 from chronoscene.training import losses
 from chronoscene.training.row_adam import DenseTable, RowAdam
 

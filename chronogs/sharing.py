@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.model import AnchorLayout, AnchorModel
+from chronoscene.kernels.compilation import kernel
 
 
 @torch.no_grad()
@@ -37,7 +38,7 @@ def share_periods(model: AnchorModel, threshold: float) -> None:
     _shrink(array, layout.base_dim, layout.num_periods, layout.period_dim, threshold)
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def _shrink(
     features: NDArray[np.float32], base_dim: int, periods: int, dim: int, threshold: float
 ) -> None:

@@ -28,7 +28,7 @@ from chronoscene.images.undistortion import (
     sampling_map,
 )
 from chronoscene.io.staging import staged_folder
-from chronoscene.kernels.threads import available_threads
+from chronoscene.kernels.runtime import available_threads
 from chronoscene.scene import Scene
 
 JPEG_QUALITY = 95

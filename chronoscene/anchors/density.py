@@ -10,11 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.voxels import cell_indices, pack_cells
+from chronoscene.kernels.compilation import kernel
 
 Float = NDArray[np.float32]
 
@@ -75,7 +76,7 @@ _CHUNK = 512
 """Anchors whose Gaussians one task looks up together."""
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def _accumulate(  # type: ignore[no-untyped-def]
     visible, positions, opacities, radii, grad, half_width, half_height,
     opacity_sum, visits, motion, grad_sum, hits,

@@ -7,10 +7,12 @@ anchor's scale and no rotation; the projection is that of the rasterizer (EWA, Z
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from chronoscene.kernels.compilation import kernel
 from chronoscene.methods import View
+from chronoscene.rasterizer import constants
 from chronoscene.rasterizer.constants import CLAMP_MARGIN, EPS2D, FAR_PLANE
 
 _EXTENT = 3.33
@@ -50,7 +52,7 @@ def visible_anchors(
     return np.flatnonzero(mask)
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True, extras=[constants])
 def _mark(  # type: ignore[no-untyped-def]
     anchors, log_scales, pose, intrinsics, width, height, near, far, extent, mask
 ):

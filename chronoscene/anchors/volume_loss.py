@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 from torch import Tensor
+
+from chronoscene.kernels.compilation import kernel
 
 _CHUNK = 4096
 """Rows that are summed one after the other; fixed, so the sum does not depend on the threads."""
@@ -54,7 +56,7 @@ class _MeanVolume(torch.autograd.Function):
         return result, None
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def _sum_volumes(
     scales: NDArray[np.float32],
     opacities: NDArray[np.float32],
@@ -70,7 +72,7 @@ def _sum_volumes(
         sums[c], counts[c] = total, count
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def _volume_gradients(
     scales: NDArray[np.float32],
     opacities: NDArray[np.float32],

@@ -19,7 +19,7 @@ from chronoscene.formats import find_scenes, format_names, read_scene
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import printable
-from chronoscene.kernels.allocator import keep_freed_memory
+from chronoscene.kernels.runtime import keep_freed_memory
 from chronoscene.stats import (
     COUNT_RULES,
     DETAIL_WRITERS,

@@ -13,7 +13,7 @@ from chronoscene.cli.progress import tracked
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted, printable
-from chronoscene.kernels.allocator import keep_freed_memory
+from chronoscene.kernels.runtime import keep_freed_memory
 from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.report.html import write_html
 from chronoscene.validation.report.json import write_json

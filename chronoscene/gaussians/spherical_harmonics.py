@@ -18,8 +18,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import prange
 from torch import Tensor
+
+from chronoscene.kernels.compilation import inner, kernel
 
 MAX_DEGREE = 3
 NUM_BASES = (MAX_DEGREE + 1) ** 2
@@ -131,7 +133,7 @@ class _Evaluate(torch.autograd.Function):
         return grad_dc, grad_rest, grad_means, None, None
 
 
-@njit(cache=True, inline="always")
+@inner(inline="always")
 def _write_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
     """The values without the constant one: ``out[k - 1]`` is basis k. [15]"""
     out[0], out[1], out[2] = -_C1 * y, _C1 * z, -_C1 * x
@@ -149,7 +151,7 @@ def _write_basis(x, y, z, degree, out):  # type: ignore[no-untyped-def]
     out[14] = -_C3_3 * x * (xx - 3 * yy)
 
 
-@njit(cache=True, inline="always")
+@inner(inline="always")
 def _direction_gradient(x, y, z, degree, s):  # type: ignore[no-untyped-def]
     """``sum_k s[k] * d basis_k / d (x, y, z)``, the polynomials taken as free of |d| = 1."""
     gx, gy, gz = -_C1 * s[2], -_C1 * s[0], _C1 * s[1]
@@ -170,7 +172,7 @@ def _direction_gradient(x, y, z, degree, s):  # type: ignore[no-untyped-def]
     return gx, gy, gz
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _forward(sh_dc, sh_rest, means, centre, degree, colors):  # type: ignore[no-untyped-def]
     count, active = len(means), (degree + 1) ** 2 - 1
     for block in prange((count + BLOCK - 1) // BLOCK):
@@ -196,7 +198,7 @@ def _forward(sh_dc, sh_rest, means, centre, degree, colors):  # type: ignore[no-
             colors[n, 2] = max(b, np.float32(0.0))
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _backward(  # type: ignore[no-untyped-def]
     sh_rest, means, centre, degree, colors, grad_colors, grad_dc, grad_rest, grad_means
 ):

@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from chronoscene.kernels.compilation import inner, kernel
 
-@njit(cache=True, nogil=True)
+
+@inner
 def _weights(t: float, out: NDArray[np.float64]) -> None:
     """Weights of the four neighbours of a place a share ``t`` of the way between the middle two."""
     out[0] = t * (-0.5 + t * (1.0 - 0.5 * t))
@@ -22,7 +23,7 @@ def _weights(t: float, out: NDArray[np.float64]) -> None:
     out[3] = t * t * (-0.5 + 0.5 * t)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _warp(
     image: NDArray[np.uint8],
     x: NDArray[np.float32],

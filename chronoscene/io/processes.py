@@ -31,7 +31,7 @@ from functools import partial
 from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 from chronoscene.errors import ChronoSceneError
-from chronoscene.kernels.threads import available_threads
+from chronoscene.kernels.runtime import available_threads
 
 if TYPE_CHECKING:
     from subprocess import Popen

@@ -1,6 +1,6 @@
 """Small matrix products inside compiled kernels, at a good part of the processor's peak.
 
-A matrix is ``(memory, start, row)``, memory as in `_simd`, with the distance between rows; a left
+A matrix is ``(memory, start, row)``, memory as in `memory`, with the distance between rows; a left
 factor is ``(memory, start, row, step)`` with the distance between columns too, so that it can be
 read transposed. Lengths are padded to `PADDING`, so there are no remainders.
 """
@@ -12,18 +12,17 @@ from typing import Any
 from numba import types
 from numba.core import cgutils
 
-from chronoscene.kernels.registers import (
+from chronoscene.kernels.compilation import inner
+from chronoscene.kernels.memory import emit_address, emit_load, emit_store
+from chronoscene.kernels.vectors import (
+    FLOAT,
     LANES,
     MANY_REGISTERS,
-    emit_address,
-    emit_constant,
-    emit_load,
+    emit_lanes,
     emit_multiply_add,
     emit_splat,
-    emit_store,
     intrinsic,
 )
-from chronoscene.kernels.training_compilation import inner
 
 ROW_TILE = 8 if MANY_REGISTERS else 4
 """Rows of the result held in registers, by one or two vectors of columns."""
@@ -72,11 +71,11 @@ def _make_tile(vectors: int, relu: bool) -> Any:
             with cgutils.for_range(builder, depth) as loop:
                 vectors_b = [emit_load(builder, b.at(loop.index, n)) for n in columns]
                 for m, row_sums in zip(rows, sums, strict=True):
-                    factor = emit_splat(builder, builder.load(a.at(m, loop.index)))
+                    factor = emit_splat(builder, builder.load(a.at(m, loop.index)), LANES)
                     for total, vector in zip(row_sums, vectors_b, strict=True):
                         new = emit_multiply_add(builder, factor, vector, builder.load(total))
                         builder.store(new, total)
-            zero = emit_constant(0.0)
+            zero = emit_lanes([0.0] * LANES, FLOAT)
             for m, row_sums in zip(rows, sums, strict=True):
                 for total, n in zip(row_sums, columns, strict=True):
                     value = builder.load(total)

@@ -1,173 +1,257 @@
-"""Memory of compiled kernels: loads and stores of vectors and single numbers.
+"""Memory of compiled kernels: loads and stores of single numbers and of vectors.
 
-Memory is a flat float32 array or, as an integer, an address. Loops over rows want addresses: Numba
-counts the references to an array whenever it is passed on, and threads that do so with the same
-array wait for each other. The caller keeps the memory alive.
+Memory is a flat contiguous array or, as an integer, an address of float32 numbers. Loops over rows
+want addresses: Numba counts the references to an array whenever it is passed on, and threads that
+do so with the same array wait for each other. The caller keeps the memory alive.
 
-None of these check bounds.
+Offsets count numbers. None of these check bounds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from chronoscene.kernels.registers import (
+from chronoscene.kernels.vectors import (
     FLOAT,
-    FLOATS,
-    INT,
-    INTS,
+    I32,
     LANES,
     Vector,
-    emit_address,
-    emit_constant,
-    emit_load,
-    emit_store,
+    emit_lanes,
+    emit_shuffle,
+    emit_splat,
     intrinsic,
 )
 
+_I64 = ir.IntType(64)
+
+
+def emit_address(
+    context: Any, builder: Any, kind: Any, memory: Any, index: Any, element: ir.Type = FLOAT
+) -> Any:
+    """Pointer to a number; ``element`` is its type where the memory is an address."""
+    if isinstance(kind, types.Integer):
+        base = builder.inttoptr(memory, element.as_pointer())
+    else:
+        base = context.make_array(kind)(context, builder, memory).data
+    return builder.gep(base, [index])
+
+
+def emit_load(builder: Any, address: Any, lanes: int = LANES) -> Any:
+    """Vector of consecutive numbers."""
+    pointer = ir.VectorType(address.type.pointee, lanes).as_pointer()
+    return builder.load(builder.bitcast(address, pointer), align=4)
+
+
+def emit_store(builder: Any, value: Any, address: Any) -> None:
+    builder.store(value, builder.bitcast(address, value.type.as_pointer()), align=4)
+
+
+# Single numbers.
+
+
+def _make_read(number: types.Type, element: ir.Type) -> Callable:
+    @intrinsic
+    def read(typingctx: Any, memory: Any, index: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            memory, index = args
+            return builder.load(emit_address(context, builder, sig.args[0], memory, index, element))
+
+        return number(memory, types.intp), codegen
+
+    return read
+
+
+def _make_write(number: types.Type, element: ir.Type) -> Callable:
+    @intrinsic
+    def write(typingctx: Any, memory: Any, index: Any, value: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            memory, index, value = args
+            builder.store(
+                value, emit_address(context, builder, sig.args[0], memory, index, element)
+            )
+            return context.get_dummy_value()
+
+        return types.void(memory, types.intp, number), codegen
+
+    return write
+
+
+read, write = _make_read(types.float32, FLOAT), _make_write(types.float32, FLOAT)
+"""One float32."""
+read_index, write_index = _make_read(types.int64, _I64), _make_write(types.int64, _I64)
+"""One int64 of those at an address."""
+
 
 @intrinsic
-def load(typing: Any, memory: Any, index: Any) -> Any:
-    """Read LANES numbers from ``index`` on."""
+def fetch_add(typingctx: Any, array: Any, offset: Any, amount: Any) -> Any:
+    """Add to an element of an int64 array as one atomic step; what it was before.
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return emit_load(builder, emit_address(context, builder, signature.args[0], *args))
+    What this thread wrote before is seen by a thread that sees the sum.
+    """
 
-    return Vector(memory, types.intp), generate
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = emit_address(context, builder, sig.args[0], *args[:2])
+        return builder.atomic_rmw("add", address, args[2], "acq_rel")
+
+    return types.int64(array, types.intp, types.int64), codegen
 
 
 @intrinsic
-def store(typing: Any, memory: Any, index: Any, value: Any) -> Any:
-    """Write LANES numbers from ``index`` on."""
+def load_shared(typingctx: Any, array: Any, offset: Any) -> Any:
+    """An element of an int64 array that other threads change, as it is now."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = emit_address(context, builder, signature.args[0], *args[:2])
-        emit_store(builder, args[2], address)
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.load_atomic(emit_address(context, builder, sig.args[0], *args), "acquire", 8)
+
+    return types.int64(array, types.intp), codegen
+
+
+def _make_prefetch(write: int) -> Callable:
+    @intrinsic
+    def prefetch(typingctx: Any, memory: Any, index: Any) -> Any:
+        """Ask for the cache line around ``index``; harmless where nothing is."""
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            pointer = emit_address(context, builder, sig.args[0], *args)
+            pointer = builder.bitcast(pointer, ir.IntType(8).as_pointer())
+            kind = ir.FunctionType(ir.VoidType(), [pointer.type, I32, I32, I32])
+            function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+            # Write or read, keep in all caches, data.
+            builder.call(function, [pointer, I32(write), I32(3), I32(1)])
+            return context.get_dummy_value()
+
+        return types.void(memory, types.intp), codegen
+
+    return prefetch
+
+
+prefetch, prefetch_write = _make_prefetch(0), _make_prefetch(1)
+
+
+# Vectors.
+
+
+def make_load(lanes: int) -> Callable:
+    """Function that reads vectors with this number of lanes."""
+
+    @intrinsic
+    def load(typingctx: Any, memory: Any, index: Any) -> Any:
+        """Vector of consecutive numbers from ``index`` on."""
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return emit_load(builder, emit_address(context, builder, sig.args[0], *args), lanes)
+
+        integers = getattr(memory, "dtype", types.float32) == types.int32
+        return Vector("i32" if integers else "f32", lanes)(memory, types.intp), codegen
+
+    return load
+
+
+load = make_load(LANES)
+
+
+@intrinsic
+def store(typingctx: Any, memory: Any, index: Any, value: Any) -> Any:
+    """Write a vector to consecutive numbers from ``index`` on."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        emit_store(builder, args[2], emit_address(context, builder, sig.args[0], *args[:2]))
         return context.get_dummy_value()
 
-    return types.void(memory, types.intp, Vector), generate
+    return types.void(memory, types.intp, value), codegen
 
 
-def emit_first_lanes(builder: Any, count: Any) -> Any:
+@intrinsic
+def store_where(typingctx: Any, array: Any, offset: Any, mask: Any, value: Any) -> Any:
+    """Write the lanes of a vector whose mask is set. The others are written too, as they were."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = emit_address(context, builder, sig.args[0], *args[:2])
+        old = emit_load(builder, address, sig.args[3].lanes)
+        emit_store(builder, builder.select(args[2], args[3], old), address)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, mask, value), codegen
+
+
+def _emit_first_lanes(builder: Any, count: Any, lanes: int) -> Any:
     """Mask of the lanes below ``count``, any integer."""
     wide = count.type
-    clipped = builder.select(builder.icmp_signed("<", count, wide(LANES)), count, wide(LANES))
-    single = builder.insert_element(
-        ir.Constant(INTS, ir.Undefined), builder.trunc(clipped, INT), INT(0)
-    )
-    counts = builder.shuffle_vector(
-        single, ir.Constant(INTS, ir.Undefined), ir.Constant(INTS, [0] * LANES)
-    )
-    return builder.icmp_signed("<", ir.Constant(INTS, list(range(LANES))), counts)
+    clipped = builder.select(builder.icmp_signed("<", count, wide(lanes)), count, wide(lanes))
+    counts = emit_splat(builder, builder.trunc(clipped, I32), lanes)
+    return builder.icmp_signed("<", emit_lanes(range(lanes), I32), counts)
+
+
+def _emit_masked(builder: Any, name: str, result: ir.Type, args: list[Any], lanes: int) -> Any:
+    """Call ``llvm.masked.<name>`` on floats."""
+    kind = ir.FunctionType(result, [arg.type for arg in args])
+    full = f"llvm.masked.{name}.v{lanes}f32.p0"
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, full), args)
 
 
 @intrinsic
-def load_first(typing: Any, memory: Any, index: Any, count: Any) -> Any:
-    """Read the first ``count`` lanes, and nothing beyond; the others are 0."""
+def load_first(typingctx: Any, memory: Any, index: Any, count: Any) -> Any:
+    """Read the first ``count`` of LANES lanes, and nothing beyond; the others are 0."""
+    result = Vector("f32", LANES)
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = emit_address(context, builder, signature.args[0], *args[:2])
-        pointer = builder.bitcast(address, FLOATS.as_pointer())
-        mask = emit_first_lanes(builder, args[2])
-        kind = ir.FunctionType(FLOATS, [pointer.type, INT, mask.type, FLOATS])
-        name = f"llvm.masked.load.v{LANES}f32.p0"
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
-        return builder.call(function, [pointer, INT(4), mask, emit_constant(0.0)])
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = emit_address(context, builder, sig.args[0], *args[:2])
+        pointer = builder.bitcast(address, result.llvm.as_pointer())
+        mask = _emit_first_lanes(builder, args[2], LANES)
+        zeros = emit_lanes([0.0] * LANES, FLOAT)
+        return _emit_masked(builder, "load", result.llvm, [pointer, I32(4), mask, zeros], LANES)
 
-    return Vector(memory, types.intp, types.intp), generate
+    return result(memory, types.intp, types.intp), codegen
 
 
 @intrinsic
-def store_first(typing: Any, memory: Any, index: Any, value: Any, count: Any) -> Any:
+def store_first(typingctx: Any, memory: Any, index: Any, value: Any, count: Any) -> Any:
     """Write the first ``count`` lanes and nothing beyond."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        address = emit_address(context, builder, signature.args[0], *args[:2])
-        pointer = builder.bitcast(address, FLOATS.as_pointer())
-        mask = emit_first_lanes(builder, args[3])
-        kind = ir.FunctionType(ir.VoidType(), [FLOATS, pointer.type, INT, mask.type])
-        name = f"llvm.masked.store.v{LANES}f32.p0"
-        function = cgutils.get_or_insert_function(builder.module, kind, name)
-        builder.call(function, [args[2], pointer, INT(4), mask])
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = emit_address(context, builder, sig.args[0], *args[:2])
+        pointer = builder.bitcast(address, args[2].type.as_pointer())
+        mask = _emit_first_lanes(builder, args[3], value.lanes)
+        operands = [args[2], pointer, I32(4), mask]
+        _emit_masked(builder, "store", ir.VoidType(), operands, value.lanes)
         return context.get_dummy_value()
 
-    return types.void(memory, types.intp, Vector, types.intp), generate
+    return types.void(memory, types.intp, value, types.intp), codegen
 
 
 @intrinsic
-def read(typing: Any, memory: Any, index: Any) -> Any:
-    """One float32."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.load(emit_address(context, builder, signature.args[0], *args))
-
-    return types.float32(memory, types.intp), generate
-
-
-@intrinsic
-def write(typing: Any, memory: Any, index: Any, value: Any) -> Any:
-    """Set one float32."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        builder.store(args[2], emit_address(context, builder, signature.args[0], *args[:2]))
-        return context.get_dummy_value()
-
-    return types.void(memory, types.intp, types.float32), generate
-
-
-@intrinsic
-def read_index(typing: Any, address: Any, index: Any) -> Any:
-    """One int64 of those at an address."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        wide = ir.IntType(64)
-        pointer = builder.inttoptr(args[0], wide.as_pointer())
-        return builder.load(builder.gep(pointer, [args[1]]))
-
-    return types.int64(types.intp, types.intp), generate
-
-
-@intrinsic
-def write_index(typing: Any, address: Any, index: Any, value: Any) -> Any:
-    """Set one int64 of those at an address."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = builder.inttoptr(args[0], ir.IntType(64).as_pointer())
-        builder.store(args[2], builder.gep(pointer, [args[1]]))
-        return context.get_dummy_value()
-
-    return types.void(types.intp, types.intp, types.int64), generate
-
-
-@intrinsic
-def copy_quad(typing: Any, out: Any, start: Any, memory: Any, index: Any) -> Any:
+def copy_quad(typingctx: Any, out: Any, start: Any, memory: Any, index: Any) -> Any:
     """Copy four float32 from ``index`` of one memory to ``start`` of another."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = ir.VectorType(FLOAT, 4).as_pointer()
-        source = emit_address(context, builder, signature.args[2], *args[2:])
-        target = emit_address(context, builder, signature.args[0], *args[:2])
-        value = builder.load(builder.bitcast(source, pointer), typ=pointer.pointee)
-        value.align = 4
-        builder.store(value, builder.bitcast(target, pointer)).align = 4
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        source = emit_address(context, builder, sig.args[2], *args[2:])
+        target = emit_address(context, builder, sig.args[0], *args[:2])
+        emit_store(builder, emit_load(builder, source, 4), target)
         return context.get_dummy_value()
 
-    return types.void(out, types.intp, memory, types.intp), generate
+    return types.void(out, types.intp, memory, types.intp), codegen
 
 
 @intrinsic
-def prefetch(typing: Any, memory: Any, index: Any) -> Any:
-    """Ask for the cache line around ``index``; harmless where nothing is."""
+def store_cycle(typingctx: Any, out: Any, start: Any, memory: Any, index: Any) -> Any:
+    """Write three numbers over and over, 3 LANES in all.
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        pointer = emit_address(context, builder, signature.args[0], *args)
-        kind = ir.FunctionType(ir.VoidType(), [pointer.type, INT, INT, INT])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-        builder.call(function, [pointer, INT(0), INT(3), INT(1)])
+    Reads LANES numbers from ``index`` on, so those must exist.
+    """
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        out, start, memory, index = args
+        value = emit_load(builder, emit_address(context, builder, sig.args[2], memory, index))
+        for part in range(3):
+            order = [(part * LANES + i) % 3 for i in range(LANES)]
+            at = builder.add(start, start.type(part * LANES))
+            target = emit_address(context, builder, sig.args[0], out, at)
+            emit_store(builder, emit_shuffle(builder, value, value, order), target)
         return context.get_dummy_value()
 
-    return types.void(memory, types.intp), generate
+    return types.void(out, types.intp, memory, types.intp), codegen

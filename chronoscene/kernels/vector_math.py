@@ -1,30 +1,24 @@
-"""Functions of vectors: sums over lanes, patterns, exponentials."""
+"""Functions of vectors of any number of lanes: exponentials, logarithms, sums over lanes."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numpy import float32
 
-from chronoscene.kernels.registers import (
-    FLOATS,
-    INT,
-    INTS,
-    LANES,
-    Vector,
-    emit_address,
-    emit_load,
-    emit_store,
+from chronoscene.kernels.compilation import inlined, inner
+from chronoscene.kernels.vectors import (
+    I32,
+    as_float,
+    as_int,
+    emit_shuffle,
     intrinsic,
     multiply_add,
-    select_less,
-    splat,
+    select,
+    to_float,
 )
-from chronoscene.kernels.training_compilation import inner
 
 LOG2_E = float32(1 / math.log(2))
 # ln 2 in two parts: the first has few digits, so that its product with an integer is exact.
@@ -32,166 +26,85 @@ LN2_HIGH = float32(0.693359375)
 LN2_LOW = float32(math.log(2) - 0.693359375)
 ROUNDER = float32(1.5 * 2**23)
 """Adding it rounds to an integer, which then stands in the lowest bits."""
-EXP_LOW = float32(-86.5)
+EXP_MIN = float32(-86.5)
 """Below, exp would leave the normal numbers; it stays at 2.7e-38."""
-EXP_HIGH = float32(88.3)
+EXP_MAX = float32(88.3)
 """Above, exp is infinite."""
+INFINITY = float32(math.inf)
 # Taylor coefficients 1 / n! of exp; the rest at |x| <= ln(2) / 2 is 1e-8 of the value.
 EXP_TAYLOR = tuple(float32(1 / math.factorial(n)) for n in range(8))
 # Of tanh(x) / x in x²: 2e-7 wrong at most up to `TANH_SERIES_END`.
 TANH_TAYLOR = tuple(float32(c) for c in (1, -1 / 3, 2 / 15, -17 / 315, 62 / 2835, -1382 / 155925))
 TANH_SERIES_END = float32(0.35)
-ZERO = float32(0)
-ONE = float32(1)
-TWO = float32(2)
-
-
-def _turned(builder: Any, value: Any, order: list[int]) -> Any:
-    return builder.shuffle_vector(value, value, ir.Constant(INTS, order))
+ZERO, ONE, TWO = float32(0), float32(1), float32(2)
 
 
 @intrinsic
-def lane_sum(typing: Any, value: Any) -> Any:
+def lane_sum(typingctx: Any, value: Any) -> Any:
     """Sum of all lanes, halves added to halves: the order is fixed."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        total, half = args[0], LANES // 2
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        total, half = args[0], value.lanes // 2
         while half:
-            order = [(i + half) % LANES for i in range(LANES)]
-            total = builder.fadd(total, _turned(builder, total, order))
+            order = [(i + half) % value.lanes for i in range(value.lanes)]
+            total = builder.fadd(total, emit_shuffle(builder, total, total, order))
             half //= 2
-        return builder.extract_element(total, INT(0))
+        return builder.extract_element(total, I32(0))
 
-    return types.float32(Vector), generate
+    return types.float32(value), codegen
 
 
 @intrinsic
-def quad_sum(typing: Any, value: Any) -> Any:
+def quad_sum(typingctx: Any, value: Any) -> Any:
     """Sum of each four neighbouring lanes, in all four of them."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         total = args[0]
         for distance in (1, 2):
-            order = [i ^ distance for i in range(LANES)]
-            total = builder.fadd(total, _turned(builder, total, order))
+            order = [i ^ distance for i in range(value.lanes)]
+            total = builder.fadd(total, emit_shuffle(builder, total, total, order))
         return total
 
-    return Vector(Vector), generate
+    return value(value), codegen
 
 
 @intrinsic
-def quad_heads(typing: Any, value: Any) -> Any:
+def quad_heads(typingctx: Any, value: Any) -> Any:
     """The first of each four lanes, moved to the front."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _turned(builder, args[0], [4 * i % LANES for i in range(LANES)])
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        order = [4 * i % value.lanes for i in range(value.lanes)]
+        return emit_shuffle(builder, args[0], args[0], order)
 
-    return Vector(Vector), generate
+    return value(value), codegen
 
 
 @intrinsic
-def quad_spread(typing: Any, value: Any) -> Any:
+def quad_spread(typingctx: Any, value: Any) -> Any:
     """The first lanes, each four times: the reverse of `quad_heads`."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _turned(builder, args[0], [i // 4 for i in range(LANES)])
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return emit_shuffle(builder, args[0], args[0], [i // 4 for i in range(value.lanes)])
 
-    return Vector(Vector), generate
-
-
-@intrinsic
-def quad_identity(typing: Any) -> Any:
-    """1, 0, 0, 0 in each four lanes."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return ir.Constant(FLOATS, [1.0 if i % 4 == 0 else 0.0 for i in range(LANES)])
-
-    return Vector(), generate
-
-
-@intrinsic
-def store_cycle(typing: Any, out: Any, start: Any, memory: Any, index: Any) -> Any:
-    """Write three numbers over and over, 3 LANES in all.
-
-    Reads LANES numbers from ``index`` on, so those must exist.
-    """
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        out, start, memory, index = args
-        source = emit_address(context, builder, signature.args[2], memory, index)
-        value = emit_load(builder, source)
-        for part in range(3):
-            order = [(part * LANES + i) % 3 for i in range(LANES)]
-            at = builder.add(start, start.type(part * LANES))
-            target = emit_address(context, builder, signature.args[0], out, at)
-            emit_store(builder, _turned(builder, value, order), target)
-        return context.get_dummy_value()
-
-    return types.void(out, types.intp, memory, types.intp), generate
-
-
-@intrinsic
-def any_bit(typing: Any, a: Any, b: Any) -> Any:
-    """Bits of both; not 0 or -0 where either is not."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        a, b = (builder.bitcast(value, INTS) for value in args)
-        return builder.bitcast(builder.or_(a, b), FLOATS)
-
-    return Vector(Vector, Vector), generate
-
-
-@intrinsic
-def is_zero(typing: Any, value: Any) -> Any:
-    """Whether all lanes are 0 or -0."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        magnitude = builder.shl(builder.bitcast(args[0], INTS), ir.Constant(INTS, [1] * LANES))
-        zeros = builder.icmp_signed("==", magnitude, ir.Constant(INTS, [0] * LANES))
-        packed = builder.bitcast(zeros, ir.IntType(LANES))
-        return builder.icmp_signed("==", packed, ir.Constant(packed.type, -1))
-
-    return types.boolean(Vector), generate
-
-
-@intrinsic
-def square_root(typing: Any, value: Any) -> Any:
-    """Root of every lane."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        name = f"llvm.sqrt.v{LANES}f32"
-        kind = ir.FunctionType(FLOATS, [FLOATS])
-        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), args)
-
-    return Vector(Vector), generate
-
-
-@intrinsic
-def _shift_exponent(typing: Any, value: Any, rounded: Any) -> Any:
-    """value * 2**n, where n stands in the lowest bits of ``rounded``."""
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        value, n = (builder.bitcast(arg, INTS) for arg in args)
-        exponent = builder.shl(n, ir.Constant(INTS, [23] * LANES))
-        return builder.bitcast(builder.add(value, exponent), FLOATS)
-
-    return Vector(Vector, Vector), generate
+    return value(value), codegen
 
 
 @inner
 def exp(x):  # type: ignore[no-untyped-def]
-    """e to the x, within 1.2e-7 of its value. What is not a number stays so."""
-    low = splat(EXP_LOW)
-    high = splat(EXP_HIGH)
-    clipped = select_less(x, low, low, select_less(high, x, high, x))
-    rounded = multiply_add(clipped, splat(LOG2_E), splat(ROUNDER))
+    """e to the x, within 1.2e-7 of its value; nan stays nan.
+
+    With n = round(x / ln 2): e^x = 2^n e^(x - n ln 2), a Taylor polynomial of the rest.
+    """
+    clipped = select(x < EXP_MIN, EXP_MIN, select(x > EXP_MAX, EXP_MAX, x))
+    rounded = multiply_add(clipped, LOG2_E, ROUNDER)
     n = rounded - ROUNDER
-    rest = multiply_add(n, splat(-LN2_HIGH), clipped)
-    rest = multiply_add(n, splat(-LN2_LOW), rest)
-    total = splat(EXP_TAYLOR[7])
-    for i in range(6, -1, -1):
-        total = multiply_add(total, rest, splat(EXP_TAYLOR[i]))
-    return select_less(high, x, splat(float32(math.inf)), _shift_exponent(total, rounded))
+    rest = multiply_add(n, -LN2_HIGH, clipped)
+    rest = multiply_add(n, -LN2_LOW, rest)
+    total = multiply_add(rest, EXP_TAYLOR[7], EXP_TAYLOR[6])
+    for i in range(5, -1, -1):
+        total = multiply_add(total, rest, EXP_TAYLOR[i])
+    # n is in the lowest bits of `rounded`; the exponent of a float32 begins at bit 23.
+    return select(x > EXP_MAX, INFINITY, as_float(as_int(total) + (as_int(rounded) << 23)))
 
 
 @inner
@@ -202,10 +115,50 @@ def sigmoid(x):  # type: ignore[no-untyped-def]
 
 @inner
 def tanh(x):  # type: ignore[no-untyped-def]
-    """Hyperbolic tangent; small numbers keep their sign and digits."""
+    """Hyperbolic tangent, 1 - 2 / (e^2x + 1); by its series where small numbers would lose their
+    sign and digits."""
     square = x * x
-    series = splat(TANH_TAYLOR[5])
-    for i in range(4, -1, -1):
-        series = multiply_add(series, square, splat(TANH_TAYLOR[i]))
+    series = multiply_add(square, TANH_TAYLOR[5], TANH_TAYLOR[4])
+    for i in range(3, -1, -1):
+        series = multiply_add(series, square, TANH_TAYLOR[i])
     far = ONE - TWO / (exp(x + x) + ONE)
-    return select_less(square, splat(TANH_SERIES_END * TANH_SERIES_END), x * series, far)
+    return select(square < TANH_SERIES_END * TANH_SERIES_END, x * series, far)
+
+
+@inlined
+def exp2(x: Any, shifted: Any) -> Any:
+    """2^x for -126 < x < 127, relative error below 2.4e-7; some other number outside.
+
+    Polynomial of least maximal relative error on half an octave either side of a whole number,
+    evaluated by pairs: what waits for it is longer than the arithmetic.
+
+    Args:
+        x: Exponents.
+        shifted: x + ROUNDER, which the caller may have sooner than x.
+    """
+    exponent = as_int(shifted) << 23
+    f = x - (shifted - ROUNDER)
+    ff = f * f
+    low = f * 0.6931469440460205 + 1.0000001192092896
+    middle = f * 0.05550713092088699 + 0.24022120237350464
+    high = f * 0.0013276472454890609 + 0.009675540961325169
+    p = (high * ff + middle) * ff + low
+    return as_float(as_int(p) + exponent)
+
+
+@inlined
+def log2(x: Any) -> Any:
+    """Base-2 logarithm of normal positive numbers, absolute error below 3e-7 near 1.
+
+    x = 2^n m with m between sqrt(1/2) and sqrt(2); log m is the series of 2 artanh((m-1)/(m+1)).
+    """
+    bits = as_int(x) - 0x3F3504F3  # sqrt(1/2)
+    n = bits >> 23
+    m = as_float((bits & 0x007FFFFF) + 0x3F3504F3)
+    t = (m - 1.0) / (m + 1.0)
+    s = t * t
+    p = s * 0.32059889 + 0.41219858
+    p = p * s + 0.57707802
+    p = p * s + 0.96179669
+    p = p * s + 2.88539008
+    return to_float(n) + t * p

@@ -1,17 +1,18 @@
 """Differentiable rendering of 3-D Gaussians: one function, several backends.
 
-Equations, constants and tolerances are in README.md beside this file.
+Gaussians and cameras go in, a `Rasterization` comes out. Equations, constants and tolerances are in
+README.md beside this file.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import BackendError
 from chronoscene.rasterizer.constants import EPS2D, FAR_PLANE, NEAR_PLANE
-from chronoscene.rasterizer.types import RasterInfo, Rasterization
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -23,7 +24,35 @@ BACKENDS = {
     "cpu": "chronoscene.rasterizer.cpu",
     "cuda": "chronoscene.rasterizer.gsplat_backend",
 }
-"""Module of each backend by name; imported when first used."""
+"""Module of each backend by name; imported when first used. Its function ``rasterize`` takes
+`inputs.Inputs` that were checked."""
+
+
+@dataclass(slots=True, eq=False)
+class RasterInfo:
+    """Per-Gaussian facts of one call. Camera index first."""
+
+    means2d: Tensor
+    """Projected centres in pixels. After ``backward()`` its ``grad`` is d loss / d means2d in
+    pixels: the densification signal of 3DGS. Zero rows for culled Gaussians. [C, N, 2]"""
+    radii: Tensor
+    """Half extent of the footprint in pixels, per axis; 0 where culled. int32 [C, N, 2]"""
+    depths: Tensor
+    """z-depth of the centres. Not differentiable. [C, N]"""
+
+
+@dataclass(slots=True, eq=False)
+class Rasterization:
+    """Images of one call."""
+
+    image: Tensor
+    """Composited colours over the background. [C, H, W, D]"""
+    alphas: Tensor
+    """Accumulated opacity. [C, H, W, 1]"""
+    depths: Tensor | None
+    """Expected z-depth: sum of weight times depth over accumulated opacity, 0 where that is 0;
+    None unless asked for. [C, H, W, 1]"""
+    info: RasterInfo
 
 
 def rasterize(
@@ -49,8 +78,8 @@ def rasterize(
 
     Differentiable in means, quats, scales, opacities, colors and backgrounds. A Gaussian outside
     the depth range or the image, with an opacity below 1/255 (negative ones too), with a
-    quaternion of no length, or with any number that is not finite is culled: it changes nothing
-    and gets gradient zero. The limits are in `constants`.
+    quaternion of length zero, or with any number that is not finite is culled: it changes nothing
+    and its gradients are zero. The limits are in `constants`.
 
     Convention:
         World to camera, +z forward; pixel (0, 0) is centred at (0.5, 0.5).
@@ -71,7 +100,7 @@ def rasterize(
         backgrounds: What the remaining light sees; None is black. [C, D]
         render_depth: Also return the expected z-depth, differentiable.
         backend: auto, reference, cpu or cuda. Auto is cuda for CUDA tensors, else cpu.
-        check_finite: Raise on nan or infinite numbers, and on cameras that are none. Off,
+        check_finite: Raise on nan or infinite numbers, and on invalid cameras. Without this check,
             Gaussians with such numbers are culled.
 
     Raises:
@@ -79,37 +108,27 @@ def rasterize(
             camera is outside the limits of `constants`.
         BackendError: If the backend is unknown or cannot be used on this machine.
     """
-    from chronoscene.rasterizer.input_checks import (
-        check_cameras,
-        check_finite_inputs,
-        check_inputs,
-        check_options,
-    )
+    from chronoscene.rasterizer.inputs import Inputs, check_inputs
 
     check_choice("backend", backend, ["auto", *BACKENDS], error=BackendError)
     if backend == "auto":
         backend = "cuda" if means.is_cuda else "cpu"
-    gaussians = {
-        "means": means,
-        "quats": quats,
-        "scales": scales,
-        "opacities": opacities,
-        "colors": colors,
-    }
-    arrays = {**gaussians, "viewmats": viewmats, "Ks": Ks}
-    check_inputs(arrays, backgrounds, width, height)
-    check_options(near_plane, far_plane, eps2d)
-    if check_finite:
-        colored = {} if backgrounds is None else {"backgrounds": backgrounds}
-        check_finite_inputs({**arrays, **colored})
-        check_cameras(viewmats, Ks, width, height)
-    return import_module(BACKENDS[backend]).rasterize(
-        *arrays.values(),
+    inputs = Inputs(
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
         width,
         height,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        eps2d=eps2d,
-        backgrounds=backgrounds,
-        render_depth=render_depth,
+        near_plane,
+        far_plane,
+        eps2d,
+        backgrounds,
+        render_depth,
     )
+    check_inputs(inputs, check_finite)
+    result: Rasterization = import_module(BACKENDS[backend]).rasterize(inputs)
+    return result

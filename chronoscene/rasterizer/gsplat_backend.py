@@ -9,6 +9,7 @@ Source: gsplat 1.5 documentation of ``rasterization`` and its ``meta`` dictionar
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
@@ -16,10 +17,9 @@ import torch
 from torch import Tensor
 
 from chronoscene.errors import BackendError
-from chronoscene.rasterizer import reference
+from chronoscene.rasterizer import RasterInfo, Rasterization, reference
 from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
-from chronoscene.rasterizer.recentring import recentred
-from chronoscene.rasterizer.types import RasterInfo, Rasterization
+from chronoscene.rasterizer.inputs import Inputs, recentred
 
 _TOOLKIT = (
     "gsplat compiles its kernels when it is first used, and needs for that a C++ compiler and the "
@@ -28,46 +28,38 @@ _TOOLKIT = (
 )
 
 
-def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *,
-    near_plane: float,
-    far_plane: float,
-    eps2d: float,
-    backgrounds: Tensor | None,
-    render_depth: bool,
-) -> Rasterization:
-    """Render Gaussians; see `chronoscene.rasterizer.rasterize`. Everything is cast to float32."""
-    render = _load(means.device)
-    options: dict[str, Any] = {
-        "near_plane": near_plane,
-        "far_plane": far_plane,
-        "eps2d": eps2d,
-        "backgrounds": None if backgrounds is None else backgrounds.float(),
-    }
-    means, viewmats = recentred(means, viewmats)
-    arrays = tuple(x.float() for x in (means, quats, scales, opacities, colors))
-    cameras = (viewmats.float(), Ks.float(), width, height)
-    if means.shape[0] == 0:  # gsplat launches no kernel for nothing
-        empty: Callable[..., Rasterization] = reference.rasterize
-        return empty(*arrays, *cameras, **options, render_depth=render_depth)
-    gaussians, drawable = _without_bad_rows(*arrays)
+def rasterize(inputs: Inputs) -> Rasterization:
+    """Render Gaussians. Everything is cast to float32."""
+    render = _load(inputs.means.device)
+    means, viewmats = recentred(inputs.means, inputs.viewmats)
+    inputs = replace(
+        inputs,
+        means=means.float(),
+        quats=inputs.quats.float(),
+        scales=inputs.scales.float(),
+        opacities=inputs.opacities.float(),
+        colors=inputs.colors.float(),
+        viewmats=viewmats.float(),
+        Ks=inputs.Ks.float(),
+        backgrounds=None if inputs.backgrounds is None else inputs.backgrounds.float(),
+    )
+    if len(means) == 0:  # gsplat launches no kernel for nothing
+        return reference.rasterize(inputs)
+    gaussians, drawable = _without_bad_rows(*inputs.gaussians)
     try:
         image, alphas, meta = render(
             *gaussians,
-            *cameras,
-            **options,
+            inputs.viewmats,
+            inputs.Ks,
+            inputs.width,
+            inputs.height,
+            near_plane=inputs.near_plane,
+            far_plane=inputs.far_plane,
+            eps2d=inputs.eps2d,
+            backgrounds=inputs.backgrounds,
             packed=False,
             rasterize_mode="classic",
-            render_mode="RGB+ED" if render_depth else "RGB",
+            render_mode="RGB+ED" if inputs.render_depth else "RGB",
         )
     except (AttributeError, ImportError) as error:  # kernels are None, or could not be built
         raise BackendError(
@@ -77,7 +69,7 @@ def rasterize(
             todo=f"install the CUDA toolkit: {_TOOLKIT}; or choose backend='cpu'",
         ) from error
     depths = None
-    if render_depth:
+    if inputs.render_depth:
         image, depths = image[..., :-1], torch.where(alphas > 0, image[..., -1:], 0)
     return Rasterization(image, alphas, depths, _info(meta, drawable))
 

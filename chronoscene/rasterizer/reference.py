@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from chronoscene.rasterizer import RasterInfo, Rasterization
 from chronoscene.rasterizer.constants import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -25,7 +26,7 @@ from chronoscene.rasterizer.constants import (
     TRANSMITTANCE_MIN,
     VALUE_MAX,
 )
-from chronoscene.rasterizer.types import RasterInfo, Rasterization
+from chronoscene.rasterizer.inputs import Inputs
 
 TILE = 16
 
@@ -50,32 +51,18 @@ class _Splats:
     extents: Tensor  # [V, 2]
 
 
-def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *,
-    near_plane: float,
-    far_plane: float,
-    eps2d: float,
-    backgrounds: Tensor | None,
-    render_depth: bool,
-) -> Rasterization:
-    """Render Gaussians; see `chronoscene.rasterizer.rasterize` for the arguments."""
-    info = _new_info(means, viewmats.shape[0], (means, quats, scales, opacities, colors))
+def rasterize(inputs: Inputs) -> Rasterization:
+    """Render Gaussians one camera after the other."""
+    means, quats, scales, opacities, colors = inputs.gaussians
+    width, height, eps2d = inputs.width, inputs.height, inputs.eps2d
+    info = _new_info(means, len(inputs.viewmats), inputs.gaussians)
     images, alphas, depths = [], [], []
-    for c, (viewmat, K) in enumerate(zip(viewmats, Ks, strict=True)):
+    for c, (viewmat, K) in enumerate(zip(inputs.viewmats, inputs.Ks, strict=True)):
         camera = (viewmat, K, width, height)
         with torch.no_grad():
             everything = _project(means, quats, scales, *camera)
             extents = _extents(everything.axes, opacities, eps2d)
-            visible = _visible(everything, extents, width, height, near_plane, far_plane)
+            visible = _visible(everything, extents, inputs)
             visible &= _determinants(everything.axes, eps2d) > 0
             visible &= (colors.abs() < VALUE_MAX).all(dim=-1) & (opacities < VALUE_MAX)
             visible &= quats.abs().amax(dim=-1) >= QUATERNION_MIN
@@ -85,23 +72,23 @@ def rasterize(
             index = order[: int(visible.sum())]
         projected = _project(means[index], quats[index], scales[index], *camera)
         values = colors[index]
-        if render_depth:
+        if inputs.render_depth:
             values = torch.cat([values, projected.depths[:, None]], dim=1)
         # The leaf has the values, the projection the gradient; both receive it in backward().
         means2d = info.means2d[c, index] + (projected.means2d - projected.means2d.detach())
         splats = _Splats(means2d, projected.axes, opacities[index], values, extents[index])
         image, transmittance = _composite(splats, width, height, eps2d)
         alphas.append(1 - transmittance)
-        if render_depth:
+        if inputs.render_depth:
             image, weighted = image[..., :-1], image[..., -1:]
             depths.append(_expected_depth(weighted, alphas[-1]))
-        if backgrounds is not None:
-            image = image + transmittance * backgrounds[c]
+        if inputs.backgrounds is not None:
+            image = image + transmittance * inputs.backgrounds[c]
         images.append(image)
     return Rasterization(
         image=torch.stack(images),
         alphas=torch.stack(alphas),
-        depths=torch.stack(depths) if render_depth else None,
+        depths=torch.stack(depths) if inputs.render_depth else None,
         info=info,
     )
 
@@ -126,7 +113,7 @@ def _fill_info(
 
 
 def _rotation(quats: Tensor) -> Tensor:
-    """Rotation matrices of quaternions wxyz of any length. [M, 4] -> [M, 3, 3]"""
+    """Rotation matrices R_q of quaternions wxyz of any length. [M, 4] -> [M, 3, 3]"""
     # Scaled first, lest squares overflow or underflow; the length has no influence.
     quats = quats / quats.detach().abs().amax(dim=-1, keepdim=True)
     w, x, y, z = (quats / torch.linalg.vector_norm(quats, dim=-1, keepdim=True)).unbind(-1)
@@ -158,10 +145,12 @@ def _project(
     """Centres in pixels and the axes of the Gaussians as J shows them."""
     rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    # p = R mu + t, m = (fx x / z + cx, fy y / z + cy).
     x, y, z = (means @ rotation.T + translation).unbind(-1)
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
     tx = z * _clamped(x / z, width, fx, cx)
     ty = z * _clamped(y / z, height, fy, cy)
+    # J = d m / d p, at the position held near the image.
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [
@@ -170,6 +159,7 @@ def _project(
         ],
         dim=-2,
     )
+    # J M with M = R R_q diag(s).
     axes = jacobian @ rotation @ _rotation(quats) * scales[:, None, :]  # [M, 2, 3]
     return _Projected(means2d, axes, z)
 
@@ -187,20 +177,13 @@ def _determinants(axes: Tensor, eps2d: float) -> Tensor:
     return (area**2).sum(-1) + eps2d * (axes**2).sum((-2, -1)) + eps2d**2
 
 
-def _visible(
-    projected: _Projected,
-    extents: Tensor,
-    width: int,
-    height: int,
-    near_plane: float,
-    far_plane: float,
-) -> Tensor:
+def _visible(projected: _Projected, extents: Tensor, inputs: Inputs) -> Tensor:
     """Between the planes, finite, and with an ellipse that meets the image. [M]"""
     (u, v), (du, dv), z = projected.means2d.unbind(-1), extents.unbind(-1), projected.depths
-    meets = (u + du > 0) & (u - du < width) & (v + dv > 0) & (v - dv < height)
+    meets = (u + du > 0) & (u - du < inputs.width) & (v + dv > 0) & (v - dv < inputs.height)
     # Comparisons with nan are false, so a Gaussian that cannot be projected is not visible.
     sized = ((extents > 0) & (extents < EXTENT_MAX)).all(-1)
-    return meets & sized & (z >= near_plane) & (z <= far_plane)
+    return meets & sized & (z >= inputs.near_plane) & (z <= inputs.far_plane)
 
 
 def _composite(splats: _Splats, width: int, height: int, eps2d: float) -> tuple[Tensor, Tensor]:
@@ -234,6 +217,7 @@ def _composite_tile(
     pixels = torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1).reshape(-1, 1, 2)
     offsets = pixels - means2d  # [P, V, 2]
     distances = _distances(offsets, splats.axes[index], eps2d)
+    # alpha = min(0.999, o exp(-d^T Sigma^-1 d / 2)), skipped below 1/255.
     alphas = splats.opacities[index] * torch.exp(-0.5 * distances)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp(max=ALPHA_MAX), 0)
     with torch.no_grad():
@@ -242,6 +226,7 @@ def _composite_tile(
     after = torch.cumprod(1 - alphas, dim=1)
     ones = after.new_ones(len(after), 1)
     transmittance = torch.cat([ones, after], dim=1)
+    # C = sum_i alpha_i T_i c_i, T_i = prod_{j < i} (1 - alpha_j).
     weights = alphas * transmittance[:, :-1]
     values = weights @ splats.values[index]
     return torch.cat([values, transmittance[:, -1:]], dim=1).reshape(height, width, -1)

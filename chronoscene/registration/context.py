@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from chronoscene.kernels.threads import available_threads
+from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.photos.camera_sharing import Calibration
 from chronoscene.registration.result import Route
 from chronoscene.registration.stages import Stages

@@ -7,7 +7,7 @@ import math
 from numba import prange
 from numpy import float32
 
-from chronoscene.kernels.training_compilation import kernel
+from chronoscene.kernels.compilation import kernel
 
 BETA1 = 0.9
 BETA2 = 0.999

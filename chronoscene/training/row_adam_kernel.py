@@ -8,16 +8,9 @@ from typing import NamedTuple
 from numba import prange
 from numpy import float32
 
-from chronoscene.kernels.memory import (
-    load_first,
-    read,
-    read_index,
-    store_first,
-    write_index,
-)
-from chronoscene.kernels.registers import LANES, select_less, splat
-from chronoscene.kernels.training_compilation import inner, kernel
-from chronoscene.kernels.vector_math import square_root
+from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.kernels.memory import load_first, read, read_index, store_first, write_index
+from chronoscene.kernels.vectors import LANES, select, splat, sqrt
 from chronoscene.training.adam_kernel import (
     BETA2,
     GAIN1,
@@ -65,8 +58,8 @@ class Part(NamedTuple):
 def _clean(mean, square):  # type: ignore[no-untyped-def]
     """Moments without denormal numbers; see `_adam_kernel`."""
     least, zero = splat(TINY_MEAN), splat(ZERO)
-    mean = select_less(mean, least, select_less(zero - least, mean, zero, mean), mean)
-    return mean, select_less(square, splat(TINY_SQUARE), zero, square)
+    mean = select(mean < least, select(zero - least < mean, zero, mean), mean)
+    return mean, select(square < splat(TINY_SQUARE), zero, square)
 
 
 @inner
@@ -88,7 +81,7 @@ def _copy(table, at, width, way, eps, out, to):  # type: ignore[no-untyped-def]
         value = load_first(table.values, at + c, left)
         if way != ZERO:
             mean = load_first(table.means, at + c, left)
-            root = square_root(load_first(table.squares, at + c, left))
+            root = sqrt(load_first(table.squares, at + c, left))
             value = value - way * mean / (root + eps)
         store_first(out, to + c, value, left)
 
@@ -130,7 +123,7 @@ def _step(table, at, width, keep, copies, grads, to, scalars):  # type: ignore[n
         mean = mean + GAIN1 * (grad - mean)
         square = (KEEP2 * keep2) * load_first(table.squares, at + c, left)
         mean, square = _clean(mean, square + GAIN2 * grad * grad)
-        moved = rate * mean / (square_root(square) * root + eps)
+        moved = rate * mean / (sqrt(square) * root + eps)
         store_first(table.values, at + c, load_first(copies, to + c, left) - moved, left)
         store_first(table.means, at + c, mean, left)
         store_first(table.squares, at + c, square, left)

@@ -28,10 +28,10 @@ import numpy as np
 from numba import prange
 from numpy import float32
 
+from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.memory import load, store, store_first
-from chronoscene.kernels.registers import LANES, multiply_add, select_less, splat
-from chronoscene.kernels.training_compilation import inner, kernel
 from chronoscene.kernels.vector_math import lane_sum
+from chronoscene.kernels.vectors import LANES, multiply_add, select, splat
 
 RADIUS = 5
 SIGMA = 1.5
@@ -107,10 +107,10 @@ def _similarity_row(x, y, start, stride, inside, maps):  # type: ignore[no-untyp
         squares = multiply_add(mu, mu, nu * nu)
         # Rounding must not take a variance below 0, nor var(x - y) above 2 var(x) + 2 var(y).
         variance = _blur_at(rows, 2 * stride + column) - squares
-        variance = select_less(variance, zero, zero, variance)
+        variance = select(variance < zero, zero, variance)
         v = _blur_at(rows, 3 * stride + column) - e * e
-        v = select_less(v, zero, zero, v)
-        v = select_less(TWO * variance, v, TWO * variance, v)
+        v = select(v < zero, zero, v)
+        v = select(TWO * variance < v, TWO * variance, v)
         mask = load(inside, column)
         over_c = mask / (squares + C1)
         over_d = mask / (variance + C2)
@@ -124,7 +124,7 @@ def _similarity_row(x, y, start, stride, inside, maps):  # type: ignore[no-untyp
         store(maps, 2 * plane + index, both)
         total = total + multiply_add(e * e, over_c, ratio * v_over_d)
         gap = load(x, index) - load(y, index)
-        difference = difference + select_less(gap, zero, zero - gap, gap)
+        difference = difference + select(gap < zero, zero - gap, gap)
     return lane_sum(total), lane_sum(difference)
 
 
@@ -149,7 +149,7 @@ def _gradient_row(x, y, maps, start, stride, scales, out):  # type: ignore[no-un
         total = _blur_at(rows, framed)
         total = multiply_add(TWO * a, _blur_at(rows, stride + framed), total)
         total = multiply_add(TWO * (a - b), _blur_at(rows, 2 * stride + framed), total)
-        sign = select_less(b, a, one, select_less(a, b, zero - one, zero))
+        sign = select(b < a, one, select(a < b, zero - one, zero))
         gradient = multiply_add(splat(scales[1]), total, scales[0] * sign)
         store_first(out, column, gradient, out.shape[0] - column)
 

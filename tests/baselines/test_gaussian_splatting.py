@@ -10,7 +10,7 @@ from baselines.gaussian_splatting import SPEC
 from baselines.gaussian_splatting.config import GaussianSplattingConfig
 from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.errors import ConfigError
-from chronoscene.kernels.threads import set_threads
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object
 
 

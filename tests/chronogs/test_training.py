@@ -15,7 +15,7 @@ from chronogs.method import ChronoGS
 from chronoscene.anchors import trainer as anchor_training
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.errors import CheckpointError
-from chronoscene.kernels.threads import set_threads
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.training.schedule import log_linear

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from chronoscene.kernels.threads import set_threads
+from chronoscene.kernels.runtime import set_threads
 
 sys.path.append(str(Path(__file__).parent / "support"))
 

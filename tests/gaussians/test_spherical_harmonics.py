@@ -6,7 +6,7 @@ import torch
 from scipy.special import sph_harm_y
 
 from chronoscene.gaussians import spherical_harmonics as sh
-from chronoscene.kernels.threads import set_threads
+from chronoscene.kernels.runtime import set_threads
 
 
 def random_inputs(count, *, seed=0, dtype=torch.float32):

@@ -6,6 +6,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+from chronoscene.kernels.compilation import source_stamp
+from chronoscene.rasterizer import constants
+from chronoscene.rasterizer.cpu import composite
+from chronoscene.synth.render import shade
 
 SCRIPT = """
 import torch
@@ -41,3 +47,27 @@ def test_kept_and_compiled_again_where_the_index_is_damaged(tmp_path: Path) -> N
         index.write_bytes(data[: len(data) // 2])
     assert run(tmp_path) == (20.0, 0)
     assert run(tmp_path) == (20.0, 1)
+
+
+def test_a_kernel_is_compiled_again_when_a_source_changes(tmp_path: Path) -> None:
+    """Sources are the kernel's folder, the package `kernels`, and what the kernel names."""
+    (tmp_path / "a.py").write_text("A = 1")
+    extra = tmp_path / "folder" / "extra.py"
+    extra.parent.mkdir()
+    extra.write_text("B = 1")
+    stamps = []
+    for path, text in ((None, ""), (tmp_path / "b.py", "C = 1"), (extra, "B = 2")):
+        if path is not None:
+            path.write_text(text)
+        source_stamp.cache_clear()
+        stamps.append(source_stamp(tmp_path, extra))
+    assert len(set(stamps)) == 3
+
+
+def test_kernels_know_their_sources() -> None:
+    def stamp(kernel: Any) -> Any:
+        return kernel._cache._cache_file._source_stamp
+
+    room = Path(constants.__file__).parent
+    assert stamp(composite.composite) == source_stamp(room / "cpu", room / "constants.py")
+    assert stamp(shade.shade) == source_stamp(Path(shade.__file__).parent)

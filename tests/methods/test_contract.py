@@ -17,7 +17,7 @@ import tiny_training
 from safetensors import safe_open
 
 from chronoscene.errors import CheckpointError
-from chronoscene.kernels.threads import set_threads
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import (
     Method,
     MethodSpec,

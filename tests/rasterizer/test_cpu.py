@@ -6,7 +6,6 @@ import gc
 import os
 import subprocess
 import sys
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,13 +18,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numba import njit
 from rasterizer_cases.comparison import everything
 
+from chronoscene.kernels.thread_pool import launch
 from chronoscene.rasterizer import rasterize
-from chronoscene.rasterizer.cpu import passes as pipeline
-from chronoscene.rasterizer.cpu import sizes as layout
-from chronoscene.rasterizer.cpu import thread_pool as team
-from chronoscene.rasterizer.cpu import workspace
+from chronoscene.rasterizer.cpu import layout, passes
 from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, SORT_PHASES, sort_phases
 
 MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
@@ -62,7 +60,7 @@ def test_bits_do_not_depend_on_the_number_of_threads(
 def test_buffers_of_other_scenes_leave_no_trace(tools: SimpleNamespace) -> None:
     """A small scene after a large one, and after one that has other pixels ended."""
     small = tools.random_scene(50, 45, 30, seed=1)
-    workspace.clear()
+    passes.clear_workspaces()
     fresh = everything(small)
     large = tools.random_scene(3000, 120, 90, seed=2)
     everything(large.with_(opacities=np.full(3000, 0.99, np.float32), scales=large.scales * 4))
@@ -90,14 +88,14 @@ def test_a_graph_can_be_walked_twice(tools: SimpleNamespace) -> None:
 
 
 def test_workspaces_come_back(tools: SimpleNamespace) -> None:
-    workspace.clear()
+    passes.clear_workspaces()
     scene = tools.random_scene(30, 20, 20)
     for _ in range(5):
         everything(scene)
         with torch.no_grad():
             scene.render("cpu")
     gc.collect()
-    assert 1 <= len(workspace._free) <= 2
+    assert 1 <= len(passes._free) <= 2
 
 
 def test_rendering_without_gradients_gives_equal_images(tools: SimpleNamespace) -> None:
@@ -150,6 +148,11 @@ def test_only_asked_gradients(tools: SimpleNamespace) -> None:
     assert_equal_bits([inputs["opacities"].grad], [expected[5 + 3]])
 
 
+@njit
+def _sort(control, keys, counts, pairs, spare, result):  # type: ignore[no-untyped-def]
+    return sort_phases(control, 0, keys, counts, pairs, spare, result)
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     keys=hnp.arrays(
@@ -165,48 +168,12 @@ def test_sort_is_stable_and_leaves_out_negative_keys(keys: np.ndarray, parts: in
     in_spare = []
 
     def kernel(worker: int, control: np.ndarray) -> None:
-        in_spare.append(sort_phases(control, 0, keys, counts, pairs, spare, result)[1])
+        in_spare.append(_sort(control, keys, counts, pairs, spare, result)[1])
 
-    team.launch(kernel, 2, phases=SORT_PHASES)
+    launch(kernel, 2, phases=SORT_PHASES)
     order = (spare if in_spare[0] else pairs)[: result[0]] & 0xFFFFFFFF
     expected = np.argsort(keys, kind="stable")
     np.testing.assert_array_equal(order, expected[keys[expected] >= 0])
-
-
-def test_team_does_every_job_once_and_waits_for_all(threads: Any) -> None:
-    """Many short launches, with more workers than processors."""
-    threads(MOST_THREADS)
-    done = np.zeros(50, np.int64)
-
-    def kernel(worker: int, control: np.ndarray, jobs: np.ndarray) -> None:
-        while True:
-            with lock:
-                job = int(control[0])
-                control[0] += 1
-            if job >= jobs.size:
-                return
-            jobs[job] += 1
-
-    lock = threading.Lock()
-    for k in range(300):
-        team.launch(kernel, 50, done)
-        assert (done == k + 1).all()
-
-
-@pytest.mark.skipif(MOST_THREADS < 2, reason="needs two threads")
-def test_an_error_in_a_helper_reaches_the_caller(threads: Any) -> None:
-    threads(2)
-    entered = threading.Event()
-
-    def kernel(worker: int, control: np.ndarray) -> None:
-        if worker == 1:
-            entered.set()
-            raise ZeroDivisionError
-        assert entered.wait(30)
-
-    with pytest.raises(ZeroDivisionError):
-        team.launch(kernel, 2)
-    team.launch(lambda worker, control: None, 2)  # and the team works on
 
 
 def test_callers_from_several_threads_get_their_own_results(tools: SimpleNamespace) -> None:
@@ -218,36 +185,19 @@ def test_callers_from_several_threads_get_their_own_results(tools: SimpleNamespa
                 assert_equal_bits(got, wanted)
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_forked_child_can_render(tools: SimpleNamespace) -> None:
-    """The child has none of the threads that the parent's team counts on."""
-    code = """
-import os, numpy as np
-from chronoscene.rasterizer.cpu import thread_pool as team
-def kernel(worker, control, seen): seen[worker] += 1
-team.launch(kernel, 2, np.zeros(2))
-child = os.fork()
-if child == 0:
-    seen = np.zeros(2)
-    team.launch(kernel, 2, seen)
-    os._exit(0 if seen[0] == 1 else 1)
-assert os.waitpid(child, 0)[1] == 0
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
-
-
 def test_blocks_are_those_that_the_ellipse_touches(tools: SimpleNamespace) -> None:
     """No block with a pixel above the threshold is missing, and few others are listed."""
     scene = tools.random_scene(400, 100, 70, seed=3)
     names = ("means", "quats", "scales", "opacities", "colors")
-    gaussians = pipeline.Gaussians(*(getattr(scene, name).reshape(-1) for name in names))
-    view = pipeline.make_view(scene.viewmats[0], scene.Ks[0], 100, 70, 0.01, 1e10, 0.3)
+    gaussians: Any = tuple(getattr(scene, name).reshape(-1) for name in names)
+    size: Any = SimpleNamespace(width=100, height=70, near_plane=0.01, far_plane=1e10, eps2d=0.3)
+    view = layout.make_view(scene.viewmats[0], scene.Ks[0], size)
     visible = (np.empty(800, np.float32), np.empty(800, np.float32), np.empty(400, np.float32))
-    binned = pipeline.bin_gaussians(workspace.Workspace(), gaussians, view, visible)
+    binned = passes.bin_gaussians(passes.Workspace(), gaussians, view, visible)
     listed = np.zeros((400, 3 * 32, 4 * 32), bool)
     for tile in range(view.tiles):
         y, x = 32 * (tile // view.tiles_x), 32 * (tile % view.tiles_x)
-        for entry in range(binned.tile_starts[tile], binned.tile_starts[tile + 1]):
+        for entry in range(binned.tiles[0][tile], binned.tiles[0][tile + 1]):
             bits = np.unpackbits(
                 binned.entries[1][entry : entry + 1].view(np.uint8), bitorder="little"
             )

@@ -12,6 +12,7 @@ from numpy import float32
 from chronoscene.anchors.decode.forward import factors, gather_inputs, hidden_layer, task_work
 from chronoscene.anchors.decode.layout import BLOCK, CHUNK, CYCLE, Gradients
 from chronoscene.anchors.decode.second_layers import add_biases, add_offset
+from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.matmul import product
 from chronoscene.kernels.memory import (
     load,
@@ -19,13 +20,13 @@ from chronoscene.kernels.memory import (
     read,
     read_index,
     store,
+    store_cycle,
     store_first,
     write,
     write_index,
 )
-from chronoscene.kernels.registers import LANES, select_less, splat
-from chronoscene.kernels.training_compilation import inner, kernel
-from chronoscene.kernels.vector_math import quad_spread, quad_sum, store_cycle
+from chronoscene.kernels.vector_math import quad_spread, quad_sum
+from chronoscene.kernels.vectors import LANES, select, splat
 
 SLICE = 1024
 """Gradients of weights summed over the chunks by one task."""
@@ -130,7 +131,7 @@ def _hidden_layer_gradient(layout, weights, work, count, partial):  # type: igno
     hiddens, inputs, columns = layout.hiddens, layout.inputs_pad, layout.features_pad
     zero = splat(ZERO)
     for i in range(0, count * hiddens, LANES):
-        grad = select_less(zero, load(work.hidden, i), load(work.d_hidden, i), zero)
+        grad = select(zero < load(work.hidden, i), load(work.d_hidden, i), zero)
         store(work.d_hidden, i, grad)
     for i in range(count * hiddens, BLOCK * hiddens, LANES):
         store(work.d_hidden, i, zero)

@@ -18,6 +18,7 @@ from chronoscene.anchors.decode.layout import (
     MIN_QUAT_NORM,
     Work,
 )
+from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.matmul import product, relu_product
 from chronoscene.kernels.memory import (
     copy_quad,
@@ -31,18 +32,11 @@ from chronoscene.kernels.memory import (
     write,
     write_index,
 )
-from chronoscene.kernels.registers import LANES, select_less, splat
-from chronoscene.kernels.training_compilation import inner, kernel
-from chronoscene.kernels.vector_math import (
-    exp,
-    quad_heads,
-    quad_identity,
-    quad_sum,
-    sigmoid,
-    square_root,
-    tanh,
-)
+from chronoscene.kernels.vector_math import exp, quad_heads, quad_sum, sigmoid, tanh
+from chronoscene.kernels.vectors import LANES, make_constant, select, splat, sqrt
 
+_identity = make_constant([1.0, 0.0, 0.0, 0.0] * (LANES // 4))
+"""The quaternion without a turn, over and over."""
 AHEAD = 16
 """Anchors between the request for a row and its use."""
 ZERO = float32(0)
@@ -221,9 +215,9 @@ def _activate(work, count, first, out):  # type: ignore[no-untyped-def]
     for c in range(0, 4 * count, LANES):
         value = load(work.quats, c)
         square = quad_sum(value * value)
-        inverse = select_less(square, least, splat(ZERO), ONE / square_root(square))
+        inverse = select(square < least, splat(ZERO), ONE / sqrt(square))
         # Without a direction they become the identity.
-        unit = select_less(square, least, quad_identity(), value * inverse)
+        unit = select(square < least, _identity(), value * inverse)
         store_first(out.quats, 4 * first + c, unit, 4 * count - c)
         quads = min(count - c // 4, LANES // 4)
         store_first(out.inverse_norms, first + c // 4, quad_heads(inverse), quads)

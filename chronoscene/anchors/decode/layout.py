@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from chronoscene.kernels.matmul import PADDING
-from chronoscene.kernels.registers import LANES
+from chronoscene.kernels.vectors import LANES
 
 BLOCK = 64
 """Anchors whose rows go through the matrix products together; multiple of every ROW_TILE. What a

@@ -13,14 +13,8 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 
-from chronoscene.kernels.registers import (
-    FLOAT,
-    emit_load,
-    emit_multiply_add,
-    emit_splat,
-    emit_store,
-    intrinsic,
-)
+from chronoscene.kernels.memory import emit_load, emit_store
+from chronoscene.kernels.vectors import FLOAT, LANES, emit_multiply_add, emit_splat, intrinsic
 
 PARTS = ((0, 1), (1, 3), (1, 4), (2, 3))
 """Head and number of outputs per offset of opacity, scale, quaternion and colour."""
@@ -81,7 +75,7 @@ def add_offset(
             for n, (part, i) in enumerate(outputs):
                 head, number = PARTS[part]
                 at = b.add(b.mul(gaussian, index(number)), index(i))
-                grad = emit_splat(b, b.load(grads[part].at(at)))
+                grad = emit_splat(b, b.load(grads[part].at(at)), LANES)
                 totals[head] = emit_multiply_add(b, grad, weights[n], totals[head])
                 new = emit_multiply_add(b, grad, values[head], b.load(sums[n]))
                 b.store(new, sums[n])

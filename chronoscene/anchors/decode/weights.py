@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.memory import read, write
-from chronoscene.kernels.training_compilation import inner, kernel
 
 
 @inner
@@ -24,7 +24,7 @@ def _num_outputs(layout, head):  # type: ignore[no-untyped-def]
     return layout.offsets * (1 if head == 0 else 7 if head == 1 else 3)
 
 
-@kernel()
+@kernel
 def pack(layout, heads, shared, out):  # type: ignore[no-untyped-def]
     """Join three heads.
 
@@ -57,7 +57,7 @@ def pack(layout, heads, shared, out):  # type: ignore[no-untyped-def]
                 write(out.w2_t, h * layout.outputs_pad + column, value)
 
 
-@kernel()
+@kernel
 def unpack_gradients(layout, grads, heads, shared, out, shared_out):  # type: ignore[no-untyped-def]
     """Spread the gradients of the joined weights over the heads and what they share.
 

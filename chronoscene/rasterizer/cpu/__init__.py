@@ -1,46 +1,35 @@
 """The CPU backend: Numba kernels behind one autograd function per image.
 
-`pipeline` says what happens in which order. Gradients are summed in an order that does not depend
-on the number of threads, so equal inputs give equal bits.
+`passes` says what happens in which order. Gradients are summed in an order that does not depend on
+the number of threads, so equal inputs give equal bits.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 
 from chronoscene.errors import BackendError
+from chronoscene.rasterizer import RasterInfo, Rasterization
 from chronoscene.rasterizer.constants import VALUE_MAX
-from chronoscene.rasterizer.cpu import passes as pipeline
-from chronoscene.rasterizer.cpu.function import Render, Request
-from chronoscene.rasterizer.cpu.simd import LANES
-from chronoscene.rasterizer.recentring import recentred
-from chronoscene.rasterizer.types import RasterInfo, Rasterization
+from chronoscene.rasterizer.cpu import passes
+from chronoscene.rasterizer.cpu.layout import LANES, Array, View, make_view
+from chronoscene.rasterizer.cpu.project import set_colors
+from chronoscene.rasterizer.inputs import Inputs, recentred
 
 __all__ = ["rasterize"]
 
 
-def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    *,
-    near_plane: float,
-    far_plane: float,
-    eps2d: float,
-    backgrounds: Tensor | None,
-    render_depth: bool,
-) -> Rasterization:
-    """Render Gaussians; see `chronoscene.rasterizer.rasterize`. Everything is cast to float32."""
+def rasterize(inputs: Inputs) -> Rasterization:
+    """Render Gaussians. Everything is cast to float32."""
+    means, quats, scales, opacities, colors = inputs.gaussians
+    viewmats, render_depth = inputs.viewmats, inputs.render_depth
     if means.device.type != "cpu":
         raise BackendError(
             "backend",
@@ -58,12 +47,10 @@ def rasterize(
     info = _Visible.empty(cameras, padded)
     leaf = info.means2d[:, :count].detach().requires_grad_(wants_grad)
     images, alphas, depths = [], [], []
-    poses, intrinsics = viewmats.detach().double().numpy(), Ks.detach().double().numpy()
+    poses, intrinsics = (x.detach().double().numpy() for x in (viewmats, inputs.Ks))
     for c in range(cameras):
-        view = pipeline.make_view(
-            poses[c], intrinsics[c], width, height, near_plane, far_plane, eps2d
-        )
-        background = None if backgrounds is None else backgrounds[c].float()
+        view = make_view(poses[c], intrinsics[c], inputs)
+        background = None if inputs.backgrounds is None else inputs.backgrounds[c].float()
         image, alpha, weighted = Render.apply(
             *gaussians,
             _slot(leaf, c, padded) if wants_grad else None,
@@ -136,7 +123,7 @@ class _Visible:
             torch.empty(cameras, count),
         )
 
-    def of(self, c: int) -> tuple[pipeline.Array, pipeline.Array, pipeline.Array]:
+    def of(self, c: int) -> tuple[Array, Array, Array]:
         """Flat arrays of one camera for the kernel, which writes integers as float bits."""
         means2d, radii, depths = (
             self.means2d[c],
@@ -144,3 +131,206 @@ class _Visible:
             self.depths[c],
         )
         return means2d.numpy().reshape(-1), radii.numpy().reshape(-1), depths.numpy()
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What to render besides the tensors, and where to put what the projection finds."""
+
+    view: View
+    visible: tuple[Array, Array, Array]
+    render_depth: bool
+
+
+class _Lease:
+    """A workspace in use; goes back when it is dropped."""
+
+    def __init__(self) -> None:
+        self.workspace = passes.acquire_workspace()
+        self.binned: passes.Binned | None = None
+
+    def __del__(self) -> None:
+        passes.release_workspace(self.workspace)
+
+
+class Render(torch.autograd.Function):
+    """(image [H, W, D], opacity [H, W, 1], weighted depth or None) of one camera."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        means2d: Tensor | None,
+        background: Tensor | None,
+        request: Request,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        lease = _Lease()
+        inputs = (means, quats, scales, opacities, colors)
+        job = _Job(inputs, background, request)
+        image, alphas, weighted = job.forward(lease)
+        ctx.set_materialize_grads(False)
+        ctx.request = request
+        ctx.slot = (-1, 2) if means2d is None else means2d.shape
+        ctx.save_for_backward(*inputs, background, alphas)
+        ctx.lease = lease if any(ctx.needs_input_grad) else None
+        return image, alphas, weighted
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *output_grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        *inputs, background, alphas = ctx.saved_tensors
+        job = _Job(tuple(inputs), background, ctx.request)
+        lease, ctx.lease = ctx.lease, None
+        if lease is None:  # a second backward pass through the same graph
+            lease = _Lease()
+            job.forward(lease)
+        image_grad, alpha_grad, weighted_grad = output_grads
+        if image_grad is None:
+            image_grad = torch.zeros(*alphas.shape[:2], inputs[-1].shape[1])
+        grads = job.backward(lease, image_grad, alpha_grad, weighted_grad)
+        background_grad = None
+        if background is not None and ctx.needs_input_grad[6]:
+            assert lease.binned is not None
+            light = passes.transmittance(lease.binned, job.view)
+            background_grad = _background_gradient(image_grad, light)
+        *gaussian_grads, means2d_grad = grads
+        return (*gaussian_grads, means2d_grad.reshape(ctx.slot), background_grad, None)
+
+
+def _background_gradient(image_grad: Tensor, light: Array) -> Tensor:
+    """Summed by numpy, whose order does not depend on the number of threads. [D]"""
+    passed = image_grad.numpy() * light[..., None]
+    return torch.from_numpy(passed.sum(axis=(0, 1), dtype=np.float64).astype(np.float32))
+
+
+class _Job:
+    """One image with any number of channels, three at a time."""
+
+    def __init__(
+        self, inputs: tuple[Tensor, ...], background: Tensor | None, request: Request
+    ) -> None:
+        self.means, self.quats, self.scales, self.opacities, self.colors = inputs
+        self.request, self.view = request, request.view
+        self.count, self.channels = self.colors.shape
+        self.total = self.channels + request.render_depth
+        self.groups = max(1, -(-self.total // 3))
+        self.direct = self.total == 3 and not request.render_depth
+        self.background = np.zeros(3 * self.groups, np.float32)
+        if background is not None:
+            self.background[: self.channels] = background.detach().numpy()
+
+    def forward(self, lease: _Lease) -> tuple[Tensor, Tensor, Tensor | None]:
+        height, width = self.view.height, self.view.width
+        lease.binned = passes.bin_gaussians(
+            lease.workspace, self._scene(), self.view, self.request.visible
+        )
+        images = torch.empty(self.groups, height, width, 3)
+        alphas = torch.empty(height, width, 1)
+        for group in range(self.groups):
+            self._load_colors(lease, group)
+            passes.render(
+                lease.workspace,
+                lease.binned,
+                self.view,
+                self.background[3 * group : 3 * group + 3],
+                images[group].numpy().reshape(-1),
+                alphas.numpy().reshape(-1),
+            )
+        if self.direct:
+            return images[0], alphas, None
+        values = torch.cat(list(images), dim=-1)
+        weighted = values[..., self.channels : self.total].clone()
+        return (
+            values[..., : self.channels].contiguous(),
+            alphas,
+            weighted if self.request.render_depth else None,
+        )
+
+    def backward(
+        self,
+        lease: _Lease,
+        image_grad: Tensor,
+        alpha_grad: Tensor | None,
+        weighted_grad: Tensor | None,
+    ) -> tuple[Tensor, ...]:
+        """Gradients of means, quats, scales, opacities, colors and means2d."""
+        assert lease.binned is not None
+        outputs = tuple(
+            torch.empty(self.count, k) if k > 1 else torch.empty(self.count)
+            for k in (3, 4, 3, 1, 3, 2)
+        )
+        grads = tuple(x.numpy().reshape(-1) for x in outputs)
+        depth_grads = np.empty(0, np.float32)
+        if self.direct:
+            summed: Any = self._sum_pixels(lease, 0, image_grad, alpha_grad)
+        else:
+            if weighted_grad is not None:
+                image_grad = torch.cat([image_grad, weighted_grad], dim=-1)
+            image_grad = pad(image_grad, (0, 3 * self.groups - image_grad.shape[-1]))
+            summed, values = self._sum_groups(lease, image_grad, alpha_grad)
+            if self.request.render_depth:
+                depth_grads = values[:, self.channels].copy()
+        passes.gaussian_gradients(
+            lease.binned, self._scene(), self.view, summed, depth_grads, grads
+        )
+        means, quats, scales, opacities, colors, means2d = outputs
+        if not self.direct:
+            colors = torch.from_numpy(values[:, : self.channels].copy())
+        return means, quats, scales, opacities, colors, means2d
+
+    def _sum_groups(
+        self, lease: _Lease, image_grad: Tensor, alpha_grad: Tensor | None
+    ) -> tuple[Array, Array]:
+        """16 sums of each Gaussian over all groups, and the gradients of all channels."""
+        assert lease.binned is not None
+        sums = np.zeros((self.count, 16), np.float32)
+        values = np.zeros((self.count, 3 * self.groups), np.float32)
+        for group in range(self.groups):
+            self._load_colors(lease, group)
+            part = image_grad[..., 3 * group : 3 * group + 3]
+            summed = self._sum_pixels(lease, group, part, alpha_grad)
+            passes.sum_rows(lease.binned, *summed, sums.reshape(-1))
+            values[:, 3 * group : 3 * group + 3] = sums[:, 6:9]
+            sums[:, 6:9] = 0
+            alpha_grad = None  # counted once
+        return sums.reshape(-1), values
+
+    def _sum_pixels(
+        self, lease: _Lease, group: int, image_grad: Tensor, alpha_grad: Tensor | None
+    ) -> tuple[Array, Array]:
+        assert lease.binned is not None
+        nothing = np.empty(0, np.float32)
+        return passes.render_backward(
+            lease.workspace,
+            lease.binned,
+            self.view,
+            self.background[3 * group : 3 * group + 3],
+            image_grad.contiguous().numpy().reshape(-1),
+            nothing if alpha_grad is None else alpha_grad.contiguous().numpy().reshape(-1),
+        )
+
+    def _scene(self) -> passes.Gaussians:
+        """Flat arrays; colours that do not go straight into the records are left out."""
+        seen = self.colors if self.direct else torch.zeros(self.count, 3)
+        tensors = (self.means, self.quats, self.scales, self.opacities, seen)
+        means, quats, scales, opacities, colors = (x.detach().numpy().reshape(-1) for x in tensors)
+        return means, quats, scales, opacities, colors
+
+    def _load_colors(self, lease: _Lease, group: int) -> None:
+        if self.direct:
+            return
+        assert lease.binned is not None
+        values = self.colors.detach()
+        if self.request.render_depth:
+            depths = torch.from_numpy(self.request.visible[2])
+            values = torch.cat([values, depths[:, None]], dim=1)
+        set_colors(
+            values.contiguous().numpy().reshape(-1),
+            self.total,
+            3 * group,
+            lease.binned.records,
+        )

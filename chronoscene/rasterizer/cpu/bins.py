@@ -14,27 +14,28 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.rasterizer.cpu import sizes as lay
-from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
-from chronoscene.rasterizer.cpu.phases import draw, finish, wait_for
-from chronoscene.rasterizer.cpu.project import chunk_of, project_chunk
-from chronoscene.rasterizer.cpu.simd import (
+from chronoscene.kernels.compilation import inlined, inner, kernel
+from chronoscene.kernels.memory import prefetch
+from chronoscene.kernels.thread_pool import draw, finish, wait_for
+from chronoscene.kernels.vectors import (
     floor,
     make_constant,
     maximum,
     minimum,
     pack_bytes,
-    prefetch,
     select,
     sqrt,
     to_int,
 )
+from chronoscene.rasterizer import constants
+from chronoscene.rasterizer.cpu import layout
+from chronoscene.rasterizer.cpu.project import chunk_of, project_chunk
 from chronoscene.rasterizer.cpu.sort import SORT_PHASES, sort_phases
 
 # A pixel on the rim of the ellipse may pass the test of its alpha after rounding; the blocks must
 # include it. In units of log2(alpha).
 _SLACK = 1e-3
-_LEVEL_MIN = lay.LEVEL_MIN - _SLACK
+_LEVEL_MIN = layout.LEVEL_MIN - _SLACK
 
 _block_rows = make_constant([4.0 * i + 0.5 for i in range(8)])  # first row of centres of each
 
@@ -50,11 +51,11 @@ def _columns(mx: Any, my: Any, tile_y: int, record: Any, at: int, width: int) ->
     top = _block_rows() + np.float32(32 * tile_y - my)
     bottom = top + 3.0
     shear, half, rightmost = (
-        record[at + lay.SHEAR],
-        record[at + lay.HALF_WIDTH],
-        record[at + lay.RIGHTMOST],
+        record[at + layout.SHEAR],
+        record[at + layout.HALF_WIDTH],
+        record[at + layout.RIGHTMOST],
     )
-    inverse_y, reach = record[at + lay.INVERSE_Y], record[at + lay.LEVEL] - _LEVEL_MIN
+    inverse_y, reach = record[at + layout.INVERSE_Y], record[at + layout.LEVEL] - _LEVEL_MIN
     yr = minimum(maximum(top, rightmost), bottom)
     yl = minimum(maximum(top, -rightmost), bottom)
     vr, vl = yr * inverse_y, yl * inverse_y
@@ -78,7 +79,7 @@ def _tile_blocks(first: Any, last: Any, tile_x: int) -> Any:
     return pack_bytes(select(some, bits, 0))
 
 
-@helper
+@inner(fast_math=True)
 def _list_part(first, last, at, limit, order, view, scene, counts, listed):
     """Pairs of the Gaussians first..last of the order of drawing. Returns the list's end.
 
@@ -91,10 +92,10 @@ def _list_part(first, last, at, limit, order, view, scene, counts, listed):
     for i in range(first, last):
         gaussian = order[i] & 0xFFFFFFFF
         if i + 8 < last:
-            prefetch(records, lay.RECORD * (order[i + 8] & 0xFFFFFFFF))
-        base = lay.RECORD * gaussian
-        xs, ys = records_int[base + lay.TILES_X], records_int[base + lay.TILES_Y]
-        row = row_bases[chunk_of(gaussian, row_bases.size - 1)] + records_int[base + lay.ROW]
+            prefetch(records, layout.RECORD * (order[i + 8] & 0xFFFFFFFF))
+        base = layout.RECORD * gaussian
+        xs, ys = records_int[base + layout.TILES_X], records_int[base + layout.TILES_Y]
+        row = row_bases[chunk_of(gaussian, row_bases.size - 1)] + records_int[base + layout.ROW]
         if at + (xs >> 16) * (ys >> 16) > limit:
             return limit + 1
         mx, my = records[base], records[base + 1]
@@ -114,7 +115,7 @@ def _list_part(first, last, at, limit, order, view, scene, counts, listed):
     return at
 
 
-@helper
+@inner(fast_math=True)
 def _tile_offsets(counts, tile_starts):
     """Turn counts by part and tile into places: by tile, within a tile by part."""
     total = 0
@@ -127,7 +128,7 @@ def _tile_offsets(counts, tile_starts):
     tile_starts[counts.shape[1]] = total
 
 
-@helper
+@inner(fast_math=True)
 def _order_tiles(tile_starts, tile_order):
     """Tiles with many entries first, so that the last ones to be taken are short. A counting sort
     by a quarter of the number's logarithm."""
@@ -143,7 +144,7 @@ def _order_tiles(tile_starts, tile_order):
         tile_order[counts[bucket]] = tile
 
 
-@helper
+@inner(fast_math=True)
 def _weight(count):
     """Four times the logarithm to base 2, roughly; 0 for 0."""
     octave = 0
@@ -152,7 +153,7 @@ def _weight(count):
     return 4 * octave + ((count << 3 >> octave) & 3 if octave > 0 else 0)
 
 
-@helper
+@inner(fast_math=True)
 def _scatter_part(first, last, places, listed, entries):
     list_tile, list_gaussian, list_blocks, list_row = listed
     entry_gaussian, entry_blocks, entry_row = entries
@@ -165,7 +166,7 @@ def _scatter_part(first, last, places, listed, entries):
         entry_row[place] = list_row[j]
 
 
-@helper
+@inner(fast_math=True)
 def _sum_up(row_bases):
     """Turn the numbers of rows of the chunks, each one place late, into first rows."""
     row_bases[0] = 0
@@ -173,7 +174,7 @@ def _sum_up(row_bases):
         row_bases[chunk] += row_bases[chunk - 1]
 
 
-@helper
+@inner(fast_math=True)
 def _list_phase(control, phase, starts, ends, order, count, view, scene, counts, listed):
     """List the pairs of each part and count them by tile. Returns whether there was room."""
     parts = ends.size
@@ -199,14 +200,14 @@ def _list_phase(control, phase, starts, ends, order, count, view, scene, counts,
     return room
 
 
-@kernel
+@kernel(fast_math=True, extras=[constants])
 def bin_gaussians(
     worker, control, gaussians, camera, view, records, keys, numbering, out, sorting, parts, tiles
 ):
     """From Gaussians to the list of every tile, in one launch.
 
     Args:
-        worker, control: See `team.launch`; `BIN_PHASES` phases.
+        worker, control: See `thread_pool.launch`; `BIN_PHASES` phases.
         gaussians, camera, records, keys, numbering, out: See `project.project_chunk`.
         view: (width, height, tiles per row).
         sorting: (counts, pairs, spare, result) of `sort.sort_phases`. The last has a fourth number

@@ -1,47 +1,110 @@
-"""Compositing, tile by tile, front to back."""
+"""Compositing, tile by tile, front to back; and how alpha is computed, for both passes.
+
+What a pass keeps of a tile is ordered by block, so that a vector is one aligned load, and all that
+belongs to a block lies together: planes a power of two apart would collide in the processor's
+store buffer.
+"""
 
 # mypy: allow-untyped-defs
 # Numba infers the types of kernels.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from chronoscene.rasterizer.constants import ALPHA_MAX, TRANSMITTANCE_MIN
-from chronoscene.rasterizer.cpu import sizes as lay
-from chronoscene.rasterizer.cpu.kernel import helper, kernel
-from chronoscene.rasterizer.cpu.phases import draw
-from chronoscene.rasterizer.cpu.simd import (
-    LANES,
+from chronoscene.kernels.compilation import inlined, inner, kernel
+from chronoscene.kernels.memory import prefetch, store, store_where
+from chronoscene.kernels.thread_pool import draw
+from chronoscene.kernels.transposes import store_pixels
+from chronoscene.kernels.vector_math import ROUNDER, exp2
+from chronoscene.kernels.vectors import (
     any_lane,
-    load,
+    make_constant,
     minimum,
     multiply_add,
-    prefetch,
     select,
-    splat,
-    splat_int,
-    store,
-    store_pixels,
-    store_where,
     trailing_zeros,
 )
-from chronoscene.rasterizer.cpu.tile import AHEAD, PART_ROWS, PARTS, offset, whitened
-from chronoscene.rasterizer.cpu.vecmath import ROUND, exp2
+from chronoscene.rasterizer import constants
+from chronoscene.rasterizer.cpu import layout
+from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, splat, splat_int
 
-_PIXELS = lay.TILE_PIXELS
+AHEAD = 6
+"""Entries by which records are asked for in advance."""
+STEPS = 32
+"""Scratch numbers of a Gaussian in a tile, see `start_gaussian`."""
+
 _STATE = 64  # numbers per block: light, red, green, blue
-_STEPS = 64 * _STATE  # where the numbers of `tile.whitened` are
-FORWARD_NUMBERS = _STEPS + 32
+_STEPS = 64 * _STATE  # where the steps are
+FORWARD_NUMBERS = _STEPS + STEPS
 """Scratch of one worker."""
-_LEVEL_MIN = lay.LEVEL_MIN
+
+_lane_x = make_constant([i % 4 + 0.5 for i in range(LANES)])
+_lane_y = make_constant([i // 4 + 0.5 for i in range(LANES)])
+_block_steps = make_constant([4.0 * i for i in range(8)])
 
 
-@helper
+@inlined
+def tile_corner(tile: Any, width: Any) -> Any:
+    """Left and top pixel of a tile."""
+    tiles_x = (width + layout.TILE - 1) // layout.TILE
+    return layout.TILE * (tile % tiles_x), layout.TILE * (tile // tiles_x)
+
+
+@inlined
+def start_gaussian(records: Any, at: int, left: Any, top: Any, state: Any, steps: int) -> Any:
+    """Level of a Gaussian, (u, v) of the pixels of a tile's first block, and `power_at`'s shift.
+
+    (u, v) is the offset from the mean, whitened: u = U_X dx + U_Y dy, and v = V dy, or V dx where V
+    is negative. How they change from block to block goes into numbers of ``state``: 8 of u by
+    column, 8 of u by row, 8 of v by row or by column, 1 of v by row. Adding them costs less than
+    multiplying anew: additions have units of their own.
+    """
+    u_x, u_y, v = records[at + layout.U_X], records[at + layout.U_Y], records[at + layout.V]
+    zero = np.float32(0.0)
+    v_x, v_y, shift = (zero, v, 3) if v > zero else (v, zero, 0)
+    store(state, steps, _block_steps() * u_x)
+    store(state, steps + 8, _block_steps() * u_y)
+    store(state, steps + 16, _block_steps() * v)
+    state[steps + 24] = np.float32(4.0) * v_y
+    dx = _lane_x() + (left - records[at + layout.MEAN_X])
+    dy = _lane_y() + (top - records[at + layout.MEAN_Y])
+    return splat(records[at + layout.LEVEL]), dx * u_x + dy * u_y, dx * v_x + dy * v_y, shift
+
+
+@inlined
+def color_of(records: Any, at: int) -> Any:
+    """Red, green and blue of a Gaussian."""
+    color = at + layout.COLOR
+    return splat(records[color]), splat(records[color + 1]), splat(records[color + 2])
+
+
+@inlined
+def power_at(gaussian: Any, block: Any, part: int, state: Any, steps: int) -> Any:
+    """log2(alpha) = LEVEL - u^2 - v^2 before the cap, in the pixels of part of a block; u and v.
+
+    Args:
+        gaussian: From `start_gaussian`. Shifted, the number of a block begins with its row if v
+            goes by rows; else it is left as it is and begins with its column.
+    """
+    level, u, v, shift = gaussian
+    row = block >> 3
+    u = u + state[steps + (block & 7)] + state[steps + 8 + row]
+    v = v + state[steps + 16 + ((block >> shift) & 7)]
+    if PARTS > 1:  # the second half is two pixels below
+        u = u + state[steps + 9] * np.float32(0.5 * part)
+        v = v + state[steps + 24] * np.float32(0.5 * part)
+    rest = level - v * v
+    return rest - u * u, u, v
+
+
+@inner(fast_math=True)
 def _start_tile(left, top, width, height, state, planes, plane, end):
     """Light everywhere, pixels outside the image dead. Returns the blocks inside."""
     transmittance, last = planes
-    transmittance[plane : plane + _PIXELS] = np.float32(1.0)
+    transmittance[plane : plane + layout.TILE_PIXELS] = np.float32(1.0)
     live = np.uint64(0)
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
@@ -61,7 +124,7 @@ def _start_tile(left, top, width, height, state, planes, plane, end):
     return live
 
 
-@helper
+@inner(fast_math=True)
 def _any_light(state, at):
     """Whether any pixel of a block is alive."""
     alive = False
@@ -70,9 +133,9 @@ def _any_light(state, at):
     return alive
 
 
-@helper
-def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records, planes, state):
-    """Composite the entries of a tile. Returns where it stopped.
+@inner(fast_math=True)
+def _forward_tile(start, end, left, top, live, plane, entries, records, planes, state):
+    """Composite the entries of a tile: C += alpha T c, T *= 1 - alpha. Returns where it stopped.
 
     A dead pixel has light 0 here, so that nothing adds to it; what light it had is kept in the
     planes, with the entry before which it ended. That happens once per pixel: the branch is rare,
@@ -80,34 +143,32 @@ def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records
     down to those that were alive, for the backward pass.
     """
     transmittance, last = planes
+    gaussians, blocks, _ = entries
     for entry in range(start, end):
         bits = blocks[entry] & live
         blocks[entry] = bits
-        prefetch(records, lay.RECORD * gaussians[entry + AHEAD])
+        prefetch(records, layout.RECORD * gaussians[entry + AHEAD])
         if bits == 0:
             if live == 0:
                 return entry
             continue
-        record = lay.RECORD * gaussians[entry]
-        level, u0, v0, shift = whitened(records, record, left, top, state, _STEPS)
-        red, green = splat(records[record + lay.COLOR]), splat(records[record + lay.COLOR + 1])
-        blue = splat(records[record + lay.COLOR + 2])
+        record = layout.RECORD * gaussians[entry]
+        gaussian = start_gaussian(records, record, left, top, state, _STEPS)
+        red, green, blue = color_of(records, record)
         while bits != 0:
             block = trailing_zeros(bits)
             bits &= bits - np.uint64(1)
             for part in range(PARTS):
                 at = _STATE * block + LANES * part
-                u, v = offset(u0, v0, block, part, state, _STEPS, shift)
-                rest = level - v * v
-                power = rest - u * u
-                alpha = minimum(exp2(power, power + ROUND), ALPHA_MAX)
-                counts = power >= _LEVEL_MIN
+                power, _, _ = power_at(gaussian, block, part, state, _STEPS)
+                alpha = minimum(exp2(power, power + ROUNDER), constants.ALPHA_MAX)
+                counts = power >= layout.LEVEL_MIN
                 light = load(state, at)
                 weight = select(counts, alpha * light, 0.0)
                 # Not light - weight: its rounding is that of the light before, which may be 1000
                 # times what is left.
                 after = select(counts, multiply_add(0.0 - alpha, light, light), light)
-                dying = (light > 0.0) & (after <= TRANSMITTANCE_MIN)
+                dying = (light > 0.0) & (after <= constants.TRANSMITTANCE_MIN)
                 if any_lane(dying):
                     weight = select(dying, 0.0, weight)
                     after = select(dying, 0.0, after)
@@ -124,34 +185,27 @@ def _forward_tile(start, end, left, top, live, plane, gaussians, blocks, records
     return end
 
 
-@helper
+@inner(fast_math=True)
 def _write_tile(left, top, width, height, plane, state, transmittance, background, image, alphas):
-    """Colours over the background, and opacity, from a tile's state to the image."""
+    """Image C + T b over the background b, and opacity 1 - T, from a tile's state."""
     red, green, blue = background
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
         at = _STATE * block
         for part in range(PARTS):
-            i = at + LANES * part
-            light, kept = (
-                load(state, i),
-                load(transmittance, plane + 16 * block + LANES * part),
-            )
+            i, k = at + LANES * part, plane + 16 * block + LANES * part
+            light, kept = load(state, i), load(transmittance, k)
             light = select(light > 0.0, light, kept)
             store(state, i, light)
-            store(transmittance, plane + 16 * block + LANES * part, light)
+            store(transmittance, k, light)
             store(state, i + 16, load(state, i + 16) + light * red)
             store(state, i + 32, load(state, i + 32) + light * green)
             store(state, i + 48, load(state, i + 48) + light * blue)
         if x + 4 <= width and y + 4 <= height:
             for part in range(PARTS):
                 i, pixel = at + LANES * part, (y + PART_ROWS * part) * width + x
-                store_pixels(
-                    image,
-                    3 * pixel,
-                    3 * width,
-                    (load(state, i + 16), load(state, i + 32), load(state, i + 48)),
-                )
+                channels = (load(state, i + 16), load(state, i + 32), load(state, i + 48))
+                store_pixels(image, 3 * pixel, 3 * width, channels)
                 store_pixels(alphas, pixel, width, (1.0 - load(state, i),))
         else:
             for k in range(16):
@@ -162,73 +216,36 @@ def _write_tile(left, top, width, height, plane, state, transmittance, backgroun
                         image[3 * pixel + c] = state[at + 16 + 16 * c + k]
 
 
-@kernel
+@kernel(fast_math=True, extras=[constants])
 def composite(
-    worker,
-    control,
-    width,
-    height,
-    tile_starts,
-    tile_stops,
-    tile_order,
-    gaussians,
-    blocks,
-    records,
-    planes,
-    states,
-    background,
-    image,
-    alphas,
+    worker, control, size, tiles, entries, records, planes, states, background, image, alphas
 ):
     """Composite all tiles.
 
     Args:
-        worker, control: See `team.launch`; a job is a tile.
-        width, height: Of the image in pixels.
-        tile_starts: First entry of each tile, and the end of the last. int64 [tiles + 1]
-        tile_stops: Written: where compositing stopped. int64 [tiles]
-        tile_order: Order in which to take the tiles. int32 [tiles]
-        gaussians: Gaussian of each entry, readable a little past the end. int32
-        blocks: Blocks of each entry; cut down to those that were alive. uint64
+        worker, control: See `thread_pool.launch`; a job is a tile.
+        size: (width, height) of the image in pixels.
+        tiles: (first entry of each tile and the end of the last, where compositing stopped, which
+            is written, order in which to take the tiles). int64, int64, int32
+        entries: (Gaussian, blocks, row) of each entry, the first readable a little past the end;
+            blocks are cut down to those that were alive. int32, uint64, int32
         records: See `layout`.
         planes: (transmittance, end of the entries that count), by tile, written.
         states: Scratch, `FORWARD_NUMBERS` per worker.
         background: Three numbers.
         image, alphas: Written. [H * W * 3], [H * W]
     """
-    tiles_x = (width + lay.TILE - 1) // lay.TILE
-    tiles = tile_stops.size
-    transmittance, _ = planes
+    width, height = size
+    starts, stops, order = tiles
     state = states[worker]
     job = draw(control, 0)
-    while job < tiles:
-        tile = tile_order[job]
-        left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
-        plane, start, end = _PIXELS * tile, tile_starts[tile], tile_starts[tile + 1]
+    while job < stops.size:
+        tile = order[job]
+        left, top = tile_corner(tile, width)
+        plane, start, end = layout.TILE_PIXELS * tile, starts[tile], starts[tile + 1]
         live = _start_tile(left, top, width, height, state, planes, plane, end)
-        tile_stops[tile] = _forward_tile(
-            start,
-            end,
-            np.float32(left),
-            np.float32(top),
-            live,
-            plane,
-            gaussians,
-            blocks,
-            records,
-            planes,
-            state,
-        )
-        _write_tile(
-            left,
-            top,
-            width,
-            height,
-            plane,
-            state,
-            transmittance,
-            (background[0], background[1], background[2]),
-            image,
-            alphas,
-        )
+        x, y = np.float32(left), np.float32(top)
+        stops[tile] = _forward_tile(start, end, x, y, live, plane, entries, records, planes, state)
+        light = (background[0], background[1], background[2])
+        _write_tile(left, top, width, height, plane, state, planes[0], light, image, alphas)
         job = draw(control, 0)

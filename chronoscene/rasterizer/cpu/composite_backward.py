@@ -7,42 +7,38 @@ from __future__ import annotations
 
 import numpy as np
 
-from chronoscene.rasterizer.constants import ALPHA_MAX
-from chronoscene.rasterizer.cpu import sizes as lay
-from chronoscene.rasterizer.cpu.kernel import helper, kernel
-from chronoscene.rasterizer.cpu.phases import draw
-from chronoscene.rasterizer.cpu.simd import (
-    LANES,
-    as_float,
-    as_int,
-    load,
-    load_pixels,
-    minimum,
-    prefetch,
-    prefetch_write,
-    select,
-    splat,
-    splat_int,
-    store,
-    store_sums,
-    trailing_zeros,
+from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.kernels.memory import prefetch, prefetch_write, store
+from chronoscene.kernels.thread_pool import draw
+from chronoscene.kernels.transposes import make_load_pixels, store_sums
+from chronoscene.kernels.vector_math import ROUNDER, exp2
+from chronoscene.kernels.vectors import as_float, as_int, minimum, select, trailing_zeros
+from chronoscene.rasterizer import constants
+from chronoscene.rasterizer.cpu import layout
+from chronoscene.rasterizer.cpu.composite import (
+    AHEAD,
+    STEPS,
+    color_of,
+    power_at,
+    start_gaussian,
+    tile_corner,
 )
-from chronoscene.rasterizer.cpu.tile import AHEAD, PART_ROWS, PARTS, offset, whitened
-from chronoscene.rasterizer.cpu.vecmath import ROUND, exp2
+from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, splat, splat_int
 
-_PIXELS = lay.TILE_PIXELS
 _STATE = 96  # numbers per block: light, behind, gradient of red, green, blue, end of what counts
-_STEPS = 64 * _STATE  # where the numbers of `tile.whitened` are
-BACKWARD_NUMBERS = _STEPS + 32
+_STEPS = 64 * _STATE  # where the steps are
+BACKWARD_NUMBERS = _STEPS + STEPS
 """Scratch of one worker."""
-_LEVEL_MIN = lay.LEVEL_MIN
+
+_load_rgb, _load_alpha = make_load_pixels(3, LANES), make_load_pixels(1, LANES)
 
 
-@helper
+@inner(fast_math=True)
 def _start_backward(
     left, top, width, height, plane, planes, image_grad, alpha_grad, background, state
 ):
-    """State of a tile: final light, the background behind it, gradients of the channels."""
+    """State of a tile: final light, gradients g of the channels, and what is behind the last
+    Gaussian, B = b . g - d loss / d opacity with b the background."""
     transmittance, last = planes
     red, green, blue = background
     for block in range(64):
@@ -53,13 +49,13 @@ def _start_backward(
         if x + 4 <= width and y + 4 <= height:
             for part in range(PARTS):
                 i, pixel = at + LANES * part, (y + PART_ROWS * part) * width + x
-                r, g, b = load_pixels(image_grad, 3 * pixel, 3 * width, 3)
+                r, g, b = _load_rgb(image_grad, 3 * pixel, 3 * width)
                 store(state, i + 32, r)
                 store(state, i + 48, g)
                 store(state, i + 64, b)
                 behind = r * red + (g * green + b * blue)
                 if alpha_grad.size > 0:
-                    behind = behind - load_pixels(alpha_grad, pixel, width, 1)[0]
+                    behind = behind - _load_alpha(alpha_grad, pixel, width)[0]
                 store(state, i + 16, behind)
         else:
             for k in range(16):
@@ -78,7 +74,7 @@ def _start_backward(
             store(state, i + 80, as_float(load(last, k)))
 
 
-@helper
+@inner(fast_math=True)
 def _backward_tile(start, stop, left, top, entries, records, touched, rows, state):
     """Rows of the entries of a tile, from the last to the first.
 
@@ -91,14 +87,13 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
         entry = stop - 1 - k
         bits = blocks[entry]
         ahead = max(entry - AHEAD, 0)
-        prefetch(records, lay.RECORD * gaussians[ahead])
-        prefetch_write(rows, lay.RECORD * places[ahead])
+        prefetch(records, layout.RECORD * gaussians[ahead])
+        prefetch_write(rows, layout.RECORD * places[ahead])
         if bits == 0:
             continue
-        record = lay.RECORD * gaussians[entry]
-        level, u0, v0, shift = whitened(records, record, left, top, state, _STEPS)
-        red, green = splat(records[record + lay.COLOR]), splat(records[record + lay.COLOR + 1])
-        blue = splat(records[record + lay.COLOR + 2])
+        record = layout.RECORD * gaussians[entry]
+        gaussian = start_gaussian(records, record, left, top, state, _STEPS)
+        red, green, blue = color_of(records, record)
         s = su = sv = suu = suv = svv = sr = sg = sb = splat(np.float32(0.0))
         number = splat_int(entry)
         while bits != 0:
@@ -106,28 +101,25 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
             bits &= bits - np.uint64(1)
             for part in range(PARTS):
                 at = _STATE * block + LANES * part
-                u, v = offset(u0, v0, block, part, state, _STEPS, shift)
-                rest = level - v * v
-                power = rest - u * u
-                raw = exp2(power, power + ROUND)
-                counts = (power >= _LEVEL_MIN) & (number < as_int(load(state, at + 80)))
-                alpha = select(counts, minimum(raw, ALPHA_MAX), 0.0)
+                power, u, v = power_at(gaussian, block, part, state, _STEPS)
+                raw = exp2(power, power + ROUNDER)
+                counts = (power >= layout.LEVEL_MIN) & (number < as_int(load(state, at + 80)))
+                alpha = select(counts, minimum(raw, constants.ALPHA_MAX), 0.0)
+                # T = T_after / (1 - alpha).
                 light = load(state, at) / (1.0 - alpha)
                 behind = load(state, at + 16)
-                gr, gg, gb = (
-                    load(state, at + 32),
-                    load(state, at + 48),
-                    load(state, at + 64),
-                )
+                gr, gg, gb = load(state, at + 32), load(state, at + 48), load(state, at + 64)
                 difference = gr * red + (gg * green + (gb * blue - behind))
                 weight = alpha * light
                 step = alpha * difference
                 store(state, at, light)
                 store(state, at + 16, step + behind)
+                # d loss / d c = alpha T grad.
                 sr = sr + weight * gr
                 sg = sg + weight * gg
                 sb = sb + weight * gb
-                g = select(raw <= ALPHA_MAX, step * light, 0.0)
+                # g = alpha d loss / d alpha, 0 where alpha is capped; its moments in (u, v).
+                g = select(raw <= constants.ALPHA_MAX, step * light, 0.0)
                 gu, gv = g * u, g * v
                 s = s + g
                 su = su + gu
@@ -137,71 +129,34 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
                 svv = svv + gv * v
         place = places[entry]
         touched[place] = 1
-        store_sums(rows, lay.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
-        rows[lay.RECORD * place + lay.SUM_SIGN] = records[record + lay.V]
+        store_sums(rows, layout.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
+        rows[layout.RECORD * place + layout.SUM_SIGN] = records[record + layout.V]
 
 
-@kernel
+@kernel(fast_math=True, extras=[constants])
 def composite_backward(
-    worker,
-    control,
-    width,
-    height,
-    tile_starts,
-    tile_stops,
-    tile_order,
-    entries,
-    records,
-    planes,
-    states,
-    background,
-    image_grad,
-    alpha_grad,
-    touched,
-    rows,
+    worker, control, size, tiles, entries, records, planes, states, background, grads, out
 ):
     """Sums over pixels of every entry, from the gradients of image and opacity.
 
     Args:
-        worker, control, width, height: As in `composite`.
-        tile_starts, tile_stops, tile_order: As `composite` left them.
-        entries: (gaussian, blocks, place of its row) of each entry; as `composite` left them.
-        records, planes: As `composite` left them.
+        worker, control, size, background: As in `composite`.
+        tiles, entries, records, planes: As `composite` left them.
         states: Scratch, `BACKWARD_NUMBERS` per worker.
-        background: Three numbers.
-        image_grad, alpha_grad: [H * W * 3], [H * W] or nothing
-        touched: Zeros; 1 is written where a row is. uint8
-        rows: Written, 16 numbers per entry; see `layout`.
+        grads: Of image and opacity. [H * W * 3], [H * W] or nothing
+        out: (touched, rows), written. Where touched, zeros at first, becomes 1, there is a row of
+            16 numbers, see `layout`. uint8, float32
     """
-    tiles_x = (width + lay.TILE - 1) // lay.TILE
-    tiles = tile_stops.size
+    width, height = size
+    starts, stops, order = tiles
+    touched, rows = out
     state = states[worker]
     job = draw(control, 0)
-    while job < tiles:
-        tile = tile_order[job]
-        left, top = lay.TILE * (tile % tiles_x), lay.TILE * (tile // tiles_x)
-        start, stop = tile_starts[tile], tile_stops[tile]
-        _start_backward(
-            left,
-            top,
-            width,
-            height,
-            _PIXELS * tile,
-            planes,
-            image_grad,
-            alpha_grad,
-            (background[0], background[1], background[2]),
-            state,
-        )
-        _backward_tile(
-            start,
-            stop,
-            np.float32(left),
-            np.float32(top),
-            entries,
-            records,
-            touched,
-            rows,
-            state,
-        )
+    while job < stops.size:
+        tile = order[job]
+        left, top = tile_corner(tile, width)
+        plane, light = layout.TILE_PIXELS * tile, (background[0], background[1], background[2])
+        _start_backward(left, top, width, height, plane, planes, grads[0], grads[1], light, state)
+        x, y = np.float32(left), np.float32(top)
+        _backward_tile(starts[tile], stops[tile], x, y, entries, records, touched, rows, state)
         job = draw(control, 0)

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from chronoscene.rasterizer.cpu import sizes as lay
-from chronoscene.rasterizer.cpu.kernel import inlined
-from chronoscene.rasterizer.cpu.simd import (
+from chronoscene.kernels.compilation import inlined
+from chronoscene.kernels.vectors import (
     absolute,
     as_float,
     as_int,
@@ -21,15 +20,16 @@ from chronoscene.rasterizer.cpu.simd import (
     select,
     sqrt,
 )
+from chronoscene.rasterizer.cpu import layout
 
 
 @inlined
 def _to_camera(camera: Any, x: Any, y: Any, z: Any) -> Any:
     """R (x - c). The centre c of the camera has a rest that float32 cannot hold: subtracted after
     c, it leaves no more error than x itself has, however far from the origin both are."""
-    x = (x - camera[lay.CENTRE]) - camera[lay.CENTRE_REST]
-    y = (y - camera[lay.CENTRE + 1]) - camera[lay.CENTRE_REST + 1]
-    z = (z - camera[lay.CENTRE + 2]) - camera[lay.CENTRE_REST + 2]
+    x = (x - camera[layout.CENTRE]) - camera[layout.CENTRE_REST]
+    y = (y - camera[layout.CENTRE + 1]) - camera[layout.CENTRE_REST + 1]
+    z = (z - camera[layout.CENTRE + 2]) - camera[layout.CENTRE_REST + 2]
     return (
         camera[0] * x + (camera[1] * y + camera[2] * z),
         camera[3] * x + (camera[4] * y + camera[5] * z),
@@ -139,22 +139,25 @@ def project_axes(camera: Any, position: Any, r: Any) -> Any:
     """
     px, py, pz = _to_camera(camera, position[0], position[1], position[2])
     inverse = 1.0 / pz
+    # The Jacobian of the projection is J = ((f_x, 0, -f_x jx), (0, f_y, -f_y jy)) / z, with jx and
+    # jy the ratios x / z and y / z held near the image.
     tx, ty = px * inverse, py * inverse
-    jx = minimum(maximum(tx, camera[lay.X_MIN]), camera[lay.X_MAX])
-    jy = minimum(maximum(ty, camera[lay.Y_MIN]), camera[lay.Y_MAX])
+    jx = minimum(maximum(tx, camera[layout.X_MIN]), camera[layout.X_MAX])
+    jy = minimum(maximum(ty, camera[layout.Y_MIN]), camera[layout.Y_MAX])
     m2 = _rotated_row(camera[6], camera[7], camera[8], r)
     rows = (
-        _image_row(camera[lay.FX], jx, _rotated_row(camera[0], camera[1], camera[2], r), m2),
-        _image_row(camera[lay.FY], jy, _rotated_row(camera[3], camera[4], camera[5], r), m2),
+        _image_row(camera[layout.FX], jx, _rotated_row(camera[0], camera[1], camera[2], r), m2),
+        _image_row(camera[layout.FY], jy, _rotated_row(camera[3], camera[4], camera[5], r), m2),
     )
-    c = lay.COFACTORS
+    c = layout.COFACTORS
     sight = _rotated_row(
         jx * camera[c] + (jy * camera[c + 3] + camera[c + 6]),
         jx * camera[c + 1] + (jy * camera[c + 4] + camera[c + 7]),
         jx * camera[c + 2] + (jy * camera[c + 5] + camera[c + 8]),
         r,
     )
-    return (pz, inverse, (tx, ty), (jx, jy)), m2, rows, by(camera[lay.FX] * camera[lay.FY], sight)
+    normal = by(camera[layout.FX] * camera[layout.FY], sight)
+    return (pz, inverse, (tx, ty), (jx, jy)), m2, rows, normal
 
 
 @inlined
@@ -186,6 +189,7 @@ def ellipse(rows: Any, normal: Any, s: Any, t: Any, blur: Any, sideways: Any) ->
     inverse = 1.0 / sqrt(bb)
     e = by(inverse, b)
     normal = by(select(sideways, 0.0 - inverse, inverse), normal)
+    # a x b by the line of sight; the rest a - shear b = e x n + blur a / bb.
     n = (s[1] * t[2] * normal[0], s[2] * t[0] * normal[1], s[0] * t[1] * normal[2])
     share = blur * inverse * inverse
     rest = plus(cross(times(e, t), normal), by(share, first))

@@ -1,63 +1,80 @@
-"""One image, forward and backward: the kernels in order, on flat numpy arrays."""
+"""One image, forward and backward: the kernels in order, on flat numpy arrays.
+
+Their buffers are in a `Workspace`, which is kept between calls: the first touch of fresh memory can
+cost more than rendering. Nothing may rely on what an earlier call left in it.
+"""
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from chronoscene.rasterizer.constants import CLAMP_MARGIN
-from chronoscene.rasterizer.cpu import sizes as lay
-from chronoscene.rasterizer.cpu.bins import BIN_PHASES
-from chronoscene.rasterizer.cpu.bins import bin_gaussians as bin_all
+from chronoscene.kernels.thread_pool import launch, num_workers
+from chronoscene.rasterizer.cpu import bins, layout
 from chronoscene.rasterizer.cpu.composite import FORWARD_NUMBERS, composite
 from chronoscene.rasterizer.cpu.composite_backward import BACKWARD_NUMBERS, composite_backward
+from chronoscene.rasterizer.cpu.layout import LANES, Array, View
 from chronoscene.rasterizer.cpu.project_backward import add_rows, project_backward
-from chronoscene.rasterizer.cpu.simd import LANES
 from chronoscene.rasterizer.cpu.sort import DIGIT_BITS
-from chronoscene.rasterizer.cpu.thread_pool import launch, threads
-from chronoscene.rasterizer.cpu.workspace import Workspace
 
-Array = NDArray[Any]
+Gaussians = tuple[Array, Array, Array, Array, Array]
+"""Means, quats, scales, opacities and colors of `layout.LANES` Gaussians or more, flat float32."""
 
+_GROWTH = 1.25
+_MAX_FREE_WORKSPACES = 4
+_CACHE_LINE = 64
 _MARGIN = 16
 """Entries that may be read past the end, to fetch records ahead."""
 
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """Where one image is taken from."""
-
-    camera: Array
-    """`layout.CAMERA` numbers, float32."""
-    width: int
-    height: int
-
-    @property
-    def tiles_x(self) -> int:
-        return -(-self.width // lay.TILE)
-
-    @property
-    def tiles(self) -> int:
-        return self.tiles_x * -(-self.height // lay.TILE)
+_free: list[Workspace] = []
+_lock = threading.Lock()
 
 
-@dataclass(frozen=True, slots=True)
-class Gaussians:
-    """Flat float32 arrays of at least `simd.LANES` Gaussians."""
+class Workspace:
+    """Named arrays of one rendering, forward and backward. They only grow."""
 
-    means: Array
-    quats: Array
-    scales: Array
-    opacities: Array
-    colors: Array
+    def __init__(self) -> None:
+        self._arrays: dict[str, Array] = {}
+        self.pairs_per_gaussian = 3.0
+        """Room for (Gaussian, tile) pairs; most Gaussians touch one or two tiles. It grows with
+        need. Memory that is not used is not touched."""
 
-    @property
-    def arrays(self) -> tuple[Array, Array, Array, Array, Array]:
-        """In the order that kernels want."""
-        return self.means, self.quats, self.scales, self.opacities, self.colors
+    def array(self, name: str, size: int, dtype: type) -> Array:
+        """Array of ``size`` elements with any content."""
+        have = self._arrays.get(name)
+        if have is None or have.size < size:
+            capacity = size if have is None else max(size, int(have.size * _GROWTH))
+            have = self._arrays[name] = _aligned(capacity, dtype)
+        return have[:size]
+
+
+def _aligned(size: int, dtype: type) -> Array:
+    """Uninitialised array that begins on a cache line, so that no vector straddles two."""
+    count = size * np.dtype(dtype).itemsize
+    raw = np.empty(count + _CACHE_LINE, np.uint8)
+    start = -raw.ctypes.data % _CACHE_LINE
+    return raw[start : start + count].view(dtype)
+
+
+def acquire_workspace() -> Workspace:
+    """A workspace that nobody uses."""
+    with _lock:
+        return _free.pop() if _free else Workspace()
+
+
+def release_workspace(workspace: Workspace) -> None:
+    """Give a workspace back for the next caller."""
+    with _lock:
+        if len(_free) < _MAX_FREE_WORKSPACES:
+            _free.append(workspace)
+
+
+def clear_workspaces() -> None:
+    """Give the memory of unused workspaces back to the system."""
+    with _lock:
+        _free.clear()
 
 
 @dataclass(slots=True)
@@ -68,74 +85,29 @@ class Binned:
     records: Array
     numbering: tuple[Array, Array]
     """First row of each Gaussian in its chunk, first row of each chunk and the end of all."""
-    tile_starts: Array
-    tile_stops: Array
-    tile_order: Array
+    tiles: tuple[Array, Array, Array]
+    """First entry of each tile and the end of all, where its compositing stopped, and the order in
+    which to take tiles."""
     entries: tuple[Array, Array, Array]
     """Gaussian, blocks and row of each (Gaussian, tile) pair, by tile, then by depth; with room
     beyond the last."""
-    total: int
-    """How many entries there are."""
     planes: tuple[Array, Array]
-
-
-def make_view(
-    viewmat: Array,
-    K: Array,
-    width: int,
-    height: int,
-    near: float,
-    far: float,
-    eps2d: float,
-) -> View:
-    """Numbers of a camera as the kernels want them."""
-    fx, fy, cx, cy = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    margin_x, margin_y = (
-        CLAMP_MARGIN * 0.5 * width / fx,
-        CLAMP_MARGIN * 0.5 * height / fy,
-    )
-    camera = np.zeros(lay.CAMERA, np.float32)
-    rows = np.asarray(viewmat[:3, :3])
-    camera[lay.ROTATION : lay.ROTATION + 9] = rows.reshape(-1)
-    cofactors = np.cross(np.roll(rows, -1, axis=0), np.roll(rows, -2, axis=0))
-    camera[lay.COFACTORS : lay.COFACTORS + 9] = cofactors.reshape(-1)
-    centre = _centre(viewmat)
-    camera[lay.CENTRE : lay.CENTRE + 3] = centre
-    camera[lay.CENTRE_REST : lay.CENTRE_REST + 3] = centre - camera[lay.CENTRE : lay.CENTRE + 3]
-    camera[lay.FX], camera[lay.FY], camera[lay.CX], camera[lay.CY] = fx, fy, cx, cy
-    camera[lay.X_MIN], camera[lay.X_MAX] = (
-        -cx / fx - margin_x,
-        (width - cx) / fx + margin_x,
-    )
-    camera[lay.Y_MIN], camera[lay.Y_MAX] = (
-        -cy / fy - margin_y,
-        (height - cy) / fy + margin_y,
-    )
-    camera[lay.NEAR], camera[lay.FAR], camera[lay.BLUR] = near, far, eps2d
-    return View(camera, width, height)
-
-
-def _centre(viewmat: Array) -> Array:
-    """Where the camera stands, also if rounding has left the rotation not quite one."""
-    try:
-        return -np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3])
-    except np.linalg.LinAlgError:  # nan: all is culled
-        return np.full(3, np.nan)
+    """Transmittance, and the end of the entries that count, of each pixel, by tile."""
 
 
 def _parts(count: int) -> int:
     """Into how many parts a list is cut: several for each worker, so that one who comes late or
     has the hard ones holds up nobody, but not so many that their counts outweigh the list."""
-    return max(1, min(4 * threads(), 64, count // 2048))
+    return max(1, min(4 * num_workers(), 64, count // 2048))
 
 
 def bin_gaussians(
-    workspace: Workspace, scene: Gaussians, view: View, visible: tuple[Array, Array, Array]
+    workspace: Workspace, gaussians: Gaussians, view: View, visible: tuple[Array, Array, Array]
 ) -> Binned:
     """Project, sort and list by tile; ``visible`` receives means2d, radii (as bits), depths."""
-    n, w = scene.opacities.size, workspace.array
-    chunks, parts = max(1, n // lay.CHUNK), _parts(n)
-    records, keys = w("records", n * lay.RECORD, np.float32), w("keys", n, np.int32)
+    n, w = gaussians[3].size, workspace.array
+    chunks, parts = max(1, n // layout.CHUNK), _parts(n)
+    records, keys = w("records", n * layout.RECORD, np.float32), w("keys", n, np.int32)
     numbering = (w("row_starts", n, np.int32), w("row_bases", chunks + 1, np.int64))
     sorting = (
         w("digits", parts << DIGIT_BITS, np.int64).reshape(parts, -1),
@@ -150,9 +122,9 @@ def bin_gaussians(
         listed, entries = _lists(workspace, int(starts[-1]))
         counts = w("tile_counts", parts * view.tiles, np.int64).reshape(parts, -1)
         launch(
-            bin_all,
+            bins.bin_gaussians,
             max(chunks, parts),
-            scene.arrays,
+            gaussians,
             view.camera,
             (view.width, view.height, view.tiles_x),
             (records, records.view(np.int32)),
@@ -162,7 +134,7 @@ def bin_gaussians(
             sorting,
             (starts, ends),
             (counts, tile_starts, tile_order, listed, entries),
-            phases=BIN_PHASES,
+            phases=bins.BIN_PHASES,
         )
         if sorting[3][3] == 0:
             break
@@ -170,12 +142,10 @@ def bin_gaussians(
         needed = numbering[1][-1] / (n // parts + 1)
         workspace.pairs_per_gaussian = min(needed, 4 * workspace.pairs_per_gaussian)
         sorting[3][3] = 0
-    total, pixels = int(tile_starts[-1]), view.tiles * lay.TILE_PIXELS
+    pixels = view.tiles * layout.TILE_PIXELS
     planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
-    tile_stops = w("tile_stops", view.tiles, np.int64)
-    return Binned(
-        keys, records, numbering, tile_starts, tile_stops, tile_order, entries, total, planes
-    )
+    tiles = (tile_starts, w("tile_stops", view.tiles, np.int64), tile_order)
+    return Binned(keys, records, numbering, tiles, entries, planes)
 
 
 def _lists(
@@ -206,18 +176,14 @@ def render(
     alphas: Array,
 ) -> None:
     """Composite the three channels in the records."""
-    workers = threads()
+    workers = num_workers()
     states = workspace.array("forward", workers * FORWARD_NUMBERS, np.float32)
     launch(
         composite,
         view.tiles,
-        view.width,
-        view.height,
-        binned.tile_starts,
-        binned.tile_stops,
-        binned.tile_order,
-        binned.entries[0],
-        binned.entries[1],
+        (view.width, view.height),
+        binned.tiles,
+        binned.entries,
         binned.records,
         binned.planes,
         states.reshape(workers, -1),
@@ -236,28 +202,23 @@ def render_backward(
     alpha_grad: Array,
 ) -> tuple[Array, Array]:
     """Sums over pixels by entry: (touched, rows)."""
-    workers, count = threads(), int(binned.numbering[1][-1])
+    workers, count = num_workers(), int(binned.numbering[1][-1])
     states = workspace.array("backward", workers * BACKWARD_NUMBERS, np.float32)
-    rows = workspace.array("rows", (count + 1) * lay.RECORD, np.float32)  # see project.py
+    rows = workspace.array("rows", (count + 1) * layout.RECORD, np.float32)  # see project.py
     touched = workspace.array("touched", count + 1, np.uint8)
     touched[:] = 0
     launch(
         composite_backward,
         view.tiles,
-        view.width,
-        view.height,
-        binned.tile_starts,
-        binned.tile_stops,
-        binned.tile_order,
+        (view.width, view.height),
+        binned.tiles,
         binned.entries,
         binned.records,
         binned.planes,
         states.reshape(workers, -1),
         background,
-        image_grad,
-        alpha_grad,
-        touched,
-        rows,
+        (image_grad, alpha_grad),
+        (touched, rows),
     )
     return touched, rows
 
@@ -266,8 +227,9 @@ def transmittance(binned: Binned, view: View) -> Array:
     """What light is left at each pixel, with more digits than 1 - opacity has. [H, W]"""
     tiles_y = view.tiles // view.tiles_x
     # By tile, block, row and column.
-    plane = binned.planes[0].reshape(tiles_y, view.tiles_x, lay.BLOCKS, lay.BLOCKS, 4, 4)
-    rows = plane.transpose(0, 2, 4, 1, 3, 5).reshape(tiles_y * lay.TILE, view.tiles_x * lay.TILE)
+    plane = binned.planes[0].reshape(tiles_y, view.tiles_x, layout.BLOCKS, layout.BLOCKS, 4, 4)
+    rows = plane.transpose(0, 2, 4, 1, 3, 5)
+    rows = rows.reshape(tiles_y * layout.TILE, view.tiles_x * layout.TILE)
     return rows[: view.height, : view.width]
 
 
@@ -279,7 +241,7 @@ def sum_rows(binned: Binned, touched: Array, rows: Array, sums: Array) -> None:
 
 def gaussian_gradients(
     binned: Binned,
-    scene: Gaussians,
+    gaussians: Gaussians,
     view: View,
     summed: tuple[Array, Array] | Array,
     depth_gradients: Array,
@@ -293,13 +255,13 @@ def gaussian_gradients(
     """
     if isinstance(summed, tuple):
         touched, rows = summed
-        sums = np.zeros(threads() * lay.RECORD * LANES, np.float32)
+        sums = np.zeros(num_workers() * layout.RECORD * LANES, np.float32)
     else:
         touched, rows, sums = np.empty(0, np.uint8), np.empty(0, np.float32), summed
     launch(
         project_backward,
         binned.numbering[1].size - 1,
-        scene.arrays,
+        gaussians,
         depth_gradients,
         view.camera,
         binned.keys,

@@ -9,14 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.rasterizer.constants import (
-    ALPHA_MIN,
-    EXTENT_MAX,
-    QUATERNION_MIN,
-    RADIUS_MAX,
-    VALUE_MAX,
+from chronoscene.kernels.compilation import inlined, inner, kernel
+from chronoscene.kernels.memory import store
+from chronoscene.kernels.transposes import store_columns, store_records
+from chronoscene.kernels.vector_math import log2
+from chronoscene.kernels.vectors import (
+    absolute,
+    as_float,
+    as_int,
+    floor,
+    maximum,
+    minimum,
+    select,
+    sqrt,
+    to_int,
 )
-from chronoscene.rasterizer.cpu import sizes as lay
+from chronoscene.rasterizer import constants
+from chronoscene.rasterizer.cpu import layout
 from chronoscene.rasterizer.cpu.ellipses import (
     by,
     dot,
@@ -26,30 +35,9 @@ from chronoscene.rasterizer.cpu.ellipses import (
     scaled,
     times,
 )
-from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
-from chronoscene.rasterizer.cpu.simd import (
-    LANES,
-    absolute,
-    as_float,
-    as_int,
-    floor,
-    load,
-    load3,
-    load4,
-    maximum,
-    minimum,
-    select,
-    splat,
-    sqrt,
-    store,
-    store_columns,
-    store_records,
-    to_int,
-)
-from chronoscene.rasterizer.cpu.vecmath import log2
+from chronoscene.rasterizer.cpu.layout import LANES, load, load_quads, load_triples, splat
 
-_RADIUS_MAX = float(RADIUS_MAX)
-_LEVEL_MIN = lay.LEVEL_MIN
+_RADIUS_MAX = float(constants.RADIUS_MAX)
 
 
 @inlined
@@ -68,35 +56,40 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     means, quats, scales, opacities, colors = gaussians
     width, height = size
     means2d, radii, depths = out
-    w, x, y, z = load4(quats, 4 * at)
+    w, x, y, z = load_quads(quats, 4 * at)
     (w, x, y, z), length2, _, longest = scaled(w, x, y, z)
     (pz, rz, (tx, ty), _), _, rows, normal = project_axes(
-        camera, load3(means, 3 * at), rotation(w, x, y, z)
+        camera, load_triples(means, 3 * at), rotation(w, x, y, z)
     )
-    sizes = by(rz, load3(scales, 3 * at))
+    sizes = by(rz, load_triples(scales, 3 * at))
     s = by(1.0 / length2, sizes)
+    # Rows a, b of J M: Sigma = ((aa, ab), (ab, bb)) + blur I.
     a, b = times(rows[0], s), times(rows[1], s)
-    xx, yy = dot(a, a) + camera[lay.BLUR], dot(b, b) + camera[lay.BLUR]
+    xx, yy = dot(a, a) + camera[layout.BLUR], dot(b, b) + camera[layout.BLUR]
     sideways = xx > yy
     _, _, shear, given, (second, inverse), _ = ellipse(
-        rows, normal, s, sizes, camera[lay.BLUR], sideways
+        rows, normal, s, sizes, camera[layout.BLUR], sideways
     )
-    mx, my = camera[lay.FX] * tx + camera[lay.CX], camera[lay.FY] * ty + camera[lay.CY]
+    # m = (f_x x / z + c_x, f_y y / z + c_y).
+    mx, my = camera[layout.FX] * tx + camera[layout.CX], camera[layout.FY] * ty + camera[layout.CY]
 
     opacity = load(opacities, at)
     level = log2(opacity)
-    reach = (level - _LEVEL_MIN) * (2.0 / lay.LOG2_E)
+    # Half extents of the ellipse alpha >= 1/255: sqrt(2 ln(255 o) Sigma_xx), likewise for y.
+    reach = (level - layout.LEVEL_MIN) * (2.0 / layout.LOG2_E)
     ex, ey = sqrt(reach * xx), sqrt(reach * yy)
-    cr, cg, cb = load3(colors, 3 * at)
+    cr, cg, cb = load_triples(colors, 3 * at)
     # Comparisons with nan are false.
-    visible = (pz >= camera[lay.NEAR]) & (pz <= camera[lay.FAR])
-    visible = visible & (opacity > ALPHA_MIN) & (opacity < VALUE_MAX) & (reach > 0.0)
-    visible = visible & (ex > 0.0) & (ex < EXTENT_MAX) & (ey > 0.0) & (ey < EXTENT_MAX)
+    visible = (pz >= camera[layout.NEAR]) & (pz <= camera[layout.FAR])
+    visible = visible & (opacity > constants.ALPHA_MIN) & (opacity < constants.VALUE_MAX)
+    visible = visible & (reach > 0.0)
+    visible = visible & (ex > 0.0) & (ex < constants.EXTENT_MAX)
+    visible = visible & (ey > 0.0) & (ey < constants.EXTENT_MAX)
     visible = visible & (mx + ex > 0.0) & (mx - ex < width)
     visible = visible & (my + ey > 0.0) & (my - ey < height) & (given > 0.0)
-    visible = visible & (longest >= QUATERNION_MIN)
-    visible = visible & (absolute(cr) < VALUE_MAX) & (absolute(cg) < VALUE_MAX)
-    visible = visible & (absolute(cb) < VALUE_MAX)
+    visible = visible & (longest >= constants.QUATERNION_MIN)
+    visible = visible & (absolute(cr) < constants.VALUE_MAX) & (absolute(cg) < constants.VALUE_MAX)
+    visible = visible & (absolute(cb) < constants.VALUE_MAX)
 
     # A little more than the ellipse: what is left out here must lie outside it after rounding.
     tx0, ntx = _tile_range(mx - ex * 1.001 - 0.01, mx + ex * 1.001 + 0.01, width)
@@ -105,13 +98,15 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     ntx, nty = select(drawn, ntx, 0), select(drawn, nty, 0)
     zero = splat(0.0)
     inverse_given, inverse_y, xy = 1.0 / sqrt(given), 1.0 / sqrt(yy), shear * second
-    u, v = lay.WHITEN * inverse_given, lay.WHITEN * inverse
+    # The conic Sigma^-1 = W^T W with W = ((1, -shear) / sqrt(given), (0, 1) / sqrt(second)): u and
+    # v are the rows of W times WHITEN.
+    u, v = layout.WHITEN * inverse_given, layout.WHITEN * inverse
     u_sheared = zero - u * shear
     # The standard deviation of x given y: the root of the determinant over that of y.
     half = (given * inverse_given) * (second * inverse) * inverse_y
     store_records(
         records,
-        lay.RECORD * at,
+        layout.RECORD * at,
         (
             mx,
             my,
@@ -123,12 +118,12 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
             cg,
             cb,
             xy * inverse_y * inverse_y,
-            half * (1.0 / lay.WHITEN),
+            half * (1.0 / layout.WHITEN),
             xy / xx * ex,
             as_float(tx0 + (ntx << 16)),
             as_float(ty0 + (nty << 16)),
             zero,
-            lay.WHITEN * inverse_y,
+            layout.WHITEN * inverse_y,
         ),
     )
     store(keys, at, select(drawn, as_int(pz), -1))
@@ -143,33 +138,34 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     store(depths, at, select(visible, pz, 0.0))
 
 
-@helper
+@inner(fast_math=True)
 def chunk_of(gaussian, chunks):
     """Number of the chunk of a Gaussian."""
-    return min(gaussian // lay.CHUNK, chunks - 1)
+    return min(gaussian // layout.CHUNK, chunks - 1)
 
 
-@helper
+@inner(fast_math=True)
 def chunk_range(chunk, chunks, n):
     """First Gaussian of a chunk and the end. The last one takes what is left of the division,
     so that none of several is shorter than a vector."""
-    first = chunk * lay.CHUNK
-    return first, n if chunk == chunks - 1 else first + lay.CHUNK
+    first = chunk * layout.CHUNK
+    return first, n if chunk == chunks - 1 else first + layout.CHUNK
 
 
-@helper
+@inner(fast_math=True)
 def _number_rows(first, last, records_int, row_starts):
     """Give each Gaussian one row for each tile of its rectangle. Returns the number of rows."""
     row = 0
     for gaussian in range(first, last):
-        base = lay.RECORD * gaussian
-        records_int[base + lay.ROW] = row
+        base = layout.RECORD * gaussian
+        records_int[base + layout.ROW] = row
         row_starts[gaussian] = row
-        row += (records_int[base + lay.TILES_X] >> 16) * (records_int[base + lay.TILES_Y] >> 16)
+        tiles_x, tiles_y = records_int[base + layout.TILES_X], records_int[base + layout.TILES_Y]
+        row += (tiles_x >> 16) * (tiles_y >> 16)
     return row
 
 
-@helper
+@inner(fast_math=True)
 def project_chunk(chunk, chunks, gaussians, camera, size, records, keys, numbering, out):
     """Project the Gaussians of a chunk. At least `LANES` of them; arrays are flat.
 
@@ -193,12 +189,12 @@ def project_chunk(chunk, chunks, gaussians, camera, size, records, keys, numberi
     row_bases[chunk + 1] = _number_rows(first, last, records[1], row_starts)
 
 
-@kernel
+@kernel(fast_math=True, extras=[constants])
 def set_colors(values, channels, first, records):
     """Put up to three of the channels of each Gaussian into its record, zeros for missing ones."""
-    for i in range(records.size // lay.RECORD):
+    for i in range(records.size // layout.RECORD):
         for c in range(3):
             value = np.float32(0.0)
             if first + c < channels:
                 value = values[i * channels + first + c]
-            records[lay.RECORD * i + lay.COLOR + c] = value
+            records[layout.RECORD * i + layout.COLOR + c] = value

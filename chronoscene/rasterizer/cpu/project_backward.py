@@ -9,7 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.rasterizer.cpu import sizes as lay
+from chronoscene.kernels.compilation import inlined, inner, kernel
+from chronoscene.kernels.memory import make_load, store
+from chronoscene.kernels.thread_pool import draw
+from chronoscene.kernels.transposes import make_load_records, store_columns
+from chronoscene.kernels.vectors import make_splat, select, sqrt
+from chronoscene.rasterizer import constants
+from chronoscene.rasterizer.cpu import layout
 from chronoscene.rasterizer.cpu.ellipses import (
     by,
     dot,
@@ -21,24 +27,12 @@ from chronoscene.rasterizer.cpu.ellipses import (
     scaled,
     times,
 )
-from chronoscene.rasterizer.cpu.kernel import helper, inlined, kernel
-from chronoscene.rasterizer.cpu.phases import draw
+from chronoscene.rasterizer.cpu.layout import LANES, load, load_quads, load_triples, splat
 from chronoscene.rasterizer.cpu.project import chunk_range
-from chronoscene.rasterizer.cpu.simd import (
-    LANES,
-    load,
-    load3,
-    load4,
-    load16,
-    load_records,
-    select,
-    splat,
-    splat16,
-    splat16_int,
-    sqrt,
-    store,
-    store_columns,
-)
+
+_load_records = make_load_records(LANES)
+_load_row = make_load(16)
+_splat_row, _splat_row_int = make_splat("f32", 16), make_splat("i32", 16)
 
 
 @inlined
@@ -48,18 +42,18 @@ def _sum_rows(row: int, end: int, touched: Any, rows: Any, total: Any) -> Any:
     Most Gaussians have one or two rows: these are added without a branch, which would often be
     mispredicted.
     """
-    wanted = (end > row) & (touched[row] != 0)
-    total = total + select(splat16_int(np.int32(wanted)) > 0, load16(rows, lay.RECORD * row), 0.0)
+    wanted = _splat_row_int(np.int32((end > row) & (touched[row] != 0))) > 0
+    total = total + select(wanted, _load_row(rows, layout.RECORD * row), 0.0)
     row += end > row
-    wanted = (end > row) & (touched[row] != 0)
-    total = total + select(splat16_int(np.int32(wanted)) > 0, load16(rows, lay.RECORD * row), 0.0)
+    wanted = _splat_row_int(np.int32((end > row) & (touched[row] != 0))) > 0
+    total = total + select(wanted, _load_row(rows, layout.RECORD * row), 0.0)
     for r in range(row + 1, end):
         if touched[r] != 0:
-            total = total + load16(rows, lay.RECORD * r)
+            total = total + _load_row(rows, layout.RECORD * r)
     return total
 
 
-@helper
+@inner(fast_math=True)
 def _rows_of(gaussian, last, chunk, numbering):
     """First row of a Gaussian and the end of its rows, in a chunk that ends before ``last``."""
     row_starts, row_bases = numbering
@@ -69,17 +63,17 @@ def _rows_of(gaussian, last, chunk, numbering):
     return base + row_starts[gaussian], end
 
 
-@kernel
+@kernel(fast_math=True, extras=[constants])
 def add_rows(worker, control, numbering, touched, rows, sums):
     """Add the rows of each Gaussian to its 16 numbers in ``sums``; see `project_backward`."""
-    n, chunks = sums.size // lay.RECORD, numbering[1].size - 1
+    n, chunks = sums.size // layout.RECORD, numbering[1].size - 1
     chunk = draw(control, 0)
     while chunk < chunks:
         first, last = chunk_range(chunk, chunks, n)
         for i in range(first, last):
             row, end = _rows_of(i, last, chunk, numbering)
-            at = lay.RECORD * i
-            store(sums, at, _sum_rows(row, end, touched, rows, load16(sums, at)))
+            at = layout.RECORD * i
+            store(sums, at, _sum_rows(row, end, touched, rows, _load_row(sums, at)))
         chunk = draw(control, 0)
 
 
@@ -124,17 +118,18 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     """Gradients of Gaussians at..at+LANES from their sums over pixels."""
     means, quats, scales, opacities, _ = gaussians
     grad_means, grad_quats, grad_scales, grad_opacities, grad_colors, grad_means2d = grads
-    f = load_records(sums, sums_at)
-    w, qx, qy, qz = load4(quats, 4 * at)
+    f = _load_records(sums, sums_at)
+    w, qx, qy, qz = load_quads(quats, 4 * at)
     (w, qx, qy, qz), length2, power, _ = scaled(w, qx, qy, qz)
     r = rotation(w, qx, qy, qz)
-    (_, rz, (tx, ty), (jx, jy)), m2, rows, normal = project_axes(camera, load3(means, 3 * at), r)
+    position = load_triples(means, 3 * at)
+    (_, rz, (tx, ty), (jx, jy)), m2, rows, normal = project_axes(camera, position, r)
     inverse2 = 1.0 / length2
-    sizes = by(rz, load3(scales, 3 * at))
+    sizes = by(rz, load_triples(scales, 3 * at))
     s = by(inverse2, sizes)
-    sideways = f[lay.SUM_SIGN] < 0.0
+    sideways = f[layout.SUM_SIGN] < 0.0
     b, second, shear, given, (_, k), rest = ellipse(
-        rows, normal, s, sizes, camera[lay.BLUR], sideways
+        rows, normal, s, sizes, camera[layout.BLUR], sideways
     )
 
     # Whitening W = [[i, -shear i], [0, k]] for offsets (first, second): Sigma^-1 = W^T W. The sums
@@ -142,9 +137,9 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     # W^T (sum g (W d)(W d)^T) W / 2 and d loss / d mean = W^T sum g W d.
     i = 1.0 / sqrt(given)
     k = select(sideways, 0.0 - k, k)
-    su, sv = f[lay.SUM_U] * (1.0 / lay.WHITEN), f[lay.SUM_V] * (1.0 / lay.WHITEN)
-    scale = 1.0 / (lay.WHITEN * lay.WHITEN)
-    suu, suv, svv = f[lay.SUM_UU] * scale, f[lay.SUM_UV] * scale, f[lay.SUM_VV] * scale
+    su, sv = f[layout.SUM_U] * (1.0 / layout.WHITEN), f[layout.SUM_V] * (1.0 / layout.WHITEN)
+    scale = 1.0 / (layout.WHITEN * layout.WHITEN)
+    suu, suv, svv = f[layout.SUM_UU] * scale, f[layout.SUM_UV] * scale, f[layout.SUM_VV] * scale
     gm_first = i * su
     gm_second = k * sv - shear * gm_first
     gmx, gmy = select(sideways, gm_second, gm_first), select(sideways, gm_first, gm_second)
@@ -159,14 +154,18 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     gb = plus(gb, by(0.0 - shear, gd))
     row_x, row_y = either(sideways, gb, gd), either(sideways, gd, gb)
 
-    d0 = times(by(camera[lay.FX], row_x), sizes)
-    d1 = times(by(camera[lay.FY], row_y), sizes)
+    d0 = times(by(camera[layout.FX], row_x), sizes)
+    d1 = times(by(camera[layout.FY], row_y), sizes)
     zero = splat(0.0)
     d2 = plus(by(zero - jx, d0), by(zero - jy, d1))
-    gjx = select((tx > camera[lay.X_MIN]) & (tx < camera[lay.X_MAX]), inverse2 * dot(d0, m2), 0.0)
-    gjy = select((ty > camera[lay.Y_MIN]) & (ty < camera[lay.Y_MAX]), inverse2 * dot(d1, m2), 0.0)
-    gpx = rz * (camera[lay.FX] * gmx - gjx)
-    gpy = rz * (camera[lay.FY] * gmy - gjy)
+    # The Jacobian's x / z and y / z have a gradient only where they are not held.
+    free_x = (tx > camera[layout.X_MIN]) & (tx < camera[layout.X_MAX])
+    free_y = (ty > camera[layout.Y_MIN]) & (ty < camera[layout.Y_MAX])
+    gjx = select(free_x, inverse2 * dot(d0, m2), 0.0)
+    gjy = select(free_y, inverse2 * dot(d1, m2), 0.0)
+    # d loss / d p, with p the centre in the camera's frame.
+    gpx = rz * (camera[layout.FX] * gmx - gjx)
+    gpy = rz * (camera[layout.FY] * gmy - gjy)
     gpz = zero - tx * gpx - ty * gpy - rz * turning
     if depth_gradients.size > 0:
         gpz = gpz + load(depth_gradients, at)
@@ -177,12 +176,14 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
         *_turned_back(camera, 1, d0, d1, d2),
         *_turned_back(camera, 2, d0, d1, d2),
     )
+    # Of the unit quaternion, then of that given: without what is along it, over its length.
     gw, gx, gy, gz = _quaternion_gradient(w, qx, qy, qz, dr)
     along = inverse2 * (w * gw + (qx * gx + (qy * gy + qz * gz)))
     inverse = inverse2 * power
 
     # Culled lanes hold nan: select, do not multiply by zero.
     drawn = load(keys, at) >= 0
+    # d loss / d mu = R^T d loss / d p.
     gm = (
         camera[0] * gpx + (camera[3] * gpy + camera[6] * gpz),
         camera[1] * gpx + (camera[4] * gpy + camera[7] * gpz),
@@ -196,20 +197,21 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     gw = select(drawn, (gw - along * w) * inverse, 0.0)
     store_columns(grad_quats, 4 * at, (gw, gq[0], gq[1], gq[2]))
     store_columns(grad_scales, 3 * at, _keep(drawn, by(inverse2 * rz, gs)))
-    store(grad_opacities, at, select(drawn, f[lay.SUM] / load(opacities, at), 0.0))
-    gc = (f[lay.SUM_COLOR], f[lay.SUM_COLOR + 1], f[lay.SUM_COLOR + 2])
+    # d loss / d o = sum g / o.
+    store(grad_opacities, at, select(drawn, f[layout.SUM] / load(opacities, at), 0.0))
+    gc = (f[layout.SUM_COLOR], f[layout.SUM_COLOR + 1], f[layout.SUM_COLOR + 2])
     store_columns(grad_colors, 3 * at, _keep(drawn, gc))
     store_columns(grad_means2d, 2 * at, (select(drawn, gmx, 0.0), select(drawn, gmy, 0.0)))
 
 
-@kernel
+@kernel(fast_math=True, extras=[constants])
 def project_backward(
     worker, control, gaussians, depth_gradients, camera, keys, numbering, touched, rows, sums, grads
 ):
     """Reduce the rows of all Gaussians in fixed order and turn them into gradients.
 
     Args:
-        worker, control: See `team.launch`; a job is a chunk of Gaussians.
+        worker, control: See `thread_pool.launch`; a job is a chunk of Gaussians.
         gaussians, camera, keys: As in `project_chunk`.
         depth_gradients: d loss / d z-depth that did not come through the projection; or nothing.
         numbering: (first row of each Gaussian in its chunk, first row of each chunk and the end).
@@ -219,18 +221,18 @@ def project_backward(
         grads: (means, quats, scales, opacities, colors, means2d), written.
     """
     n, chunks = keys.size, numbering[1].size - 1
-    scratch = lay.RECORD * LANES * worker
+    scratch = layout.RECORD * LANES * worker
     chunk = draw(control, 0)
     while chunk < chunks:
         first, last = chunk_range(chunk, chunks, n)
         for i in range(first, last, LANES):
             at = min(i, last - LANES)
-            place = lay.RECORD * at
+            place = layout.RECORD * at
             if rows.size > 0:
                 place = scratch
                 for lane in range(LANES):
                     row, end = _rows_of(at + lane, last, chunk, numbering)
-                    total = _sum_rows(row, end, touched, rows, splat16(0.0))
-                    store(sums, place + lay.RECORD * lane, total)
+                    total = _sum_rows(row, end, touched, rows, _splat_row(0.0))
+                    store(sums, place + layout.RECORD * lane, total)
             _backward_group(at, sums, place, gaussians, depth_gradients, camera, keys, grads)
         chunk = draw(control, 0)

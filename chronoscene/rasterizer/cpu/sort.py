@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from chronoscene.rasterizer.cpu.kernel import helper
-from chronoscene.rasterizer.cpu.phases import draw, finish, wait_for
+from chronoscene.kernels.compilation import inner
+from chronoscene.kernels.thread_pool import draw, finish, wait_for
 
 DIGIT_BITS = 11
 SORT_PHASES = 3 + 3 * 3  # keys have 31 bits
 
 
-@helper
+@inner(fast_math=True)
 def _find_range(keys, first, last, found):
     """Count, smallest and largest of the keys that are not negative."""
     count, low, high = 0, np.int64(0x7FFFFFFF), np.int64(-1)
@@ -26,7 +26,7 @@ def _find_range(keys, first, last, found):
     found[0], found[1], found[2] = count, low, high
 
 
-@helper
+@inner(fast_math=True)
 def _compact(keys, first, last, base, at, pairs):
     """Write (key - base) << 32 | index for the keys that are not negative."""
     for i in range(first, last):
@@ -36,14 +36,14 @@ def _compact(keys, first, last, base, at, pairs):
             at += 1
 
 
-@helper
+@inner(fast_math=True)
 def _count_digits(pairs, first, last, shift, mask, counts):
     counts[:] = 0
     for i in range(first, last):
         counts[(pairs[i] >> shift) & mask] += 1
 
 
-@helper
+@inner(fast_math=True)
 def _scatter(pairs, first, last, shift, mask, places, target):
     for i in range(first, last):
         pair = pairs[i]
@@ -52,7 +52,7 @@ def _scatter(pairs, first, last, shift, mask, places, target):
         places[digit] += 1
 
 
-@helper
+@inner(fast_math=True)
 def _merge_ranges(counts, result):
     """Turn the counts of the parts into places. Result: total, smallest key, bits of the range."""
     total, base, top = 0, np.int64(0x7FFFFFFF), np.int64(-1)
@@ -67,7 +67,7 @@ def _merge_ranges(counts, result):
     result[0], result[1], result[2] = total, base, bits
 
 
-@helper
+@inner(fast_math=True)
 def _digit_offsets(counts, digits):
     """Turn counts [parts, digits] into places: by digit, within a digit by part."""
     total = 0
@@ -78,14 +78,14 @@ def _digit_offsets(counts, digits):
             total += count
 
 
-@helper
+@inner(fast_math=True)
 def sort_phases(control, phase, keys, counts, pairs, spare, result):
     """Sort the indices of keys that are not negative by key, then by index.
 
     Takes part in up to `SORT_PHASES` phases.
 
     Args:
-        control, phase: See `phases`; the first phase that is free.
+        control, phase: See `thread_pool`; the first phase that is free.
         keys: Bits of positive float depths, or negative. int32 [N]
         counts: Scratch; the work is cut into as many parts as it has rows. int64 [parts, 2048]
         pairs, spare: Scratch; the order is in the low 32 bits of one of them. int64 [N]
@@ -124,7 +124,7 @@ def sort_phases(control, phase, keys, counts, pairs, spare, result):
     return phase, passes % 2 == 1
 
 
-@helper
+@inner(fast_math=True)
 def _sort_pass(control, phase, source, target, total, shift, mask, counts):
     """Three phases: move the pairs to the places of one digit."""
     parts = counts.shape[0]

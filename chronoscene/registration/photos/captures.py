@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared.json_values import is_iso_date
 from chronoscene.images.exif import read_exif
-from chronoscene.kernels.threads import available_threads
+from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.photos.photo import Capture, open_photo, taken_at
 from chronoscene.scene.splits import IMAGE_SUFFIXES, read_text
 

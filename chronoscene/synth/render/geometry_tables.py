@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.synth.render.compiled import inner
+from chronoscene.kernels.compilation import inner
 
 Array = NDArray[np.float64]
 MISS = 0xFFFFFFFF

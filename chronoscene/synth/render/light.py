@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.synth.render.compiled import inner
+from chronoscene.kernels.compilation import inner
 from chronoscene.synth.render.noise import fbm, smooth
 from chronoscene.synth.seeds import rng_for
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from chronoscene.synth.render.compiled import inner
+from chronoscene.kernels.compilation import inner
 
 MASK = 0xFFFFFFFF
 

@@ -12,7 +12,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from chronoscene.synth.render.compiled import inner, kernel
+from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.synth.render.geometry_tables import MISS
 from chronoscene.synth.render.light import sky_radiance
 
@@ -55,7 +55,7 @@ def probe_light(probes, x, y, z, dx, dy, dz, slope):  # type: ignore[no-untyped-
     return r * inverse, g * inverse, b * inverse
 
 
-@kernel
+@kernel(parallel=True)
 def probe_values(  # type: ignore[no-untyped-def]
     rays, t, tri, uv, lit, tables, mean_albedo, sky, count
 ):

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import prange
 
-from chronoscene.synth.render.compiled import inner, kernel
+from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.synth.render.geometry_tables import MISS, hit_normals
 from chronoscene.synth.render.light import sky_radiance
 from chronoscene.synth.render.noise import mix
@@ -19,7 +19,7 @@ from chronoscene.synth.render.probes import probe_light
 from chronoscene.synth.render.textures import albedo
 
 
-@kernel
+@kernel(parallel=True)
 def camera_rays(world_from_cam, k, width, row0, rows, ss):  # type: ignore[no-untyped-def]
     """Rays with unit z in the camera, so that the hit parameter is z-depth. [n, 6]
 
@@ -40,7 +40,7 @@ def camera_rays(world_from_cam, k, width, row0, rows, ss):  # type: ignore[no-un
     return rays
 
 
-@kernel
+@kernel(parallel=True)
 def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ignore[no-untyped-def]
     """Rays to the sun for all samples; whether each is needed.
 
@@ -193,7 +193,7 @@ def _tone(x):  # type: ignore[no-untyped-def]
     return 12.92 * y if y <= 0.0031308 else 1.055 * y ** (1.0 / 2.4) - 0.055
 
 
-@kernel
+@kernel(parallel=True)
 def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # type: ignore[no-untyped-def]
     """Displayed colours of pixels. [pixels, 3] uint8
 
@@ -243,7 +243,7 @@ def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # ty
     return out
 
 
-@kernel
+@kernel(parallel=True)
 def albedo_at(points, tri, tables, fw):  # type: ignore[no-untyped-def]
     """Albedo of hit points at given pixel widths; zero where nothing was hit. [n, 3]"""
     out = np.zeros((len(points), 3))

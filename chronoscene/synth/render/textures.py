@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from chronoscene.synth.render.compiled import inner
+from chronoscene.kernels.compilation import inner
 from chronoscene.synth.render.noise import (
     colors,
     fade,

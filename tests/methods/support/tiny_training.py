@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from chronoscene.bench.training_loop import seed_everything
-from chronoscene.kernels.threads import set_threads
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import (
     Method,
     MethodSpec,

@@ -158,19 +158,3 @@ def test_pieces_of_one_frame_share_one_texture() -> None:
     part = b.build()
     assert part.patch_seed[0] == part.patch_seed[1]
     assert (part.patches[0, :9] == part.patches[1, :9]).all()
-
-
-def test_a_changed_texture_is_compiled_again() -> None:
-    """The cache of a kernel knows all sources, so that no stale texture is drawn."""
-    from pathlib import Path
-
-    from chronoscene.kernels.compilation import source_stamp
-    from chronoscene.synth.render import compiled, shade
-
-    folder = Path(compiled.__file__).parent
-    listed = set(compiled.NAMES.split())
-    for path in folder.glob("*.py"):
-        if "render.compiled import" in path.read_text():
-            assert path.stem in listed, f"{path.name} is missing in NAMES"
-    stamp = shade.shade._cache._cache_file._source_stamp
-    assert stamp == source_stamp(tuple(folder / f"{name}.py" for name in compiled.NAMES.split()))

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from numba import njit
 
-from chronoscene.kernels import simd
-from chronoscene.rasterizer.cpu.simd import LANES, load, select, splat, store
+from chronoscene.kernels import vectors
+from chronoscene.kernels.memory import load, store
+from chronoscene.kernels.vectors import LANES, select, splat
 
 A = np.linspace(-3, 4, LANES, dtype=np.float32)
 B = np.where(np.arange(LANES) % 3 == 0, A, np.linspace(5, 1, LANES)).astype(np.float32)
@@ -59,7 +60,7 @@ def test_numbers_stand_for_vectors() -> None:
 
 
 def test_widths_do_not_mix() -> None:
-    narrow = simd.make_splat("f32", LANES // 2)
+    narrow = vectors.make_splat("f32", LANES // 2)
 
     with pytest.raises(numba.TypingError):
         apply(lambda a, b: a + narrow(np.float32(1)), A, B)
@@ -71,4 +72,4 @@ def test_widths_do_not_mix() -> None:
 )
 def test_registers(monkeypatch: pytest.MonkeyPatch, features: str, lanes: int) -> None:
     monkeypatch.setattr(numba.config, "CPU_FEATURES", features)
-    assert simd._register_lanes() == lanes
+    assert vectors._register_lanes() == lanes

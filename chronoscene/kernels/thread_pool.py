@@ -1,10 +1,17 @@
-"""Threads that help with kernels.
+"""A pool of threads that run kernels together, and how they share the work.
 
-A kernel divides its work into jobs that workers draw from a counter. The caller works too and
-waits only for helpers that have begun: on a machine with other things to do, a helper that gets
-no processor delays nobody, where a barrier of all threads would wait for it. Results do not depend
-on who does which job.
+A kernel divides its work into jobs that workers draw from a counter. The caller is a worker too,
+and at the end waits only for those others that have begun: on a machine with other things to do, a
+thread that gets no processor delays nobody, where a barrier of all threads would wait for it.
+Results do not depend on who does which job.
+
+A kernel may have several phases. Each has a counter that jobs are drawn from and a counter of
+finished jobs. Between phases a worker waits for jobs, not for workers: who comes late finds
+everything done and passes through.
 """
+
+# mypy: allow-untyped-defs
+# Numba infers the types of kernels.
 
 from __future__ import annotations
 
@@ -16,32 +23,79 @@ from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
-from chronoscene.rasterizer.cpu.phases import look_for_change, new_control
+from chronoscene.kernels.compilation import inlined, inner, kernel
+from chronoscene.kernels.memory import fetch_add, load_shared
+
+_STRIDE = 16  # numbers per phase, so that phases do not share cache lines
+_FINISHED = 8
+_PATIENCE = 64  # looks before the processor is offered to others
+
+_CAN_YIELD = hasattr(os, "sched_yield")
+_sched_yield = numba.types.ExternalFunction("sched_yield", numba.types.int32())
+
+
+# What kernels call.
+
+
+@inlined
+def draw(control: Any, phase: int) -> int:
+    """Number of a job that nobody else has; as many as there are or more when all are taken."""
+    return fetch_add(control, _STRIDE * phase, 1)
+
+
+@inlined
+def finish(control: Any, phase: int) -> None:
+    """A drawn job is done."""
+    fetch_add(control, _STRIDE * phase + _FINISHED, 1)
+
+
+@inner
+def wait_for(control, phase, jobs):
+    """Until all jobs of a phase are done."""
+    looks = 0
+    while load_shared(control, _STRIDE * phase + _FINISHED) < jobs:
+        looks += 1
+        if _CAN_YIELD and looks % _PATIENCE == 0:
+            _sched_yield()
+
+
+@kernel
+def _wait_for_change(shared, offset, value, looks):
+    """Wait a while for a number to become another one. Returns whether it did."""
+    for look in range(looks):
+        if load_shared(shared, offset) != value:
+            return True
+        if _CAN_YIELD and look % _PATIENCE == _PATIENCE - 1:
+            _sched_yield()
+    return False
+
+
+# What runs them.
 
 Kernel = Callable[..., Any]
 
 _GENERATION, _ACTIVE = 0, 8  # numbers that are watched without Python's lock
 _LOOKS = 20_000
-"""How often a helper looks for the next launch before it sleeps: tens of microseconds, which is
+"""How often a worker looks for the next launch before it sleeps: tens of microseconds, which is
 what passes between the kernels of one image. Waking a thread takes longer than that."""
 
 
 @dataclass(slots=True, eq=False)
 class _Task:
-    """One launch of a kernel. Guarded by the team's mutex."""
+    """One launch of a kernel. Guarded by the pool's mutex."""
 
     kernel: Kernel
     args: tuple[Any, ...]
-    slots: int
+    workers: int
     taken: int = 1
-    open: bool = True
     caller_sleeps: bool = False
     error: BaseException | None = None
 
 
-class _Team:
-    """Helpers of this process; grows to the largest number asked for."""
+class _Pool:
+    """Threads of this process that wait for kernels; grows to the largest number asked for."""
 
     def __init__(self) -> None:
         self.busy = threading.Lock()  # one launch at a time
@@ -54,10 +108,10 @@ class _Team:
         self._awake: list[bool] = []
 
     def run(self, kernel: Kernel, args: tuple[Any, ...], workers: int) -> None:
-        """Call ``kernel(number, *args)`` here with number 0, and in helpers with 1 and so on."""
+        """Call ``kernel(number, *args)`` here with number 0, and in threads with 1 and so on."""
         task = _Task(kernel, args, workers)
         with self._mutex:
-            self._hire(workers - 1)
+            self._start_threads(workers - 1)
             self._task = task
             self._shared[_GENERATION] += 1
             for i in range(workers - 1):
@@ -74,9 +128,9 @@ class _Team:
     def _close(self, task: _Task) -> None:
         """Let nobody else begin, and wait for those who have: they write to our arrays."""
         with self._mutex:
-            task.open, self._task = False, None
+            self._task = None
             active = int(self._shared[_ACTIVE])
-        while active > 0 and look_for_change(self._shared, _ACTIVE, active, _LOOKS):
+        while active > 0 and _wait_for_change(self._shared, _ACTIVE, active, _LOOKS):
             active = int(self._shared[_ACTIVE])
         with self._mutex:
             task.caller_sleeps = bool(self._shared[_ACTIVE] > 0)
@@ -90,16 +144,17 @@ class _Team:
         if interrupted is not None:
             raise interrupted
 
-    def _hire(self, helpers: int) -> None:
-        while len(self._wake) < helpers:
+    def _start_threads(self, count: int) -> None:
+        while len(self._wake) < count:
             self._wake.append(threading.Lock())
             self._wake[-1].acquire()
             self._awake.append(False)
-            name = f"rasterizer-{len(self._wake)}"
+            name = f"kernels-{len(self._wake)}"
             args = (len(self._wake) - 1,)
-            threading.Thread(target=self._help, args=args, name=name, daemon=True).start()
+            threading.Thread(target=self._serve, args=args, name=name, daemon=True).start()
 
-    def _help(self, me: int) -> None:
+    def _serve(self, me: int) -> None:
+        """What a thread does for ever."""
         while True:
             self._wake[me].acquire()
             while self._stay(me):
@@ -108,16 +163,16 @@ class _Team:
                     self._work(*claim)
 
     def _stay(self, me: int) -> bool:
-        """Whether there is a task, waiting a little for one; without, this helper is asleep."""
+        """Whether there is a task, waiting a little for one; without, this thread is asleep."""
         for last_look in (False, True):
             with self._mutex:
                 generation = int(self._shared[_GENERATION])
-                if self._task is not None and self._task.taken < self._task.slots:
+                if self._task is not None and self._task.taken < self._task.workers:
                     return True
                 if last_look:
                     self._awake[me] = False
                     return False
-            if look_for_change(self._shared, _GENERATION, generation, _LOOKS):
+            if _wait_for_change(self._shared, _GENERATION, generation, _LOOKS):
                 return True
         raise AssertionError
 
@@ -125,7 +180,7 @@ class _Team:
         """A place in the present task."""
         with self._mutex:
             task = self._task
-            if task is None or task.taken >= task.slots:
+            if task is None or task.taken >= task.workers:
                 return None
             number = task.taken
             task.taken += 1
@@ -144,22 +199,27 @@ class _Team:
             self._finished.release()
 
 
-_team = _Team()
+_pool = _Pool()
 
 
 def _forget() -> None:
     """A forked child has none of its parent's threads."""
-    global _team
-    _team = _Team()
+    global _pool
+    _pool = _Pool()
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget)
 
 
-def threads() -> int:
-    """Workers to use, the caller included: Numba's setting; see `kernels.threads`."""
+def num_workers() -> int:
+    """Workers to use, the caller included: Numba's setting, see `runtime.set_threads`."""
     return int(numba.get_num_threads())
+
+
+def new_control(phases: int = 1) -> NDArray[np.int64]:
+    """Counters of a launch."""
+    return np.zeros(phases * _STRIDE, np.int64)
 
 
 def launch(kernel: Kernel, jobs: int, *args: Any, phases: int = 1) -> None:
@@ -167,16 +227,16 @@ def launch(kernel: Kernel, jobs: int, *args: Any, phases: int = 1) -> None:
 
     Args:
         kernel: Called as ``kernel(number, control, *args)``, from several threads.
-        jobs: How many there are at most in a phase; no more workers than that are started.
+        jobs: How many there are at most in a phase; no more workers than that are used.
         args: The rest of its arguments.
-        phases: How many it has; see `phases`.
+        phases: How many it has.
     """
-    workers, control = min(threads(), jobs), new_control(phases)
-    team = _team
-    if workers > 1 and team.busy.acquire(blocking=False):
+    workers, control = min(num_workers(), jobs), new_control(phases)
+    pool = _pool
+    if workers > 1 and pool.busy.acquire(blocking=False):
         try:
-            team.run(kernel, (control, *args), workers)
+            pool.run(kernel, (control, *args), workers)
         finally:
-            team.busy.release()
-    else:  # alone, or another thread of the program has the helpers
+            pool.busy.release()
+    else:  # alone, or another thread of the program uses the pool
         kernel(0, control, *args)

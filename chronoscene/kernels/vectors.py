@@ -1,0 +1,336 @@
+"""Vectors of several numbers inside Numba kernels, written as LLVM vector instructions.
+
+Numba has no vector type, and leaving loops to the auto-vectoriser costs a factor of four to ten in
+the compositing kernels; in matrix products LLVM does not keep a block in registers. Here a vector
+is a Numba type of its own, with any number of lanes; ``+ - * /``, comparisons and bit operations
+emit one or a few instructions of LLVM's portable vector IR, which LLVM turns into AVX-512, AVX2,
+SSE or NEON as the machine has it. Nothing names a processor's instruction, so the same kernels run
+everywhere; only the width that they are written for is chosen from the processor.
+
+Functions that make a vector from nothing are made for a number of lanes (``make_...``); all others
+take it from their arguments, of which some may be single numbers. Functions named ``emit_`` write
+LLVM code and are for other intrinsics.
+"""
+
+from __future__ import annotations
+
+import operator
+import platform
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numba.extending
+from llvmlite import binding, ir
+from numba import config, types
+from numba.core import cgutils
+from numba.extending import lower_builtin, models, register_model, type_callable
+
+from chronoscene.kernels.compilation import FAST_MATH
+
+# The declared type of an intrinsic has the typing context as an argument that callers leave out.
+intrinsic: Any = numba.extending.intrinsic
+
+
+def _register_lanes() -> int:
+    """16 with AVX-512, 8 with AVX2, else 4. Honours NUMBA_CPU_FEATURES, as compiled code does."""
+    features = config.CPU_FEATURES  # type: ignore[attr-defined]
+    if features is None:
+        features = binding.get_host_cpu_features().flatten()
+    names = str(features).split(",")
+    return 16 if "+avx512f" in names else 8 if "+avx2" in names else 4
+
+
+LANES = _register_lanes()
+"""Numbers of 32 bits in the widest register of the processor."""
+MANY_REGISTERS = LANES == 16 or platform.machine() in ("aarch64", "arm64")
+"""32 vector registers, else 16."""
+
+FLOAT = ir.FloatType()
+I32 = ir.IntType(32)
+_ELEMENTS = {"f32": FLOAT, "i32": I32, "i1": ir.IntType(1)}
+_SCALARS = {"f32": types.float32, "i32": types.int32}
+
+
+class Vector(types.Type):
+    """A Numba value of several f32, i32 or i1 (a mask)."""
+
+    def __init__(self, kind: str, lanes: int) -> None:
+        self.kind, self.lanes = kind, lanes
+        super().__init__(name=f"{kind}x{lanes}")
+
+    @property
+    def llvm(self) -> ir.VectorType:
+        return ir.VectorType(_ELEMENTS[self.kind], self.lanes)
+
+    def with_kind(self, kind: str) -> Vector:
+        return Vector(kind, self.lanes)
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Vector) -> None:
+        super().__init__(dmm, fe_type, fe_type.llvm)
+
+
+# What other intrinsics are written with.
+
+
+def emit_lanes(values: Sequence[float], element: ir.Type) -> ir.Constant:
+    """A constant vector with these lanes."""
+    return ir.Constant(
+        ir.VectorType(element, len(values)), [ir.Constant(element, v) for v in values]
+    )
+
+
+def emit_splat(builder: Any, value: Any, lanes: int) -> Any:
+    """A vector with one number in every lane."""
+    undefined = ir.Constant(ir.VectorType(value.type, lanes), ir.Undefined)
+    first = builder.insert_element(undefined, value, I32(0))
+    return builder.shuffle_vector(first, undefined, emit_lanes([0] * lanes, I32))
+
+
+def emit_shuffle(builder: Any, a: Any, b: Any, lanes: Sequence[int | None]) -> Any:
+    """Lanes of a, then of b, by number; None is any value."""
+    last = a.type.count - 1
+    order = [min(k, last) if i is None else i for k, i in enumerate(lanes)]
+    return builder.shuffle_vector(a, b, emit_lanes(order, I32))
+
+
+def emit_call(builder: Any, name: str, *args: Any, flags: Sequence[str] = ()) -> Any:
+    """Call ``llvm.<name>`` on float vectors of one type."""
+    vector = args[0].type
+    kind = ir.FunctionType(vector, [vector] * len(args))
+    full = f"llvm.{name}.v{vector.count}f32"
+    return builder.call(
+        cgutils.get_or_insert_function(builder.module, kind, full), args, fastmath=flags
+    )
+
+
+def emit_multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """a * b + c: fmuladd fuses where the processor can; fma would call a slow library function
+    where not."""
+    return emit_call(builder, "fmuladd", a, b, c)
+
+
+def _like(*kinds: Any) -> Any:
+    """Type of the vectors among some types if they are all of one and the rest are numbers."""
+    vectors = [kind for kind in kinds if isinstance(kind, Vector)]
+    numbers = [kind for kind in kinds if isinstance(kind, types.Number)]
+    if len({v.name for v in vectors}) != 1 or len(vectors) + len(numbers) < len(kinds):
+        return None
+    return vectors[0]
+
+
+def _promote(context: Any, builder: Any, kinds: Any, args: Any) -> tuple[Vector, list[Any]]:
+    """Numbers among the arguments as vectors like the others."""
+    like = _like(*kinds)
+
+    def promoted(kind: Any, value: Any) -> Any:
+        if isinstance(kind, Vector):
+            return value
+        scalar = context.cast(builder, value, kind, _SCALARS[like.kind])
+        return emit_splat(builder, scalar, like.lanes)
+
+    return like, [promoted(*pair) for pair in zip(kinds, args, strict=True)]
+
+
+# Operators.
+
+Emit = Callable[[Any, str, Any, Any], Any]
+"""Writes an operation on two vectors of one kind: (builder, kind, a, b)."""
+
+
+def _define_operator(op: Callable, emit: Emit, mask: bool) -> None:
+    """Let ``op`` take two vectors, or a vector and a number."""
+
+    @type_callable(op)
+    def _type(context: Any) -> Callable:
+        def typer(a: Any, b: Any) -> Any:
+            like = _like(a, b)
+            return like.with_kind("i1") if like and mask else like
+
+        return typer
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        like, (a, b) = _promote(context, builder, sig.args, args)
+        return emit(builder, like.kind, a, b)
+
+    for pair in ((Vector, Vector), (Vector, types.Number), (types.Number, Vector)):
+        lower_builtin(op, *pair)(lower)
+
+
+def _arithmetic(name: str) -> Emit:
+    def emit(builder: Any, kind: str, a: Any, b: Any) -> Any:
+        if kind == "f32":
+            return getattr(builder, "f" + name)(a, b, flags=FAST_MATH)
+        return getattr(builder, name)(a, b)
+
+    return emit
+
+
+def _bitwise(name: str) -> Emit:
+    return lambda builder, kind, a, b: getattr(builder, name)(a, b)
+
+
+def _comparison(symbol: str) -> Emit:
+    """False where either is nan."""
+
+    def emit(builder: Any, kind: str, a: Any, b: Any) -> Any:
+        compare = builder.fcmp_ordered if kind == "f32" else builder.icmp_signed
+        return compare(symbol, a, b)
+
+    return emit
+
+
+for _op, _name in (("add", "add"), ("sub", "sub"), ("mul", "mul"), ("truediv", "div")):
+    _define_operator(getattr(operator, _op), _arithmetic(_name), mask=False)
+for _op, _name in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">=")):
+    _define_operator(getattr(operator, _op), _comparison(_name), mask=True)
+for _op, _name in (("and_", "and_"), ("or_", "or_"), ("lshift", "shl"), ("rshift", "ashr")):
+    _define_operator(getattr(operator, _op), _bitwise(_name), mask=False)
+
+
+# Functions for kernels.
+
+
+def make_splat(kind: str, lanes: int) -> Callable:
+    """Function that makes a vector of a number."""
+
+    @intrinsic
+    def splat(typingctx: Any, value: Any) -> Any:
+        """Vector with one number in every lane."""
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return emit_splat(builder, args[0], lanes)
+
+        return Vector(kind, lanes)(_SCALARS[kind]), codegen
+
+    return splat
+
+
+splat = make_splat("f32", LANES)
+
+
+def make_constant(values: Sequence[float]) -> Callable:
+    """Function of no arguments that gives these lanes."""
+    kind = "i32" if all(isinstance(v, int) for v in values) else "f32"
+
+    @intrinsic
+    def constant(typingctx: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return emit_lanes(values, _ELEMENTS[kind])
+
+        return Vector(kind, len(values))(), codegen
+
+    return constant
+
+
+def _make_function(name: str) -> Callable:
+    @intrinsic
+    def function(typingctx: Any, a: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return emit_call(builder, name, args[0], flags=FAST_MATH)
+
+        return a(a), codegen
+
+    return function
+
+
+sqrt = _make_function("sqrt")
+"""Square root of each lane; nan for negative ones."""
+floor = _make_function("floor")
+"""Largest whole number not above each lane."""
+absolute = _make_function("fabs")
+
+
+def _make_conversion(instruction: str, kind: str) -> Callable:
+    @intrinsic
+    def convert(typingctx: Any, a: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return getattr(builder, instruction)(args[0], sig.return_type.llvm)
+
+        return a.with_kind(kind)(a), codegen
+
+    return convert
+
+
+to_int = _make_conversion("fptosi", "i32")
+"""Lanes truncated towards zero; they must fit."""
+to_float = _make_conversion("sitofp", "f32")
+"""Integer lanes as floats."""
+as_int = _make_conversion("bitcast", "i32")
+"""The bits of float lanes."""
+as_float = _make_conversion("bitcast", "f32")
+"""Float lanes of these bits."""
+
+
+@intrinsic
+def multiply_add(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
+    """a * b + c, rounded once where the processor can."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        _, args = _promote(context, builder, sig.args, args)
+        return emit_multiply_add(builder, *args)
+
+    return _like(a, b, c)(a, b, c), codegen
+
+
+@intrinsic
+def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
+    """Lanes of ``a`` where the mask is set, of ``b`` elsewhere."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        _, chosen = _promote(context, builder, sig.args[1:], args[1:])
+        return builder.select(args[0], *chosen)
+
+    return _like(a, b)(mask, a, b), codegen
+
+
+def _make_extremum(symbol: str) -> Callable:
+    @intrinsic
+    def extremum(typingctx: Any, a: Any, b: Any) -> Any:
+        """The smaller (larger) of two per lane; the second if one is nan."""
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            like, (x, y) = _promote(context, builder, sig.args, args)
+            return builder.select(_comparison(symbol)(builder, like.kind, x, y), x, y)
+
+        return _like(a, b)(a, b), codegen
+
+    return extremum
+
+
+minimum = _make_extremum("<")
+maximum = _make_extremum(">")
+
+
+@intrinsic
+def any_lane(typingctx: Any, mask: Any) -> Any:
+    """Whether any lane of the mask is set."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        bits = builder.bitcast(args[0], ir.IntType(sig.args[0].lanes))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+    return types.boolean(mask), codegen
+
+
+@intrinsic
+def pack_bytes(typingctx: Any, a: Any) -> Any:
+    """The low bytes of eight integer lanes as one 64-bit number, lane 0 lowest."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        low = builder.trunc(args[0], ir.VectorType(ir.IntType(8), 8))
+        return builder.bitcast(low, ir.IntType(64))
+
+    return types.uint64(a), codegen
+
+
+@intrinsic
+def trailing_zeros(typingctx: Any, bits: Any) -> Any:
+    """Number of the lowest set bit of a nonzero 64-bit number."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.intp(types.uint64), codegen

@@ -1,0 +1,113 @@
+"""What the CPU kernels agree on: tiles, records, camera numbers, and the width of vectors.
+
+Numba reads these numbers when a kernel is compiled.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.kernels import memory, transposes, vectors
+from chronoscene.rasterizer.constants import ALPHA_MIN, CLAMP_MARGIN
+from chronoscene.rasterizer.inputs import Inputs
+
+Array = NDArray[Any]
+
+# An image is cut into tiles of 32 x 32 pixels, a tile into 64 blocks of 4 x 4, so that the blocks
+# of a tile which a Gaussian touches are the bits of one 64-bit number. Planes in memory are
+# ordered by tile, block, row and column.
+TILE = 32
+TILE_PIXELS = TILE * TILE
+BLOCKS = 8  # per side of a tile
+
+# A vector holds the pixels of one block, or of half a block where vectors are narrow.
+LANES = max(vectors.LANES, 8)
+PARTS = 16 // LANES  # vectors per block
+PART_ROWS = LANES // 4
+splat, splat_int = vectors.make_splat("f32", LANES), vectors.make_splat("i32", LANES)
+load = memory.make_load(LANES)
+load_triples = transposes.make_load_columns(3, LANES)
+load_quads = transposes.make_load_columns(4, LANES)
+
+# One Gaussian on the screen is a record of 16 numbers: one cache line.
+RECORD = 16
+MEAN_X, MEAN_Y = 0, 1  # pixels
+# alpha = 2^(LEVEL - u^2 - v^2) with u = U_X dx + U_Y dy; v = V dy, or V dx where V is negative.
+U_X, U_Y, V, LEVEL = 2, 3, 4, 5
+COLOR = 6  # three numbers
+SHEAR, HALF_WIDTH, RIGHTMOST = 9, 10, 11  # see bins.py
+TILES_X, TILES_Y = 12, 13  # int: first tile + (number of tiles << 16), per axis
+ROW = 14  # int: first row of sums in the backward pass, counted from that of the chunk
+INVERSE_Y = 15  # WHITEN over the standard deviation of y
+
+# One row of sums over the pixels of a tile, for a (Gaussian, tile) pair. With
+# g = alpha * d loss / d alpha: sums of g, g u, g v, g u^2, g u v, g v^2, and of the weight times
+# the gradient of each channel; and the sign of V, so that both passes agree on it.
+SUM, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_COLOR = 0, 1, 2, 3, 4, 5, 6
+SUM_SIGN = 9
+
+LOG2_E = math.log2(math.e)
+LEVEL_MIN = math.log2(ALPHA_MIN)  # LEVEL - u^2 - v^2 is at least this where alpha counts
+WHITEN = math.sqrt(0.5 * LOG2_E)  # u and v over WHITEN are standard deviations
+
+# Camera numbers in one float32 array.
+ROTATION, CENTRE, FX, FY, CX, CY = 0, 9, 12, 13, 14, 15  # centre in the world
+X_MIN, X_MAX, Y_MIN, Y_MAX = 16, 17, 18, 19  # limits of x / z and y / z for the Jacobian
+NEAR, FAR, BLUR = 20, 21, 22
+CENTRE_REST = 23  # what float32 cannot hold of the centre
+COFACTORS = 26  # of the rotation: row i is the cross product of the rows i + 1 and i + 2
+CAMERA = 35
+
+CHUNK = 1024  # Gaussians that a thread takes at a time
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Where one image is taken from."""
+
+    camera: Array
+    """`CAMERA` numbers, float32."""
+    width: int
+    height: int
+
+    @property
+    def tiles_x(self) -> int:
+        return -(-self.width // TILE)
+
+    @property
+    def tiles(self) -> int:
+        return self.tiles_x * -(-self.height // TILE)
+
+
+def make_view(viewmat: Array, K: Array, inputs: Inputs) -> View:
+    """Numbers of one camera of the inputs as the kernels want them, from its float64 matrices."""
+    width, height = inputs.width, inputs.height
+    fx, fy, cx, cy = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    margin_x, margin_y = CLAMP_MARGIN * 0.5 * width / fx, CLAMP_MARGIN * 0.5 * height / fy
+    camera = np.zeros(CAMERA, np.float32)
+    rows = np.asarray(viewmat[:3, :3])
+    camera[ROTATION : ROTATION + 9] = rows.reshape(-1)
+    cofactors = np.cross(np.roll(rows, -1, axis=0), np.roll(rows, -2, axis=0))
+    camera[COFACTORS : COFACTORS + 9] = cofactors.reshape(-1)
+    centre = _centre(viewmat)
+    camera[CENTRE : CENTRE + 3] = centre
+    camera[CENTRE_REST : CENTRE_REST + 3] = centre - camera[CENTRE : CENTRE + 3]
+    camera[FX], camera[FY], camera[CX], camera[CY] = fx, fy, cx, cy
+    camera[X_MIN], camera[X_MAX] = -cx / fx - margin_x, (width - cx) / fx + margin_x
+    camera[Y_MIN], camera[Y_MAX] = -cy / fy - margin_y, (height - cy) / fy + margin_y
+    camera[NEAR], camera[FAR] = inputs.near_plane, inputs.far_plane
+    camera[BLUR] = inputs.eps2d
+    return View(camera, width, height)
+
+
+def _centre(viewmat: Array) -> Array:
+    """Where the camera stands, also if rounding has left the rotation not quite one."""
+    try:
+        return -np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3])
+    except np.linalg.LinAlgError:  # nan: all is culled
+        return np.full(3, np.nan)

@@ -1,0 +1,181 @@
+"""What a backend gets, and the checks on it: shapes always, finite numbers unless switched off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chronoscene.checks import check_shape
+from chronoscene.errors import ShapeError
+from chronoscene.rasterizer.constants import DEPTH_MAX, EXTENT_MAX, FOCAL_MIN, SIZE_MAX
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """Arguments of `chronoscene.rasterizer.rasterize`, which describes them."""
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    viewmats: Tensor
+    Ks: Tensor
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    eps2d: float
+    backgrounds: Tensor | None
+    render_depth: bool
+
+    @property
+    def gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Means, quats, scales, opacities, colors."""
+        return self.means, self.quats, self.scales, self.opacities, self.colors
+
+
+def recentred(means: Tensor, viewmats: Tensor) -> tuple[Tensor, Tensor]:
+    """Move the origin to the first camera, so that a cast to float32 loses nothing that counts.
+
+    Survey coordinates are millions of metres; float32 has seven digits. The images are the same,
+    and so are all gradients.
+
+    Args:
+        means: Centres in world units. [N, 3]
+        viewmats: World-to-camera transforms. [C, 4, 4]
+
+    Returns:
+        means: In their own float type. [N, 3]
+        viewmats: float64. [C, 4, 4]
+    """
+    viewmats = viewmats.detach().double()
+    if len(viewmats) == 0:
+        return means, viewmats
+    rotation, translation = viewmats[0, :3, :3], viewmats[0, :3, 3]
+    centre = -torch.linalg.solve_ex(rotation, translation).result
+    # What is subtracted from the means and what is added to the cameras must be the same number.
+    origin = torch.where(torch.isfinite(centre).all(), centre, 0).to(means.dtype)
+    moved = viewmats.clone()
+    moved[:, :3, 3] += viewmats[:, :3, :3] @ origin.double()
+    return means - origin, moved
+
+
+def check_inputs(inputs: Inputs, finite: bool) -> None:
+    """Raise a ShapeError that names the first argument that is wrong.
+
+    Args:
+        inputs: What to check.
+        finite: Whether to look for nan, infinite numbers and invalid cameras too.
+    """
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+    arrays = {name: getattr(inputs, name) for name in names}
+    _check_sizes(inputs.width, inputs.height)
+    _check_shapes(arrays, inputs.backgrounds)
+    _check_options(inputs.near_plane, inputs.far_plane, inputs.eps2d)
+    if finite:
+        if inputs.backgrounds is not None:
+            arrays["backgrounds"] = inputs.backgrounds
+        _check_finite(arrays)
+        _check_cameras(inputs.viewmats, inputs.Ks, inputs.width, inputs.height)
+
+
+def _check_sizes(width: int, height: int) -> None:
+    for name, size in (("width", width), ("height", height)):
+        if not 1 <= size <= SIZE_MAX:
+            raise ShapeError(
+                name,
+                expected=f"1 to {SIZE_MAX} pixels",
+                found=str(size),
+                todo="correct the argument, or render a larger image in parts",
+            )
+
+
+def _check_shapes(arrays: dict[str, Tensor], backgrounds: Tensor | None) -> None:
+    for name, array in arrays.items():
+        if not array.is_floating_point():
+            raise ShapeError(
+                name, expected="floating point", found=str(array.dtype), todo="call .float()"
+            )
+    count, cameras = len(arrays["means"]), len(arrays["viewmats"])
+    shapes: dict[str, tuple[int | None, ...]] = {
+        "means": (count, 3),
+        "quats": (count, 4),
+        "scales": (count, 3),
+        "opacities": (count,),
+        "colors": (count, None),
+        "viewmats": (cameras, 4, 4),
+        "Ks": (cameras, 3, 3),
+    }
+    for name, shape in shapes.items():
+        check_shape(name, arrays[name], shape)
+    if backgrounds is not None:
+        check_shape("backgrounds", backgrounds, (cameras, arrays["colors"].shape[1]))
+
+
+def _check_options(near_plane: float, far_plane: float, eps2d: float) -> None:
+    """0 < near < far, within limits, and the blur is not negative."""
+    if not 1 / DEPTH_MAX <= near_plane < far_plane <= DEPTH_MAX:
+        raise ShapeError(
+            "near_plane, far_plane",
+            expected=f"{1 / DEPTH_MAX:g} <= near_plane < far_plane <= {DEPTH_MAX:g}",
+            found=f"{near_plane}, {far_plane}",
+            todo="correct the arguments",
+        )
+    if not 0 <= eps2d < EXTENT_MAX:
+        raise ShapeError(
+            "eps2d", expected=f"0 to {EXTENT_MAX:g}", found=str(eps2d), todo="correct the argument"
+        )
+
+
+def _check_finite(arrays: dict[str, Tensor]) -> None:
+    for name, array in arrays.items():
+        data = array.detach()
+        if _all_finite(data):
+            continue
+        index = torch.nonzero(~torch.isfinite(data))[0].tolist()
+        raise ShapeError(
+            f"{name}{index}",
+            expected="a finite number",
+            found=str(data[tuple(index)].item()),
+            todo="find where it comes from, or pass check_finite=False to cull such Gaussians",
+        )
+
+
+def _all_finite(data: Tensor) -> bool:
+    """By numpy where it can: torch would wake its threads, which then spin for milliseconds and
+    keep those of the kernels from their processors."""
+    if data.device.type == "cpu" and data.dtype in (torch.float32, torch.float64):
+        return bool(np.isfinite(data.numpy()).all())
+    return bool(torch.isfinite(data).all())
+
+
+def _check_cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> None:
+    """No camera may be mirrored, too wide or singular."""
+    focals = Ks.detach().double().cpu().numpy()[:, [0, 1], [0, 1]]
+    for camera in np.flatnonzero((focals <= 0).any(-1))[:1]:
+        raise ShapeError(
+            f"Ks[{camera}]",
+            expected="positive focal lengths",
+            found=str(focals[camera].tolist()),
+            todo="mirror the camera by its pose, not by its intrinsics",
+        )
+    sizes = np.array([width, height])
+    for camera in np.flatnonzero((focals < FOCAL_MIN * sizes).any(-1))[:1]:
+        raise ShapeError(
+            f"Ks[{camera}]",
+            expected=f"focal lengths of at least {FOCAL_MIN:g} of the image's width and height",
+            found=f"{focals[camera].tolist()} for {width} x {height} pixels",
+            todo="give intrinsics in pixels",
+        )
+    volumes = np.linalg.det(viewmats.detach().double().cpu().numpy()[:, :3, :3])
+    for camera in np.flatnonzero(volumes == 0)[:1]:
+        raise ShapeError(
+            f"viewmats[{camera}]",
+            expected="a rotation in the upper left 3 x 3",
+            found="a singular matrix",
+            todo="pass world-to-camera transforms",
+        )
