@@ -1,18 +1,19 @@
-"""What cameras and drones write into their photos: when, where, with which lens.
+"""What cameras and drones write into their photos: when, where, with which lens; orientation tags.
 
 Nothing of it is trusted: whatever is absent, damaged or absurd is None. Only the header of a file
 is read.
 
-Sources: Exif 2.32 (CIPA DC-008) for the tags; the names of DJI's XMP attributes are as the makers'
-photos have them.
+Sources: Exif 2.32 (CIPA DC-008) for the tags, JFIF and TIFF 6.0 for where they are in a file; the
+names of DJI's XMP attributes are as the makers' photos have them.
 """
 
 from __future__ import annotations
 
 import math
 import re
+import struct
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -25,14 +26,15 @@ _MAKE, _MODEL, _ORIENTATION = 0x010F, 0x0110, 0x0112
 _TAKEN, _DIGITISED = 0x9003, 0x9004
 _FOCAL, _FOCAL_35, _WIDTH, _HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
 
-LONGEST_XMP = 1_000_000
-"""Bytes of XMP that are looked at."""
+_EXIF, _APP1, _START_OF_SCAN = b"Exif\0\0", 0xE1, 0xDA
+_SHORT, _LONG = 3, 4
 
-LONGEST_NAME = 100
-"""Characters of a maker's name that are kept."""
+MAX_XMP_BYTES = 1_000_000
 
-EARLIEST = 1990
-"""Year; clocks that were never set say less."""
+MAX_NAME_LENGTH = 100
+
+MIN_YEAR = 1990
+"""Clocks that were never set say less."""
 
 _DATE = re.compile(
     r"(\d{4})[-:./](\d{1,2})[-:./](\d{1,2})(?!\d)(?:[ T]+(\d{1,2})\D(\d{1,2})(?:\D(\d{1,2}))?)?",
@@ -155,9 +157,9 @@ def _parse(
 
 def _drone(xmp: Any) -> DroneData | None:
     """DJI's attributes, by their names: XMP from a file is not given to an XML parser."""
-    if not isinstance(xmp, bytes) or b"drone-dji:" not in xmp[:LONGEST_XMP]:
+    if not isinstance(xmp, bytes) or b"drone-dji:" not in xmp[:MAX_XMP_BYTES]:
         return None
-    text = xmp[:LONGEST_XMP].decode("utf-8", "replace")
+    text = xmp[:MAX_XMP_BYTES].decode("utf-8", "replace")
 
     def value(name: str) -> float | None:
         pattern = rf"drone-dji:{name}\s*(?:=\s*[\"']|>)\s*([-+0-9.eE]{{1,40}})"
@@ -192,7 +194,7 @@ def _date(value: Any) -> datetime | None:
             date = datetime(year, month, day, *clock)
         except ValueError:
             continue
-        return date if year >= EARLIEST else None
+        return date if year >= MIN_YEAR else None
     return None
 
 
@@ -253,4 +255,44 @@ def _text(value: Any) -> str | None:
     if not isinstance(value, str):
         return None
     text = "".join(c for c in value if c.isprintable()).strip()
-    return text[:LONGEST_NAME] or None
+    return text[:MAX_NAME_LENGTH] or None
+
+
+def set_upright(data: bytes) -> bytes | None:
+    """The same JPEG with orientation 1; None if it has no such tag. No pixel is compressed again.
+
+    Pillow would write all metadata anew, and lose what it does not know.
+    """
+    upright = bytearray(data)
+    for at, order in _orientation_values(data):
+        struct.pack_into(f"{order}H", upright, at, 1)
+    return bytes(upright) if upright != data else None
+
+
+def _orientation_values(data: bytes) -> Iterator[tuple[int, str]]:
+    """Where the orientation tags of the main directories are, as 16 bits, and their byte order."""
+    for start, tiff in _exif_segments(data):
+        order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+        if order is None:
+            continue
+        try:
+            (directory,) = struct.unpack_from(f"{order}I", tiff, 4)
+            (count,) = struct.unpack_from(f"{order}H", tiff, directory)
+            for i in range(count):
+                entry = directory + 2 + 12 * i
+                tag, kind, length, _ = struct.unpack_from(f"{order}HHII", tiff, entry)
+                if tag == _ORIENTATION and kind in (_SHORT, _LONG) and length == 1:
+                    yield start + entry + (10 if kind == _LONG and order == ">" else 8), order
+        except struct.error:
+            pass  # a directory beyond the end of the segment
+
+
+def _exif_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Where the TIFF headers in the Exif segments of a JPEG begin, and all that is theirs."""
+    at = 2 if data[:2] == b"\xff\xd8" else len(data)
+    while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != _START_OF_SCAN:
+        end = at + 2 + struct.unpack_from(">H", data, at + 2)[0]
+        if data[at + 1] == _APP1 and data.startswith(_EXIF, at + 4):
+            start = at + 4 + len(_EXIF)
+            yield start, data[start:end]
+        at = end

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from chronoscene.images.exif import DroneData, ExifData, exif_of, read_exif
+from chronoscene.images.exif import DroneData, ExifData, exif_of, read_exif, set_upright
 
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description
  drone-dji:AbsoluteAltitude="+132.50" drone-dji:RelativeAltitude="+61.30"
@@ -189,3 +189,37 @@ def test_date_of_the_gps_fix_where_there_is_no_other():
     assert read(photo(gps=gps)).date == datetime(2016, 5, 3, 9, 30, 15, 500000)
     assert read(photo(gps=gps, exif={0x9003: "2017:05:03 12:00:00"})).date.year == 2017
     assert read(photo(gps={29: "2016:05:03", 7: (99.0, 0.0, 0.0)})).date == datetime(2016, 5, 3)
+
+
+def tagged(orientation, order="<"):
+    exif = Image.Exif()
+    exif.endian = order
+    exif[0x010F], exif[0x0112] = "Maker", orientation
+    Image.new("RGB", (8, 8)).save(file := io.BytesIO(), "JPEG", exif=exif)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("is_long", [False, True])
+def test_upright(order, is_long):
+    data = tagged(6, order)
+    if is_long:  # as some programs write it
+        entry = struct.pack(f"{order}HHI", 0x0112, 3, 1)
+        assert data.count(entry) == 1
+        long = struct.pack(f"{order}HHII", 0x0112, 4, 1, 6)
+        at = data.index(entry)
+        data = data[:at] + long + data[at + 12 :]
+        assert exif_of(Image.open(io.BytesIO(data))).orientation == 6
+    new = Image.open(io.BytesIO(set_upright(data)))
+    assert exif_of(new).orientation == 1 and exif_of(new).make == "Maker"
+    assert set_upright(set_upright(data)) is None
+
+
+@given(st.binary(max_size=60), st.integers(0, 200))
+def test_upright_changes_two_bytes_or_nothing(garbage, at):
+    good = tagged(6)
+    data = good[:at] + garbage + good[at + len(garbage) :]
+    found = set_upright(data)
+    if found is not None:
+        assert len(found) == len(data)
+        assert sum(a != b for a, b in zip(found, data, strict=True)) <= 2

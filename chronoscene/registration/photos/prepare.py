@@ -10,14 +10,13 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import shutil
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
+from chronoscene.images.exif import set_upright
 from chronoscene.images.store import load_rgb
 from chronoscene.io.staging import replacing
 from chronoscene.registration.photos.photo import Capture
@@ -85,7 +84,7 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
             target = _convert(capture.path, target)
             converted += 1
         elif capture.exif.orientation != 1 and capture.path.suffix.lower() in (".jpg", ".jpeg"):
-            _copy_without_orientation(capture.path, target)
+            _copy_upright(capture.path, target)
             turned += 1
         else:
             link(capture.path, target)
@@ -144,40 +143,7 @@ def link(source: Path, target: Path) -> None:
     partial.replace(target)
 
 
-def _copy_without_orientation(source: Path, target: Path) -> None:
+def _copy_upright(source: Path, target: Path) -> None:
+    data = source.read_bytes()
     with replacing(target) as partial:
-        shutil.copyfile(source, partial)
-        data = bytearray(partial.read_bytes())
-        for offset, order in _orientation_values(data):
-            struct.pack_into(f"{order}H", data, offset, 1)
-        partial.write_bytes(data)
-
-
-def _orientation_values(data: bytes | bytearray) -> list[tuple[int, str]]:
-    """Where the orientation tags of a JPEG's main EXIF directories are, and their byte order."""
-    found = []
-    position = 2
-    while position + 4 <= len(data) and data[position] == 0xFF and data[position + 1] != 0xDA:
-        marker, length = data[position + 1], struct.unpack_from(">H", data, position + 2)[0]
-        start = position + 4
-        if marker == 0xE1 and bytes(data[start : start + 6]) == b"Exif\0\0":
-            found += _tiff_orientation(data, start + 6, position + 2 + length)
-        position += 2 + length
-    return found
-
-
-def _tiff_orientation(data: bytes | bytearray, start: int, end: int) -> list[tuple[int, str]]:
-    """The orientation entry of the first directory of a TIFF header."""
-    order = {b"II": "<", b"MM": ">"}.get(bytes(data[start : start + 2]))
-    if order is None or start + 8 > end:
-        return []
-    directory = start + struct.unpack_from(f"{order}I", data, start + 4)[0]
-    if directory + 2 > end:
-        return []
-    count = struct.unpack_from(f"{order}H", data, directory)[0]
-    entries = range(directory + 2, min(directory + 2 + 12 * count, end - 11), 12)
-    return [
-        (entry + 8, order)
-        for entry in entries
-        if struct.unpack_from(f"{order}H", data, entry)[0] == _ORIENTATION
-    ]
+        partial.write_bytes(set_upright(data) or data)

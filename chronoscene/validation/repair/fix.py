@@ -16,13 +16,13 @@ from chronoscene.colmap.raw_model import FORMS, MODEL_FILES, RawModel
 from chronoscene.colmap.write import write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD
+from chronoscene.images.exif import set_upright
 from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
 from chronoscene.validation.checks.spelling import spelling
 from chronoscene.validation.other_formats import other_format
 from chronoscene.validation.repair.colmap_model import Repair, repair_model
-from chronoscene.validation.repair.orientation import set_upright
 from chronoscene.validation.repair.split_files import plain_table, repair_split, repair_test
 from chronoscene.validation.rules import split_file as split_rules
 from chronoscene.validation.rules import test_list as test_rules

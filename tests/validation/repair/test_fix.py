@@ -8,8 +8,6 @@ import signal
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from chronoscene.colmap.raw_model import read_raw_model
@@ -17,7 +15,6 @@ from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.io.processes import stoppable
 from chronoscene.validation.repair.fix import fix_scene
-from chronoscene.validation.repair.orientation import set_upright
 from chronoscene.validation.run import validate_scene
 
 SPLIT, TEST = "sparse/split.txt", "sparse/0/test.txt"
@@ -269,16 +266,6 @@ def test_orientation_tag_that_the_camera_agrees_with_stays(scene, fix):
     scene.write("images/a000.jpg", tagged(Image.new("RGB", (48, 64)), 6))
     fixed, after, _ = fix()
     assert fixed == set() and "CS204" in after
-
-
-@given(st.binary(max_size=60), st.integers(0, 200))
-def test_upright_changes_two_bytes_or_nothing(garbage, at):
-    good = tagged(Image.new("RGB", (8, 8)), 6)
-    data = good[:at] + garbage + good[at + len(garbage) :]
-    found = set_upright(data)
-    if found is not None:
-        assert len(found) == len(data)
-        assert sum(a != b for a, b in zip(found, data, strict=True)) <= 2
 
 
 def test_model_that_cannot_be_read_is_copied(scene, fix):
