@@ -149,7 +149,7 @@ def add_period(scene: Scene, registered: Registered, name: str) -> Scene:
     is an observation of a point of the scene at the same pixel, its new observations join that
     point instead.
     """
-    from chronoscene.registration.reconstruct.extend_tracks import grow_points
+    from chronoscene.registration.reconstruct.extend_tracks import extend_tracks
 
     new = as_scene(registered, name)
     old_names = {f.name for f in scene.frames}
@@ -162,7 +162,7 @@ def add_period(scene: Scene, registered: Registered, name: str) -> Scene:
         for i, f in enumerate(added)
     ]
     frames = tuple(sorted((*scene.frames, *fresh), key=lambda f: f.name))
-    points = grow_points(scene, new, frames)
+    points = extend_tracks(scene, new, frames)
     label = registered.labels[added_period]
     period = Period(added_period, label, registered.dates[added_period])
     return replace(

@@ -1,4 +1,4 @@
-"""A scene that gets images and points without losing any: nothing that was there changes."""
+"""A scene that gets images and points: nothing that was there changes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ SAME_PIXELS = 1.0
 """Two observations in one image this near to each other are of one point..."""
 
 SAME_ERROR = 4.0
-"""...if the point projects into the new images this near to what they see, in pixels."""
+"""...if the point projects into the new images this near to their observations, in pixels."""
+
+Ints = NDArray[np.int64]
 
 
-def grow_points(scene: Scene, new: Scene, frames: Sequence[Frame]) -> Points:
+def extend_tracks(scene: Scene, new: Scene, frames: Sequence[Frame]) -> Points:
     """Points of both scenes, with tracks over ``frames``.
+
+    New points are those that a new image sees. Where one is an old point, its observations by new
+    images extend the track of that point.
 
     Args:
         scene: The old scene.
@@ -28,45 +33,59 @@ def grow_points(scene: Scene, new: Scene, frames: Sequence[Frame]) -> Points:
         frames: All frames, sorted by name; those of both scenes are among them.
     """
     index = {frame.name: i for i, frame in enumerate(frames)}
-    old_frame = np.array([index[f.name] for f in scene.frames], np.int64)
-    new_frame = np.array([index[f.name] for f in new.frames], np.int64)
-    is_old = np.zeros(len(frames), bool)
-    is_old[old_frame] = True
     a, b = scene.points, new.points
-    a_frame, b_frame = old_frame[a.track_frame], new_frame[b.track_frame]
+    old_frame = np.array([index[f.name] for f in scene.frames], np.int64)
+    a_point, a_frame = track_owners(a.track_start), old_frame[a.track_frame]
     b_point = track_owners(b.track_start)
-    wanted = np.zeros(len(b), bool)
-    wanted[b_point[~is_old[b_frame]]] = True
-    target = _same_points(scene, a_frame, b_point, b_frame, b.track_xy, is_old)
-    target = _check(scene.points, target, b_point, b_frame, b, frames, is_old)
-    joins, is_new = wanted & (target >= 0), wanted & (target < 0)
-    return _concatenate(a, b, a_frame, b_frame, b_point, target, joins, is_new, is_old)
+    b_frame = np.array([index[f.name] for f in new.frames], np.int64)[b.track_frame]
+    by_new = ~np.isin(b_frame, old_frame)
+    target = _same_points(a, a_point, a_frame, b, b_point, b_frame, by_new)
+    target[_misfits(a, target, b, b_point, b_frame, by_new, frames)] = -1
+
+    is_new = np.zeros(len(b), bool)
+    is_new[b_point[by_new]] = True
+    is_new &= target < 0
+    number = np.where(target < 0, np.cumsum(is_new) - 1 + len(a), target)
+    rows = np.flatnonzero(is_new[b_point] | (by_new & (target[b_point] >= 0)))
+    point = np.concatenate([a_point, number[b_point[rows]]])
+    frame = np.concatenate([a_frame, b_frame[rows]])
+    order = np.argsort(point, kind="stable")
+    # An image observes a point once: the first observation counts.
+    key = point * len(frames) + frame
+    order = order[np.sort(np.unique(key[order], return_index=True)[1])]
+    count = int(is_new.sum())
+    first_id = 1 + int(a.ids.max(initial=0))
+    return Points(
+        ids=np.concatenate([a.ids, first_id + np.arange(count)]),
+        xyz=np.concatenate([a.xyz, b.xyz[is_new]]),
+        rgb=np.concatenate([a.rgb, b.rgb[is_new]]),
+        error=np.concatenate([a.error, b.error[is_new]]),
+        track_start=np.searchsorted(point[order], np.arange(len(a) + count + 1)).astype(np.int64),
+        track_frame=frame[order].astype(np.int32),
+        track_xy=np.concatenate([a.track_xy, b.track_xy[rows]])[order],
+    )
 
 
 def _same_points(
-    scene: Scene,
-    a_frame: NDArray[np.int64],
-    b_point: NDArray[np.int64],
-    b_frame: NDArray[np.int64],
-    b_xy: NDArray[np.float64],
-    is_old: NDArray[np.bool_],
-) -> NDArray[np.int64]:
-    """Old point that each new point shares most of its old observations with; -1 without.
-
-    [new points]
-    """
-    a = scene.points
-    a_point = track_owners(a.track_start)
+    a: Points,
+    a_point: Ints,
+    a_frame: Ints,
+    b: Points,
+    b_point: Ints,
+    b_frame: Ints,
+    by_new: NDArray[np.bool_],
+) -> Ints:
+    """Old point that each new point shares most of its old observations with; -1 without. [b]"""
     shared = np.full(len(b_point), -1, np.int64)
-    for frame in np.unique(b_frame[is_old[b_frame]]).tolist():
+    for frame in np.unique(b_frame[~by_new]).tolist():
         mine, theirs = np.flatnonzero(b_frame == frame), np.flatnonzero(a_frame == frame)
         if not len(theirs):
             continue
-        distance, nearest = cKDTree(a.track_xy[theirs]).query(b_xy[mine])
+        distance, nearest = cKDTree(a.track_xy[theirs]).query(b.track_xy[mine])
         near = distance < SAME_PIXELS
         shared[mine[near]] = a_point[theirs[nearest[near]]]
-    target = np.full(int(b_point.max(initial=-1)) + 1, -1, np.int64)
-    observed = np.bincount(b_point[is_old[b_frame]], minlength=len(target))
+    target = np.full(len(b), -1, np.int64)
+    observed = np.bincount(b_point[~by_new], minlength=len(b))
     found = shared >= 0
     pairs, counts = np.unique(
         np.column_stack([b_point[found], shared[found]]), axis=0, return_counts=True
@@ -76,64 +95,21 @@ def _same_points(
     return target
 
 
-def _check(
-    old: Points,
-    target: NDArray[np.int64],
-    b_point: NDArray[np.int64],
-    b_frame: NDArray[np.int64],
-    b: Points,
-    frames: Sequence[Frame],
-    is_old: NDArray[np.bool_],
-) -> NDArray[np.int64]:
-    """Undo pairs whose old point does not lie where new images see it."""
-    target = np.concatenate([target, np.full(len(b) - len(target), -1, np.int64)])
-    bad = np.zeros(len(b), bool)
-    for i in np.unique(b_frame[~is_old[b_frame]]).tolist():
-        mine = np.flatnonzero((b_frame == i) & (target[b_point] >= 0))
-        if len(mine):
-            pose = frames[i].cam_from_world
-            local = old.xyz[target[b_point[mine]]] @ pose[:3, :3].T + pose[:3, 3]
-            seen = project_points(frames[i].camera, local)
-            error = np.linalg.norm(seen - b.track_xy[mine], axis=1)
-            bad[b_point[mine[~(error < SAME_ERROR)]]] = True
-    return np.where(bad, -1, target)
-
-
-def _concatenate(
+def _misfits(
     a: Points,
+    target: Ints,
     b: Points,
-    a_frame: NDArray[np.int64],
-    b_frame: NDArray[np.int64],
-    b_point: NDArray[np.int64],
-    target: NDArray[np.int64],
-    joins: NDArray[np.bool_],
-    is_new: NDArray[np.bool_],
-    is_old: NDArray[np.bool_],
-) -> Points:
-    """Old points with longer tracks, then new ones."""
-    a_point = track_owners(a.track_start)
-    joined = joins[b_point] & ~is_old[b_frame]
-    fresh = is_new[b_point]
-    number = np.cumsum(is_new) - 1 + len(a)
-    point = np.concatenate([a_point, target[b_point[joined]], number[b_point[fresh]]])
-    frame = np.concatenate([a_frame, b_frame[joined], b_frame[fresh]])
-    xy = np.concatenate([a.track_xy, b.track_xy[joined], b.track_xy[fresh]])
-    order = np.argsort(point, kind="stable")
-    point, frame, xy = point[order], frame[order], xy[order]
-    once = np.ones(len(point), bool)
-    seen = np.unique(point * (int(frame.max(initial=0)) + 1) + frame, return_index=True)[1]
-    once[:] = False
-    once[seen] = True
-    point, frame, xy = point[once], frame[once], xy[once]
-    count = len(a) + int(is_new.sum())
-    start = np.searchsorted(point, np.arange(count + 1))
-    first_id = 1 + int(a.ids.max(initial=0))
-    return Points(
-        ids=np.concatenate([a.ids, first_id + np.arange(int(is_new.sum()))]),
-        xyz=np.concatenate([a.xyz, b.xyz[is_new]]),
-        rgb=np.concatenate([a.rgb, b.rgb[is_new]]),
-        error=np.concatenate([a.error, b.error[is_new]]),
-        track_start=start.astype(np.int64),
-        track_frame=frame.astype(np.int32),
-        track_xy=xy,
-    )
+    b_point: Ints,
+    b_frame: Ints,
+    by_new: NDArray[np.bool_],
+    frames: Sequence[Frame],
+) -> Ints:
+    """New points whose old point does not project to where new images see it."""
+    bad = [np.zeros(0, np.int64)]
+    for i in np.unique(b_frame[by_new]).tolist():
+        mine = np.flatnonzero((b_frame == i) & (target[b_point] >= 0))
+        pose = frames[i].cam_from_world
+        local = a.xyz[target[b_point[mine]]] @ pose[:3, :3].T + pose[:3, 3]
+        error = np.linalg.norm(project_points(frames[i].camera, local) - b.track_xy[mine], axis=1)
+        bad.append(b_point[mine[~(error < SAME_ERROR)]])
+    return np.concatenate(bad)

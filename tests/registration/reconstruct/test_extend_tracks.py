@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from chronoscene.formats import read_scene
-from chronoscene.registration.reconstruct.extend_tracks import grow_points
+from chronoscene.registration.reconstruct.extend_tracks import extend_tracks
 from chronoscene.scene import Points, Scene
 
 
@@ -40,7 +40,7 @@ def tracks(points: Points, names: list[str]) -> dict[int, set[str]]:
 
 def test_old_points_get_the_observations_of_new_images(scene: Scene) -> None:
     old = split_off(scene, [0, 1])
-    grown = grow_points(old, scene, scene.frames)
+    grown = extend_tracks(old, scene, scene.frames)
     assert grown.xyz.tobytes() == old.points.xyz.tobytes()
     assert grown.ids.tolist() == old.points.ids.tolist()
     names = [f.name for f in scene.frames]
@@ -60,7 +60,7 @@ def test_new_points_are_those_that_new_images_see(scene: Scene) -> None:
         track_frame=old.points.track_frame[: old.points.track_start[15]],
         track_xy=old.points.track_xy[: old.points.track_start[15]],
     )
-    grown = grow_points(replace(old, points=fewer), scene, scene.frames)
+    grown = extend_tracks(replace(old, points=fewer), scene, scene.frames)
     assert len(grown) == 30
     assert grown.ids[:15].tolist() == fewer.ids.tolist()
     assert (grown.ids[15:] > fewer.ids.max()).all()
@@ -74,7 +74,7 @@ def test_a_point_that_moved_does_not_join_the_old_one(scene: Scene) -> None:
     moved = old.points.xyz.copy()
     moved[4] += 1.0
     old = replace(old, points=replace(old.points, xyz=moved))
-    grown = grow_points(old, scene, scene.frames)
+    grown = extend_tracks(old, scene, scene.frames)
     assert len(grown) == 31
     names = [f.name for f in scene.frames]
     assert tracks(grown, names)[int(old.points.ids[4])] == set(names[:2])
