@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from generated_registrations import pose_errors
 
-from chronoscene.registration.inspection import Inspection
+from chronoscene.registration.output import Inspection
 from chronoscene.registration.pipeline import Options
 from chronoscene.registration.quality.verdict import Verdict
 from chronoscene.registration.result import Registered

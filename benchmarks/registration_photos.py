@@ -30,7 +30,7 @@ from registration_outcomes import (
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
-from chronoscene.registration.inspection import Inspection
+from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import run, run_into
 from chronoscene.registration.result import Registered

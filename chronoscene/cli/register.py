@@ -10,12 +10,9 @@ from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
-from chronoscene.registration.inspection import Inspection
-from chronoscene.registration.photos.camera_sharing import (
-    CALIBRATIONS,
-    MIN_PHOTOS,
-    Calibration,
-)
+from chronoscene.registration.context import CALIBRATIONS, Calibration
+from chronoscene.registration.features.matching import MIN_PHOTOS
+from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import Options, run, run_into
 from chronoscene.registration.result import ROUTES, Registered, Route

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
+from chronoscene.io.processes import Report
 from chronoscene.kernels.runtime import available_threads
-from chronoscene.registration.photos.camera_sharing import Calibration
 from chronoscene.registration.result import Route
-from chronoscene.registration.stages import Stages
-from chronoscene.registration.worker import Report, run_step
+from chronoscene.registration.stages import Stages, run_step
+
+Calibration = Literal["auto", "per-period", "shared"]
+
+CALIBRATIONS: tuple[Calibration, ...] = get_args(Calibration)
 
 EXHAUSTIVE_LIMIT = 60
 """Images; at most 1,770 pairs."""

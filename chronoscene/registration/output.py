@@ -1,31 +1,48 @@
-"""The result as a scene in the ChronoScene format, beside it what was decided and where it lies."""
+"""What a registration writes: a scene in the ChronoScene format, and files about it beside it."""
 
 from __future__ import annotations
 
 import json
 import os
 import shutil
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared.writing import Progress
 from chronoscene.io.staging import write_text_atomic
+from chronoscene.registration.quality.certificate import Certificate, certify
+from chronoscene.registration.quality.certificate_json import to_json
+from chronoscene.registration.quality.verdict import Verdict, judge
+from chronoscene.registration.report.page import write_report
 from chronoscene.registration.result import Registered
+from chronoscene.registration.ties.tie_alignment import TieAlignment, with_tie_tracks
+from chronoscene.registration.ties.tie_points import TiePoints
 from chronoscene.scene import Frame, Period, Points, Scene, WorldFrame
+from chronoscene.scene.cameras import project_points
 from chronoscene.scene.splits import default_tests, split_of
 from chronoscene.scene.tracks import reproject, track_owners
 from chronoscene.undistort import undistort
 
 LOG = "registration_log.json"
 GEOREFERENCE = "georeference.json"
+CERTIFICATE = "registration.json"
+PAGE = "registration.html"
 
-OURS = (LOG, GEOREFERENCE, "registration.json")
+SAME_PIXELS = 1.0
+"""Two observations in one image this near to each other are of one point..."""
+
+SAME_ERROR = 4.0
+"""...if the point projects into the new images this near to their observations, in pixels."""
+
+Ints = NDArray[np.int64]
 
 
 def as_scene(registered: Registered, name: str) -> Scene:
@@ -72,16 +89,11 @@ def as_points(registered: Registered) -> Points:
     )
 
 
-def point_errors(registered: Registered) -> np.ndarray:
-    """Mean reprojection error of each point, pixels; 0 without observations. [P]"""
-    errors = observation_errors(registered)
-    point = track_owners(registered.track_start)
-    sums = np.bincount(point, weights=errors, minlength=len(registered.points))
-    return np.asarray(sums / np.maximum(np.diff(registered.track_start), 1), np.float64)
+def point_errors(registered: Registered) -> NDArray[np.float64]:
+    """Mean reprojection error of each point, pixels; 0 without observations. [P]
 
-
-def observation_errors(registered: Registered) -> np.ndarray:
-    """Reprojection error of each observation, pixels; 0 behind a camera. [O]"""
+    An observation behind its camera counts as 0.
+    """
     offset, _ = reproject(
         list(zip(registered.cameras, registered.cam_from_world, strict=True)),
         registered.points,
@@ -89,8 +101,10 @@ def observation_errors(registered: Registered) -> np.ndarray:
         registered.track_image,
         registered.track_xy,
     )
-    errors = np.linalg.norm(offset, axis=1)
-    return np.where(np.isfinite(errors), errors, 0.0)
+    errors = np.nan_to_num(np.linalg.norm(offset, axis=1), nan=0.0, posinf=0.0)
+    point = track_owners(registered.track_start)
+    sums = np.bincount(point, weights=errors, minlength=len(registered.points))
+    return np.asarray(sums / np.maximum(np.diff(registered.track_start), 1), np.float64)
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
@@ -149,8 +163,6 @@ def add_period(scene: Scene, registered: Registered, name: str) -> Scene:
     is an observation of a point of the scene at the same pixel, its new observations join that
     point instead.
     """
-    from chronoscene.registration.reconstruct.extend_tracks import extend_tracks
-
     new = as_scene(registered, name)
     old_names = {f.name for f in scene.frames}
     added_period = scene.num_periods
@@ -168,3 +180,142 @@ def add_period(scene: Scene, registered: Registered, name: str) -> Scene:
     return replace(
         new, frames=frames, points=points, periods=(*scene.periods, period), world=scene.world
     )
+
+
+def extend_tracks(scene: Scene, new: Scene, frames: Sequence[Frame]) -> Points:
+    """Points of both scenes, with tracks over ``frames``.
+
+    New points are those that a new image sees. Where one is an old point, its observations by new
+    images extend the track of that point.
+
+    Args:
+        scene: The old scene.
+        new: Old and new images, with points that were triangulated from both.
+        frames: All frames, sorted by name; those of both scenes are among them.
+    """
+    index = {frame.name: i for i, frame in enumerate(frames)}
+    a, b = scene.points, new.points
+    old_frame = np.array([index[f.name] for f in scene.frames], np.int64)
+    a_point, a_frame = track_owners(a.track_start), old_frame[a.track_frame]
+    b_point = track_owners(b.track_start)
+    b_frame = np.array([index[f.name] for f in new.frames], np.int64)[b.track_frame]
+    by_new = ~np.isin(b_frame, old_frame)
+    target = _same_points(a, a_point, a_frame, b, b_point, b_frame, by_new)
+    target[_misfits(a, target, b, b_point, b_frame, by_new, frames)] = -1
+
+    is_new = np.zeros(len(b), bool)
+    is_new[b_point[by_new]] = True
+    is_new &= target < 0
+    number = np.where(target < 0, np.cumsum(is_new) - 1 + len(a), target)
+    rows = np.flatnonzero(is_new[b_point] | (by_new & (target[b_point] >= 0)))
+    point = np.concatenate([a_point, number[b_point[rows]]])
+    frame = np.concatenate([a_frame, b_frame[rows]])
+    order = np.argsort(point, kind="stable")
+    # An image observes a point once: the first observation counts.
+    key = point * len(frames) + frame
+    order = order[np.sort(np.unique(key[order], return_index=True)[1])]
+    count = int(is_new.sum())
+    first_id = 1 + int(a.ids.max(initial=0))
+    return Points(
+        ids=np.concatenate([a.ids, first_id + np.arange(count)]),
+        xyz=np.concatenate([a.xyz, b.xyz[is_new]]),
+        rgb=np.concatenate([a.rgb, b.rgb[is_new]]),
+        error=np.concatenate([a.error, b.error[is_new]]),
+        track_start=np.searchsorted(point[order], np.arange(len(a) + count + 1)).astype(np.int64),
+        track_frame=frame[order].astype(np.int32),
+        track_xy=np.concatenate([a.track_xy, b.track_xy[rows]])[order],
+    )
+
+
+def _same_points(
+    a: Points,
+    a_point: Ints,
+    a_frame: Ints,
+    b: Points,
+    b_point: Ints,
+    b_frame: Ints,
+    by_new: NDArray[np.bool_],
+) -> Ints:
+    """Old point that each new point shares most of its old observations with; -1 without. [b]"""
+    shared = np.full(len(b_point), -1, np.int64)
+    for frame in np.unique(b_frame[~by_new]).tolist():
+        mine, theirs = np.flatnonzero(b_frame == frame), np.flatnonzero(a_frame == frame)
+        if not len(theirs):
+            continue
+        distance, nearest = cKDTree(a.track_xy[theirs]).query(b.track_xy[mine])
+        near = distance < SAME_PIXELS
+        shared[mine[near]] = a_point[theirs[nearest[near]]]
+    target = np.full(len(b), -1, np.int64)
+    observed = np.bincount(b_point[~by_new], minlength=len(b))
+    found = shared >= 0
+    pairs, counts = np.unique(
+        np.column_stack([b_point[found], shared[found]]), axis=0, return_counts=True
+    )
+    most = 2 * counts > observed[pairs[:, 0]]
+    target[pairs[most, 0]] = pairs[most, 1]
+    return target
+
+
+def _misfits(
+    a: Points,
+    target: Ints,
+    b: Points,
+    b_point: Ints,
+    b_frame: Ints,
+    by_new: NDArray[np.bool_],
+    frames: Sequence[Frame],
+) -> Ints:
+    """New points whose old point does not project to where new images see it."""
+    bad = [np.zeros(0, np.int64)]
+    for i in np.unique(b_frame[by_new]).tolist():
+        mine = np.flatnonzero((b_frame == i) & (target[b_point] >= 0))
+        pose = frames[i].cam_from_world
+        local = a.xyz[target[b_point[mine]]] @ pose[:3, :3].T + pose[:3, 3]
+        error = np.linalg.norm(project_points(frames[i].camera, local) - b.track_xy[mine], axis=1)
+        bad.append(b_point[mine[~(error < SAME_ERROR)]])
+    return np.concatenate(bad)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inspection:
+    """What came of looking at a registration."""
+
+    certificate: Certificate
+    verdict: Verdict
+
+    @property
+    def summary(self) -> str:
+        """For the end of a command: the verdict and what to do, without colours."""
+        lines = [f"verdict: {self.verdict.level}. {self.verdict.text}"]
+        lines += [f"  to do: {todo}" for todo in self.verdict.todo[:3]]
+        return "\n".join(lines) + "\n"
+
+
+def inspect_registration(
+    model: Registered,
+    folder: Path,
+    *,
+    page: bool = False,
+    ties: TieAlignment | None = None,
+    tie_points: TiePoints | None = None,
+    title: str | None = None,
+) -> Inspection:
+    """Write ``registration.json`` and, if asked for, ``registration.html`` into a folder.
+
+    Args:
+        model: The registration, after tie points were heeded.
+        folder: Exists.
+        page: Whether to write the page.
+        ties: What tie points did to it.
+        tie_points: The file: its points then count as ties.
+        title: Of the page; None for the name of the folder.
+    """
+    model = model if tie_points is None else with_tie_tracks(model, tie_points)
+    certificate = certify(model)
+    verdict = judge(certificate)
+    data = to_json(certificate, verdict, ties)
+    write_text_atomic(folder / CERTIFICATE, json.dumps(data, indent=1, allow_nan=False) + "\n")
+    if page:
+        title = title or f"Registration of {folder.resolve().name}"
+        write_report(folder / PAGE, model, certificate, verdict, ties=ties, title=title)
+    return Inspection(certificate, verdict)

@@ -8,10 +8,11 @@ from typing import Any
 
 from chronoscene.colmap.model import copy_poses
 from chronoscene.errors import ConfigError
+from chronoscene.io.processes import Report
 from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.features.matching import find_matches
-from chronoscene.registration.inspection import Inspection, inspect_registration
+from chronoscene.registration.output import Inspection, inspect_registration
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.inputs import Inputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
@@ -20,7 +21,6 @@ from chronoscene.registration.stages import Stages, work_folder
 from chronoscene.registration.ties.apply import tie
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
-from chronoscene.registration.worker import Report
 from chronoscene.scene import Scene
 
 __all__ = ["Options", "run", "run_into"]

@@ -1,9 +1,13 @@
-"""Stages that are done once: a killed command goes on where it was.
+"""Stages that are done once, so that a killed command continues where it was.
 
-A stage stores a record when it has ended well: a fingerprint of all that went into it, its result,
-and its remarks. The record is written last, to a temporary name that is renamed. A stage whose
-record has another fingerprint is done again, and so is everything after it, because the fingerprint
-of a stage covers the one before.
+A stage stores a record when it has succeeded: a fingerprint of all its inputs, its result, and its
+remarks. The record is written last, to a temporary name that is renamed. A stage whose record has
+another fingerprint is done again, and so is everything after it, because the fingerprint of a stage
+covers the one before.
+
+pycolmap can abort the process, and deadlocks after a fork. Its steps therefore run in a fresh
+interpreter (see `chronoscene.io.processes`): an abort turns into a message, and what the step had
+stored stays.
 """
 
 from __future__ import annotations
@@ -12,13 +16,14 @@ import fcntl
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from chronoscene.errors import RegistrationError
+from chronoscene.io.processes import Report, run_worker
 from chronoscene.io.staging import write_text_atomic
 
 VERSION = 1
@@ -134,3 +139,63 @@ def _locked(descriptor: int) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+STEPS = {
+    "features": "chronoscene.registration.features.database:extract",
+    "pairs": "chronoscene.registration.features.pairs:choose_pairs",
+    "matches": "chronoscene.registration.features.database:match",
+    "holdout": "chronoscene.registration.features.holdout:hold_out",
+    "joint": "chronoscene.registration.reconstruct.routes:joint",
+    "separate": "chronoscene.registration.reconstruct.routes:separate",
+    "frozen": "chronoscene.registration.reconstruct.routes:add_period",
+    "refine": "chronoscene.registration.reconstruct.routes:refine",
+}
+"""Name of a step to ``module:function``, which takes a dictionary and a `Report` and returns what
+JSON can hold."""
+
+LOG_LINES = 4
+"""Of the step's own output, at the end of a message."""
+
+
+def run_step(
+    step: str,
+    arguments: Mapping[str, Any],
+    *,
+    log: Path,
+    report: Report | None = None,
+    inherited: Sequence[int] = (),
+) -> Any:
+    """Run a step in a process of its own and return its result.
+
+    Args:
+        step: One of `STEPS`.
+        arguments: What JSON can hold.
+        log: File to which the step's own output is appended.
+        report: Called with its progress.
+        inherited: File descriptors that stay open in the process.
+
+    Raises:
+        RegistrationError: If the process dies.
+        ChronoSceneError: What the step raised, as a `RegistrationError` with the same words.
+    """
+    with log.open("ab") as file:
+        outcome = run_worker(STEPS[step], arguments, report=report, log=file, inherited=inherited)
+    if outcome.message is None:
+        said = _end_of(log)
+        raise RegistrationError(
+            f"step {step}",
+            expected="the step to finish",
+            found=f"{outcome.cause} ({said})" if said else outcome.cause,
+            todo="what was computed before is kept: run the command again, with --threads 1 or "
+            f"other settings if it happens again; see {log}",
+        )
+    if "error" in outcome.message:
+        raise RegistrationError(**outcome.message["error"])
+    return outcome.message["result"]
+
+
+def _end_of(log: Path) -> str:
+    """The last lines of a log on one line."""
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return " / ".join(line.strip()[:160] for line in lines[-LOG_LINES:])

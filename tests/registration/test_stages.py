@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from chronoscene.errors import RegistrationError
-from chronoscene.registration import worker
+from chronoscene.registration import stages
 from chronoscene.registration.stages import Stages, work_folder
 
 
@@ -105,12 +105,12 @@ def odd_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "odd_steps.py").write_text(STEPS)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     for name in ("good", "aborts", "refuses", "breaks", "sleeps"):
-        monkeypatch.setitem(worker.STEPS, name, f"odd_steps:{name}")
+        monkeypatch.setitem(stages.STEPS, name, f"odd_steps:{name}")
 
 
 def test_a_step_gives_its_result_and_tells_its_progress(tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
-    result = worker.run_step(
+    result = stages.run_step(
         "good", {"x": 21}, log=tmp_path / "log", report=lambda *p: told.append(p)
     )
     assert result == {"twice": 42}
@@ -124,21 +124,21 @@ def test_a_step_gives_its_result_and_tells_its_progress(tmp_path: Path) -> None:
 )
 def test_the_death_of_a_step_is_a_message(tmp_path: Path, step: str, found: str) -> None:
     with pytest.raises(RegistrationError, match=found) as caught:
-        worker.run_step(step, {}, log=tmp_path / "log")
+        stages.run_step(step, {}, log=tmp_path / "log")
     assert "is kept" in caught.value.todo
 
 
 def test_a_refusal_of_a_step_is_the_same_refusal(tmp_path: Path) -> None:
     with pytest.raises(RegistrationError, match=r"^here: expected this, found that; do it$"):
-        worker.run_step("refuses", {}, log=tmp_path / "log")
+        stages.run_step("refuses", {}, log=tmp_path / "log")
 
 
 def test_a_step_dies_with_the_process_that_asked_for_it(tmp_path: Path) -> None:
     code = (
-        "from chronoscene.registration import worker\n"
+        "from chronoscene.registration import stages\n"
         "from pathlib import Path\n"
-        "worker.STEPS['sleeps'] = 'odd_steps:sleeps'\n"
-        f"worker.run_step('sleeps', {{'mark': {str(tmp_path / 'mark')!r}}}, log=Path('log'))\n"
+        "stages.STEPS['sleeps'] = 'odd_steps:sleeps'\n"
+        f"stages.run_step('sleeps', {{'mark': {str(tmp_path / 'mark')!r}}}, log=Path('log'))\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path)
     mark = tmp_path / "mark"

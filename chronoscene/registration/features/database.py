@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.features import feature_reuse
-from chronoscene.registration.worker import Report
 
 FEATURE_BATCH = 8
 MATCH_BATCH = 64

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import replacing
 from chronoscene.registration.features.database import keypoints_of, quiet, verified_matches
-from chronoscene.registration.worker import Report
 
 MIN_LEFT = 16
 """A pair of images keeps at least this many matches: sparse pairs stay useful."""

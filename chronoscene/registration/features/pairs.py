@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import quiet, write_pairs
-from chronoscene.registration.worker import Report
 
 SPATIAL_NEIGHBOURS = 10
 SEQUENTIAL_NEIGHBOURS = 4

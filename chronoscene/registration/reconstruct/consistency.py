@@ -7,7 +7,7 @@ such a group with the other images then contradict its poses, except the few tha
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,13 +33,14 @@ MAX_MISPLACED = 0.4
 
 Mask = NDArray[np.bool_]
 
+Matches = Mapping[tuple[int, int], NDArray[np.int64]]
+"""Verified matches of all pairs of images, by image ids. [M, 2] each"""
+
 Agreements = Mapping[tuple[int, int], tuple[int, int]]
 """Pair of image ids to matches that agree with the poses, and all matches."""
 
 
-def pair_agreements(
-    model: pycolmap.Reconstruction, matches: Mapping[tuple[int, int], NDArray[np.int64]]
-) -> Agreements:
+def pair_agreements(model: pycolmap.Reconstruction, matches: Matches) -> Agreements:
     """How many of the matches of each pair of posed images lie near its epipolar lines."""
     posed = {int(i): model.images[i] for i in model.reg_image_ids()}
     rays, poses, focals = {}, {}, {}
@@ -133,3 +134,26 @@ def epipolar_distance(
     lines_b, lines_a = a @ essential.T, b @ essential
     norm = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
     return np.asarray(np.abs((b * lines_b).sum(axis=1)) / np.sqrt(np.maximum(norm, 1e-30)))
+
+
+def deregister_misplaced(
+    model: pycolmap.Reconstruction,
+    matches: Matches,
+    remarks: list[str],
+    trusted: Sequence[int] = (),
+) -> int:
+    """Deregister images whose matches contradict their poses; how many there were.
+
+    Args:
+        model: Changed in place.
+        matches: Of all images.
+        remarks: Added to.
+        trusted: Ids of images that are right by definition.
+    """
+    wrong = misplaced(pair_agreements(model, matches), model.reg_image_ids(), trusted)
+    if wrong:
+        names = ", ".join(sorted(str(model.images[i].name) for i in wrong))
+        remarks.append(f"{names}: deregistered: matches with the other photos contradict the pose")
+    for image_id in wrong:
+        model.deregister_frame(model.images[image_id].frame_id)
+    return len(wrong)

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import SEED, quiet
 from chronoscene.registration.reconstruct.gps_alignment import Priors
 from chronoscene.registration.reconstruct.models import summary, write_model
-from chronoscene.registration.worker import Report
 
 MIN_MODEL_SIZE = 3
 """Images. COLMAP's default discards models that are a large part of a small period."""

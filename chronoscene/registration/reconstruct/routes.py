@@ -13,9 +13,16 @@ from typing import Any
 import numpy as np
 
 from chronoscene.errors import RegistrationError
+from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features.database import verified_matches
-from chronoscene.registration.reconstruct.consistency import agreement, pair_agreements
+from chronoscene.registration.reconstruct.consistency import (
+    Matches,
+    agreement,
+    deregister_misplaced,
+    pair_agreements,
+)
+from chronoscene.registration.reconstruct.gps_alignment import Priors, to_gps_frame
 from chronoscene.registration.reconstruct.mapping import (
     Job,
     adjust,
@@ -23,16 +30,20 @@ from chronoscene.registration.reconstruct.mapping import (
     register_rest,
     triangulate,
 )
-from chronoscene.registration.reconstruct.merge import deregister_misplaced, merge_and_finish
-from chronoscene.registration.reconstruct.models import known_images, set_pose
-from chronoscene.registration.reconstruct.submodels import Submodel
-from chronoscene.registration.worker import Report
+from chronoscene.registration.reconstruct.models import known_images, set_pose, summary
+from chronoscene.registration.reconstruct.submodels import Combined, Submodel, combine
 
 MIN_POINTS = 50
 """With fewer points from the photos of the scene, no new photos are registered against them."""
 
 MIN_AGREEMENT = 0.5
 """Share of the matches among the photos of the scene that must agree with its poses."""
+
+ROUNDS = 2
+"""Of triangulation with all matches and bundle adjustment, after merging."""
+
+ATTEMPTS = 2
+"""To register an image: at the second, more of the others have poses."""
 
 TIE_COLOR = np.array([255, 255, 255], np.uint8)
 
@@ -68,6 +79,7 @@ def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 def _merged(
     submodels: Sequence[Submodel], arguments: Mapping[str, Any], job: Job
 ) -> dict[str, Any]:
+    """Align, merge, adjust and write submodels; the result of the step."""
     if not submodels:
         also = "tie points align models, they do not create them; "
         raise RegistrationError(
@@ -77,7 +89,66 @@ def _merged(
             todo="add photos that overlap by more than half, taken from different positions; "
             f"{also if arguments['keep_unplaced'] else ''}features and matches are kept",
         )
-    return merge_and_finish(submodels, arguments, job)
+    _, matches = verified_matches(job.database)
+    priors, keep_unplaced = Priors.of(arguments["priors"]), arguments["keep_unplaced"]
+    if len(submodels) == 1:
+        combined = Combined(submodels[0].model, (), (), ())
+        model = combined.model
+        adjust(model, threads=job.threads)
+    else:
+        job.report("aligning", 0, 1)
+        combined = combine(submodels, matches, priors, job.database, keep_unplaced=keep_unplaced)
+        job.remarks.extend(combined.remarks)
+        model = combined.model
+        for i in range(ROUNDS):
+            job.report("adjusting", i, ROUNDS)
+            model = triangulate(model, job, "points")
+            adjust(model, threads=job.threads)
+    if not keep_unplaced:  # periods that wait for tie points would contradict the others
+        model = _settled(model, matches, len(arguments["periods"]), job)
+    job.report("adjusting", 0, 1)
+    placed, used = to_gps_frame(model, priors, job.remarks)
+    if placed:
+        before = summary(model)["reprojection_error_px"]
+        ended = adjust(model, priors=used, threads=job.threads)
+        after = summary(model)["reprojection_error_px"]
+        job.remarks.append(
+            f"bundle adjustment with {len(used.enu)} position priors: {ended.lower()}, "
+            f"reprojection error {before} -> {after} px"
+        )
+    return job.finish(
+        model,
+        is_georeferenced=placed,
+        positions_used=sorted(used.enu),
+        left=[list(group) for group in combined.left],
+        unplaced=list(combined.unplaced),
+    )
+
+
+def _settled(
+    model: pycolmap.Reconstruction, matches: Matches, total: int, job: Job
+) -> pycolmap.Reconstruction:
+    """Register missing images, deregister those that the others contradict, and try these again."""
+    for _ in range(ATTEMPTS):
+        model = _complete(model, total, job)
+        if not deregister_misplaced(model, matches, job.remarks):
+            break
+        adjust(model, threads=job.threads)
+    return model
+
+
+def _complete(model: pycolmap.Reconstruction, total: int, job: Job) -> pycolmap.Reconstruction:
+    """Register what its own period could not: other periods may have the points for it."""
+    before = int(model.num_reg_images())
+    if before == total or not model.num_points3D():
+        return model
+    fuller = register_rest(model, job, total, "rest")
+    added = int(fuller.num_reg_images()) - before
+    if added <= 0:
+        return model
+    adjust(fuller, threads=job.threads)
+    job.remarks.append(f"{added} more images registered with the merged model")
+    return fuller
 
 
 def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:

@@ -16,8 +16,7 @@ from chronoscene.registration.quality.certificate import Certificate, PairFigure
 from chronoscene.registration.quality.certificate_json import Figure, pair_figures, period_figures
 from chronoscene.registration.quality.rays import Array
 from chronoscene.registration.quality.verdict import THRESHOLDS, Level, Verdict
-from chronoscene.registration.report.camera_map import camera_map
-from chronoscene.registration.report.pictures import PHOTO_WIDTH, Photos
+from chronoscene.registration.report.pictures import PHOTO_WIDTH, Photos, camera_map
 from chronoscene.registration.report.spots import DrawnPair, Spot, drawn_pairs, spots
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment

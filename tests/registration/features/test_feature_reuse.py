@@ -17,7 +17,7 @@ import pytest
 from chronoscene.errors import RegistrationError
 from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration import worker
+from chronoscene.registration import stages
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.features import feature_reuse
 from chronoscene.registration.features.database import extract, match, write_pairs
@@ -435,7 +435,7 @@ def test_a_kill_within_a_copy_loses_nothing(
 KILLED = """
 import os, signal, sys
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration import worker
+from chronoscene.registration import stages
 from chronoscene.registration.features import feature_reuse
 from chronoscene.registration.features.database import read_pairs
 
@@ -536,7 +536,7 @@ def test_the_command_goes_on_from_the_run_before(
     # that the database has no more.
     write_table(captures, "2016", "2023", "2023", "2023")
     with monkeypatch.context() as patch:
-        patch.setitem(worker.STEPS, "pairs", "no_such_module:killed")
+        patch.setitem(stages.STEPS, "pairs", "no_such_module:killed")
         with pytest.raises(RegistrationError, match="no_such_module"):
             matched(captures)
     write_table(captures, "2016", "2023", "2023", "2023", "2016")

@@ -13,10 +13,10 @@ from chronoscene.registration.features.database import verified_matches
 from chronoscene.registration.reconstruct.consistency import (
     MIN_MATCHES,
     agreement,
+    deregister_misplaced,
     misplaced,
     pair_agreements,
 )
-from chronoscene.registration.reconstruct.merge import deregister_misplaced
 from chronoscene.registration.reconstruct.models import known_images, set_pose
 
 

@@ -15,13 +15,12 @@ import pytest
 from generated_registrations import CaseSettings, generate_case
 from PIL import Image
 
-from chronoscene.registration.inspection import inspect_registration
+from chronoscene.registration.output import inspect_registration
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.rays import gather
 from chronoscene.registration.quality.verdict import judge
-from chronoscene.registration.report.camera_map import camera_map
 from chronoscene.registration.report.page import render_report
-from chronoscene.registration.report.pictures import PATCH, Photos, patch_grid
+from chronoscene.registration.report.pictures import PATCH, Photos, camera_map, patch_grid
 from chronoscene.registration.report.spots import drawn_pairs, spots
 from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.registration.ties.tie_alignment import align_with_tie_points

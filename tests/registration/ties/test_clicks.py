@@ -8,7 +8,7 @@ from generated_registrations import pose_errors
 from PIL import Image, ImageOps
 
 from chronoscene.formats import read_scene
-from chronoscene.registration.inspection import Inspection
+from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import Options, run
 from chronoscene.registration.result import Registered

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from chronoscene.formats import read_scene
-from chronoscene.registration.reconstruct.extend_tracks import extend_tracks
+from chronoscene.registration.output import extend_tracks
 from chronoscene.scene import Points, Scene
 
 

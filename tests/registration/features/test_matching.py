@@ -4,11 +4,8 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from chronoscene.images.exif import ExifData
-from chronoscene.registration.photos.camera_sharing import (
-    MIN_PHOTOS,
-    Calibration,
-    camera_groups,
-)
+from chronoscene.registration.context import Calibration
+from chronoscene.registration.features.matching import MIN_PHOTOS, camera_groups
 from chronoscene.registration.photos.photo import Capture
 
 
