@@ -13,6 +13,7 @@ from chronoscene.errors import SceneError
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import MethodSpec, TrainingSet, TrainingView, View
 from chronoscene.scene import Frame, Scene
+from chronoscene.scene.cameras import PINHOLE_MODELS
 from chronoscene.scene.geometry import Sim3, camera_centre
 
 STRATEGIES = ("joint", "pooled", "separate")
@@ -88,9 +89,10 @@ def check_scene(scene: Scene) -> None:
         if not frame.camera.is_pinhole:
             raise SceneError(
                 f"{scene.root}: {frame.name}",
-                expected="a camera without distortion (SIMPLE_PINHOLE, PINHOLE)",
+                expected=f"a camera without distortion ({', '.join(sorted(PINHOLE_MODELS))}, or "
+                "another model whose distortion parameters are all zero)",
                 found=frame.camera.model,
-                todo="undistort the images first (colmap image_undistorter)",
+                todo=f"run 'chronoscene undistort {scene.root} OUT' and use OUT",
             )
     for split in ("train", "test"):
         if not any(f.split == split for f in scene.frames):

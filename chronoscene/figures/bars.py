@@ -22,7 +22,7 @@ from chronoscene.stats.counts import PeriodCount, SceneCount, period_title
 BAR = 0.3
 """Inches per scene."""
 WIDTH = 9.0
-MOST_IN_LEGEND = 12
+MAX_LEGEND_ENTRIES = 12
 """Periods up to which each has an entry."""
 
 
@@ -120,7 +120,7 @@ def _legend(figure: Any, names: Sequence[str], colors: Sequence[str], top: float
     from matplotlib.patches import Patch
 
     fitting = int((WIDTH - 0.3) / (0.45 + 0.075 * max(map(len, names))))
-    step = -(-len(colors) // min(MOST_IN_LEGEND, max(fitting, 1)))
+    step = -(-len(colors) // min(MAX_LEGEND_ENTRIES, max(fitting, 1)))
     shown = range(0, len(colors), step)
     figure.legend(
         [Patch(color=colors[i]) for i in shown],

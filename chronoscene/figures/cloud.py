@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 MARGIN = 0.03
 """Of the longest edge, on every side."""
-SMALLEST_EDGE = 0.18
+MIN_EDGE = 0.18
 """Of the longest edge: a flat scene gets room above and below it."""
 
 
@@ -88,5 +88,5 @@ def shown_box(cloud: Cloud, *, cameras: bool) -> Box:
     low, high = corners.min(axis=0), corners.max(axis=0)
     longest = float((high - low).max()) or 1.0
     middle = (low + high) / 2
-    half = np.maximum((high - low) / 2 + MARGIN * longest, SMALLEST_EDGE * longest / 2)
+    half = np.maximum((high - low) / 2 + MARGIN * longest, MIN_EDGE * longest / 2)
     return Box(middle - half, middle + half)

@@ -19,13 +19,13 @@ from chronoscene.figures.canvas import rgb_of
 Array = NDArray[np.float64]
 Counts = NDArray[np.float32]
 
-FAINTEST = 0.6
+MIN_OPACITY = 0.6
 """Opacity of a pixel with one point, where others have many."""
 DARK_QUANTILE = 0.97
 """Of the pixels with points: the opacity of this many points is 1."""
 DOT_SHARE = 0.35
 """Dots grow until about this share of the occupied area is covered."""
-LARGEST_DOT = 6
+MAX_DOT_RADIUS = 6
 """Radius in pixels."""
 
 
@@ -70,7 +70,7 @@ def dot_radius(points: int, occupied: int) -> int:
         occupied: Pixels of the area that they lie in.
     """
     radius = 0
-    while radius < LARGEST_DOT and points * _disc(radius + 1).sum() < DOT_SHARE * occupied:
+    while radius < MAX_DOT_RADIUS and points * _disc(radius + 1).sum() < DOT_SHARE * occupied:
         radius += 1
     return radius
 
@@ -119,6 +119,6 @@ def shade(counts: Counts, colors: Sequence[str], *, seed: int = 0) -> NDArray[np
 
 
 def opacity(counts: Counts) -> Counts:
-    """From `FAINTEST` for one point to 1 for as many as the densest pixels have. [n]"""
+    """From `MIN_OPACITY` for one point to 1 for as many as the densest pixels have. [n]"""
     dark = max(float(np.quantile(counts, DARK_QUANTILE)), 2.0)
-    return np.clip(FAINTEST + (1 - FAINTEST) * np.log(counts) / np.log(dark), FAINTEST, 1.0)
+    return np.clip(MIN_OPACITY + (1 - MIN_OPACITY) * np.log(counts) / np.log(dark), MIN_OPACITY, 1.0)

@@ -40,7 +40,7 @@ GAP = 0.12
 LEFT, RIGHT, BOTTOM = 0.62, 0.15, 0.5
 TITLE, LINE = 0.4, 0.24
 """Height in inches of the title and of each line of the legend."""
-LEAST_WIDTH = 3.5
+MIN_WIDTH = 3.5
 BEHIND = 0.7
 """Strength of the points where cameras are drawn, too."""
 PATCH = 16
@@ -68,7 +68,7 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
     cloud, box, axis_names = readable(cloud, shown_box(cloud, cameras=cameras))
     dx, dy, dz = box.edges
     scale = min((DRAWING[0] - GAP) / (dx + dz), (DRAWING[1] - GAP) / (dy + dz))
-    width = max(LEFT + (dx + dz) * scale + GAP + RIGHT, LEAST_WIDTH)
+    width = max(LEFT + (dx + dz) * scale + GAP + RIGHT, MIN_WIDTH)
     names = legend_names(cloud.labels)
     columns = max(1, int((width - LEFT) / (0.42 + 0.075 * max(map(len, names)))))
     top = TITLE + LINE * -(-len(names) // columns)

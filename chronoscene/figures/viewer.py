@@ -19,36 +19,36 @@ from chronoscene.scene import Scene
 
 Array = NDArray[np.float64]
 
-MOST_POINTS = 300_000
+MAX_POINTS = 300_000
 """In a page, so that it opens at once and turns smoothly. The page says how many there are."""
 ELEVATION = np.deg2rad(35.0)
 """Of the first view above the plane of the scene."""
 
 
-def write_page(scene: Scene, path: Path, *, most_points: int = MOST_POINTS) -> None:
+def write_page(scene: Scene, path: Path, *, max_points: int = MAX_POINTS) -> None:
     """Write the page of a scene.
 
     Args:
         scene: The scene.
         path: The HTML file.
-        most_points: A random choice of so many points is in it if there are more; the same one
+        max_points: A random choice of so many points is in it if there are more; the same one
             for equal scenes.
     """
-    write_text_atomic(path, page_of(cloud_of(scene), scene.points.rgb, most_points=most_points))
+    write_text_atomic(path, page_of(cloud_of(scene), scene.points.rgb, max_points=max_points))
 
 
-def page_of(cloud: Cloud, rgb: NDArray[np.uint8], *, most_points: int = MOST_POINTS) -> str:
+def page_of(cloud: Cloud, rgb: NDArray[np.uint8], *, max_points: int = MAX_POINTS) -> str:
     """The text of the page; see `write_page`. ``rgb``: colours of the points. [P, 3]"""
-    data = json.dumps(_page_data(cloud, rgb, most_points), ensure_ascii=False)
+    data = json.dumps(_page_data(cloud, rgb, max_points), ensure_ascii=False)
     # No text can end the script: JSON has "<" inside of strings only.
     return render_page("viewer", title=cloud.name, data=Markup(data.replace("<", "\\u003c")))
 
 
-def _page_data(cloud: Cloud, rgb: NDArray[np.uint8], most_points: int) -> dict[str, Any]:
+def _page_data(cloud: Cloud, rgb: NDArray[np.uint8], max_points: int) -> dict[str, Any]:
     """What the script draws. Coordinates are relative to the middle of the scene."""
     periods = len(cloud.labels)
     good = np.flatnonzero((cloud.period >= 0) & np.isfinite(cloud.xyz).all(axis=1))
-    shown = np.random.default_rng(0).permutation(good)[:most_points]
+    shown = np.random.default_rng(0).permutation(good)[:max_points]
     # By period, in random order within: any first part of a period stands for all of it.
     shown = shown[np.argsort(cloud.period[shown], kind="stable")]
     box = shown_box(cloud, cameras=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-LONGEST = 120
+MAX_NAME_LENGTH = 120
 """Characters of a name from a file that a message repeats."""
 
 
@@ -17,7 +17,7 @@ def printable(text: str) -> str:
 
 def quote(text: str) -> str:
     """A name in quotes, cut where it is absurdly long."""
-    return repr(text if len(text) <= LONGEST else text[:LONGEST] + "...")
+    return repr(text if len(text) <= MAX_NAME_LENGTH else text[:MAX_NAME_LENGTH] + "...")
 
 
 def shown(items: Iterable[str], limit: int = 3) -> str:

@@ -25,7 +25,7 @@ SCALE = (0.458, 0.448, 0.450)
 """Per RGB channel: the mean and deviation of ImageNet, moved to inputs in [-1, 1]."""
 EPSILON = 1e-10
 """Added to the length of a feature vector before the division."""
-SMALLEST = 16
+MIN_SIZE = 16
 """Pixels per axis that survive the four poolings of VGG16."""
 
 
@@ -72,10 +72,10 @@ class Lpips:
 
     def _tensor(self, image: ArrayLike) -> Tensor:
         array = unit_float(image)
-        if array.shape[2] != 3 or min(array.shape[:2]) < SMALLEST:
+        if array.shape[2] != 3 or min(array.shape[:2]) < MIN_SIZE:
             raise ShapeError(
                 "image",
-                expected=f"three channels and at least {SMALLEST} x {SMALLEST} pixels for LPIPS",
+                expected=f"three channels and at least {MIN_SIZE} x {MIN_SIZE} pixels for LPIPS",
                 found=str(list(array.shape)),
                 todo="use another metric, or evaluate larger images",
             )

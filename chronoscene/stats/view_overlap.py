@@ -12,13 +12,13 @@ from chronoscene.scene.cameras import project_points
 
 Array = NDArray[np.float64]
 
-MOST_POINTS, LEAST_POINTS = 4000, 400
+MAX_POINTS, MIN_POINTS_PER_PERIOD = 4000, 400
 """Points of all periods together that are looked for, and of each: a share is known to a percent or
 two."""
-DEEP, FARTHER = 95.0, 1.5
+DEPTH_PERCENTILE, REACH_FACTOR = 95.0, 1.5
 """Percentile of the depths at which the images of a period see points, and how many times as far
 they could see some."""
-DIRECTIONS, WIDEST, STEPS = 8, 4.0, 400
+DIRECTIONS, MAX_TANGENT, STEPS = 8, 4.0, 400
 """Where lenses are tried: so many directions, up to this hypot(x, y) / z, in so many steps."""
 
 
@@ -40,8 +40,8 @@ def common_view(
         no point. [T, T]
     """
     periods = seen.shape[1]
-    most = max(MOST_POINTS // periods, LEAST_POINTS)
-    chosen = [_evenly(np.flatnonzero(column), most) for column in seen.T]
+    count = max(MAX_POINTS // periods, MIN_POINTS_PER_PERIOD)
+    chosen = [_evenly(np.flatnonzero(column), count) for column in seen.T]
     owner = np.repeat(np.arange(periods), [len(rows) for rows in chosen])
     counts = np.bincount(owner, minlength=periods)
     xyz = scene.points.xyz[np.concatenate(chosen)]
@@ -70,11 +70,11 @@ def _viewed(frames: Sequence[Frame], xyz: Array, reach: float) -> NDArray[np.boo
     return viewed
 
 
-def _evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """At most ``most`` of them, evenly spread."""
-    if len(rows) <= most:
+def _evenly(rows: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """At most ``count`` of them, evenly spread."""
+    if len(rows) <= count:
         return rows
-    return rows[np.linspace(0, len(rows) - 1, most).astype(np.int64)]
+    return rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
 
 
 def _reach(scene: Scene, depths: Array) -> Array:
@@ -84,7 +84,7 @@ def _reach(scene: Scene, depths: Array) -> Array:
     if not ahead.any():
         return np.full(scene.num_periods, np.nan)
     mine = [depths[ahead & (period == p)] for p in range(scene.num_periods)]
-    return np.array([FARTHER * np.percentile(d if len(d) else depths[ahead], DEEP) for d in mine])
+    return np.array([REACH_FACTOR * np.percentile(d if len(d) else depths[ahead], DEPTH_PERCENTILE) for d in mine])
 
 
 def _limit(camera: Camera) -> float:
@@ -95,7 +95,7 @@ def _limit(camera: Camera) -> float:
     if camera.is_pinhole:
         return np.inf
     angle = np.arange(DIRECTIONS)[:, None] * (2 * np.pi / DIRECTIONS)
-    tangent = np.linspace(0, WIDEST, STEPS)
+    tangent = np.linspace(0, MAX_TANGENT, STEPS)
     x, y = np.cos(angle) * tangent, np.sin(angle) * tangent
     u, v = project_points(camera, np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)).T
     u, v = u.reshape(x.shape), v.reshape(x.shape)

@@ -1,7 +1,9 @@
 """Run records survive JSON, also with infinite values; damaged ones are named."""
 
+import csv
 import json
 import math
+from pathlib import Path
 
 import pytest
 
@@ -75,3 +77,16 @@ def test_damaged_rows_are_named(runs):
 def test_missing_runs_are_named(tmp_path):
     with pytest.raises(CheckpointError, match="no such file; run bench first"):
         read_run(tmp_path)
+
+
+def test_all_keys_and_columns_are_in_the_documentation(finished_bench):
+    runs = finished_bench[0]
+    text = (Path(__file__).parents[2] / "docs/benchmark.md").read_text(encoding="utf-8")
+    documents = json.loads((runs / "results.json").read_text())
+    keys = {key for document in documents for key in (*document, *document["aggregates"])}
+    with (runs / "rows.csv").open(newline="") as file:
+        keys |= {*next(csv.reader(file))}
+    for path in runs.glob("*/*/seed0/curve.csv"):
+        keys |= {*path.read_text().splitlines()[0].split(",")}
+    missing = {key for key in keys if f"`{key}`" not in text}
+    assert not missing

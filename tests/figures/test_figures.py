@@ -14,7 +14,7 @@ from chronoscene.figures.bars import _period_names, draw_bars
 from chronoscene.figures.canvas import EIGHT, FOUR, period_colors, rgb_of
 from chronoscene.figures.cloud import Cloud, shown_box
 from chronoscene.figures.density_map import (
-    FAINTEST,
+    MIN_OPACITY,
     Window,
     count_points,
     dot_radius,
@@ -136,10 +136,10 @@ def test_pixels_without_points_are_transparent_and_dense_ones_opaque():
     counts[0, 0, 1:] = np.arange(1, 40)
     alpha = shade(counts, ["#123456"])[0, :, 3].astype(int)
     assert alpha[0] == 0
-    assert alpha[1] == round(255 * FAINTEST)
+    assert alpha[1] == round(255 * MIN_OPACITY)
     assert alpha[-1] == 255 and (np.diff(alpha[1:]) >= 0).all()
     assert not shade(np.zeros((1, 3, 3), np.float32), ["#123456"]).any()
-    assert opacity(np.ones(5, np.float32)).tolist() == [FAINTEST] * 5
+    assert opacity(np.ones(5, np.float32)).tolist() == [MIN_OPACITY] * 5
 
 
 def test_strays_do_not_widen_the_panels(cloud):

@@ -69,12 +69,12 @@ def test_all_points_are_there_by_period(cloud):
 
 
 def test_many_points_are_thinned_evenly_and_equally(cloud):
-    page = page_of(cloud, colors(cloud), most_points=200)
+    page = page_of(cloud, colors(cloud), max_points=200)
     data = data_of(page)
     shown = [p["shown"] for p in data["periods"]]
     assert sum(shown) == 200 and shown[0] == pytest.approx(125, abs=25)
     assert [p["points"] for p in data["periods"]] == [500, 300, 0]
-    assert page == page_of(cloud, colors(cloud), most_points=200)
+    assert page == page_of(cloud, colors(cloud), max_points=200)
 
 
 class Tags(HTMLParser):
@@ -206,7 +206,7 @@ def browse(page: Path, folder: Path) -> str:
 
 def test_in_a_browser(cloud, tmp_path):
     nasty = replace(cloud, labels=("0", NASTY, "2"))
-    page = page_of(nasty, colors(cloud), most_points=700)
+    page = page_of(nasty, colors(cloud), max_points=700)
     (tmp_path / "page.html").write_text(page.replace("</body>", SCRIPT + "</body>"), "utf-8")
     found = re.search('data-report="(.*?)"', browse(tmp_path / "page.html", tmp_path))
     assert found is not None
