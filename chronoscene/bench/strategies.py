@@ -89,7 +89,7 @@ def check_scene(scene: Scene) -> None:
         if not frame.camera.is_pinhole:
             raise SceneError(
                 f"{scene.root}: {frame.name}",
-                expected=f"a camera without distortion ({', '.join(sorted(PINHOLE_MODELS))}, or "
+                expected=f"a camera without distortion ({', '.join(PINHOLE_MODELS)}, or "
                 "another model whose distortion parameters are all zero)",
                 found=frame.camera.model,
                 todo=f"run 'chronoscene undistort {scene.root} OUT' and use OUT",

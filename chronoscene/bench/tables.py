@@ -19,7 +19,6 @@ from chronoscene.metrics.names import METRICS, MetricInfo, metric_info
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
-FORMATS = ("table", "csv", "markdown", "latex", "json")
 AGGREGATES = ("macro", "micro", "worst")
 
 
@@ -82,7 +81,7 @@ def format_runs(
     style: str,
     metrics: Sequence[str] = (),
 ) -> str:
-    """All tables of some runs in one of `FORMATS`."""
+    """All tables of some runs in one of `chronoscene.io.tables.FORMATS`."""
     entries = summarise(records, metrics)
     if style == "csv":
         # NaN is a spread that is not defined, an empty cell that there is none.

@@ -18,20 +18,21 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import find_scenes, format_names, read_scene
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
+from chronoscene.io.tables import FORMATS
 from chronoscene.io.wording import printable
 from chronoscene.kernels.runtime import keep_freed_memory
-from chronoscene.stats import (
+from chronoscene.stats.counts import (
     COUNT_RULES,
-    DETAIL_WRITERS,
-    WRITERS,
     CountRule,
     SceneCount,
-    SceneStatistics,
     Unreadable,
     count_scene,
-    measure_scene,
+    format_counts,
+    in_paper_order,
+    published,
 )
-from chronoscene.stats.published import in_paper_order, published
+from chronoscene.stats.details import format_details
+from chronoscene.stats.measures import SceneStatistics, measure_scene
 
 Layout = Literal["full", "paper"]
 FIGURE_FORMATS = ("png", "pdf", "svg")
@@ -77,7 +78,7 @@ class Request:
 @click.option(
     "--format",
     "output_format",
-    type=click.Choice(sorted(WRITERS)),
+    type=click.Choice(sorted(FORMATS)),
     default="table",
     show_default=True,
     help="What to write.",
@@ -145,12 +146,11 @@ def command(
     full = [r for r in results if isinstance(r, SceneStatistics)]
     counts = [s.counts for s in full] or [r for r in results if isinstance(r, SceneCount)]
     if counts:
-        writers = DETAIL_WRITERS if full else WRITERS
-        extra: dict[str, dict[str, Any]] = {
-            "table": {"width": _width(out)},
-            "json": {"unreadable": unreadable},
-        }
-        text = writers[output_format](full or counts, **extra.get(output_format, {}))
+        extra: Any = {"width": _width(out), "unreadable": unreadable}
+        if full:
+            text = format_details(full, output_format, **extra)
+        else:
+            text = format_counts(counts, output_format, **extra)
         emit(text, out)
         if request.figures is not None:
             _draw_bars(counts, request.figures / f"counts.{request.figure_format}")

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.tables import FORMATS, format_runs, read_runs
+from chronoscene.bench.tables import format_runs, read_runs
 from chronoscene.cli.output import emit
 from chronoscene.errors import ConfigError
+from chronoscene.io.tables import FORMATS
 from chronoscene.metrics.names import metric_info
 
 

@@ -16,6 +16,9 @@ from typing import Any
 
 from chronoscene.io.wording import printable
 
+FORMATS = ("table", "csv", "markdown", "latex", "json")
+"""What commands write tables as; ``table`` is text for a terminal."""
+
 Head = tuple[str, str]
 """Two lines; a column whose first line is empty shares that of the column before."""
 GAP = 2

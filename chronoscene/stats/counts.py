@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -15,11 +16,41 @@ from chronoscene.io import tables
 from chronoscene.io.tables import Table
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
-from chronoscene.stats.published import published
 
 SCHEMA_VERSION = 1
 CountRule = Literal["assigned", "seen"]
 COUNT_RULES = ("assigned", "seen")
+
+PAPER_COUNTS: Mapping[str, tuple[tuple[int, int], ...]] = {
+    "Lawncourt": ((234, 85_655), (193, 57_884), (277, 117_595)),
+    "Overstreet": ((83, 35_513), (295, 235_537), (208, 132_957)),
+    "BioBuilding": ((258, 120_122), (240, 143_694), (258, 171_462)),
+    "Canteen": ((340, 101_523), (183, 99_915), (279, 159_250)),
+    "Incubator": ((202, 98_073), (199, 126_315), (194, 125_461)),
+    "TriPlot": ((365, 150_896), (94, 50_081), (189, 106_937)),
+    "Street1": ((200, 110_591), (200, 108_932), (200, 95_038), (200, 101_074)),
+    "Street2": ((200, 108_621), (200, 112_293), (200, 101_061), (200, 110_714)),
+    "Aerial1": ((200, 136_491), (200, 116_790), (200, 136_624), (200, 101_494)),
+    "Aerial2": ((200, 116_443), (200, 115_481), (200, 109_213), (200, 116_434)),
+    "Aerial3": ((200, 171_323), (200, 145_781), (200, 139_733), (200, 73_597)),
+    "Aerial4": ((200, 144_446), (200, 133_058), (200, 129_169), (200, 92_044)),
+}
+"""Scene to (images, points) of each period as the paper prints them, real scenes first.
+
+Source: table of counts in "ChronoGS: Disentangling Invariants and Changes in Multi-Period Scenes",
+CVPR 2026 (arXiv 2511.18794). Facts only; nothing here was measured by us.
+"""
+
+PAPER_TOTALS = (
+    (2_682, 1_379_697),
+    (2_404, 1_445_761),
+    (2_605, 1_524_500),
+    (1_200, 595_357),
+    (8_891, 4_945_315),
+)
+"""The last row of the table as printed: images and points of periods 0 to 3, and of all."""
+
+_BY_NAME = {name.casefold(): name for name in PAPER_COUNTS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,26 +192,35 @@ def _table(counts: Sequence[SceneCount], images: str = "images", points: str = "
     return Table(heads, rows, breaks={len(counts) - 1})
 
 
-def to_csv(counts: Sequence[SceneCount]) -> str:
-    """Wide table; empty cells where a scene has no such period."""
-    heads = [name.lower().replace(" ", "_") for name in _period_names(counts)]
-    columns = ["scene", *(f"{h}_{what}" for h in heads for what in ("images", "points"))]
-    return tables.csv_text(columns, count_table(counts))
+def format_counts(
+    counts: Sequence[SceneCount],
+    style: str,
+    *,
+    width: int | None = None,
+    unreadable: Sequence[Unreadable] = (),
+) -> str:
+    """The table of counts in one of `chronoscene.io.tables.FORMATS`.
 
+    CSV has empty cells where a scene has no such period; JSON has train and test images and the
+    fingerprint of the split, too.
 
-def to_markdown(counts: Sequence[SceneCount]) -> str:
-    """Pipe table with one head row."""
-    return tables.markdown(_table(counts))
-
-
-def to_latex(counts: Sequence[SceneCount]) -> str:
-    """A ``tabular`` for the booktabs package."""
-    return tables.latex(_table(counts, "Images", "Points"), cmidrules=True)
-
-
-def to_json(counts: Sequence[SceneCount], *, unreadable: Sequence[Unreadable] = ()) -> str:
-    """Everything that was counted, with train and test images and the split's fingerprint."""
-    return document([asdict(c) | {"paper": compared(c)} for c in counts], counts, unreadable)
+    Args:
+        counts: One per scene.
+        style: The format.
+        width: Of the terminal that ``table`` goes to; None for as wide as it is.
+        unreadable: Scenes that are missing, named in JSON.
+    """
+    if style == "json":
+        scenes = [asdict(c) | {"paper": compared(c)} for c in counts]
+        return document(scenes, counts, unreadable)
+    if style == "csv":
+        heads = [name.lower().replace(" ", "_") for name in _period_names(counts)]
+        columns = ["scene", *(f"{h}_{what}" for h in heads for what in ("images", "points"))]
+        return tables.csv_text(columns, count_table(counts))
+    if style == "latex":
+        return tables.latex(_table(counts, "Images", "Points"), cmidrules=True)
+    table = _table(counts)
+    return tables.markdown(table) if style == "markdown" else tables.boxed_text(table, width=width)
 
 
 def document(
@@ -197,6 +237,17 @@ def document(
         "unreadable": [asdict(u) for u in unreadable],
     }
     return json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def published(name: str) -> tuple[tuple[int, int], ...] | None:
+    """Images and points of each period as printed, if a scene of this name is in the paper."""
+    return PAPER_COUNTS.get(_BY_NAME.get(name.casefold(), ""))
+
+
+def in_paper_order(folders: Sequence[Path]) -> list[Path]:
+    """Scenes of the paper as its table lists them, then all others in the order they have."""
+    ranks = {name: rank for rank, name in enumerate(PAPER_COUNTS)}
+    return sorted(folders, key=lambda p: ranks.get(_BY_NAME.get(p.name.casefold(), ""), len(ranks)))
 
 
 def compared(count: SceneCount) -> dict[str, Any] | None:
@@ -218,19 +269,3 @@ def totals(counts: Sequence[SceneCount]) -> dict[str, Any]:
     _, *sums = count_table(counts)[-1]
     pairs = [{"images": sums[i], "points": sums[i + 1]} for i in range(0, len(sums), 2)]
     return {"periods": pairs[:-1], "all": pairs[-1]}
-
-
-def to_text(counts: Sequence[SceneCount], *, width: int | None = None) -> str:
-    """Table for a terminal of this width, without colours; None for as wide as it is."""
-    return tables.boxed_text(_table(counts), width=width)
-
-
-WRITERS: dict[str, Callable[..., str]] = {
-    "table": to_text,
-    "csv": to_csv,
-    "markdown": to_markdown,
-    "latex": to_latex,
-    "json": to_json,
-}
-"""Output format to the function that writes it. ``table`` takes a ``width``, ``json`` the scenes
-that are ``unreadable``."""

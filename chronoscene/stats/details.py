@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -87,8 +87,30 @@ def _max_periods(statistics: Sequence[SceneStatistics]) -> int:
     return max((len(s.periods) for s in statistics), default=0)
 
 
-def details_csv(statistics: Sequence[SceneStatistics]) -> str:
-    """One line per row in the stored units; empty cells where there is no value.
+def format_details(
+    statistics: Sequence[SceneStatistics],
+    style: str,
+    *,
+    width: int | None = None,
+    unreadable: Sequence[Unreadable] = (),
+) -> str:
+    """Everything that was measured in one of `chronoscene.io.tables.FORMATS`.
+
+    CSV and JSON are in the stored units. Arguments as in `chronoscene.stats.counts.format_counts`.
+    """
+    if style == "json":
+        scenes = [_scene_item(s) for s in statistics]
+        return document(scenes, [s.counts for s in statistics], unreadable)
+    if style == "csv":
+        return _csv(statistics)
+    table = _table(statistics)
+    if style == "latex":
+        return tables.latex(table)
+    return tables.markdown(table) if style == "markdown" else tables.boxed_text(table, width=width)
+
+
+def _csv(statistics: Sequence[SceneStatistics]) -> str:
+    """One line per row; empty cells where there is no value.
 
     The number of the period is empty for a whole scene, so that the column is of numbers.
     """
@@ -102,14 +124,6 @@ def details_csv(statistics: Sequence[SceneStatistics]) -> str:
         lines.append([row.scene, row.period, row.label, row.date, *cells])
     columns = ["scene", "period", "label", "date", *(c.name for c in COLUMNS), *shares]
     return tables.csv_text(columns, lines)
-
-
-def details_json(
-    statistics: Sequence[SceneStatistics], *, unreadable: Sequence[Unreadable] = ()
-) -> str:
-    """Counts and measures of every period and scene, and the overlaps, in the stored units."""
-    scenes = [_scene_item(s) for s in statistics]
-    return document(scenes, [s.counts for s in statistics], unreadable)
 
 
 def _scene_item(statistics: SceneStatistics) -> dict[str, Any]:
@@ -157,28 +171,3 @@ def _percent(row: Row, shares: tuple[float | None, ...], other: int) -> str:
         return ""
     value = None if other == row.period else shares[other]
     return "-" if value is None else f"{100 * value:.1f}"
-
-
-def details_text(statistics: Sequence[SceneStatistics], *, width: int | None = None) -> str:
-    """Table for a terminal of this width, without colours; None for as wide as it is."""
-    return tables.boxed_text(_table(statistics), width=width)
-
-
-def details_markdown(statistics: Sequence[SceneStatistics]) -> str:
-    """Pipe table."""
-    return tables.markdown(_table(statistics))
-
-
-def details_latex(statistics: Sequence[SceneStatistics]) -> str:
-    """A ``tabular`` for the booktabs package."""
-    return tables.latex(_table(statistics))
-
-
-DETAIL_WRITERS: dict[str, Callable[..., str]] = {
-    "table": details_text,
-    "csv": details_csv,
-    "markdown": details_markdown,
-    "latex": details_latex,
-    "json": details_json,
-}
-"""Output format to the function that writes it, like `chronoscene.stats.counts.WRITERS`."""

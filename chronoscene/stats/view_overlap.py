@@ -84,7 +84,12 @@ def _reach(scene: Scene, depths: Array) -> Array:
     if not ahead.any():
         return np.full(scene.num_periods, np.nan)
     mine = [depths[ahead & (period == p)] for p in range(scene.num_periods)]
-    return np.array([REACH_FACTOR * np.percentile(d if len(d) else depths[ahead], DEPTH_PERCENTILE) for d in mine])
+    return np.array(
+        [
+            REACH_FACTOR * np.percentile(d if len(d) else depths[ahead], DEPTH_PERCENTILE)
+            for d in mine
+        ]
+    )
 
 
 def _limit(camera: Camera) -> float:

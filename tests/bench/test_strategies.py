@@ -182,7 +182,9 @@ def test_distorted_cameras_are_refused(make_scene):
         scene.frames[0].camera, model="OPENCV", params=(20.0, 20.0, 12.0, 8.0) + (0.1,) * 4
     )
     bent = scene.with_frames([replace(scene.frames[0], camera=camera), *scene.frames[1:]])
-    with pytest.raises(SceneError, match=r"a/0\.png: expected .* found OPENCV; undistort"):
+    with pytest.raises(
+        SceneError, match=r"a/0\.png: expected .* found OPENCV; run 'chronoscene undistort"
+    ):
         parts_of(bent, "joint")
 
 

@@ -10,7 +10,6 @@ import pytest
 from chronoscene.bench.results import Failure, RunRecord
 from chronoscene.bench.tables import (
     ENTRY_COLUMNS,
-    FORMATS,
     footnotes,
     format_runs,
     read_runs,
@@ -18,6 +17,7 @@ from chronoscene.bench.tables import (
     summarise,
 )
 from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.io.tables import FORMATS
 
 
 def record(method="chronogs", seed=0, *, psnr=(20.0, 30.0), ssim=None, **changes):

@@ -14,8 +14,7 @@ from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import load_rgb
 from chronoscene.scene import Scene
-from chronoscene.stats import count_scene
-from chronoscene.stats.published import PAPER_COUNTS, PAPER_TOTALS
+from chronoscene.stats.counts import PAPER_COUNTS, PAPER_TOTALS, count_scene
 from chronoscene.validation.run import validate_scene
 
 COUNTS = [(20, 700), (9, 300), (31, 1100)]

@@ -17,8 +17,8 @@ from skeletons.dataset import write_skeleton
 from chronoscene.cli import cli
 from chronoscene.cli.stats import against_paper
 from chronoscene.errors import ConfigError
-from chronoscene.stats import WRITERS, PeriodCount, SceneCount
-from chronoscene.stats.published import PAPER_COUNTS
+from chronoscene.io.tables import FORMATS
+from chronoscene.stats.counts import PAPER_COUNTS, PeriodCount, SceneCount
 
 
 def run(*args: object):
@@ -46,7 +46,7 @@ def test_a_folder_of_scenes_and_several_folders(make_scene_folder, tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["full", "paper"])
-@pytest.mark.parametrize("output_format", WRITERS)
+@pytest.mark.parametrize("output_format", FORMATS)
 def test_out_holds_what_would_be_printed(make_scene_folder, tmp_path, output_format, layout):
     folder = make_scene_folder()
     options = ("--format", output_format, "--layout", layout)
@@ -224,7 +224,7 @@ def test_scenes_of_the_paper_are_in_its_order(make_scene_folder, tmp_path):
 @pytest.mark.skipif(sys.platform != "linux", reason="names of files are not bytes here")
 def test_names_that_are_not_text(make_scene_folder, tmp_path):
     folder = make_scene_folder().rename(os.fsdecode(bytes(tmp_path) + b"/bad\xff$x$"))
-    for output_format in WRITERS:
+    for output_format in FORMATS:
         result = run(folder, "--format", output_format, "--out", tmp_path / "table")
         assert result.exit_code == 0, result.exception
         assert "bad" in (tmp_path / "table").read_text(encoding="utf-8")

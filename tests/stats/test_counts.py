@@ -14,17 +14,13 @@ from hypothesis import strategies as st
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.scene.splits import split_hash
-from chronoscene.stats import (
+from chronoscene.stats.counts import (
     PeriodCount,
     SceneCount,
     assign_points,
     count_scene,
     count_table,
-    to_csv,
-    to_json,
-    to_latex,
-    to_markdown,
-    to_text,
+    format_counts,
 )
 
 CAMERA = Camera(1, "PINHOLE", 8, 8, (8.0, 8.0, 4.0, 4.0))
@@ -125,18 +121,20 @@ def test_table_of_the_paper():
 
 
 def test_text():
-    lines = to_text(COUNTS).strip().splitlines()
+    lines = format_counts(COUNTS, "table").strip().splitlines()
     (row,) = [line for line in lines if "Lawncourt" in line]
     assert row.split() == [
         *("Lawncourt", "234", "85,655", "193", "57,884", "277", "117,595", "-", "-"),
         *("704", "261,134"),
     ]
     assert lines[-1].split()[0] == "Total"
-    assert "Period 3" in to_text(COUNTS) and "Period 4" not in to_text(COUNTS)
+    assert "Period 3" in format_counts(COUNTS, "table") and "Period 4" not in format_counts(
+        COUNTS, "table"
+    )
 
 
 def test_csv():
-    rows = list(csv.reader(io.StringIO(to_csv(COUNTS))))
+    rows = list(csv.reader(io.StringIO(format_counts(COUNTS, "csv"))))
     assert rows[0][:3] == ["scene", "period_0_images", "period_0_points"]
     assert rows[0][-2:] == ["total_images", "total_points"]
     assert rows[1] == [
@@ -151,30 +149,32 @@ def test_csv():
 
 
 def test_markdown():
-    lines = to_markdown(COUNTS).splitlines()
+    lines = format_counts(COUNTS, "markdown").splitlines()
     assert lines[2] == (
         "| Lawncourt | 234 | 85,655 | 193 | 57,884 | 277 | 117,595 | - | - | 704 | 261,134 |"
     )
     assert {line.count("|") for line in lines} == {12}
-    assert r"a\|b" in to_markdown([replace(COUNTS[0], name="a|b")])
+    assert r"a\|b" in format_counts([replace(COUNTS[0], name="a|b")], "markdown")
 
 
 def test_latex():
-    text = to_latex(COUNTS)
+    text = format_counts(COUNTS, "latex")
     assert r"Street\_1 & 200 & 110,591" in text
     assert r"\begin{tabular}{lrrrrrrrrrr}" in text
     rows = [line for line in text.splitlines() if line.startswith(("Lawn", "Street", "Total"))]
     assert {line.count("&") for line in rows} == {10}
-    assert r"\textbackslash{}\%" in to_latex([replace(COUNTS[0], name="\\%")])
+    assert r"\textbackslash{}\%" in format_counts([replace(COUNTS[0], name="\\%")], "latex")
 
 
 def test_markup_in_names_is_only_text():
-    assert "[red]x[/red]:smile:" in to_text([replace(COUNTS[0], name="[red]x[/red]:smile:")])
+    assert "[red]x[/red]:smile:" in format_counts(
+        [replace(COUNTS[0], name="[red]x[/red]:smile:")], "table"
+    )
 
 
 def test_json(make_scene_folder):
     scene = read_scene(make_scene_folder(tests=["b/0003"]))
-    data = json.loads(to_json([count_scene(scene)]))
+    data = json.loads(format_counts([count_scene(scene)], "json"))
     (entry,) = data["scenes"]
     assert entry["split_hash"] == split_hash(scene)
     assert [(p["images"], p["train"], p["test"]) for p in entry["periods"]] == [
@@ -185,9 +185,10 @@ def test_json(make_scene_folder):
     assert sum(p["points"] for p in data["totals"]["periods"]) == 30
 
 
-@pytest.mark.parametrize("writer", [to_text, to_csv, to_markdown, to_latex, to_json])
-def test_one_period(writer):
-    assert "Total" in writer([published("one", [(3, 5)])]) or writer is to_json
+@pytest.mark.parametrize("style", ["table", "csv", "markdown", "latex", "json"])
+def test_one_period(style):
+    text = format_counts([published("one", [(3, 5)])], style)
+    assert "Total" in text or style == "json"
 
 
 def test_real_scenes(shared_data):

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from chronoscene.formats import read_scene
-from chronoscene.stats import DETAIL_WRITERS, SceneStatistics, measure_scene
 from chronoscene.stats.counts import SCHEMA_VERSION, period_title
-from chronoscene.stats.details import COLUMNS, MAX_SHOWN, rows_of
+from chronoscene.stats.details import COLUMNS, MAX_SHOWN, format_details, rows_of
+from chronoscene.stats.measures import SceneStatistics, measure_scene
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def statistics(make_scene_folder) -> SceneStatistics:
 
 
 def test_csv_has_every_value_in_its_stored_unit(statistics):
-    rows = list(csv.DictReader(io.StringIO(DETAIL_WRITERS["csv"]([statistics]))))
+    rows = list(csv.DictReader(io.StringIO(format_details([statistics], "csv"))))
     assert [row["period"] for row in rows] == ["0", "1", ""]
     assert [row["label"] for row in rows] == ["before | after", "1", "all"]
     assert [row["images"] for row in rows] == ["2", "2", "4"]
@@ -38,7 +38,7 @@ def test_csv_has_every_value_in_its_stored_unit(statistics):
 
 def test_csv_has_numbers_where_pandas_wants_them(statistics):
     pandas = pytest.importorskip("pandas")
-    frame = pandas.read_csv(io.StringIO(DETAIL_WRITERS["csv"]([statistics])))
+    frame = pandas.read_csv(io.StringIO(format_details([statistics], "csv")))
     text = {"scene", "label", "date"}
     assert {c for c in frame if not pandas.api.types.is_numeric_dtype(frame[c])} <= text
     assert frame[frame.period == 1].label.tolist() == ["1"]
@@ -46,7 +46,7 @@ def test_csv_has_numbers_where_pandas_wants_them(statistics):
 
 
 def test_json_has_counts_measures_and_totals(statistics):
-    data = json.loads(DETAIL_WRITERS["json"]([statistics, statistics]))
+    data = json.loads(format_details([statistics, statistics], "json"))
     scene = data["scenes"][0]
     assert scene["observations"] == sum(p["observations"] for p in scene["periods"])
     assert scene["periods"][0]["overlap"] == list(statistics.overlap[0])
@@ -60,22 +60,22 @@ def test_json_has_counts_measures_and_totals(statistics):
 
 def test_all_keys_are_in_the_documentation(statistics):
     text = (Path(__file__).parents[2] / "docs/statistics.md").read_text(encoding="utf-8")
-    data = json.loads(DETAIL_WRITERS["json"]([statistics]))
+    data = json.loads(format_details([statistics], "json"))
     scene = data["scenes"][0]
     for key in {*data, *scene, *scene["periods"][0]}:
         assert f"`{key}`" in text, key
 
 
 def test_text_markdown_and_latex_have_one_line_per_row(statistics):
-    text = DETAIL_WRITERS["table"]([statistics])
+    text = format_details([statistics], "table")
     assert "old_town" in text and "0: before | after" in text
     (first,) = [line for line in text.splitlines() if "old_town" in line]
     error = f"{statistics.periods[0].reprojection_error:.3f}"
     assert error in first.split()
-    lines = DETAIL_WRITERS["markdown"]([statistics]).splitlines()
+    lines = format_details([statistics], "markdown").splitlines()
     assert len(lines) == 5
     assert {line.replace("\\|", "").count("|") for line in lines} == {len(COLUMNS) + 7}
-    latex = DETAIL_WRITERS["latex"]([statistics, statistics])
+    latex = format_details([statistics, statistics], "latex")
     assert latex.count(r"old\_town") == 2 and latex.count(r"\midrule") == 2
     body = [line for line in latex.splitlines() if line.endswith(r"\\")]
     wide = [sum(int(n) - 1 for n in re.findall(r"multicolumn{(\d+)}", line)) for line in body]
@@ -85,31 +85,31 @@ def test_text_markdown_and_latex_have_one_line_per_row(statistics):
 
 def test_one_period_has_no_overlap_columns(make_scene_folder):
     one = measure_scene(read_scene(make_scene_folder({"1.png": 0, "2.png": 0})))
-    assert "Also seen by" not in DETAIL_WRITERS["table"]([one])
+    assert "Also seen by" not in format_details([one], "table")
     assert len(rows_of(one)) == 2
 
 
 def test_many_periods_keep_the_table_narrow(make_scene_folder):
     count = MAX_SHOWN + 1
     many = measure_scene(read_scene(make_scene_folder({f"{i}.png": i for i in range(count)})))
-    assert "Also seen by" not in DETAIL_WRITERS["table"]([many])
-    assert f"overlap_{count - 1}" in DETAIL_WRITERS["csv"]([many]).splitlines()[0]
+    assert "Also seen by" not in format_details([many], "table")
+    assert f"overlap_{count - 1}" in format_details([many], "csv").splitlines()[0]
 
 
 def test_markup_in_names_is_only_text(make_scene_folder):
     scene = measure_scene(read_scene(make_scene_folder(name="[red]x:smile:")))
-    assert "[red]x:smile:" in DETAIL_WRITERS["table"]([scene])
+    assert "[red]x:smile:" in format_details([scene], "table")
 
 
 def test_narrow_terminals_get_the_table_in_blocks(statistics):
-    text = DETAIL_WRITERS["table"]([statistics], width=60)
+    text = format_details([statistics], "table", width=60)
     assert max(map(len, text.splitlines())) <= 60
     assert text.count("old_town") == text.count("Scene") > 1
     for title in ("Observations", "Coverage", "Also seen by", "In view of"):
         assert text.count(title) == 1
-    wide = DETAIL_WRITERS["table"]([statistics])
+    wide = format_details([statistics], "table")
     needed = max(map(len, wide.splitlines()))
-    assert DETAIL_WRITERS["table"]([statistics], width=needed + 2) == wide
+    assert format_details([statistics], "table", width=needed + 2) == wide
     assert set(re.findall(r"[\d.,]+", text)) == set(re.findall(r"[\d.,]+", wide))
 
 
@@ -117,8 +117,8 @@ def test_narrow_terminals_get_the_table_in_blocks(statistics):
 def test_names_cannot_break_a_line(make_scene_folder, output_format):
     scene = measure_scene(read_scene(make_scene_folder()))
     nasty = replace(scene, counts=replace(scene.counts, name="a\nb\x1b[31m"))
-    text = DETAIL_WRITERS[output_format]([nasty])
-    plain = DETAIL_WRITERS[output_format]([scene])
+    text = format_details([nasty], output_format)
+    plain = format_details([scene], output_format)
     assert "\x1b" not in text and text.count("\n") == plain.count("\n")
 
 

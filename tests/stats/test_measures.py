@@ -11,8 +11,14 @@ from skeletons.dataset import write_skeleton
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.stats import count_scene, measure_scene
-from chronoscene.stats.measures import period_coverage, period_overlap, reproject, robust_range
+from chronoscene.stats.counts import count_scene
+from chronoscene.stats.measures import (
+    measure_scene,
+    period_coverage,
+    period_overlap,
+    reproject,
+    robust_range,
+)
 
 PINHOLE = Camera(1, "PINHOLE", 64, 48, (50.0, 52.0, 30.0, 25.5))
 

@@ -9,7 +9,7 @@ from skeletons.dataset import write_skeleton
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.stats.measures import reproject
-from chronoscene.stats.view_overlap import DEEP, FARTHER, common_view
+from chronoscene.stats.view_overlap import DEPTH_PERCENTILE, REACH_FACTOR, common_view
 
 PINHOLE = Camera(1, "PINHOLE", 100, 100, (50.0, 50.0, 50.0, 50.0))
 """Sees 45 degrees to every side."""
@@ -85,7 +85,7 @@ def test_equals_plain_loops(tmp_path) -> None:
     seen, found = scene.count_views() > 0, reproject(scene)
     period = np.array([f.period for f in scene.frames])[scene.points.track_frame]
     for b in range(3):
-        reach = FARTHER * np.percentile(found.depth[period == b], DEEP)
+        reach = REACH_FACTOR * np.percentile(found.depth[period == b], DEPTH_PERCENTILE)
         for a in range(3):
             hits = []
             for xyz in scene.points.xyz[seen[:, a]]:
