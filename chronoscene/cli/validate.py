@@ -14,12 +14,12 @@ from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted, printable
 from chronoscene.kernels.runtime import keep_freed_memory
+from chronoscene.validation.finding import SceneReport, is_valid
 from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.report.html import write_html
-from chronoscene.validation.report.json import write_json
-from chronoscene.validation.report.report import SceneReport, counts
-from chronoscene.validation.report.sarif import write_sarif
-from chronoscene.validation.report.text import describe_rule, write_text
+from chronoscene.validation.report.json import write_json, write_sarif
+from chronoscene.validation.report.rule_list import describe_rule
+from chronoscene.validation.report.text import write_text
 from chronoscene.validation.rules import choose_rules
 from chronoscene.validation.run import find_folders, lost_report, validate_scene
 from chronoscene.validation.scene_folder import Track, no_progress
@@ -93,7 +93,7 @@ def command(
     """Check a scene, or every scene in a folder, and report all problems.
 
     Exit status: 0 valid, 1 there are errors (with --strict: or warnings), 2 there is no scene, or
-    wrong usage. DATASET.md lists the rules. Nothing is written into the scene. With --fix, the
+    wrong usage. --explain CS lists the rules. Nothing is written into the scene. With --fix, the
     report and the exit status are of the corrected copy.
     """
     check = partial(_check, _codes(select), _codes(ignore), decode)
@@ -116,8 +116,7 @@ def command(
     for option, file, write in (("--sarif", sarif, write_sarif), ("--html", html, write_html)):
         if file is not None:
             emit(write(reports, strict=strict), file, option=option)
-    total = counts(reports)
-    if total["error"] or (strict and total["warning"]):
+    if not is_valid(reports, strict=strict):
         context.exit(NOT_VALID)
 
 

@@ -1,7 +1,5 @@
-"""Scenes of other formats, made checkable: read, and written in ours into a temporary folder.
-
-The images there are links, so that nothing is copied.
-"""
+"""Scenes in other formats: converted into a temporary folder, with links to the images, to be
+checked."""
 
 from __future__ import annotations
 
@@ -21,21 +19,21 @@ from chronoscene.formats.shared.writing import place_image
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """What a scene was before it became what is checked."""
+    """The format that a scene was converted from."""
 
     format: str
-    """Its name in `chronoscene.formats`."""
+    """Name in `chronoscene.formats`."""
     error: ChronoSceneError | None = None
-    """Why it cannot be read; then there is nothing to check."""
+    """Why the scene cannot be read; then there is nothing to check."""
     remarks: tuple[str, ...] = ()
-    """What it has that does not become part of the scene."""
+    """What the conversion leaves out."""
 
 
 def other_format(path: Path) -> str | None:
-    """The format of a folder that is of another one than ours beyond doubt.
+    """The format of a folder that is certainly not in the ChronoScene format, else None.
 
-    A model in ``sparse/0/`` is taken for ours, without ``split.txt`` for ours with a fault: its
-    images may be in folders for other reasons than periods.
+    A model in ``sparse/0/`` without ``split.txt`` counts as a faulty ChronoScene folder: its images
+    may be in subfolders for other reasons than periods.
     """
     if our_format.matches(path) or model_files(path / our_format.MODEL):
         return None
@@ -47,7 +45,7 @@ def other_format(path: Path) -> str | None:
 
 @contextmanager
 def in_our_format(path: Path) -> Iterator[tuple[Path, Origin | None]]:
-    """The folder itself, or a temporary one with the same scene in our format, and its origin."""
+    """The folder itself, or a temporary ChronoScene folder of the same scene and its origin."""
     name = other_format(path)
     if name is None:
         yield path, None
@@ -62,7 +60,7 @@ def in_our_format(path: Path) -> Iterator[tuple[Path, Origin | None]]:
 
 
 def _write(path: Path, name: str, ours: Path) -> tuple[str, ...]:
-    """Write the scene with links to the images that are there; returns what is left out."""
+    """Convert the scene, with links to the existing images; returns what is left out."""
     scene = formats.read_scene(path, format=name)
     our_format.write(scene, ours, image_source="none")
     (ours / "images").mkdir(exist_ok=True)

@@ -1,59 +1,36 @@
-"""What a rule is, and the table of all rules.
+"""What a rule is, and the table that rules register in.
 
-A rule is one small function in `chronoscene.validation.rules` with the decorator `rule`. It gets
-the scene as it lies on disk and yields a `Hit` for each problem::
+A rule is a small function in `chronoscene.validation.rules` with the decorator `rule`. Its
+parameters name the attributes of `RawScene` that it looks at (``scene`` is the scene itself); it is
+skipped if one of them is None, and yields a `Hit` for each problem::
 
     @rule(
-        "CS201",
-        "image-missing",
-        "error",
-        what="A registered image has no file.",
-        remedy="copy the image into images/, or remove it from the model",
-        bad="`images.bin` names `a.jpg`, `images/a.jpg` does not exist",
-        needs=("images",),
+        "CS122",
+        "warning",
+        what="A quaternion does not have unit length.",
+        bad="quaternion `2 0 0 0`",
+        remedy="normalise the quaternion",
     )
-    def image_missing(scene: RawScene) -> Iterator[Hit]:
+    def quaternion_not_unit(scene: RawScene, images: RawImages) -> Iterator[Hit]:
         ...
 
-Codes are stable: a code is never given to another rule. DATASET.md has the table
-(`python -m chronoscene.validation.report.rule_list` prints it).
+The name of the rule is that of the function, here ``quaternion-not-unit``. Codes are stable and are
+never reused. ``docs/validation-rules.md`` lists all rules.
 """
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 from chronoscene.validation.finding import SEVERITIES, Hit, Severity
 from chronoscene.validation.scene_folder import RawScene
 
-Check = Callable[[RawScene], Iterable[Hit]]
-
-
-@dataclass(frozen=True, slots=True)
-class Rule:
-    """One rule. Everything except ``check`` is documentation and is shown to users."""
-
-    code: str
-    """``CS`` and three digits; the first digit is the group."""
-    name: str
-    severity: Severity
-    what: str
-    """What is wrong, in one sentence."""
-    remedy: str
-    """What to do, in the imperative, without a full stop."""
-    bad: str
-    """Short example of a scene that breaks the rule. Markdown."""
-    needs: tuple[str, ...]
-    """Attributes of `RawScene` that must not be None; else the rule is not run."""
-    last: bool
-    """Run after all others, and only if those found no error."""
-    check: Check
-
-
-RULES: dict[str, Rule] = {}
-"""All rules by code. Filled when `chronoscene.validation.rules` is imported."""
+Check = Callable[..., Iterable[Hit]]
+C = TypeVar("C", bound=Check)
 
 GROUPS = {
     "CS0": "Folder",
@@ -68,24 +45,62 @@ GROUPS = {
 """First digit of a code to what its rules look at."""
 
 
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One rule. All texts are shown to users."""
+
+    code: str
+    """``CS`` and three digits; the first digit is the group."""
+    name: str
+    severity: Severity
+    what: str
+    """What is wrong, in one or two sentences. Markdown."""
+    remedy: str
+    """What to do, in the imperative, without a full stop."""
+    bad: str
+    """Short example of a scene that breaks the rule. Markdown."""
+    parameters: tuple[str, ...]
+    """Attributes of `RawScene` that ``check`` takes, or ``scene``."""
+    needs: tuple[str, ...]
+    """Attributes that must not be None; else the rule is skipped."""
+    last: bool
+    """Run after all others, and only if those found no error."""
+    check: Check
+
+    def hits(self, scene: RawScene) -> Iterable[Hit]:
+        """Run the rule; all that it needs must be there."""
+        return self.check(*(scene if p == "scene" else getattr(scene, p) for p in self.parameters))
+
+
+RULES: dict[str, Rule] = {}
+"""Rules by code. Complete when `chronoscene.validation.rules` has been imported."""
+
+
 def rule(
     code: str,
-    name: str,
     severity: Severity,
     *,
     what: str,
-    remedy: str,
     bad: str,
+    remedy: str,
     needs: tuple[str, ...] = (),
     last: bool = False,
-) -> Callable[[Check], Check]:
-    """Register the decorated function as a rule; see `Rule` for the arguments."""
+) -> Callable[[C], C]:
+    """Register the decorated function as a rule; see `Rule` for the arguments.
+
+    Args:
+        needs: Attributes that must not be None besides those that are parameters of the function.
+    """
     assert re.fullmatch("CS[0-9]{3}", code) and code[:3] in GROUPS, code
     assert severity in SEVERITIES, severity
-    assert code not in RULES and name not in {r.name for r in RULES.values()}, f"{code} {name}"
+    assert code not in RULES, code
 
-    def register(check: Check) -> Check:
-        RULES[code] = Rule(code, name, severity, what, remedy, bad, needs, last, check)
+    def register(check: C) -> C:
+        name = check.__name__.replace("_", "-")
+        assert name not in {r.name for r in RULES.values()}, name
+        parameters = tuple(inspect.signature(check).parameters)
+        needed = (*(p for p in parameters if p != "scene"), *needs)
+        RULES[code] = Rule(code, name, severity, what, remedy, bad, parameters, needed, last, check)
         return check
 
     return register

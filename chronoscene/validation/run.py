@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,41 +14,49 @@ import numpy as np
 from chronoscene.colmap.raw_model import model_files
 from chronoscene.errors import SceneError
 from chronoscene.io.wording import printable
-from chronoscene.validation.finding import SEVERITIES, Finding, Hit
+from chronoscene.validation.checks.reprojection import period_errors
+from chronoscene.validation.finding import (
+    SEVERITIES,
+    Finding,
+    Hit,
+    PeriodSummary,
+    SceneReport,
+    Skipped,
+    Summary,
+)
 from chronoscene.validation.other_formats import in_our_format, other_format
-from chronoscene.validation.report.report import SceneReport, Skipped, Summary, summarise
 from chronoscene.validation.rule import Rule
 from chronoscene.validation.rules import all_rules
-from chronoscene.validation.rules.foreign_folder import OF_ORIGINS
+from chronoscene.validation.rules.cs0_folder import RULES_ON_ORIGINS
 from chronoscene.validation.scene_folder import RawScene, Track, no_progress
 
 RULE_FAILED = "CS000"
-"""Code of the finding that a rule itself failed: our mistake, reported as such."""
+"""Code of the finding that a rule itself failed: a bug of ours, reported as such."""
 
-
-NOTHING_KNOWN = Summary(None, None, None, None, 0, ())
+UNKNOWN = Summary(None, None, None, None, 0, ())
 
 
 def find_folders(path: Path) -> list[Path]:
-    """The folder itself if it looks like a scene, else the folders in it that do, sorted.
+    """The folder itself if it looks like a scene, else its subfolders that do, sorted.
 
-    Looking like a scene is not much: it has ``sparse/`` or ``images/``, or files of a model, or the
-    marks of another format.
+    A folder looks like a scene if it has ``sparse/`` or ``images/``, model files, or the files of
+    another format.
 
     Raises:
-        SceneError: If there is nothing that looks like a scene.
+        SceneError: If nothing looks like a scene.
     """
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
         raise SceneError(path, expected="a scene folder", found=found, todo="check the path")
     try:
         children = sorted(p for p in path.iterdir() if p.is_dir())
-        if _like_scene(path):
+        if _looks_like_scene(path):
             return [path]
-        inside = [child for child in children if _like_scene(child)]
+        inside = [child for child in children if _looks_like_scene(child)]
     except OSError as error:
         found = error.strerror or "an error"
-        raise SceneError(path, expected="a folder", found=found, todo="check the rights") from error
+        todo = "check the permissions"
+        raise SceneError(path, expected="a folder", found=found, todo=todo) from error
     if inside:
         return inside
     raise SceneError(
@@ -58,7 +67,7 @@ def find_folders(path: Path) -> list[Path]:
     )
 
 
-def _like_scene(path: Path) -> bool:
+def _looks_like_scene(path: Path) -> bool:
     ours = any((path / name).is_dir() for name in ("sparse", "images")) or bool(model_files(path))
     return ours or other_format(path) is not None
 
@@ -72,13 +81,13 @@ def validate_scene(
 ) -> SceneReport:
     """Run rules on one scene folder. Reads only; never raises for what is in the folder.
 
-    A scene of another format is checked as `chronoscene convert` would write it.
+    A scene in another format is checked as `chronoscene convert` would write it.
 
     Args:
         path: The scene folder.
-        rules: Rules to run (see `chronoscene.validation.rule.choose_rules`); None for all.
+        rules: Rules to run (see `chronoscene.validation.rules.choose_rules`); None for all.
         decode: Whether to decode all images: slower, finds damaged pixels and copied images.
-        track: Shows the progress of what takes long.
+        track: Shows the progress of slow parts.
     """
     chosen = all_rules() if rules is None else rules
     with quiet_numbers(), in_our_format(Path(path)) as (root, origin):
@@ -91,7 +100,7 @@ def validate_scene(
 
 @contextmanager
 def quiet_numbers() -> Iterator[None]:
-    """Without numpy's warnings: absurd numbers are what is looked for, and compare as false."""
+    """Without NumPy's warnings: absurd numbers are what rules look for; they compare as false."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         yield
@@ -106,8 +115,8 @@ def _validate(scene: RawScene, rules: Sequence[Rule]) -> SceneReport:
             if reason is not None:
                 skipped.append(Skipped(rule.code, reason))
                 continue
-            findings.extend(_finding(rule, hit) for hit in rule.check(scene))
-        except Exception as error:  # a mistake of ours must not hide what other rules find
+            findings.extend(_finding(rule, hit) for hit in rule.hits(scene))
+        except Exception as error:  # a bug of ours must not hide what other rules find
             findings.append(_failure(rule, error))
     findings.sort(key=lambda f: (SEVERITIES.index(f.severity), f.code))
     return SceneReport(
@@ -120,48 +129,15 @@ def _validate(scene: RawScene, rules: Sequence[Rule]) -> SceneReport:
 
 
 def _reason_to_skip(rule: Rule, scene: RawScene, findings: Sequence[Finding]) -> str | None:
-    if scene.origin is not None and scene.origin.error is not None and rule.code not in OF_ORIGINS:
-        return f"it cannot be read as {scene.origin.format}"
+    origin = scene.origin
+    if origin is not None and origin.error is not None and rule.code not in RULES_ON_ORIGINS:
+        return f"the folder cannot be read as {origin.format}"
     for attribute in rule.needs:
         if getattr(scene, attribute) is None:
             return scene.reason(attribute)
     if rule.last and any(f.severity == "error" for f in findings):
         return "other rules found errors"
     return None
-
-
-def _failure(rule: Rule, error: Exception) -> Finding:
-    hit = Hit(
-        f"rule {rule.code}",
-        "a rule that runs on every scene",
-        f"{type(error).__name__}: {error}",
-        "report this; it is a mistake in ChronoScene, not in the scene",
-    )
-    failed = replace(rule, code=RULE_FAILED, name="rule-failed", severity="error")
-    return _finding(failed, hit)
-
-
-def _summary(scene: RawScene) -> Summary:
-    try:
-        return summarise(scene)
-    except Exception:  # the rules that need the same part have said so
-        return NOTHING_KNOWN
-
-
-def lost_report(path: Path) -> SceneReport:
-    """The report on a scene whose check ended with its process."""
-    finding = Finding(
-        code=RULE_FAILED,
-        name="rule-failed",
-        severity="error",
-        place=".",
-        expected="a scene that can be checked",
-        found="one whose check died with its process",
-        remedy="if memory ran out, check this scene by itself; else report this",
-        count=1,
-    )
-    name = printable(path.resolve().name)
-    return SceneReport(name, path, NOTHING_KNOWN, findings=(finding,), skipped=())
 
 
 def _finding(rule: Rule, hit: Hit) -> Finding:
@@ -175,4 +151,65 @@ def _finding(rule: Rule, hit: Hit) -> Finding:
         remedy=printable(hit.remedy or rule.remedy),
         count=hit.count,
         also=tuple(map(printable, hit.also)),
+    )
+
+
+def _failure(rule: Rule, error: Exception) -> Finding:
+    hit = Hit(
+        f"rule {rule.code}",
+        "a rule that runs on every scene",
+        f"{type(error).__name__}: {error}",
+        "report this bug; the scene is not at fault",
+    )
+    failed = replace(rule, code=RULE_FAILED, name="rule-failed", severity="error")
+    return _finding(failed, hit)
+
+
+def lost_report(path: Path) -> SceneReport:
+    """The report on a scene whose process died."""
+    finding = Finding(
+        code=RULE_FAILED,
+        name="rule-failed",
+        severity="error",
+        place=".",
+        expected="a scene that can be checked",
+        found="one whose checking process died",
+        remedy="if memory ran out, check this scene by itself; otherwise report the bug",
+        count=1,
+    )
+    name = printable(path.resolve().name)
+    return SceneReport(name, path, UNKNOWN, findings=(finding,), skipped=())
+
+
+def _summary(scene: RawScene) -> Summary:
+    try:
+        return _summarise(scene)
+    except Exception:  # the rules that need the same part have said so
+        return UNKNOWN
+
+
+def _summarise(scene: RawScene) -> Summary:
+    periods = scene.periods or {}
+    images = Counter(periods.values())
+    tests = Counter(periods[name] for name in scene.tests or () if name in periods)
+    # Medians are shown, but not computed, if no rule has needed the reprojections.
+    reprojected = "reprojections" in vars(scene) and scene.reprojections is not None
+    medians = period_errors(scene) if reprojected else {}
+    known = scene.tests is not None
+    return Summary(
+        images=None if scene.images is None else len(scene.images),
+        cameras=None if scene.cameras is None else len(scene.cameras),
+        points=None if scene.points is None else len(scene.points),
+        observations=None if scene.points is None else len(scene.points.track_image),
+        image_files=len(scene.files),
+        periods=tuple(
+            PeriodSummary(
+                period,
+                images[period],
+                images[period] - tests[period] if known else None,
+                tests[period] if known else None,
+                medians.get(period),
+            )
+            for period in scene.period_ids
+        ),
     )

@@ -1,7 +1,7 @@
-"""A scene folder as it lies on disk: read lazily, part by part, with nothing repaired.
+"""A scene folder as it is on disk: read lazily, part by part, with nothing repaired.
 
-A part that cannot be had is None, and `RawScene.reason` says why; rules that need it are skipped
-with that reason. Nothing here raises for what is on the disk.
+A part that cannot be read is None, and `RawScene.reason` says why; rules that need it are skipped
+with that reason. Nothing here raises for what is on disk.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, wraps
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -24,8 +24,7 @@ from chronoscene.colmap.raw_model import (
     numbered_models,
     read_raw_model,
 )
-from chronoscene.errors import SceneError
-from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, check_name
+from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST
 from chronoscene.scene import Camera
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.splits import (
@@ -41,7 +40,14 @@ from chronoscene.scene.splits import (
     parse_test_text,
 )
 from chronoscene.scene.tracks import seen_by_period
-from chronoscene.validation.checks.observations import Observations, observe
+from chronoscene.validation.checks.names import is_safe
+from chronoscene.validation.checks.observations import (
+    Observations,
+    Reprojection,
+    good_poses,
+    observe,
+    reproject,
+)
 from chronoscene.validation.checks.pixels import (
     Header,
     Pixels,
@@ -49,31 +55,17 @@ from chronoscene.validation.checks.pixels import (
     read_headers,
     read_pixels,
 )
-from chronoscene.validation.checks.reprojection import Reprojection, good_poses, reproject
 from chronoscene.validation.other_formats import Origin
 
 T = TypeVar("T")
 Track = Callable[[Sequence[T], str], Iterable[T]]
-"""Passes items on and shows how far it is, under a description."""
+"""Passes items on and shows the progress under a description."""
 
 MODEL_PLACES = (MODEL, "sparse", "colmap/sparse/0", "dense/sparse", "dense/0/sparse", "")
-"""Where a model is looked for; only the first is right."""
+"""Where a model is looked for; only the first place is right."""
 
-FEWEST = 10
-"""Observations of an image from which the median of its errors means something."""
-
-LIMIT_SHARE, LEAST_LIMIT = 0.01, 4.0
-"""Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
-pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
-
-MOST_DEPTHS = 500
-"""Depths of an image that are looked at: enough for a percentile over a period."""
-
-FEWEST_IMAGES = 3
-"""Images with an error from which the median of a period means something."""
-
-MOST_CELLS = 500_000_000
-"""Points times periods, in bytes: a table of more is not made. Real scenes have a few percent."""
+MAX_CELLS = 500_000_000
+"""Largest table of points times periods, in bytes. Real scenes have a few percent of this."""
 
 _REASONS = {
     "model": f"there is no COLMAP model in {MODEL}",
@@ -88,7 +80,7 @@ _REASONS = {
     "test": "sparse/0/test.txt is absent or cannot be read",
     "tests": f"{SPLIT}, test.txt or the images of the model cannot be read",
     "point_periods": "points or periods cannot be read, or there are too many periods",
-    "pixels": "pixels are decoded with --decode only",
+    "pixels": "images are decoded only with --decode",
 }
 
 
@@ -121,20 +113,15 @@ class RawScene:
         Args:
             root: The scene folder.
             decode: Whether rules may decode all images.
-            track: Shows the progress of what takes long.
-            origin: The other format that the scene has come from.
+            track: Shows the progress of slow parts.
+            origin: The other format that the scene was converted from.
         """
         self.root = root
         self.decode = decode
         self.origin = origin
         self._track = track
-        self._derived: dict[Callable[[RawScene], Any], Any] = {}
-
-    def derived(self, compute: Callable[[RawScene], T]) -> T:
-        """What a function computes from this scene, computed once for all rules that ask for it."""
-        if compute not in self._derived:
-            self._derived[compute] = compute(self)
-        return cast(T, self._derived[compute])
+        self.memory: dict[Callable[[RawScene], Any], Any] = {}
+        """What `derived` functions have computed of this scene."""
 
     def reason(self, attribute: str) -> str:
         """Why an attribute is None."""
@@ -181,9 +168,13 @@ class RawScene:
         """Place of an image of the model in messages."""
         return f"{self.model_file('images')} ({name})"
 
+    def camera_place(self, camera: Camera) -> str:
+        """Place of a camera in messages."""
+        return f"{self.model_file('cameras')} (camera {camera.camera_id})"
+
     @cached_property
     def usable_cameras(self) -> dict[int, Camera]:
-        """Cameras by id, those with a size and focal lengths that mean something."""
+        """Cameras by id, those with a plausible size and focal length."""
         usable = (c for c in self.cameras or () if c.is_usable and c.model != "EQUIRECTANGULAR")
         return {camera.camera_id: camera for camera in usable}
 
@@ -195,7 +186,7 @@ class RawScene:
 
     @cached_property
     def centres(self) -> NDArray[np.float64]:
-        """Camera centres in the world, NaN for poses that are not good. [I, 3]"""
+        """Camera centres in the world, NaN for invalid poses. [I, 3]"""
         if self.images is None:
             return np.zeros((0, 3))
         with np.errstate(all="ignore"):  # absurd translations become infinite
@@ -205,64 +196,17 @@ class RawScene:
         return centres
 
     @cached_property
+    def is_posed(self) -> NDArray[np.bool_]:
+        """Which images have a camera centre. [I]"""
+        return np.isfinite(self.centres[:, 0])
+
+    @cached_property
     def reprojections(self) -> list[Reprojection] | None:
-        """Of the images with a usable camera, a finite pose and observations."""
+        """Reprojections in the images with a usable camera, a valid pose and observations."""
         images, points, seen = self.images, self.points, self.observations
         if self.cameras is None or images is None or points is None or seen is None:
             return None
         return list(reproject(self.usable_cameras, images, points, seen))
-
-    @cached_property
-    def image_errors(self) -> NDArray[np.float64]:
-        """Median reprojection error of each image in pixels, of the points in front of it.
-
-        NaN for images with fewer than `FEWEST` points. What a camera cannot see by its distortion
-        is infinitely wrong. [I]
-        """
-        errors = np.full(len(self.images or ()), np.nan)
-        for seen in self.reprojections or ():
-            front = seen.error[seen.depth > 0]
-            if len(front) >= FEWEST:
-                errors[seen.image] = np.median(np.where(np.isnan(front), np.inf, front))
-        return errors
-
-    def pose_limit(self, image: int) -> float:
-        """Reprojection error in pixels beyond which the pose of an image does not fit."""
-        assert self.images is not None
-        camera = self.usable_cameras[int(self.images.camera_ids[image])]
-        return max(LEAST_LIMIT, LIMIT_SHARE * float(np.hypot(camera.width, camera.height)))
-
-    @cached_property
-    def period_errors(self) -> dict[int, float]:
-        """Median over the images of a period of `image_errors`, for periods with enough of them."""
-        medians = {}
-        for index, period in enumerate(self.period_ids):
-            errors = self.image_errors[self.image_periods == index]
-            errors = errors[~np.isnan(errors)]
-            if len(errors) >= FEWEST_IMAGES:
-                medians[period] = float(np.median(errors))
-        return medians
-
-    @cached_property
-    def _front(self) -> dict[int, NDArray[np.float64]]:
-        """Depths in front of the cameras by index of the period, some of each image."""
-        by_period: dict[int, list[NDArray[np.float64]]] = {}
-        for seen in self.reprojections or ():
-            depth = seen.depth[:: len(seen.depth) // MOST_DEPTHS + 1]
-            front = depth[(depth > 0) & np.isfinite(depth)]
-            if len(front):
-                by_period.setdefault(int(self.image_periods[seen.image]), []).append(front)
-        return {period: np.concatenate(depths) for period, depths in by_period.items()}
-
-    def depths(self, percent: float) -> dict[int, float]:
-        """Percentile of the depths by index of the period, of the periods that have some."""
-        return {period: float(np.percentile(d, percent)) for period, d in self._front.items()}
-
-    @cached_property
-    def typical_depth(self) -> float:
-        """Median distance of the points from the cameras that see them; 0 if unknown."""
-        every = np.concatenate([np.zeros(0), *self._front.values()])
-        return float(np.median(every)) if len(every) else 0.0
 
     # Periods and split.
 
@@ -290,7 +234,7 @@ class RawScene:
 
     @property
     def split_problems(self) -> list[Problem]:
-        """All problems of ``split.txt``; those of names only if the images can be read."""
+        """All problems of ``split.txt``; problems with names only if the images can be read."""
         found = list(self._parsed_split[1])
         return found + (self._assigned[1] if self.periods is not None else [])
 
@@ -337,11 +281,11 @@ class RawScene:
 
     @cached_property
     def point_periods(self) -> NDArray[np.bool_] | None:
-        """Whether an image of a period sees the point; columns as `period_ids`. [P, T]"""
+        """Whether a point is seen by an image of a period; columns as `period_ids`. [P, T]"""
         points, seen = self.points, self.observations
         if points is None or seen is None or self.periods is None:
             return None
-        if len(points) * len(self.period_ids) > MOST_CELLS:
+        if len(points) * len(self.period_ids) > MAX_CELLS:
             return None
         period = np.append(self.image_periods, -1)[seen.image]
         rows = (period >= 0) & seen.valid
@@ -357,7 +301,7 @@ class RawScene:
 
     @cached_property
     def files(self) -> list[str]:
-        """Image files below ``images/`` by their suffix, as relative names, sorted."""
+        """Files below ``images/`` with an image extension, as relative names, sorted."""
         found = []
         top = self.root / "images"
         for folder, _, files in os.walk(top):
@@ -389,7 +333,7 @@ class RawScene:
 
     @cached_property
     def digests(self) -> dict[str, bytes]:
-        """SHA-256 of those present files that have the size of another; others are unique."""
+        """SHA-256 of the present files that have the same size as another; the rest are unique."""
         return hash_files(self.root / "images", self.present, self._track)
 
     @cached_property
@@ -403,8 +347,20 @@ class RawScene:
         return read_text_file(self.root / place)
 
 
+def derived(compute: Callable[[RawScene], T]) -> Callable[[RawScene], T]:
+    """Decorator of a function of a scene that is called by several rules: computed once."""
+
+    @wraps(compute)
+    def remembered(scene: RawScene) -> T:
+        if compute not in scene.memory:
+            scene.memory[compute] = compute(scene)
+        return cast(T, scene.memory[compute])
+
+    return remembered
+
+
 def read_text_file(path: Path) -> TextFile | None:
-    """A small text file, or None if it is absent, no file, or no text."""
+    """A small text file, or None if it is absent, not a regular file, or not text."""
     try:
         if not path.is_file():  # a pipe would block
             return None
@@ -413,12 +369,3 @@ def read_text_file(path: Path) -> TextFile | None:
         return None if "\0" in text else TextFile(data, text)  # UTF-16 without its mark
     except (OSError, UnicodeDecodeError):
         return None
-
-
-def is_safe(name: str) -> bool:
-    """Whether an image name stays below ``images/``."""
-    try:
-        check_name(Path(), name)
-    except SceneError:
-        return False
-    return True

@@ -117,7 +117,7 @@ def test_select(broken, options):
 
 
 def test_decode(good):
-    assert "not checked (pixels are decoded with --decode only): CS206" in run(good)[1]
+    assert "not checked (images are decoded only with --decode): CS206" in run(good)[1]
     status, text = run(good, "--decode")
     assert status == 0 and "not checked" not in text
 
@@ -127,7 +127,7 @@ def test_decode(good):
     [
         (["{tmp}/absent"], "expected a scene folder, found nothing"),
         (["{tmp}/empty"], "expected a scene (a folder with images/ and sparse/)"),
-        (["{scene}", "--select", "CS999"], "--select: expected codes of rules"),
+        (["{scene}", "--select", "CS999"], "--select: expected rule codes"),
         (["{scene}", "--out", "{tmp}/absent/report"], "No such file or directory"),
     ],
 )
@@ -182,7 +182,8 @@ def test_fix_into_the_scene_is_refused(good, monkeypatch, capsys):
 def test_explain():
     status, text = run("--explain", "pose-leak,CS201")
     assert status == 0
-    assert text.startswith("error CS201 image-missing: A registered image has no file.\n  for exam")
+    what = "The file of a registered image is missing."
+    assert text.startswith(f"error CS201 image-missing: {what}\n  for exam")
     assert "\nwarning CS605 pose-leak: A test image has the pose" in text
     assert text.count("  to do: ") == 2
 
@@ -192,7 +193,7 @@ def test_explain_nothing_that_is_there(capsys, monkeypatch):
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 2
-    assert "--explain: expected codes of rules" in capsys.readouterr().err
+    assert "--explain: expected rule codes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("option", ["--out", "--sarif", "--html"])

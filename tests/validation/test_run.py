@@ -15,7 +15,9 @@ from chronoscene.validation.run import find_folders, validate_scene
 
 
 def make_rule(check, *, needs=(), severity="error", last=False):
-    return Rule("CS299", "made-up", severity, "What.", "do it", "bad", needs, last, check)
+    return Rule(
+        "CS299", "made-up", severity, "What.", "do it", "bad", ("scene",), needs, last, check
+    )
 
 
 def test_good_scene(scene):
@@ -183,7 +185,7 @@ def test_what_the_reader_refuses_has_an_error(scene):
 
 
 def test_too_many_periods_for_a_table_of_points(scene, monkeypatch):
-    monkeypatch.setattr("chronoscene.validation.scene_folder.MOST_CELLS", 79)
+    monkeypatch.setattr("chronoscene.validation.scene_folder.MAX_CELLS", 79)
     report = scene.validate()
     assert not report.findings
     skipped = {s.code for s in report.skipped if "too many periods" in s.reason}

@@ -1,1 +1,1 @@
-"""What rules compute: pixels, observations, reprojection, frames of periods, likeness of photos."""
+"""What rules compute: names, image files, photo metadata, observations, reprojection, frames."""

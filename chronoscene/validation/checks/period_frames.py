@@ -1,8 +1,8 @@
-"""Whether a period has a frame of its own: mirrored, scaled or moved against the others.
+"""Which periods are in a frame of their own: mirrored, scaled or moved against the others.
 
-A period whose poses belong to another frame disagrees with the points that it shares with the
-others. Two explanations are tried: axes of world and camera that were negated, and a similarity,
-found from the same points as the period's own cameras place them.
+The points that such a period shares with the others do not fit its poses. Two explanations are
+tried: negated axes of world and camera, and a similarity to the same points as triangulated by the
+cameras of the period alone.
 """
 
 from __future__ import annotations
@@ -15,23 +15,24 @@ from numpy.typing import NDArray
 from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import Similarity, fit_robustly
-from chronoscene.validation.scene_folder import RawScene
+from chronoscene.validation.checks.reprojection import image_errors, period_errors, pose_limit
+from chronoscene.validation.scene_folder import RawScene, derived
 
 Array = NDArray[np.float64]
 
-MOST_RAYS = 20_000
-"""Observations of a period that are looked at."""
+MAX_RAYS = 20_000
+"""Observations sampled from a period."""
 
-FEWEST_POINTS = 10
-"""Points that a period must place by itself."""
+MIN_POINTS = 10
+"""Points that the cameras of a period must triangulate alone."""
 
-LEAST_PARALLAX = 1e-4
+MIN_PARALLAX = 1e-4
 """Smallest eigenvalue of the mean of ``I - d d^T`` over the rays of a point: sine squared of about
 half a degree."""
 
 STRAY = 100.0
 """Distance of a camera from the others, in units of their median distance, beyond which its rays
-would pull all points away."""
+would distort all points."""
 
 FITS = 0.02
 """Median distance after the similarity, as a share of the extent of the points."""
@@ -40,66 +41,69 @@ BETTER = 1 / 3
 """Share of the median distance before the similarity that may be left after it."""
 
 WELL = 0.5
-"""Share of the limit, and of what a similarity leaves, that may be left where a factor explains all
-errors: cameras that look at one place from one distance see a wrong scale nearly like a wrong focal
-length."""
+"""Share of the limit, and of the error that a similarity leaves, that may remain if a factor of the
+focal length explains everything: to cameras that see one place from one distance, a wrong scale
+looks nearly like a wrong focal length."""
 
 SAME_FOCAL = 0.002
-"""Relative difference of focal lengths that explains nothing."""
+"""Relative difference of focal lengths too small to explain anything."""
 
 AXES = "xyz"
 
 WORSE = 3.0
-"""Ratio of median reprojection errors, of a period to the best one or of an image to its period."""
+"""Ratio of median reprojection errors, of a period to the best one or of an image to its period,
+beyond which it stands out."""
 
-LEAST_ERROR = 1.0
-"""Pixels; below, everything is well whatever its ratio to the rest."""
+MIN_ERROR = 1.0
+"""Pixels; smaller errors are fine whatever their ratio to the rest."""
 
-MOST_WRONG = 0.5
-"""Share of the images of a period with a pose that does not fit: beyond, the period is at fault."""
+MAX_WRONG = 0.5
+"""Share of the images of a period with a pose that does not fit, beyond which the period is at
+fault."""
 
 
 def period_limit(scene: RawScene) -> float:
     """Median reprojection error in pixels beyond which a period stands out among the others."""
-    return max(LEAST_ERROR, WORSE * min(scene.period_errors.values(), default=0.0))
+    return max(MIN_ERROR, WORSE * min(period_errors(scene).values(), default=0.0))
 
 
+@derived
 def own_frames(scene: RawScene) -> dict[int, str]:
-    """Periods in a frame of their own by index, with what brings them into that of the others."""
+    """Periods in a frame of their own by index, and what brings them into that of the others."""
     if scene.point_periods is None:
         return {}
-    judged = ~np.isnan(scene.image_errors) | _behind(scene)
+    judged = ~np.isnan(image_errors(scene)) | _behind(scene)
     limits = {
         i: _limit_of_wrong(scene, np.flatnonzero(judged & (scene.image_periods == i)))
         for i in range(len(scene.period_ids))
     }
     if all(limit is not None for limit in limits.values()):
-        return {}  # there is no frame to be in
+        return {}  # no period is right: there is no frame to compare with
     found = {i: explain(scene, i, limit) for i, limit in limits.items() if limit is not None}
     return {i: words for i, words in found.items() if words is not None}
 
 
 def _limit_of_wrong(scene: RawScene, mine: NDArray[np.int64]) -> float | None:
-    """Error in pixels that most images of a period exceed, if they do.
+    """Error in pixels that most images of a period exceed, or None.
 
     Args:
         scene: The scene.
-        mine: Indices of those images of the period that can be judged.
+        mine: Indices of the images of the period that can be judged.
     """
     if not len(mine):
         return None
-    usual = period_limit(scene) if len(scene.period_errors) > 1 else np.inf
-    limit = min(usual, float(np.median([scene.pose_limit(i) for i in mine.tolist()])))
-    wrong = np.count_nonzero(~(scene.image_errors[mine] <= limit))
-    return limit if wrong > MOST_WRONG * len(mine) else None
+    usual = period_limit(scene) if len(period_errors(scene)) > 1 else np.inf
+    limit = min(usual, float(np.median([pose_limit(scene, i) for i in mine.tolist()])))
+    wrong = np.count_nonzero(~(image_errors(scene)[mine] <= limit))
+    return limit if wrong > MAX_WRONG * len(mine) else None
 
 
 def _behind(scene: RawScene) -> NDArray[np.bool_]:
-    """Which images have most of their points behind them. [I]"""
+    """Whether most points of an image are behind it. [I]"""
     behind = np.zeros(len(scene.images or ()), bool)
     for seen in scene.reprojections or ():
         wrong = np.count_nonzero(~(seen.depth > 0))
-        behind[seen.image] = wrong > MOST_WRONG * len(seen.depth)
+        behind[seen.image] = wrong > MAX_WRONG * len(seen.depth)
     return behind
 
 
@@ -107,7 +111,7 @@ class Rays:
     """Observations of points by the images of one period (M observations)."""
 
     def __init__(self, scene: RawScene, period: int) -> None:
-        """Take those whose camera is usable and whose pose is good.
+        """Take the observations with a usable camera and a valid pose.
 
         Args:
             scene: The scene, with its model.
@@ -120,11 +124,11 @@ class Rays:
         of_period = [r for r in scene.reprojections or () if scene.image_periods[r.image] == period]
         share = table.sum(axis=1) > 1
         if not (share & table[:, period]).any():
-            share = table[:, period]  # with its own points it may at least agree
+            share = table[:, period]  # it may at least agree with its own points
         rows = np.concatenate([np.zeros(0, np.int64), *(r.rows for r in of_period)])
         rows = rows[share[seen.point[rows]]]
-        # Whole tracks, so that points keep several rays.
-        step = len(rows) // MOST_RAYS + 1
+        # Sample whole tracks, so that points keep several rays.
+        step = len(rows) // MAX_RAYS + 1
         rows = rows[seen.point[rows] % step == 0]
         self.image, self.point = seen.image[rows], seen.point[rows]
         self.xyz = points.xyz[self.point]
@@ -134,7 +138,7 @@ class Rays:
         self.focal = np.ones((len(rows), 2))
         """Pixels. [M, 2]"""
         self.plane = images.keypoint_xy[seen.keypoint[rows]]
-        """Where the observations are on the plane one unit in front of the camera. [M, 2]"""
+        """Observations on the plane one unit in front of the camera. [M, 2]"""
         camera_ids = images.camera_ids[self.image]
         for camera_id in np.unique(camera_ids).tolist():
             camera, mine = scene.usable_cameras[camera_id], camera_ids == camera_id
@@ -142,7 +146,7 @@ class Rays:
             self.plane[mine] = unproject_pixels(camera, self.plane[mine])
 
     def error(self, world: Array, camera: Array) -> float:
-        """Median error in pixels, without distortion, with some axes of both negated."""
+        """Median error in pixels, without distortion, with signs of world and camera axes."""
         local = np.einsum("nij,nj->ni", self.rotation, self.xyz * world) + self.translation
         local = local * camera
         distance = self._distances(local)
@@ -150,21 +154,22 @@ class Rays:
         return float(np.median(distance)) if len(distance) else np.inf
 
     def error_in(self, similarity: Similarity) -> float:
-        """Median error in pixels with the points in the frame that a similarity leads from."""
+        """Median error in pixels with the points in the source frame of a similarity."""
         own = np.linalg.solve(similarity.matrix, (self.xyz - similarity.translation).T).T
         local = np.einsum("nij,nj->ni", self.rotation, own) + self.translation
         return float(np.median(self._distances(local)))
 
     def _distances(self, local: Array) -> Array:
-        """Pixels, without distortion, between points in the frames of the cameras and their
-        observations; infinite where there is no such number. [M, 3] -> [M]
+        """Pixels, without distortion, between points in camera frames and their observations.
+
+        Infinite where undefined. [M, 3] -> [M]
         """
         shift = (local[:, :2] / local[:, 2:] - self.plane) * self.focal
         distance = np.linalg.norm(shift, axis=1)
         return np.where(np.isnan(distance), np.inf, distance)
 
     def focal_factor(self) -> tuple[float, float]:
-        """Factor of the focal lengths that fits best, and the median error in pixels with it."""
+        """Best factor of the focal lengths, and the median error in pixels with it."""
         local = np.einsum("nij,nj->ni", self.rotation, self.xyz) + self.translation
         projected, observed = local[:, :2] / local[:, 2:] * self.focal, self.plane * self.focal
         known = (local[:, 2] > 0) & np.isfinite(projected).all(axis=1)
@@ -176,9 +181,9 @@ class Rays:
         return factor, float(np.median(np.linalg.norm(projected * factor - observed, axis=1)))
 
     def place_points(self) -> tuple[NDArray[np.int64], Array]:
-        """Indices and positions of the points by these rays alone, those with enough parallax.
+        """Triangulate the points with enough parallax from these rays alone: indices and positions.
 
-        The position is the nearest to all rays: ``sum(I - d d^T) x = sum((I - d d^T) c)``.
+        A position is nearest to all rays: ``sum(I - d d^T) x = sum((I - d d^T) c)``.
         """
         local = np.column_stack([self.plane, np.ones(len(self.plane))])
         direction = np.einsum("nji,nj->ni", self.rotation, local)
@@ -191,21 +196,21 @@ class Rays:
         left, right = np.zeros((len(index), 3, 3)), np.zeros((len(index), 3))
         np.add.at(left, slot, across)
         np.add.at(right, slot, np.einsum("nij,nj->ni", across, centre))
-        good = np.linalg.eigvalsh(left / count[:, None, None])[:, 0] > LEAST_PARALLAX
+        good = np.linalg.eigvalsh(left / count[:, None, None])[:, 0] > MIN_PARALLAX
         placed = np.linalg.solve(left[good], right[good][:, :, None])[:, :, 0]
         return index[good], np.asarray(placed, np.float64)
 
 
 def explain(scene: RawScene, period: int, limit: float) -> str | None:
-    """In words, what brings a period that disagrees with the others into their frame.
+    """Description of what transforms a period that disagrees with the others into their frame.
 
     Args:
         scene: The scene, with its model.
         period: Index of the period.
-        limit: Reprojection error in pixels that a right explanation leaves at most.
+        limit: Largest reprojection error in pixels that a right explanation leaves.
     """
     rays = Rays(scene, period)
-    if len(rays.point) < FEWEST_POINTS:
+    if len(rays.point) < MIN_POINTS:
         return None
     signs = [np.array(s, np.float64) for s in product((1, -1), repeat=3)]
     errors = {(i, j): rays.error(a, b) for i, a in enumerate(signs) for j, b in enumerate(signs)}
@@ -216,7 +221,7 @@ def explain(scene: RawScene, period: int, limit: float) -> str | None:
     assert scene.points is not None
     index, own = rays.place_points()
     target = scene.points.xyz[index]
-    if len(index) < FEWEST_POINTS:
+    if len(index) < MIN_POINTS:
         return None
     found = fit_robustly(own, target, mirror=True)
     extent = float(np.median(np.linalg.norm(target - np.median(target, axis=0), axis=1)))
@@ -227,13 +232,13 @@ def explain(scene: RawScene, period: int, limit: float) -> str | None:
         return None
     _, focal_error = rays.focal_factor()
     if focal_error <= WELL * min(limit, rays.error_in(found[0])):
-        return None  # not the frame is wrong, but the camera
+        return None  # the camera is wrong, not the frame
     return _moved(found[0], own, target)
 
 
 def focal_factor(rays: Rays, limit: float) -> float | None:
-    """What the focal lengths should be multiplied with, if that alone explains a period."""
-    if len(rays.point) < FEWEST_POINTS:
+    """Factor of the focal lengths that alone explains a period, if there is one."""
+    if len(rays.point) < MIN_POINTS:
         return None
     factor, error = rays.focal_factor()
     return factor if error <= WELL * limit and abs(factor - 1) > SAME_FOCAL else None
@@ -245,8 +250,8 @@ def _negated(world: Array, camera: Array) -> str:
         if (signs < 0).any():
             axes = " and ".join(AXES[i] for i in np.flatnonzero(signs < 0))
             parts.append(f"{axes} of the {what} negated")
-    mirrored = "mirrored: " if np.prod(world) < 0 else ""
-    return f"a period {mirrored}it fits with {', '.join(parts)}"
+    mirrored = " mirrored," if np.prod(world) < 0 else ""
+    return f"a period that fits{mirrored} with {', '.join(parts)}"
 
 
 def _moved(similarity: Similarity, own: Array, target: Array) -> str:
@@ -257,5 +262,5 @@ def _moved(similarity: Similarity, own: Array, target: Array) -> str:
     mirrored = "mirrored, " if similarity.mirrored else ""
     return (
         f"a period in a frame of its own: it fits {mirrored}scaled by {similarity.scale:.4g}, "
-        f"turned by {angle:.3g} degrees and moved by {shift:.3g}"
+        f"rotated by {angle:.3g} degrees and moved by {shift:.3g}"
     )

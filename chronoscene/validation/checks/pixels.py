@@ -1,4 +1,4 @@
-"""What the validator reads of image files: headers, digests of bytes and pixels, thumbnails."""
+"""What rules read of image files: headers, digests of bytes and pixels, thumbnails."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from PIL import Image
 from chronoscene.errors import ImageError
 from chronoscene.images.exif import ExifData, exif_of
 from chronoscene.images.store import load_rgb
-from chronoscene.validation.checks.jpeg import has_end, jpeg_damage
 
 THUMBNAIL = 32
 """Pixels along each side of a thumbnail."""
@@ -29,7 +28,7 @@ GREY_SIDE = 160
 """Pixels along the longer side of a small grey image: 20 kB for each image."""
 
 END_MARKS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND"}
-"""What ends a file. Compressed JPEG data cannot contain its mark."""
+"""End markers of files. Compressed JPEG data cannot contain its own."""
 
 ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 """Pillow's modes with transparency. Other modes may have one transparent colour."""
@@ -38,26 +37,35 @@ JPEG = ("JPEG", "MPO")
 """Pillow's names of JPEG files."""
 
 TAIL = 4096
-"""Bytes at the end of a file in which its mark is looked for."""
+"""Bytes at the end of a file in which its end marker is looked for."""
 
 _SUBFILE, _REDUCED, _MASK = 254, 1, 4
-"""Tag of TIFF that says what an image in the file is, and two of its bits (TIFF 6.0, page 36)."""
+"""TIFF tag for the kind of an image in the file, and two of its bits (TIFF 6.0, page 36)."""
 
 _HEADER_THREADS = 4
-_FEW = 32
-"""Headers that are read before threads would have begun."""
+_MIN_THREADED = 32
+"""Fewer headers than this are read before threads have started."""
+
+_START, _SCAN, _END = b"\xff\xd8", 0xDA, 0xD9
+_RESTART_INTERVAL = 0xDD
+
+_SEGMENTS = frozenset({0xC4, 0xDA, 0xDB, 0xDC, 0xDD, 0xFE, *range(0xE0, 0xF0)})
+"""Markers that may occur between two scans: tables, comments, the next scan."""
+
+PADDING = 64
+"""Number of equal bytes that compressed data never ends in."""
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What the first bytes of an image file say."""
+    """What the header of an image file says."""
 
     problem: str | None
-    """Why it is not a readable image; then the rest means nothing."""
+    """Why it is not a readable image; then the rest is meaningless."""
     size: tuple[int, int] = (0, 0)
     """Width and height as stored."""
     mode: str = ""
-    """Pillow's name of the kind of pixels."""
+    """Pillow's name of the type of pixels."""
     orientation: int = 1
     """EXIF orientation; 1 is upright."""
     kind: str = ""
@@ -66,16 +74,16 @@ class Header:
     """Whether it has more than 8 bits per channel."""
     transparent: bool = False
     """Whether it may have transparent pixels."""
-    moving: bool = False
+    animated: bool = False
     """Whether it has several frames."""
-    cut_off: bool = False
-    """Whether it ends before its end."""
+    truncated: bool = False
+    """Whether the file ends before its image does."""
     exif: ExifData = field(default_factory=ExifData)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pixels:
-    """What is kept of a decoded image."""
+    """Digests and thumbnails of a decoded image."""
 
     problem: str | None
     """Why it cannot be decoded; then the rest is None."""
@@ -91,7 +99,7 @@ def read_headers(folder: Path, names: Sequence[str]) -> dict[str, Header]:
     """Headers of some images below a folder, in several threads: a disk may be slow."""
     paths = [folder / name for name in names]
     with _quiet():
-        if len(paths) < _FEW:
+        if len(paths) < _MIN_THREADED:
             return dict(zip(names, map(read_header, paths), strict=True))
         with ThreadPoolExecutor(_HEADER_THREADS) as pool:
             return dict(zip(names, pool.map(read_header, paths), strict=True))
@@ -113,7 +121,7 @@ def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
     exif = exif_of(image)
     width, height = image.size
     kind = image.format or ""
-    if kind == "TIFF" and exif.orientation >= 5:  # Pillow tells the size after turning
+    if kind == "TIFF" and exif.orientation >= 5:  # Pillow gives the size after rotation
         width, height = height, width
     return Header(
         problem=None,
@@ -123,8 +131,8 @@ def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
         kind=kind,
         deep=_is_deep(image),
         transparent=image.mode in ALPHA_MODES or "transparency" in image.info,
-        cut_off=_is_cut_off(path, file, image),
-        moving=_has_frames(image),
+        truncated=_is_truncated(path, file, image),
+        animated=_has_frames(image),
         exif=exif,
     )
 
@@ -138,7 +146,7 @@ def _is_deep(image: Image.Image) -> bool:
 
 
 def _has_frames(image: Image.Image) -> bool:
-    """Whether there are several images of equal rank; previews and masks do not count."""
+    """Whether there are several images that are not previews or masks."""
     if image.format == "MPO" or not getattr(image, "is_animated", False):
         return False
     if image.format != "TIFF":
@@ -152,11 +160,11 @@ def _has_frames(image: Image.Image) -> bool:
     return image.size == size and not kind & (_REDUCED | _MASK)
 
 
-def _is_cut_off(path: Path, file: BinaryIO, image: Image.Image) -> bool:
+def _is_truncated(path: Path, file: BinaryIO, image: Image.Image) -> bool:
     """Whether a file ends before its image does.
 
-    A file without the mark of its end may still be whole: phones append what they like. Only such
-    files are read to their end and, if the mark is really missing, decoded.
+    A file that does not end in its marker may still be complete: phones append other data. Only
+    such files are read completely and, if the marker is really missing, decoded.
     """
     kind = image.format or ""
     size = file.seek(0, os.SEEK_END)
@@ -178,8 +186,64 @@ def _is_cut_off(path: Path, file: BinaryIO, image: Image.Image) -> bool:
     return read_pixels_of(path).problem is not None
 
 
+def jpeg_damage(data: bytes) -> str | None:
+    """Damage to the compressed data of a JPEG file that decoders silently accept, if it shows.
+
+    libjpeg decodes almost anything: parts that a broken transfer filled with zeros become grey or
+    stripes, without an error. The structure of the file reveals them.
+
+    Args:
+        data: The whole file. Everything after the end of its first image is ignored.
+
+    Source: ITU-T T.81, annex B (markers) and F.1.2.3 (in compressed data, 255 is followed by 0).
+    """
+    at, has_restarts = _first_scan(data)
+    if at is None:
+        return None  # decoders report a missing scan
+    codes = np.frombuffer(data, np.uint8)
+    marks = np.flatnonzero(codes[at:-1] == 0xFF) + at
+    follow = codes[marks + 1]
+    plain = (follow == 0) | (follow == 0xFF)
+    if has_restarts:
+        plain |= (follow >= 0xD0) & (follow <= 0xD7)
+    skip = at
+    for mark in marks[~plain].tolist():
+        marker = data[mark + 1]
+        if mark < skip:
+            continue
+        if marker == _END:
+            return None
+        if marker not in _SEGMENTS:
+            return f"compressed data with an impossible marker at byte {mark}"
+        skip = mark + 2 + int.from_bytes(data[mark + 2 : mark + 4])
+    if len(set(data[-PADDING:])) == 1:
+        return f"no end of the image, and {data[-1]:#04x} in all of the last bytes"
+    return None
+
+
+def has_end(data: bytes) -> bool:
+    """Whether the marker that ends an image follows the beginning of the compressed data."""
+    at, _ = _first_scan(data)
+    return at is not None and data.find(bytes((0xFF, _END)), at) >= 0
+
+
+def _first_scan(data: bytes) -> tuple[int | None, bool]:
+    """Where compressed data begins, and whether it contains restart markers."""
+    at, restarts = len(_START), False
+    while data.startswith(_START) and at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # a fill byte
+            at += 1
+            continue
+        restarts |= marker == _RESTART_INTERVAL
+        at += 2 + int.from_bytes(data[at + 2 : at + 4])
+        if marker == _SCAN:
+            return at, restarts
+    return None, restarts
+
+
 def _tiff_end(image: Image.Image) -> int:
-    """Where the last strip or tile of a TIFF file should end; 0 if its tags do not say."""
+    """Where the last strip or tile of a TIFF file should end; 0 if its tags do not tell."""
     tags = getattr(image, "tag_v2", {})
     ends = [0]
     for offsets, lengths in ((273, 279), (324, 325)):
@@ -211,7 +275,7 @@ def read_pixels(
     threads = os.cpu_count() or 2
     found: dict[str, Pixels] = {}
     with _quiet(), ThreadPoolExecutor(threads) as pool:
-        # Only so many are handed out that an interruption does not wait for all of them.
+        # Only a few are submitted at a time, so that an interruption does not wait for all of them.
         waiting: list[tuple[str, Any]] = []
         for name in track(names, "decode images"):
             waiting.append((name, pool.submit(read_pixels_of, folder / name)))
@@ -247,7 +311,7 @@ def _problem(error: Exception) -> str:
 
 
 def _without_path(text: str, path: Path) -> str:
-    """Pillow's message without the path, which the place of the finding has already."""
+    """Pillow's message without the path, which is in the place of the finding."""
     return text.replace(repr(str(path)), "it")
 
 

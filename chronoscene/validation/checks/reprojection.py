@@ -1,80 +1,83 @@
-"""Where points project to in the images that see them."""
+"""Reprojection errors of images and periods, and depths of the points that they see."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator, Mapping
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawImages, RawPoints
-from chronoscene.scene.cameras import Camera, project_points
-from chronoscene.scene.geometry import rotation_from_quaternion
-from chronoscene.validation.checks.observations import Observations
+from chronoscene.validation.scene_folder import RawScene, derived
 
-Array = NDArray[np.float64]
+MIN_OBSERVATIONS = 10
+"""Observations of an image from which the median of its errors is meaningful."""
 
+MAX_ERROR_SHARE, MIN_LIMIT = 0.01, 4.0
+"""Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
+pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
 
-class Reprojection(NamedTuple):
-    """Of one image, over its m finite observations."""
+MAX_DEPTHS = 500
+"""Depths sampled from an image: enough for a percentile over a period."""
 
-    image: int
-    """Index into the images."""
-    rows: NDArray[np.int64]
-    """Indices into the observations. [m]"""
-    depth: NDArray[np.float64]
-    """World units along the optical axis. [m]"""
-    error: NDArray[np.float64]
-    """Distance in pixels between projection and observation; NaN behind the camera. [m]"""
-    outside: int
-    """Observations that are not within the image."""
+MIN_IMAGES = 3
+"""Images with an error from which the median of a period is meaningful."""
 
 
-def good_poses(images: RawImages) -> NDArray[np.bool_]:
-    """Which poses are finite with a quaternion that is not zero. [I]"""
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(images.quaternions, axis=1)
-    return np.isfinite(norm) & (norm > 0) & np.isfinite(images.translations).all(axis=1)
+@derived
+def image_errors(scene: RawScene) -> NDArray[np.float64]:
+    """Median reprojection error of each image in pixels, of the points in front of it. [I]
 
-
-def reproject(
-    cameras: Mapping[int, Camera], images: RawImages, points: RawPoints, seen: Observations
-) -> Iterator[Reprojection]:
-    """Project the points of every image that has a good pose, a camera and observations."""
-    good = good_poses(images)
-    with np.errstate(all="ignore"):
-        rotations = rotation_from_quaternion(images.quaternions)
-    # Columns by themselves: numpy is several times slower along a short last axis. And `take` is
-    # three times quicker than brackets.
-    xyz = np.ascontiguousarray(points.xyz.T)
-    uv = np.ascontiguousarray(images.keypoint_xy.T)
-    for image, rows in seen.by_image(images):
-        camera = cameras.get(int(images.camera_ids[image]))
-        if camera is None or not good[image]:
-            continue
-        place = xyz.take(seen.point.take(rows), axis=1)
-        u, v = uv.take(seen.keypoint.take(rows), axis=1)
-        with np.errstate(all="ignore"):  # infinite for absurd poses
-            depth, x, y = project(rotations[image], images.translations[image], camera, *place)
-            error = np.sqrt((x - u) ** 2 + (y - v) ** 2)
-        # What is not finite in points and keypoints has rules of its own.
-        known = np.isfinite(place).all(axis=0) & np.isfinite(u) & np.isfinite(v)
-        inside = (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-        outside = int(np.count_nonzero(known & ~inside))
-        if not known.all():
-            rows, depth, error = rows[known], depth[known], error[known]
-        yield Reprojection(image, rows, depth, error, outside)
-
-
-def project(
-    rotation: Array, translation: Array, camera: Camera, x: Array, y: Array, z: Array
-) -> tuple[Array, Array, Array]:
-    """Depth, and pixel position along x and y, of points at ``x, y, z`` in the world. [m] each
-
-    Behind the camera, positions are NaN.
+    NaN for images with fewer than `MIN_OBSERVATIONS` points. Points that a camera cannot see
+    because of its distortion count as infinitely wrong.
     """
-    local = np.empty((3, len(x)))
-    for i, (row, shift) in enumerate(zip(rotation.tolist(), translation.tolist(), strict=True)):
-        local[i] = row[0] * x + row[1] * y + row[2] * z + shift
-    return local[2], *project_points(camera, local.T).T
+    errors = np.full(len(scene.images or ()), np.nan)
+    for seen in scene.reprojections or ():
+        front = seen.error[seen.depth > 0]
+        if len(front) >= MIN_OBSERVATIONS:
+            errors[seen.image] = np.median(np.where(np.isnan(front), np.inf, front))
+    return errors
+
+
+def judged_images(scene: RawScene) -> list[int]:
+    """Indices of the images with a reprojection error."""
+    return list(np.flatnonzero(~np.isnan(image_errors(scene))).tolist())
+
+
+def pose_limit(scene: RawScene, image: int) -> float:
+    """Reprojection error in pixels beyond which the pose of an image does not fit."""
+    assert scene.images is not None
+    camera = scene.usable_cameras[int(scene.images.camera_ids[image])]
+    return max(MIN_LIMIT, MAX_ERROR_SHARE * float(np.hypot(camera.width, camera.height)))
+
+
+@derived
+def period_errors(scene: RawScene) -> dict[int, float]:
+    """Median over the images of a period of `image_errors`, for periods with enough of them."""
+    medians = {}
+    for index, period in enumerate(scene.period_ids):
+        errors = image_errors(scene)[scene.image_periods == index]
+        errors = errors[~np.isnan(errors)]
+        if len(errors) >= MIN_IMAGES:
+            medians[period] = float(np.median(errors))
+    return medians
+
+
+@derived
+def _depths(scene: RawScene) -> dict[int, NDArray[np.float64]]:
+    """Samples of the depths in front of the cameras by index of the period, -1 for none."""
+    by_period: dict[int, list[NDArray[np.float64]]] = {}
+    for seen in scene.reprojections or ():
+        depth = seen.depth[:: len(seen.depth) // MAX_DEPTHS + 1]
+        front = depth[(depth > 0) & np.isfinite(depth)]
+        if len(front):
+            by_period.setdefault(int(scene.image_periods[seen.image]), []).append(front)
+    return {period: np.concatenate(depths) for period, depths in by_period.items()}
+
+
+def depth_percentiles(scene: RawScene, percent: float) -> dict[int, float]:
+    """Percentile of the depths by index of the period, of the periods that have any."""
+    return {period: float(np.percentile(d, percent)) for period, d in _depths(scene).items()}
+
+
+def typical_depth(scene: RawScene) -> float:
+    """Median distance of the points from the cameras that see them; 0 if unknown."""
+    every = np.concatenate([np.zeros(0), *_depths(scene).values()])
+    return float(np.median(every)) if len(every) else 0.0

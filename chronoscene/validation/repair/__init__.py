@@ -1,1 +1,1 @@
-"""Corrected copies of scenes."""
+"""Corrected copies of scenes: `fix_scene` writes them, `contents` corrects the files."""

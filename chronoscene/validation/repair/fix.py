@@ -1,7 +1,4 @@
-"""A corrected copy of a scene: what has one possible correction is corrected, the rest reported.
-
-The scene itself is only read. Files that stay as they are become hard links where the disk can.
-"""
+"""A corrected copy of a scene. The scene itself is only read; unchanged files become hard links."""
 
 from __future__ import annotations
 
@@ -20,13 +17,17 @@ from chronoscene.images.exif import set_upright
 from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
-from chronoscene.validation.checks.spelling import spelling
+from chronoscene.validation.checks.names import spelling
 from chronoscene.validation.other_formats import other_format
-from chronoscene.validation.repair.colmap_model import Repair, repair_model
-from chronoscene.validation.repair.split_files import plain_table, repair_split, repair_test
-from chronoscene.validation.rules import split_file as split_rules
-from chronoscene.validation.rules import test_list as test_rules
-from chronoscene.validation.rules.image_files import images_of_other_shape
+from chronoscene.validation.repair.contents import (
+    Repair,
+    plain_table,
+    repair_model,
+    repair_split,
+    repair_test,
+)
+from chronoscene.validation.rules.cs2_image_files import images_of_other_shape
+from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE, TEST_ELSEWHERE
 from chronoscene.validation.run import quiet_numbers
 from chronoscene.validation.scene_folder import RawScene, TextFile, read_text_file
 
@@ -39,7 +40,7 @@ def fix_scene(root: Path, out: Path) -> list[Repair]:
         out: Folder that does not exist yet, or is empty, and is not inside the scene.
 
     Returns:
-        What was done.
+        The corrections.
 
     Raises:
         ConfigError: If ``out`` is inside the scene, or the scene is of another format.
@@ -58,7 +59,7 @@ def _check_format(root: Path) -> None:
             f"--fix of {root}",
             expected="a scene in the ChronoScene format",
             found=f"one in {name}",
-            todo="chronoscene convert makes one of it, which can be corrected",
+            todo="convert it with chronoscene convert, then correct the result",
         )
 
 
@@ -83,7 +84,7 @@ class _Fix:
         return self._repairs
 
     def _model(self) -> None:
-        """Write the model in ``sparse/0/`` if anything about it is better otherwise."""
+        """Write the model into ``sparse/0/`` if anything in it is corrected."""
         model, place = self._scene.model, self._scene.model_place
         if model is None or place is None:
             return
@@ -100,7 +101,7 @@ class _Fix:
         try:
             write_raw_model(folder, model.cameras, images, points)
         except (struct.error, OverflowError, ValueError):
-            for stem in MODEL_FILES:  # a number that no field holds; the rules name it
+            for stem in MODEL_FILES:  # a number out of range, which has its own rule
                 (folder / f"{stem}.bin").unlink(missing_ok=True)
             return
         self._repairs += repairs
@@ -111,7 +112,7 @@ class _Fix:
             self._move_rigs(model, below)
 
     def _move_rigs(self, model: RawModel, below: str) -> None:
-        """Rigs and frames follow a binary model; those of a text model would not be read."""
+        """Rigs and frames move with a binary model; those of a text model would not be read."""
         binary = model.files.get("cameras", "").endswith(".bin")
         for stem in ("rigs", "frames"):
             for form in FORMS:
@@ -121,7 +122,7 @@ class _Fix:
                 _link(source, self._out / MODEL / f"{stem}.bin")
 
     def _split(self, names: list[str] | None) -> None:
-        text = self._find_text(SPLIT, split_rules.ELSEWHERE, "CS301")
+        text = self._find_text(SPLIT, SPLIT_ELSEWHERE, "CS301")
         if text is None or names is None:
             return
         plain, repairs = plain_table(text.text, names)
@@ -137,7 +138,7 @@ class _Fix:
             self._number_periods(new_ids)
 
     def _number_periods(self, new_ids: dict[int, int]) -> None:
-        """Give the labels of the periods their new ids, if they have exactly the old ones."""
+        """Renumber the labels of the periods, if they have exactly the old ids."""
         text = read_text_file(self._scene.root / PERIODS)
         try:
             items = json.loads(text.text) if text else []
@@ -149,7 +150,7 @@ class _Fix:
         self._write(PERIODS, json.dumps(items, indent=1, ensure_ascii=False) + "\n")
 
     def _test(self, names: list[str] | None) -> None:
-        text = self._find_text(TEST, test_rules.ELSEWHERE, "CS322")
+        text = self._find_text(TEST, TEST_ELSEWHERE, "CS322")
         if text is None or names is None:
             return
         lines, repairs = repair_test(names, parse_test_text(text.text))
@@ -157,7 +158,7 @@ class _Fix:
             self._repairs += repairs
 
     def _find_text(self, right: str, elsewhere: tuple[str, ...], code: str) -> TextFile | None:
-        """The text file of the right place, else of the one wrong place where there is one."""
+        """The text file at the right place, else at the only wrong place that has one."""
         root = self._scene.root
         if os.path.lexists(root / right):
             return read_text_file(root / right)
@@ -169,7 +170,7 @@ class _Fix:
         return text
 
     def _misspelt_images(self) -> None:
-        """Files whose name differs from that in the model by case or Unicode form only."""
+        """Rename files whose name differs from that in the model only by case or Unicode form."""
         registered, present = set(self._scene.names), set(self._scene.present)
         by_spelling: dict[str, list[str]] = {}
         for file in self._scene.files:
@@ -186,7 +187,7 @@ class _Fix:
             self._repairs.append(Repair("CS201", what))
 
     def _orientation_tags(self) -> None:
-        """Images whose tag turns them in viewers while the poses refer to the pixels as stored."""
+        """Reset tags that rotate images in viewers: the poses refer to the pixels as stored."""
         headers = self._scene.headers
         turned = {n for n, h in headers.items() if h.problem is None and h.orientation > 1}
         done = []
@@ -209,7 +210,7 @@ class _Fix:
         return (images / name).resolve().is_relative_to(images)
 
     def _copy_rest(self) -> None:
-        """Everything else, as it is; links that lead out of the scene are left out."""
+        """Copy everything else unchanged, except links that lead out of the scene."""
         top = self._scene.root.resolve()
         left_out = []
         for path, place in _files(top):
@@ -222,13 +223,17 @@ class _Fix:
         kept = self._behind_links(top)
         left_out = [p for p in left_out if not any(k == p or k.startswith(f"{p}/") for k in kept)]
         if left_out:
-            what = f"{counted(len(left_out), 'link')} out of the scene left out: {shown(left_out)}"
+            links = counted(len(left_out), "link")
+            what = f"{links} leading out of the scene left out: {shown(left_out)}"
             self._repairs.append(Repair("", what))
 
     def _behind_links(self, top: Path) -> list[str]:
-        """What makes up the scene and is still missing: it is in folders or files that are links.
+        """Add parts of the scene that are still missing because they are behind links.
 
-        Images elsewhere are linked again, so that nothing is copied from there but the model.
+        Images elsewhere are linked again, so that only the model is copied from there.
+
+        Returns:
+            What was added.
         """
         names = [f"images/{name}" for name in self._scene.present]
         below = f"{self._scene.model_place}/" if self._scene.model_place else ""
@@ -251,7 +256,7 @@ class _Fix:
         return kept
 
     def _write(self, place: str, text: str) -> bool:
-        """Write a text file, unless it has names that are no text, which have their own rule."""
+        """Write a text file, unless it has names that are not text, which have their own rule."""
         (self._out / place).parent.mkdir(parents=True, exist_ok=True)
         try:
             write_text_atomic(self._out / place, text)
@@ -262,7 +267,7 @@ class _Fix:
 
 
 def _form_repairs(model: RawModel, place: str) -> list[Repair]:
-    """What is wrong with the place and the form of the files."""
+    """Corrections of the place and the form of the files."""
     repairs = []
     forms = {file[-4:] for file in model.files.values()}
     if place != MODEL:
@@ -277,7 +282,7 @@ def _form_repairs(model: RawModel, place: str) -> list[Repair]:
 
 
 def _files(top: Path) -> Iterator[tuple[Path, str]]:
-    """Files below a folder, and their names relative to it; folders are not followed as links."""
+    """Files below a folder, and their names relative to it; linked folders are not followed."""
     for folder, folders, files in os.walk(top):
         for name in sorted(files) + [n for n in folders if os.path.islink(os.path.join(folder, n))]:
             path = Path(folder) / name
@@ -285,7 +290,7 @@ def _files(top: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _link(source: Path, target: Path) -> None:
-    """A hard link, or a copy where the disk has none."""
+    """A hard link, or a copy if the file system has none."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if os.path.lexists(target):
         return  # never into a file that may be a link to the original

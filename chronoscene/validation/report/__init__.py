@@ -1,1 +1,1 @@
-"""Outcome of a validation, for people and for programs."""
+"""Reports as text, JSON, SARIF and HTML, and the page of all rules."""

@@ -1,7 +1,7 @@
-"""Report as one HTML page that needs nothing else: styles and small pictures are in it.
+"""Report as a self-contained HTML page with styles and small pictures.
 
-Everything from a scene is escaped by the template engine. Pictures are shown of the first images
-that findings name, and only of files that really lie below ``images/``.
+Everything from a scene is escaped by the template engine. The first images that findings name are
+shown, and only files that really are below ``images/``.
 """
 
 from __future__ import annotations
@@ -17,24 +17,31 @@ from PIL import Image
 
 from chronoscene import __version__
 from chronoscene.io.pages import render_page
-from chronoscene.validation.finding import NOTHING, SEVERITIES, Finding, Severity
-from chronoscene.validation.report.report import SceneReport, counts
+from chronoscene.validation.checks.names import is_safe
+from chronoscene.validation.finding import (
+    NOTHING,
+    SEVERITIES,
+    Finding,
+    SceneReport,
+    Severity,
+    counts,
+    is_valid,
+)
 from chronoscene.validation.rule import RULES
-from chronoscene.validation.scene_folder import is_safe
 
-PICTURES = 24
-"""Pictures for one scene."""
+MAX_PICTURES = 24
+"""Pictures of one scene."""
 
-SIDE_BY_SIDE = 3
+MAX_SIDE_BY_SIDE = 3
 """Pictures of one finding."""
 
 PICTURE_SIDE = 160
 """Pixels."""
 
-LARGEST_FILE = 50_000_000
-"""Bytes of an image file that is opened for a picture."""
+MAX_FILE_BYTES = 50_000_000
+"""Larger image files are not opened for a picture."""
 
-ROWS = 100
+MAX_ROWS = 100
 """Findings of one rule that are listed."""
 
 TITLES: dict[Severity, str] = {"error": "Errors", "warning": "Warnings", "info": "Remarks"}
@@ -67,21 +74,16 @@ def write_html(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
         "validation",
         scenes=[(report, _sections(report), _skipped(report)) for report in reports],
         total=counts(reports),
-        valid=_is_valid(reports, strict),
-        is_valid=lambda report: _is_valid([report], strict),
+        valid=is_valid(reports, strict=strict),
+        is_valid=lambda report: is_valid([report], strict=strict),
         severities=SEVERITIES,
         titles=TITLES,
         version=__version__,
     )
 
 
-def _is_valid(reports: Sequence[SceneReport], strict: bool) -> bool:
-    total = counts(reports)
-    return not total["error"] and not (strict and total["warning"])
-
-
 def _sections(report: SceneReport) -> list[tuple[Severity, list[_Block]]]:
-    """Blocks by severity, those without findings left out."""
+    """Blocks by severity, without severities that have no findings."""
     pictures = Pictures(report.path)
     sections = []
     for severity in SEVERITIES:
@@ -100,7 +102,7 @@ def _block(findings: list[Finding], pictures: Pictures) -> _Block:
         what=RULES[first.code].what if first.code in RULES else first.expected,
         rows=tuple(
             _Row(f.place, f.expected, f.found, pictures.of(f.place, f.also))
-            for f in findings[:ROWS]
+            for f in findings[:MAX_ROWS]
         ),
         total=len(findings),
         remedies=tuple(dict.fromkeys(f.remedy for f in findings if f.remedy != NOTHING))[:5],
@@ -108,22 +110,22 @@ def _block(findings: list[Finding], pictures: Pictures) -> _Block:
 
 
 def _skipped(report: SceneReport) -> list[tuple[str, str]]:
-    """Reasons, and the rules that could not be run for them."""
+    """Reasons, and the rules that were skipped for them."""
     reasons = dict.fromkeys(s.reason for s in report.skipped)
     return [(r, ", ".join(s.code for s in report.skipped if s.reason == r)) for r in reasons]
 
 
 class Pictures:
-    """Small pictures of the first few images that are asked for."""
+    """Small pictures of the first few images that are requested."""
 
     def __init__(self, root: Path) -> None:
         self._images = root / "images"
-        self._left = PICTURES
+        self._left = MAX_PICTURES
 
     def of(self, place: str, also: Sequence[str] = ()) -> tuple[str, ...]:
-        """Data URIs of the image that a place names and of some others, as far as there are any."""
+        """Data URIs of the image that a place names and of other images, if they can be read."""
         found: list[str] = []
-        for name in islice((*_names(place), *also), SIDE_BY_SIDE):
+        for name in islice((*_names(place), *also), MAX_SIDE_BY_SIDE):
             if self._left > 0 and (picture := self._draw(name)) is not None:
                 self._left -= 1
                 found.append(picture)
@@ -133,7 +135,7 @@ class Pictures:
         try:
             path = (self._images / name).resolve()
             inside = is_safe(name) and path.is_relative_to(self._images.resolve())
-            if not inside or not path.is_file() or path.stat().st_size > LARGEST_FILE:
+            if not inside or not path.is_file() or path.stat().st_size > MAX_FILE_BYTES:
                 return None
             with Image.open(path) as image:
                 image.draft("RGB", (2 * PICTURE_SIDE, 2 * PICTURE_SIDE))
@@ -145,7 +147,7 @@ class Pictures:
 
 
 def _names(place: str) -> Iterator[str]:
-    """What in a place may be the name of an image."""
+    """The part of a place that may be the name of an image."""
     if place.startswith("images/"):
         yield place.removeprefix("images/")
     elif place.endswith(")") and " (" in place:

@@ -1,20 +1,48 @@
-"""Table of rules: ``python -m chronoscene.validation.report.rule_list`` prints it."""
+"""The rules for people: ``--explain``, and the page ``docs/validation-rules.md``.
+
+``python -m chronoscene.validation.report.rule_list > docs/validation-rules.md`` renews the page.
+"""
 
 from __future__ import annotations
 
+import click
+
+from chronoscene.validation.finding import Severity
 from chronoscene.validation.rule import GROUPS, Rule
 from chronoscene.validation.rules import all_rules
 
+COLOURS: dict[Severity, str] = {"error": "red", "warning": "yellow", "info": "cyan"}
 
-def rules_markdown() -> str:
-    """One table for each group of rules."""
-    return "\n".join(_group(prefix, title) for prefix, title in GROUPS.items())
+INTRODUCTION = """\
+# Validation rules
+
+`chronoscene validate` checks a scene with the rules below; [DATASET.md](../DATASET.md#validation)
+describes the command. `chronoscene validate --explain CS201` prints a rule in the terminal. Codes
+are stable: a code is never reused.
+
+This page is generated: `python -m chronoscene.validation.report.rule_list >
+docs/validation-rules.md`. The rules of group CS1 are in the files
+`chronoscene/validation/rules/cs1_*.py`, and so on; `chronoscene/validation/rule.py` explains how to
+add one.
+"""
+
+
+def describe_rule(rule: Rule) -> str:
+    """What a rule looks for, with an example and what to do."""
+    head = click.style(f"{rule.severity} {rule.code}", fg=COLOURS[rule.severity])
+    lines = (f"{head} {rule.name}: {rule.what}", f"  for example: {rule.bad}")
+    return "\n".join([*lines, f"  to do: {rule.remedy}"]) + "\n"
+
+
+def rules_page() -> str:
+    """The page in Markdown: one table for each group of rules."""
+    return "\n".join([INTRODUCTION, *(_group(*group) for group in GROUPS.items())]).rstrip() + "\n"
 
 
 def _group(prefix: str, title: str) -> str:
     rows = [_row(rule) for rule in all_rules() if rule.code.startswith(prefix)]
     head = "| code | severity | name | what is wrong | for example | what to do |"
-    return "\n".join([f"**{prefix}: {title}**", "", head, "| --- " * 6 + "|", *rows, ""])
+    return "\n".join([f"## {prefix}: {title}", "", head, "| --- " * 6 + "|", *rows, ""])
 
 
 def _row(rule: Rule) -> str:
@@ -23,4 +51,4 @@ def _row(rule: Rule) -> str:
 
 
 if __name__ == "__main__":
-    print(rules_markdown())
+    click.echo(rules_page(), nl=False)

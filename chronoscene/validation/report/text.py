@@ -1,4 +1,4 @@
-"""Report for people: grouped by scene and rule, equal findings folded into one line."""
+"""Report for people: grouped by scene and rule, similar findings folded into one line."""
 
 from __future__ import annotations
 
@@ -11,59 +11,58 @@ from itertools import groupby
 import click
 
 from chronoscene.io.wording import counted
-from chronoscene.validation.finding import NOTHING, SEVERITIES, Finding, Severity
-from chronoscene.validation.report.report import SceneReport, Summary, counts
-from chronoscene.validation.rule import RULES, Rule
+from chronoscene.validation.finding import (
+    NOTHING,
+    SEVERITIES,
+    Finding,
+    SceneReport,
+    Summary,
+    counts,
+    is_valid,
+)
+from chronoscene.validation.report.rule_list import COLOURS
+from chronoscene.validation.rule import RULES
 
-FIRST = 3
-"""Places that are named of equal findings."""
+MAX_PLACES = 3
+"""Places listed of findings that differ only in their place."""
 
-CODES = 8
-"""Rules that are named of those that were not run for one reason."""
+MAX_CODES = 8
+"""Rules listed of those that were skipped for one reason."""
 
-LINES = 5
-"""Different lines of one rule that are shown."""
+MAX_LINES = 5
+"""Different lines shown of one rule."""
 
-NARROWEST = 40
-"""Columns below which lines are not broken further."""
-
-COLOURS: dict[Severity, str] = {"error": "red", "warning": "yellow", "info": "cyan"}
+MIN_WIDTH = 40
+"""Columns below which lines are not wrapped further."""
 
 
 def write_text(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
     """Readable report of some scenes."""
     blocks = [_scene(report) for report in reports]
     if len(reports) > 1:
-        bad = sum(bool(r.count("error") or (strict and r.count("warning"))) for r in reports)
+        bad = sum(not is_valid([r], strict=strict) for r in reports)
         blocks.append([f"{counted(len(reports), 'scene')}, {bad} not valid: {_total(reports)}"])
     width = _width()
     return "\n\n".join("\n".join(_fit(line, width) for line in block) for block in blocks) + "\n"
 
 
 def _width() -> int | None:
-    """Columns of the terminal; None without one: lines stay whole for other programs."""
+    """Columns of the terminal; None without one: other programs get unwrapped lines."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def _fit(line: str, width: int | None) -> str:
-    """A line with what does not fit below it, further in."""
+    """A line, wrapped with an indent if it is too long."""
     if width is None or len(click.unstyle(line)) <= width:
         return line
     indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
     return textwrap.fill(
         line,
-        max(width, NARROWEST),
+        max(width, MIN_WIDTH),
         subsequent_indent=indent,
         break_long_words=False,
         break_on_hyphens=False,
     )
-
-
-def describe_rule(rule: Rule) -> str:
-    """What a rule looks for, with an example and what to do."""
-    head = click.style(f"{rule.severity} {rule.code}", fg=COLOURS[rule.severity])
-    lines = (f"{head} {rule.name}: {rule.what}", f"  for example: {rule.bad}")
-    return "\n".join([*lines, f"  to do: {rule.remedy}"]) + "\n"
 
 
 def _scene(report: SceneReport) -> list[str]:
@@ -72,8 +71,8 @@ def _scene(report: SceneReport) -> list[str]:
         lines += _rule(code, list(group))
     for reason in sorted({s.reason for s in report.skipped}):
         codes = [s.code for s in report.skipped if s.reason == reason]
-        rest = f" and {len(codes) - CODES} more" if len(codes) > CODES else ""
-        lines.append(f"  not checked ({reason}): {', '.join(codes[:CODES])}{rest}")
+        rest = f" and {len(codes) - MAX_CODES} more" if len(codes) > MAX_CODES else ""
+        lines.append(f"  not checked ({reason}): {', '.join(codes[:MAX_CODES])}{rest}")
     return [*lines, f"  {_total([report])}"]
 
 
@@ -85,22 +84,22 @@ def _rule(code: str, findings: list[Finding]) -> list[str]:
     times = f" ({len(findings)} findings)" if len(findings) > 1 else ""
     lines = [f"  {head} {first.name}: {what}{times}"]
     folded = _fold(findings)
-    lines += [f"    {line}" for line in folded[:LINES]]
-    if len(folded) > LINES:
-        lines.append(f"    and {len(folded) - LINES} more such lines (--format json has all)")
+    lines += [f"    {line}" for line in folded[:MAX_LINES]]
+    if len(folded) > MAX_LINES:
+        lines.append(f"    and {len(folded) - MAX_LINES} more (--format json lists all)")
     remedies = dict.fromkeys(f.remedy for f in findings if f.remedy != NOTHING)
-    return lines + [f"    to do: {remedy}" for remedy in list(remedies)[:LINES]]
+    return lines + [f"    to do: {remedy}" for remedy in list(remedies)[:MAX_LINES]]
 
 
 def _fold(findings: Iterable[Finding]) -> list[str]:
-    """One line for all findings that differ in their place only."""
+    """One line for all findings that differ only in their place."""
     places: dict[str, list[str]] = {}
     for f in findings:
         places.setdefault(f"expected {f.expected}, found {f.found}", []).append(f.place)
     lines = []
     for text, where in places.items():
-        rest = f" and {len(where) - FIRST} more" if len(where) > FIRST else ""
-        lines.append(f"{', '.join(where[:FIRST])}{rest}: {text}")
+        rest = f" and {len(where) - MAX_PLACES} more" if len(where) > MAX_PLACES else ""
+        lines.append(f"{', '.join(where[:MAX_PLACES])}{rest}: {text}")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""All rules, one module for each group. A new module is added to the imports below."""
+"""All rules, by the groups of their codes: ``cs1_cameras`` has rules CS1xx, those on cameras."""
 
 from __future__ import annotations
 
@@ -9,28 +9,20 @@ from difflib import get_close_matches
 from chronoscene.errors import ConfigError
 from chronoscene.validation.rule import GROUPS, RULES, Rule
 from chronoscene.validation.rules import (  # noqa: F401  (importing them registers the rules)
-    conventions,
-    dates,
-    duplicates,
-    folder,
-    foreign_folder,
-    image_files,
-    image_kinds,
-    intrinsics,
-    model_files,
-    names,
-    official,
-    outliers,
-    periods,
-    photo_contents,
-    photo_metadata,
-    points,
-    poses,
-    reprojection_errors,
-    rigs,
-    split_file,
-    test_list,
-    world_frames,
+    cs0_folder,
+    cs1_cameras,
+    cs1_model,
+    cs1_poses,
+    cs2_image_files,
+    cs2_metadata,
+    cs2_other_photo,
+    cs3_split,
+    cs4_periods,
+    cs5_across_periods,
+    cs5_points,
+    cs5_reprojection,
+    cs6_leaks,
+    cs7_released_code,
 )
 
 
@@ -45,12 +37,12 @@ def choose_rules(
     """Rules to run.
 
     Args:
-        select: Codes, beginnings of codes (``CS2``) or names; nothing selects all.
-        ignore: The same, taken away afterwards.
+        select: Codes, prefixes of codes (``CS2``) or names; empty selects all.
+        ignore: The same, removed from the selection.
         place: Option that ``select`` comes from, for errors.
 
     Raises:
-        ConfigError: If one fits no rule.
+        ConfigError: If one matches no rule.
     """
     rules = all_rules()
     wanted = [_matching(place, text, rules) for text in select]
@@ -61,7 +53,6 @@ def choose_rules(
 
 
 def _matching(place: str, text: str, rules: tuple[Rule, ...]) -> set[str]:
-    """Codes of the rules that a user means."""
     key = text.strip()
     codes = {r.code for r in rules if r.name == key.lower()}
     if re.fullmatch("CS[0-9]{0,3}", key.upper()):
@@ -72,7 +63,7 @@ def _matching(place: str, text: str, rules: tuple[Rule, ...]) -> set[str]:
     close = get_close_matches(key, known, n=1)
     raise ConfigError(
         place,
-        expected=f"codes of rules, beginnings of codes ({', '.join(GROUPS)}) or names",
+        expected=f"rule codes, prefixes of codes ({', '.join(GROUPS)}) or rule names",
         found=repr(text),
-        todo=f"did you mean {close[0]}?" if close else "DATASET.md lists the rules",
+        todo=f"did you mean {close[0]}?" if close else "--explain CS lists all rules",
     )

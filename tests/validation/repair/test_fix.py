@@ -284,7 +284,7 @@ def test_other_files_come_along_but_no_links_out_of_the_scene(scene, tmp_path):
     assert (tmp_path / "fixed/notes/read me.txt").read_text() == "notes"
     assert not (tmp_path / "fixed/images/link.png").exists()
     assert not (tmp_path / "fixed/images/up").exists()
-    assert any("2 links out of the scene left out" in repair.text for repair in repairs)
+    assert any("2 links leading out of the scene left out" in repair.text for repair in repairs)
 
 
 @pytest.mark.parametrize("place", ["scene/inside", "used", "file"])

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import pytest
 from PIL import Image
 
-from chronoscene.validation.report.html import PICTURES, SIDE_BY_SIDE, Pictures, write_html
+from chronoscene.validation.report.html import MAX_PICTURES, MAX_SIDE_BY_SIDE, Pictures, write_html
 
 VOID = {"meta", "img", "br"}
 
@@ -71,13 +71,13 @@ def test_pictures_of_the_first_images(bad):
     sources = [s for s in Page(write_html([bad.validate()])).sources if s.startswith("data:")]
     assert len(sources) == 4  # two side by side are of the finding that both are the same
     pictures = Pictures(bad.root)
-    drawn = [pictures.of("images/a001.png") for _ in range(PICTURES + 1)]
+    drawn = [pictures.of("images/a001.png") for _ in range(MAX_PICTURES + 1)]
     assert all(len(d) == 1 for d in drawn[:-1]) and not drawn[-1]
 
 
 def test_pictures_side_by_side(scene):
     also = tuple(f"b00{i}.png" for i in range(5))
-    assert len(Pictures(scene.root).of("images/a001.png", also)) == SIDE_BY_SIDE
+    assert len(Pictures(scene.root).of("images/a001.png", also)) == MAX_SIDE_BY_SIDE
 
 
 def test_no_pictures_of_files_outside(scene, tmp_path):

@@ -7,15 +7,15 @@ import click
 import pytest
 
 from chronoscene.io.wording import counted, printable, quote, shown
-from chronoscene.validation.finding import Finding
-from chronoscene.validation.report.json import SCHEMA_VERSION, write_json
-from chronoscene.validation.report.report import (
+from chronoscene.validation.finding import (
+    Finding,
     PeriodSummary,
     SceneReport,
     Skipped,
     Summary,
     counts,
 )
+from chronoscene.validation.report.json import SCHEMA_VERSION, write_json
 from chronoscene.validation.report.text import write_text
 
 
@@ -39,11 +39,11 @@ def test_text_of_a_scene():
     remark = finding(3, code="CS507", severity="info", remedy="nothing to do")
     assert text_of(report(finding(), remark, skipped=skipped)).splitlines() == [
         "scene: 14 images, 1 camera, points unknown, 2 periods (0: 6 + 1 test, 1: 7)",
-        "  error CS201 image-missing: A registered image has no file.",
+        "  error CS201 image-missing: The file of a registered image is missing.",
         "    images/0.jpg: expected an image, found nothing",
         "    to do: copy it",
-        "  info CS507 points-of-one-period: How many points are seen in one period only, and how "
-        "many in several.",
+        "  info CS507 points-of-one-period: Number of points seen in a single period, and in "
+        "several.",
         "    images/3.jpg: expected an image, found nothing",
         "  not checked (why not): CS206, CS604",
         "  1 error, 0 warnings, 1 remark",
@@ -61,7 +61,7 @@ def test_equal_findings_are_folded():
 def test_many_different_findings_are_cut():
     lines = text_of(report(*(finding(i, found=f"x{i}") for i in range(12)))).splitlines()
     assert sum("expected an image" in line for line in lines) == 5
-    assert "    and 7 more such lines (--format json has all)" in lines
+    assert "    and 7 more (--format json lists all)" in lines
 
 
 def test_several_scenes_end_in_a_total():

@@ -1,0 +1,73 @@
+"""Names of images: which are safe and portable, and which one a misspelt name means."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+from chronoscene.errors import SceneError
+from chronoscene.formats.chronoscene import check_name
+
+PUNCTUATION = "\"'`,;"
+"""What tables put around and after a name."""
+
+FORBIDDEN = re.compile(r'[<>:"|?*\\]|[ .]$')
+"""What a file or folder name cannot contain, or end in, on Windows (Microsoft, *Naming Files,
+Paths, and Namespaces*)."""
+
+DEVICES = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
+"""Names that Windows reserves for devices, with any extension."""
+
+MAX_NAME_BYTES = 255
+"""Longest name on most file systems."""
+
+
+def is_safe(name: str) -> bool:
+    """Whether an image name stays below ``images/``."""
+    try:
+        check_name(Path(), name)
+    except SceneError:
+        return False
+    return True
+
+
+def is_portable(name: str) -> bool:
+    """Whether the common systems can store a file of this name, folders included."""
+    return not any(
+        FORBIDDEN.search(part)
+        or DEVICES.fullmatch(part)
+        or len(part.encode("utf-8", "surrogateescape")) > MAX_NAME_BYTES
+        for part in PurePosixPath(name).parts
+    )
+
+
+def spelling(name: str) -> str:
+    """A key that ignores case, the two Unicode spellings of accented letters, and backslashes."""
+    return unicodedata.normalize("NFC", name).casefold().replace("\\", "/")
+
+
+class Spellings:
+    """Finds the one name that another one probably means."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._by_key: tuple[dict[str, set[str]], ...] = ({}, {}, {})
+        for name in names:
+            for table, key in zip(self._by_key, _keys(name), strict=True):
+                table.setdefault(key, set()).add(name)
+
+    def find(self, text: str) -> str | None:
+        """The name with the same full name, file name, or file name without extension.
+
+        The first of these that matches any name decides; None if it matches several.
+        """
+        for table, key in zip(self._by_key, _keys(text.strip(PUNCTUATION)), strict=True):
+            if found := table.get(key):
+                return next(iter(found)) if len(found) == 1 else None
+        return None
+
+
+def _keys(name: str) -> tuple[str, str, str]:
+    full = spelling(name)
+    return full, PurePosixPath(full).name, PurePosixPath(full).stem

@@ -1,0 +1,137 @@
+"""What the photos and `sparse/periods.json` say about dates, and the photos about positions."""
+
+from __future__ import annotations
+
+from bisect import bisect
+from datetime import datetime, timedelta
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.errors import ChronoSceneError
+from chronoscene.formats.chronoscene import read_periods
+from chronoscene.geodesy import Georeference, median_longitude
+from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.scene.similarity import SIGMA, Similarity, fit_robustly
+from chronoscene.validation.scene_folder import RawScene, derived
+
+MIN_DATES = 3
+"""Photos with a date from which the median date of a period is meaningful."""
+
+DAY = timedelta(days=1)
+"""Periods less than this apart may be confused by a time zone."""
+
+MUCH_NEARER = 0.25
+"""A photo is of another period if its date is within this share of the distance to its own."""
+
+MIN_PHOTOS = 6
+"""Photos with a position from which a similarity is meaningful."""
+
+MIN_SPREAD = 10.0
+"""Metres; smaller spreads of positions are the noise of the receiver."""
+
+MAX_UP = 0.9
+"""Share of the cameras that look up if the model was turned over."""
+
+
+@derived
+def dates_of(scene: RawScene) -> dict[str, datetime]:
+    """When the images that have a period were taken."""
+    headers = {n: scene.headers[n] for n in scene.periods or () if n in scene.headers}
+    return {n: h.exif.date for n, h in headers.items() if h.exif.date is not None}
+
+
+@derived
+def median_dates(scene: RawScene) -> dict[int, datetime]:
+    """Median dates of the periods with enough dates."""
+    by_period: dict[int, list[datetime]] = {}
+    for name, taken in dates_of(scene).items():
+        by_period.setdefault((scene.periods or {})[name], []).append(taken)
+    return {
+        period: sorted(dates)[len(dates) // 2]
+        for period, dates in by_period.items()
+        if len(dates) >= MIN_DATES
+    }
+
+
+@derived
+def of_other_period(scene: RawScene) -> dict[str, tuple[datetime, datetime, int]]:
+    """Photos with the date of another period: their date, that of their period, the other one."""
+    wrong = {}
+    medians = median_dates(scene)
+    ordered = sorted((median, period) for period, median in medians.items())
+    for name, taken in dates_of(scene).items():
+        own = medians.get((scene.periods or {})[name])
+        if own is None:
+            continue
+        at = bisect(ordered, (taken, 0))
+        median, period = min(ordered[max(0, at - 1) : at + 1], key=lambda m: abs(m[0] - taken))
+        if abs(median - own) >= DAY and abs(taken - median) < MUCH_NEARER * abs(taken - own):
+            wrong[name] = (taken, own, period)
+    return wrong
+
+
+@derived
+def stated_dates(scene: RawScene) -> dict[int, str]:
+    """Dates in ``periods.json`` by period; none if the file is invalid, which has its own rule."""
+    ids = scene.period_ids
+    if ids != list(range(len(ids))):
+        return {}
+    try:
+        periods = read_periods(scene.root, len(ids))
+    except ChronoSceneError:
+        return {}
+    return {period.id: period.date for period in periods if period.date is not None}
+
+
+class GpsFit(NamedTuple):
+    """The similarity that aligns the model with the positions of N photos."""
+
+    images: NDArray[np.int64]
+    """Indices into the images. [N]"""
+    metres_from_world: Similarity
+    distance: NDArray[np.float64]
+    """Horizontal metres between model and photo. [N]"""
+    sigma: float
+    """Robust standard deviation of `distance`."""
+    spread: float
+    """Median horizontal distance of the positions from their centre, in metres."""
+
+
+@derived
+def fit_gps(scene: RawScene) -> GpsFit | None:
+    """Fit the camera centres to the positions of the photos; None if there are too few."""
+    images = scene.images
+    if images is None:
+        return None
+    rows, places = [], []
+    for i, name in enumerate(images.names):
+        exif = scene.headers[name].exif if name in scene.headers else None
+        if exif is not None and exif.has_position and scene.is_posed[i]:
+            rows.append(i)
+            places.append((exif.latitude, exif.longitude, exif.altitude or 0.0))
+    if len(rows) < MIN_PHOTOS:
+        return None
+    latitude, longitude, altitude = np.array(places, np.float64).T
+    middle = (float(np.median(latitude)), median_longitude(longitude), float(np.median(altitude)))
+    target = Georeference(*middle, "as stated").to_enu(latitude, longitude, altitude)
+    spread = float(np.median(np.linalg.norm(target[:, :2], axis=1)))
+    found = fit_robustly(scene.centres[rows], target, axes=2) if spread >= MIN_SPREAD else None
+    if found is None:
+        return None
+    sigma = SIGMA * float(np.median(found[1]))
+    return GpsFit(np.array(rows, np.int64), found[0], found[1], sigma, spread)
+
+
+def is_upside_down(scene: RawScene, fit: GpsFit) -> bool:
+    """Whether the fit turned the model over, as it does if model or positions are mirrored.
+
+    Cameras look down, or to the horizon with their lower side down. A mirrored plan fits only with
+    the model upside down.
+    """
+    assert scene.images is not None
+    rotations = rotation_from_quaternion(scene.images.quaternions[fit.images])
+    middle = rotations[:, 1] + rotations[:, 2]  # between down and forwards, in the world
+    up = middle @ fit.metres_from_world.matrix[2]
+    return bool(np.mean(up > 0) > MAX_UP)

@@ -1,0 +1,329 @@
+"""CS13, CS14: intrinsics, and the rigs and frames of COLMAP 3.12 and later."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from chronoscene.colmap.arrays import CAMERA, RawFrame, RawImages
+from chronoscene.colmap.raw_model import RawModel
+from chronoscene.io.wording import counted, shown
+from chronoscene.scene.cameras import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
+from chronoscene.scene.geometry import camera_centre, rotation_from_quaternion
+from chronoscene.validation.checks.observations import good_poses
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene, derived
+
+Array = NDArray[np.float64]
+
+VISIBLE = 0.5
+"""Pixels; distortion that moves no pixel this far may be dropped instead of undone."""
+
+MAX_ANGLE, MIN_ANGLE = 150.0, 1.0
+"""Horizontal field of view, in degrees, that a pinhole photo may plausibly have."""
+
+UNEQUAL = 0.1
+"""Relative difference of fx and fy; pixels are square to a few percent in any camera."""
+
+UNDISTORT = "undistort the images and the model: chronoscene undistort SCENE OUT"
+DROP = "write the camera as PINHOLE or SIMPLE_PINHOLE; its distortion is below half a pixel"
+NO_DISTORTION = "PINHOLE, SIMPLE_PINHOLE, or a radial or OPENCV model without distortion"
+
+SAME_ANGLE = 1e-3
+"""Radians between two records of one pose beyond rounding in a text file."""
+
+SAME_PLACE = 1e-3
+"""The same for positions, as a share of the extent of the cameras."""
+
+
+@rule(
+    "CS131",
+    "error",
+    what="A camera has no size, an absurd size, or a focal length that is not positive and finite.",
+    bad="`1 PINHOLE 640 480 -500 500 320 240`",
+    remedy="correct the camera",
+)
+def camera_unusable(scene: RawScene, cameras: Sequence[Camera]) -> Iterator[Hit]:
+    for camera in cameras:
+        if not camera.is_usable:
+            expected = "a plausible size, positive focal lengths and finite parameters"
+            params = ", ".join(f"{p:g}" for p in camera.params)
+            found = f"{camera.width} x {camera.height}, parameters {params}"
+            yield Hit(scene.camera_place(camera), expected, found)
+
+
+@rule(
+    "CS132",
+    "error",
+    what="A camera model cannot be used as a pinhole camera.",
+    bad="`OPENCV_FISHEYE`",
+    remedy=UNDISTORT,
+)
+def camera_model(scene: RawScene, cameras: Sequence[Camera]) -> Iterator[Hit]:
+    for camera in cameras:
+        if camera.model not in (*PINHOLE_MODELS, *POLYNOMIAL_MODELS):
+            yield Hit(scene.camera_place(camera), NO_DISTORTION, camera.model)
+
+
+@rule(
+    "CS133",
+    "error",
+    what="A camera has lens distortion, which methods cannot train with. Benchmarks refuse it.",
+    bad="`SIMPLE_RADIAL` with k = -0.16",
+    remedy=UNDISTORT,
+    needs=("cameras",),
+)
+def camera_distorted(scene: RawScene) -> Iterator[Hit]:
+    for camera in _polynomial(scene):
+        if not camera.is_pinhole:
+            shift = displacement(camera)
+            found = f"{camera.model} with distortion that moves pixels by up to {shift:.3g} px"
+            remedy = DROP if shift < VISIBLE else None
+            yield Hit(scene.camera_place(camera), "a camera without distortion", found, remedy)
+
+
+@rule(
+    "CS134",
+    "info",
+    what="The distortion parameters of a camera are all zero. It is used as a pinhole camera; "
+    "other readers may go by the name of its model.",
+    bad="`SIMPLE_RADIAL` with k = 0",
+    remedy="nothing to do here; write it as PINHOLE or SIMPLE_PINHOLE for other readers",
+    needs=("cameras",),
+)
+def zero_distortion(scene: RawScene) -> Iterator[Hit]:
+    for camera in _polynomial(scene):
+        if camera.is_pinhole:
+            found = f"{camera.model} without distortion"
+            yield Hit(scene.camera_place(camera), "PINHOLE or SIMPLE_PINHOLE", found)
+
+
+@rule(
+    "CS135",
+    "warning",
+    what="The focal lengths imply a field of view or an aspect ratio of pixels that no ordinary "
+    "camera has.",
+    bad="f = 35 (millimetres) with a width of 4000 pixels",
+    remedy="check that the focal lengths are in pixels and belong to images of this size",
+    needs=("cameras",),
+)
+def implausible_focal(scene: RawScene) -> Iterator[Hit]:
+    for camera in scene.usable_cameras.values():
+        fx, fy = camera.K[0, 0], camera.K[1, 1]
+        angle = np.degrees(2 * np.arctan(camera.width / (2 * fx)))
+        if not MIN_ANGLE <= angle <= MAX_ANGLE:
+            found = f"{angle:.3g} degrees (f = {fx:.4g}, width {camera.width})"
+            expected = f"a field of view of {MIN_ANGLE:g} to {MAX_ANGLE:g} degrees"
+            yield Hit(scene.camera_place(camera), expected, found)
+        if abs(fx - fy) > UNEQUAL * max(fx, fy):
+            found = f"fx = {fx:.4g}, fy = {fy:.4g}"
+            yield Hit(scene.camera_place(camera), "nearly equal focal lengths", found)
+
+
+@rule(
+    "CS136",
+    "warning",
+    what="The principal point is outside the image.",
+    bad="cx = 2000 with a width of 1600",
+    remedy="check that the camera belongs to images of this size (not to a crop or a scaled copy)",
+    needs=("cameras",),
+)
+def principal_point_outside(scene: RawScene) -> Iterator[Hit]:
+    for camera in scene.usable_cameras.values():
+        cx, cy = camera.K[0, 2], camera.K[1, 2]
+        if not (0 <= cx <= camera.width and 0 <= cy <= camera.height):
+            expected = f"a principal point within {camera.width} x {camera.height}"
+            yield Hit(scene.camera_place(camera), expected, f"({cx:.5g}, {cy:.5g})")
+
+
+@rule(
+    "CS137",
+    "info",
+    what="A camera is not used by any image.",
+    bad="`cameras.bin` has cameras 1 and 2, but all images have camera 1",
+    remedy="nothing to do, unless images are missing from the model",
+)
+def camera_unused(scene: RawScene, cameras: Sequence[Camera], images: RawImages) -> Iterator[Hit]:
+    used = set(images.camera_ids.tolist())
+    if not used or not used <= {camera.camera_id for camera in cameras}:
+        return  # cameras and images do not belong together, which has its own rule
+    for camera in cameras:
+        if camera.camera_id not in used:
+            yield Hit(scene.camera_place(camera), "images of this camera", "none")
+
+
+def _polynomial(scene: RawScene) -> list[Camera]:
+    """Usable cameras of polynomial models."""
+    return [c for c in scene.usable_cameras.values() if c.model in POLYNOMIAL_MODELS]
+
+
+def displacement(camera: Camera) -> float:
+    """Largest distance in pixels by which distortion moves a pixel on the border of the image.
+
+    Source: Brown's model as in COLMAP and OpenCV, with the rational factor of FULL_OPENCV.
+    """
+    along = np.linspace(0.0, 1.0, 65)
+    edges = [(along, 0 * along), (along, 0 * along + 1), (0 * along, along), (0 * along + 1, along)]
+    u, v = np.concatenate(edges, axis=1) * [[camera.width], [camera.height]]
+    K = camera.K
+    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+    with np.errstate(all="ignore"):
+        moved_x, moved_y = _distort(camera, x, y)
+        shift = np.hypot((moved_x - x) * K[0, 0], (moved_y - y) * K[1, 1])
+    return float(shift.max()) if np.isfinite(shift).all() else float("inf")
+
+
+def _distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
+    given = camera.distortion
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*given, *(0.0,) * (8 - len(given)))
+    r2 = x * x + y * y
+    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    factor = numerator / denominator
+    return (
+        x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * factor + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+@rule(
+    "CS141",
+    "error",
+    what="Only one of the files `rigs` and `frames`, which belong together, is present.",
+    bad="`frames.bin` without `rigs.bin`",
+    remedy="copy the missing file, or delete the other one: without both, each image is its own "
+    "frame",
+)
+def rigs_partial(scene: RawScene, model: RawModel) -> Iterator[Hit]:
+    form = _form(model)
+    present = [s for s in ("rigs", "frames") if (model.folder / f"{s}{form}").is_file()]
+    if len(present) == 1:
+        missing = "frames" if present == ["rigs"] else "rigs"
+        place = f"{scene.model_place or '.'}/{missing}{form}"
+        yield Hit(place, f"the file that belongs to {present[0]}{form}", "none")
+
+
+@rule(
+    "CS142",
+    "error",
+    what="Rigs, frames, cameras and images refer to something that does not exist, or an image is "
+    "in no frame or in two frames.",
+    bad="`frames.bin` of an earlier run, with images that are not in `images.bin`",
+    remedy="write all five files again together, or delete rigs and frames: then each image is its "
+    "own frame",
+    needs=("cameras", "images"),
+)
+def rigs_inconsistent(scene: RawScene, model: RawModel) -> Iterator[Hit]:
+    place = f"{scene.model_place or '.'}/frames{_form(model)}"
+    for expected, wrong in _contradictions(scene).items():
+        if wrong:
+            yield Hit(place, expected, shown(sorted(wrong)), count=len(wrong))
+
+
+@derived
+def _contradictions(scene: RawScene) -> dict[str, set[str]]:
+    """What rigs and frames should refer to, and which references are broken."""
+    raw = scene.model.rigs if scene.model else None
+    if raw is None or scene.images is None or scene.cameras is None:
+        return {}
+    cameras = {camera.camera_id for camera in scene.cameras}
+    images = dict(zip(scene.images.ids.tolist(), scene.images.names, strict=True))
+    camera_of = dict(zip(images, scene.images.camera_ids.tolist(), strict=False))
+    taken = Counter(image for frame in raw.frames for image in _images(frame))
+    return {
+        "rigs of cameras in the model": {
+            f"camera {i} of rig {rig}"
+            for rig, sensors in raw.rigs.items()
+            for kind, i in sensors
+            if kind == CAMERA and i not in cameras
+        },
+        "frames of existing rigs": {
+            f"rig {f.rig_id} of frame {f.frame_id}" for f in raw.frames if f.rig_id not in raw.rigs
+        },
+        "frames with the sensors of their rig": {
+            f"sensor {sensor[1]} of frame {f.frame_id}"
+            for f in raw.frames
+            for sensor, _ in f.data
+            if f.rig_id in raw.rigs and sensor not in raw.rigs[f.rig_id]
+        },
+        "frames with images of the model": {f"image {i}" for i in taken if i not in images},
+        "each image in exactly one frame": {
+            f"{images[i]} in {counted(taken[i], 'frame')}" for i in images if taken[i] != 1
+        },
+        "frames whose images have the camera of the sensor": {
+            images[i]
+            for frame in raw.frames
+            for sensor, i in frame.data
+            if sensor[0] == CAMERA and camera_of.get(i, sensor[1]) != sensor[1]
+        },
+    }
+
+
+@rule(
+    "CS143",
+    "error",
+    what="The pose of an image in `images` differs from the pose given by its frame and rig. "
+    "COLMAP reads the frames, older readers read the images, so they see two different scenes.",
+    bad="poses transformed in `images.bin` only, with `frames.bin` left as it was",
+    remedy="write the model again with COLMAP, or delete rigs and frames if the poses in images "
+    "are right",
+)
+def rig_pose_differs(scene: RawScene, model: RawModel, images: RawImages) -> Iterator[Hit]:
+    raw = model.rigs
+    if raw is None or not len(images) or any(_contradictions(scene).values()):
+        return  # no rigs, or those of another model
+    row = {image_id: i for i, image_id in enumerate(images.ids.tolist())}
+    good = good_poses(images)
+    triples = [
+        (row[image_id], pose, frame.rig_from_world)
+        for frame in raw.frames
+        for sensor, image_id in frame.data
+        if sensor[0] == CAMERA
+        and (pose := raw.rigs.get(frame.rig_id, {}).get(sensor)) is not None
+        and good[row.get(image_id, -1)]
+        and image_id in row
+    ]
+    if not triples:
+        return
+    index = np.array([i for i, _, _ in triples])
+    stored = np.concatenate([images.quaternions[index], images.translations[index]], axis=1)
+    # cam_from_world = cam_from_rig @ rig_from_world
+    composed = pose_matrices([pose for _, pose, _ in triples]) @ pose_matrices(
+        [rig_from_world for _, _, rig_from_world in triples]
+    )
+    extent = float(np.max(np.ptp(scene.centres[good], axis=0)))
+    same = _same_pose(pose_matrices(stored), composed, extent)
+    different = [images.names[i] for i in index[~same].tolist()]
+    if different:
+        found = f"other poses for {counted(len(different), 'image')}: {shown(sorted(different))}"
+        place = scene.model_file("images")
+        yield Hit(place, "the poses of rigs and frames", found, count=len(different))
+
+
+def pose_matrices(poses: ArrayLike) -> Array:
+    """``[R t; 0 1]`` of poses of 7 numbers each; not finite where the pose is not. [n, 4, 4]"""
+    values = np.asarray(poses, np.float64).reshape(-1, 7)
+    matrices = np.tile(np.eye(4), (len(values), 1, 1))
+    matrices[:, :3, :3] = rotation_from_quaternion(values[:, :4])
+    matrices[:, :3, 3] = values[:, 4:]
+    return matrices
+
+
+def _same_pose(a: Array, b: Array, extent: float) -> NDArray[np.bool_]:
+    """Whether poses [n, 4, 4] agree; false where one is not finite. [n]"""
+    turned = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2))
+    moved = np.linalg.norm(camera_centre(a) - camera_centre(b), axis=1)
+    return np.asarray((turned <= 2 * SAME_ANGLE) & (moved <= SAME_PLACE * extent + 1e-9))
+
+
+def _images(frame: RawFrame) -> list[int]:
+    return [image for (kind, _), image in frame.data if kind == CAMERA]
+
+
+def _form(model: RawModel) -> str:
+    """Extension of the model files."""
+    return next(iter(model.files.values()))[-4:]

@@ -1,0 +1,302 @@
+"""CS20, CS21: image files: whether they are there, their sizes, and what kind of files they are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from chronoscene.colmap.arrays import RawImages
+from chronoscene.io.wording import quote
+from chronoscene.scene import Camera
+from chronoscene.validation.checks.names import Spellings
+from chronoscene.validation.checks.pixels import Pixels
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
+
+KINDS = {
+    ".jpg": ("JPEG", "MPO"),
+    ".jpeg": ("JPEG", "MPO"),
+    ".png": ("PNG",),
+    ".tif": ("TIFF",),
+    ".tiff": ("TIFF",),
+    ".bmp": ("BMP", "DIB"),
+    ".webp": ("WEBP",),
+}
+"""Extension to Pillow's names of the formats found in such files. Cameras put MPO into ``.jpg``."""
+
+BLANK = 2.0
+"""Grey levels between the means of the darkest and the brightest part of an image."""
+
+
+@rule(
+    "CS201",
+    "error",
+    what="The file of a registered image is missing.",
+    bad="`images.bin` has `a.jpg`, but there is only `images/a.JPG`",
+    remedy="copy the image there, or remove it from the model",
+    needs=("images",),
+)
+def image_missing(scene: RawScene) -> Iterator[Hit]:
+    if not (scene.root / "images").is_dir():
+        return  # has its own rule
+    present, others = set(scene.present), Spellings(_unregistered(scene))
+    for name in scene.names:
+        if name not in present:
+            near = others.find(name)
+            found = _instead(scene, name) + (f"; there is {quote(near)}" if near else "")
+            yield Hit(f"images/{name}", "an image", found)
+
+
+def _instead(scene: RawScene, name: str) -> str:
+    """What is in the place of an image file."""
+    path = scene.image_path(name)
+    if os.path.isdir(path):
+        return "a folder"
+    return "a broken link" if os.path.islink(path) else "nothing"
+
+
+def _unregistered(scene: RawScene) -> list[str]:
+    registered = set(scene.names)
+    return [file for file in scene.files if file not in registered]
+
+
+@rule(
+    "CS202",
+    "info",
+    what="A file in `images/` is not registered in the model, so it is not used.",
+    bad="`images/b.jpg`, which COLMAP could not register",
+    remedy="nothing to do, unless the image should have been registered",
+)
+def image_unregistered(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    if not scene.names:
+        return  # has its own rule
+    files, present = _unregistered(scene), set(scene.present)
+    spellings = Spellings(files)
+    # Files that a missing image, or one with an impossible name, probably means are named there.
+    named = {spellings.find(name) for name in set(images.names) - present}
+    for file in files:
+        if file not in named:
+            yield Hit(f"images/{file}", "a registered image", "one that is not in the model")
+
+
+@rule(
+    "CS203",
+    "error",
+    what="An image file is empty, or is not an image.",
+    bad="a file of zero bytes; a text file named `a.jpg`",
+    remedy="copy the file again, or convert it to JPEG or PNG",
+    needs=("images",),
+)
+def image_unreadable(scene: RawScene) -> Iterator[Hit]:
+    for name, header in scene.headers.items():
+        if header.problem is not None:
+            yield Hit(f"images/{name}", "an image", header.problem)
+        elif header.mode == "F":
+            yield Hit(f"images/{name}", "8 or 16 bit pixels", "floating point pixels")
+
+
+@rule(
+    "CS204",
+    "error",
+    what="The aspect ratio of an image differs from that of its camera, so pixels and rays do not "
+    "match.",
+    bad="a camera of 4000 x 3000 and a file of 3000 x 4000, rotated by its orientation tag",
+    remedy="use the images that the model was made from, not cropped, rotated or padded copies",
+    needs=("cameras", "images"),
+)
+def image_shape(scene: RawScene) -> Iterator[Hit]:
+    for name, size, camera in _sizes(scene):
+        if not _same_shape(size, camera):
+            rotated = _same_shape(size[::-1], camera)
+            found = f"{size[0]} x {size[1]}" + (", rotated by 90 degrees" if rotated else "")
+            tag = scene.headers[name].orientation
+            found += f" as its orientation tag {tag} says" if rotated and tag >= 5 else ""
+            yield Hit(f"images/{name}", _expected(camera), found)
+
+
+@rule(
+    "CS205",
+    "warning",
+    what="An image has the aspect ratio of its camera, but another size.",
+    bad="a camera of 4000 x 3000 and a file of 1000 x 750",
+    remedy="scale the camera to the files, or use files of the camera's size",
+    needs=("cameras", "images"),
+)
+def image_size(scene: RawScene) -> Iterator[Hit]:
+    for name, size, camera in _sizes(scene):
+        if size != (camera.width, camera.height) and _same_shape(size, camera):
+            yield Hit(f"images/{name}", _expected(camera), f"{size[0]} x {size[1]}")
+
+
+def images_of_other_shape(scene: RawScene) -> set[str]:
+    """Names of the images whose aspect ratio is not that of their camera."""
+    return {name for name, size, camera in _sizes(scene) if not _same_shape(size, camera)}
+
+
+def _sizes(scene: RawScene) -> Iterator[tuple[str, tuple[int, int], Camera]]:
+    """Name, size of the file, and camera of the images that have both."""
+    assert scene.images is not None
+    cameras = scene.usable_cameras
+    for name, camera_id in zip(scene.images.names, scene.images.camera_ids.tolist(), strict=True):
+        header = scene.headers.get(name)
+        if header is not None and header.problem is None and camera_id in cameras:
+            yield name, header.size, cameras[camera_id]
+
+
+def _same_shape(size: tuple[int, ...], camera: Camera) -> bool:
+    """Whether the aspect ratios are equal up to rounding of one side to whole pixels."""
+    width, height = size
+    exact_height = width * camera.height / camera.width
+    exact_width = height * camera.width / camera.height
+    return abs(height - exact_height) <= 1 or abs(width - exact_width) <= 1
+
+
+def _expected(camera: Camera) -> str:
+    return f"{camera.width} x {camera.height} as in camera {camera.camera_id}"
+
+
+@rule(
+    "CS206",
+    "error",
+    what="An image file is damaged: its header is valid, but its pixels cannot be decoded (needs "
+    "`--decode`).",
+    bad="a JPEG truncated during transfer",
+    remedy="copy the file again from its source",
+    needs=("images",),
+)
+def image_damaged(scene: RawScene, pixels: dict[str, Pixels]) -> Iterator[Hit]:
+    for name, decoded in pixels.items():
+        if decoded.problem is not None and scene.headers[name].mode != "F":
+            yield Hit(f"images/{name}", "an image that can be decoded", decoded.problem)
+
+
+@rule(
+    "CS207",
+    "info",
+    what="An image has an orientation tag. ChronoScene and COLMAP ignore it, but viewers rotate "
+    "the image.",
+    bad="a phone photo in portrait with EXIF orientation 6",
+    remedy="remove the tag, but leave the pixels as they are: the poses refer to them (chronoscene "
+    "validate --fix does so for JPEG files)",
+    needs=("images",),
+)
+def orientation_tag(scene: RawScene) -> Iterator[Hit]:
+    rotated = images_of_other_shape(scene) if scene.cameras is not None else set()
+    for name in scene.readable:
+        orientation = scene.headers[name].orientation
+        if name not in rotated and orientation in range(2, 9):  # else an error names the tag
+            yield Hit(f"images/{name}", "no orientation tag", f"orientation {orientation}")
+
+
+@rule(
+    "CS208",
+    "error",
+    what="An image file is truncated. With `--decode`, CS206 reports such files.",
+    bad="a JPEG of which only the first half was uploaded",
+    remedy="copy the file again from its source",
+    needs=("images",),
+)
+def image_cut_off(scene: RawScene) -> Iterator[Hit]:
+    pixels = scene.pixels or {}
+    for name in scene.readable:
+        header = scene.headers[name]
+        if header.truncated and (name not in pixels or pixels[name].problem is None):
+            yield Hit(f"images/{name}", f"a complete {header.kind} file", "one without its end")
+
+
+@rule(
+    "CS211",
+    "info",
+    what="An image has more than 8 bits per channel. Only 8 are used; the released code may not be "
+    "able to read it.",
+    bad="a PNG with 16 bits per channel",
+    remedy="nothing to do here; save it with 8 bits per channel for other readers",
+    needs=("images",),
+)
+def image_deep(scene: RawScene) -> Iterator[Hit]:
+    for name in scene.readable:
+        header = scene.headers[name]
+        if header.deep and header.mode != "F":
+            yield Hit(f"images/{name}", "8 bits per channel", f"more ({header.kind})")
+
+
+@rule(
+    "CS212",
+    "warning",
+    what="An image is in CMYK, the colours of printing: it is converted to RGB without its colour "
+    "profile, so its colours differ from those of the other images.",
+    bad="a JPEG in CMYK",
+    remedy="convert the image to RGB using its colour profile",
+    needs=("images",),
+)
+def image_cmyk(scene: RawScene) -> Iterator[Hit]:
+    for name in scene.readable:
+        if scene.headers[name].mode == "CMYK":
+            yield Hit(f"images/{name}", "pixels in RGB", "pixels in CMYK")
+
+
+@rule(
+    "CS213",
+    "info",
+    what="An image may have transparent pixels, which are filled with the background colour in "
+    "training and in testing.",
+    bad="a PNG with an alpha channel",
+    remedy="nothing to do if this is intended; otherwise save the image without transparency",
+    needs=("images",),
+)
+def image_transparent(scene: RawScene) -> Iterator[Hit]:
+    for name in scene.readable:
+        header = scene.headers[name]
+        if header.transparent:
+            yield Hit(f"images/{name}", "opaque pixels", f"pixels of mode {header.mode}")
+
+
+@rule(
+    "CS214",
+    "warning",
+    what="An image has several frames, of which only the first is used.",
+    bad="an animated WebP",
+    remedy="save the frame that is meant as a file of its own",
+    needs=("images",),
+)
+def image_animated(scene: RawScene) -> Iterator[Hit]:
+    for name in scene.readable:
+        header = scene.headers[name]
+        if header.animated:
+            yield Hit(f"images/{name}", "a single frame", f"several frames ({header.kind})")
+
+
+@rule(
+    "CS215",
+    "warning",
+    what="The extension of an image does not match its file format; programs that go by the "
+    "extension fail.",
+    bad="a PNG named `a.jpg`",
+    remedy="rename the file, in images/ and in the model, or convert it",
+    needs=("images",),
+)
+def image_misnamed(scene: RawScene) -> Iterator[Hit]:
+    for name in scene.readable:
+        kind, known = scene.headers[name].kind, KINDS.get(PurePosixPath(name).suffix.lower())
+        if known is not None and kind not in known:
+            yield Hit(f"images/{name}", f"a {known[0]} file", f"a {kind} file")
+
+
+@rule(
+    "CS216",
+    "warning",
+    what="An image consists of a single colour (needs `--decode`).",
+    bad="a black frame of a video; a photo with the lens cap on",
+    remedy="remove the image from the model: there is nothing in it to train or test on",
+)
+def image_blank(pixels: dict[str, Pixels]) -> Iterator[Hit]:
+    for name, decoded in pixels.items():
+        thumbnail = decoded.thumbnail
+        if thumbnail is not None and np.ptp(thumbnail, axis=(0, 1)).max() <= BLANK:
+            red, green, blue = (round(float(c)) for c in thumbnail.mean(axis=(0, 1)))
+            found = f"a single colour, #{red:02x}{green:02x}{blue:02x}"
+            yield Hit(f"images/{name}", "an image with content", found)

@@ -1,0 +1,365 @@
+"""CS30, CS31: `sparse/split.txt`; CS32: `sparse/0/test.txt`."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+
+from chronoscene.formats.chronoscene import SPLIT, TEST
+from chronoscene.io.wording import counted, quote, shown
+from chronoscene.scene.splits import DEFAULT_RULE, NameEntry, NameIndex, Problem, ProblemKind
+from chronoscene.validation.checks.names import Spellings
+from chronoscene.validation.finding import Hit, Severity
+from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene, TextFile, derived
+
+_SIMILAR = re.compile(r"(splits?|periods?)(\.(txt|csv|tsv))*", re.IGNORECASE)
+
+SPLIT_ELSEWHERE = ("split.txt", "sparse/0/split.txt", "images/split.txt")
+TEST_ELSEWHERE = ("test.txt", "sparse/test.txt", "images/test.txt")
+
+
+def problem_hit(file: str, problem: Problem) -> Hit:
+    """A problem of the parser as a hit."""
+    place = file if problem.line is None else f"{file}:{problem.line}"
+    remedy = None if "DATASET.md" in problem.todo else problem.todo
+    return Hit(place, problem.expected, problem.found, remedy)
+
+
+def _parser_rule(
+    code: str,
+    name: str,
+    severity: Severity,
+    kind: ProblemKind,
+    *,
+    what: str,
+    bad: str,
+    remedy: str,
+    needs: tuple[str, ...],
+) -> None:
+    """Register a rule that reports the parser's problems of one kind."""
+    file = SPLIT if name.startswith("split") else TEST
+
+    def check(scene: RawScene) -> Iterator[Hit]:
+        problems = scene.split_problems if file == SPLIT else scene.test_problems
+        return (problem_hit(file, problem) for problem in problems if problem.kind == kind)
+
+    check.__name__ = name
+    rule(code, severity, what=what, bad=bad, remedy=remedy, needs=needs)(check)
+
+
+@rule(
+    "CS301",
+    "error",
+    what="There is no `sparse/split.txt`, so no image has a period.",
+    bad="`split.txt` in `sparse/0/`",
+    remedy='write one line "<image name> <period id>" for each image',
+)
+def split_absent(scene: RawScene) -> Iterator[Hit]:
+    if os.path.lexists(scene.root / SPLIT):
+        return
+    elsewhere = [p for p in SPLIT_ELSEWHERE if (scene.root / p).is_file()]
+    if elsewhere:
+        yield Hit(SPLIT, "the periods of the images", f"{elsewhere[0]} instead", "move the file")
+    else:
+        similar = _similar_files(scene)
+        found = "no such file" + (f"; there is {shown(similar)}" if similar else "")
+        yield Hit(SPLIT, "the periods of the images", found, _by_folders(scene))
+
+
+def _similar_files(scene: RawScene) -> list[str]:
+    """Files with a name similar to the right one."""
+    found = []
+    for folder in ("", "sparse", "sparse/0"):
+        try:
+            names = sorted(os.listdir(scene.root / folder))
+        except OSError:
+            continue
+        similar = (name for name in names if _SIMILAR.fullmatch(name))
+        found += [f"{folder}/{name}".removeprefix("/") for name in similar]
+    return found
+
+
+def _by_folders(scene: RawScene) -> str | None:
+    """The remedy if the folders of the images may be the periods."""
+    folders = sorted({file.split("/")[0] for file in scene.files if "/" in file})
+    if len(folders) < 2 or not all("/" in file for file in scene.files):
+        return None
+    return (
+        'write one line "<image name> <period id>" for each image; if the folders '
+        f"{shown(folders)} are the periods, chronoscene convert DIR OUT makes a scene of them"
+    )
+
+
+def _not_text(scene: RawScene, file: str, text: TextFile | None) -> Iterator[Hit]:
+    """A hit if the file exists but could not be read as text."""
+    if text is None and os.path.lexists(scene.root / file):
+        yield Hit(file, "a text file", "bytes that are not UTF-8, or no readable file")
+
+
+@rule(
+    "CS302",
+    "error",
+    what="`split.txt` is not a readable text file.",
+    bad="a spreadsheet saved under this name",
+    remedy="save it as UTF-8 text",
+)
+def split_not_text(scene: RawScene) -> Iterator[Hit]:
+    return _not_text(scene, SPLIT, scene.split_text)
+
+
+_parser_rule(
+    "CS303",
+    "split-line",
+    "error",
+    "fields",
+    what="A line of `split.txt` does not have a name and a period.",
+    bad="`a.jpg`",
+    remedy='write "<image name> <period id>"',
+    needs=("split",),
+)
+
+_parser_rule(
+    "CS304",
+    "split-period",
+    "error",
+    "period",
+    what="The last field of a line of `split.txt` is not a period id.",
+    bad="`a.jpg 2016-05`",
+    remedy="end the line with a period id: 0, 1 and so on",
+    needs=("split",),
+)
+
+
+@rule(
+    "CS305",
+    "error",
+    what="A registered image is not listed in `split.txt`.",
+    bad="`images.bin` has `a.jpg`, but `split.txt` does not",
+    remedy="add a line for it, or correct the name in its line",
+    needs=("images", "split"),
+)
+def image_without_period(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
+    reported = names_on_bad_lines(scene)
+    entries = {entry.line: entry for entry in scene.split or ()}
+    misspelt = {name: entries[line] for line, name in meant_in_split(scene).items()}
+    for name in scene.names:
+        if name not in periods and name not in reported:
+            found, entry = "none with this name", misspelt.get(name)
+            if entry is not None:
+                found += f"; line {entry.line} has {quote(entry.name)}"
+            yield Hit(scene.image_place(name), f"a line in {SPLIT}", found)
+
+
+_parser_rule(
+    "CS306",
+    "split-ambiguous",
+    "error",
+    "ambiguous",
+    what="A name in `split.txt` matches several images.",
+    bad="`0001 0` with `x/0001.png` and `y/0001.png` in the model",
+    remedy="write the full names relative to images/",
+    needs=("images", "split"),
+)
+
+_parser_rule(
+    "CS307",
+    "split-contradiction",
+    "error",
+    "contradiction",
+    what="`split.txt` gives an image two periods.",
+    bad="`a.jpg 0` and, further down, `a.jpg 1`",
+    remedy="keep one of the two lines",
+    needs=("images", "split"),
+)
+
+_parser_rule(
+    "CS308",
+    "split-duplicate",
+    "info",
+    "duplicate",
+    what="`split.txt` lists an image twice, with the same period.",
+    bad="`a.jpg 0` twice",
+    remedy="delete one of the lines",
+    needs=("images", "split"),
+)
+
+
+@rule(
+    "CS309",
+    "warning",
+    what="`split.txt` lists an image that is not in the model; the line has no effect.",
+    bad="`IMG_1.jpg 0` when the image is `IMG_0001.jpg`",
+    remedy="correct the name, or delete the line if the image could not be registered",
+    needs=("images", "split"),
+)
+def split_unknown(scene: RawScene) -> Iterator[Hit]:
+    images, known = meant_in_split(scene), set(scene.period_ids)
+    period = {entry.line: entry.period for entry in scene.split or ()}
+    periods = scene.periods or {}
+    worth = [
+        p
+        for p in scene.split_problems
+        # A period or an image that gets nothing at all has its own rule.
+        if (images[p.line] in periods if p.line in images else period.get(p.line or 0) in known)
+    ]
+    yield from _unknown_hits(SPLIT, worth, images)
+
+
+@rule(
+    "CS310",
+    "info",
+    what="`split.txt` has Windows line endings; tools that split at spaces read a carriage return "
+    "as part of the period.",
+    bad="`a.jpg 0` followed by `\\r\\n`",
+    remedy="nothing to do here; save it with Unix line endings for other tools",
+)
+def split_line_ends(split_text: TextFile) -> Iterator[Hit]:
+    if lines := split_text.text.count("\r"):
+        found = f"carriage returns in {counted(lines, 'line')}"
+        yield Hit(SPLIT, "Unix line endings", found, count=lines)
+
+
+@rule(
+    "CS321",
+    "info",
+    what="There is no `sparse/0/test.txt`; the default split is used.",
+    bad="a scene without `test.txt`",
+    remedy="list the test images in sparse/0/test.txt, so that everybody uses the same split",
+)
+def test_absent(scene: RawScene) -> Iterator[Hit]:
+    if os.path.lexists(scene.root / TEST) or test_elsewhere(scene):
+        return
+    size = "" if scene.tests is None else f" gives {counted(len(scene.tests), 'test view')}"
+    yield Hit(TEST, "a list of test images", f"none; {DEFAULT_RULE}{size}")
+
+
+@rule(
+    "CS322",
+    "warning",
+    what="`test.txt` is not in `sparse/0/`, so it is not read.",
+    bad="`sparse/test.txt`",
+    remedy="move it to sparse/0/test.txt",
+)
+def test_misplaced(scene: RawScene) -> Iterator[Hit]:
+    if not os.path.lexists(scene.root / TEST):
+        for place in test_elsewhere(scene):
+            yield Hit(TEST, "the list of test images", f"{place} instead")
+
+
+def test_elsewhere(scene: RawScene) -> list[str]:
+    """Places where ``test.txt`` is, but is not read."""
+    return [place for place in TEST_ELSEWHERE if (scene.root / place).is_file()]
+
+
+@rule(
+    "CS323",
+    "error",
+    what="`test.txt` is not a readable text file.",
+    bad="a `test.txt` in an old Windows encoding",
+    remedy="save it as UTF-8 text",
+)
+def test_not_text(scene: RawScene) -> Iterator[Hit]:
+    return _not_text(scene, TEST, scene.test_text)
+
+
+@rule(
+    "CS324",
+    "warning",
+    what="`test.txt` lists an image that is not in the model; the line has no effect, so the image "
+    "that is meant may be a training image.",
+    bad="`IMG_1` in `test.txt` when the image is `IMG_0001.jpg`",
+    remedy="correct the name (test.txt has names only, without periods), or delete the line",
+    needs=("images",),
+)
+def test_unknown(scene: RawScene, test: list[NameEntry]) -> Iterator[Hit]:
+    if not scene.names:
+        return  # has its own rule
+    lines = {entry.line: entry.name for entry in test}
+    images = _meant(scene, scene.test_problems, lines)
+    without_period = {line: text.rsplit(maxsplit=1)[0] for line, text in lines.items()}
+    images |= _meant(scene, scene.test_problems, without_period)
+    yield from _unknown_hits(TEST, scene.test_problems, images)
+
+
+_parser_rule(
+    "CS325",
+    "test-ambiguous",
+    "error",
+    "ambiguous",
+    what="A name in `test.txt` matches several images.",
+    bad="`0001` with `x/0001.png` and `y/0001.png` in the model",
+    remedy="write the full names relative to images/",
+    needs=("images", "test"),
+)
+
+
+@rule(
+    "CS326",
+    "info",
+    what="`test.txt` lists an image twice.",
+    bad="`a.jpg` twice; `a.jpg` and `a`",
+    remedy="delete one of the lines",
+)
+def test_duplicate(scene: RawScene, test: list[NameEntry]) -> Iterator[Hit]:
+    index = NameIndex(scene.names)
+    written: dict[str, list[str]] = {}
+    for entry in test:
+        images = index.find(entry.name)
+        written.setdefault(images[0] if len(images) == 1 else entry.name, []).append(entry.name)
+    for name, forms in written.items():
+        if len(forms) > 1:
+            as_forms = f", as {shown(sorted(set(forms)))}" if len(set(forms)) > 1 else ""
+            yield Hit(TEST, "each name once", f"{quote(name)} {len(forms)} times{as_forms}")
+
+
+def _meant(scene: RawScene, problems: Iterable[Problem], lines: dict[int, str]) -> dict[int, str]:
+    """By line, the image that an unknown name probably means.
+
+    Args:
+        scene: The scene.
+        problems: Problems of one file.
+        lines: The names in this file, by line.
+    """
+    unknown = [p.line for p in problems if p.kind == "unknown" and p.line]
+    if not unknown:
+        return {}
+    spellings = Spellings(scene.names)
+    found = {line: spellings.find(lines[line]) for line in unknown}
+    return {line: name for line, name in found.items() if name is not None}
+
+
+@derived
+def meant_in_split(scene: RawScene) -> dict[int, str]:
+    """By line of ``split.txt``, the image that an unknown name probably means."""
+    return _meant(scene, scene.split_problems, {e.line: e.name for e in scene.split or ()})
+
+
+def _unknown_hits(file: str, problems: Iterable[Problem], images: dict[int, str]) -> Iterator[Hit]:
+    """Unknown names, with the images that they probably mean by line."""
+    for problem in problems:
+        if problem.kind == "unknown":
+            hit, image = problem_hit(file, problem), images.get(problem.line or 0)
+            found = hit.found if image is None else f"{hit.found}; there is {quote(image)}"
+            yield Hit(hit.place, hit.expected, found, hit.remedy)
+
+
+@derived
+def names_on_bad_lines(scene: RawScene) -> set[str]:
+    """Images that have no period because of a line that has its own finding."""
+    if scene.split_text is None:
+        return set()
+    kinds = ("fields", "period", "ambiguous")
+    wrong = [p.line for p in scene.split_problems if p.line and p.kind in kinds]
+    if not wrong:
+        return set()
+    lines = re.split("\r\n|\r|\n", scene.split_text.text)
+    index = NameIndex(scene.names)
+    found: set[str] = set()
+    for number in wrong:
+        line = lines[number - 1]
+        # Some put the period first; with commas instead of spaces, the name ends at the comma.
+        names = (line.rsplit(maxsplit=1)[0], line.split()[-1], re.split("[,;]", line)[0].strip())
+        found.update(*(index.find(name) for name in names))
+    return found

@@ -1,0 +1,180 @@
+"""CS4: periods, and the views in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from chronoscene.formats.chronoscene import SPLIT, TEST
+from chronoscene.io.wording import counted
+from chronoscene.scene.splits import SplitEntry, check_period_ids
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import rule
+from chronoscene.validation.rules.cs3_split import meant_in_split, names_on_bad_lines, problem_hit
+from chronoscene.validation.scene_folder import RawScene
+
+MIN_TRAIN = 5
+"""Training views below which a period can hardly be reconstructed."""
+
+UNEVEN = 3
+"""Ratio between the number of test views of a period and its fair share."""
+
+MIN_OFF = 3
+"""Deviation from the fair share, in test views, that is worth a warning."""
+
+UNEQUAL = 10
+"""Ratio between the numbers of training views of two periods."""
+
+
+@rule(
+    "CS401",
+    "error",
+    what="The period ids are not 0..T-1.",
+    bad="ids 2016 and 2023; ids 0 and 2",
+    remedy="number the periods from 0 without gaps; put labels and dates into sparse/periods.json",
+)
+def period_ids(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
+    if not split and any(p.kind in ("fields", "period") for p in scene.split_problems):
+        return  # no line could be read, which has its own rules
+    if names_on_bad_lines(scene):
+        return  # periods may be missing because of these lines
+    for problem in check_period_ids(split, {entry.period for entry in split}):
+        hit = problem_hit(SPLIT, problem)
+        yield Hit(hit.place, hit.expected, hit.found)
+
+
+@rule(
+    "CS402",
+    "error",
+    what="A period has no registered image.",
+    bad="COLMAP could not register any photo of period 2",
+    remedy="register images of this period, or remove it and renumber the others",
+    needs=("images",),
+)
+def period_empty(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
+    if not scene.names:
+        return  # has its own rule
+    images = meant_in_split(scene)
+    ambiguous = {p.line for p in scene.split_problems if p.kind == "ambiguous"}
+    listed = {entry.period for entry in split}
+    listed -= {entry.period for entry in split if entry.line in images or entry.line in ambiguous}
+    for period in sorted(listed - set(scene.period_ids)):
+        yield Hit(SPLIT, f"a registered image of period {period}", "none")
+
+
+@rule(
+    "CS403",
+    "error",
+    what="A period has no training view.",
+    bad="all images of period 1 are in `test.txt`",
+    remedy="remove some of its images from test.txt",
+    needs=("tests",),
+)
+def period_without_train(scene: RawScene) -> Iterator[Hit]:
+    default = "register more of its images, or list none of them in a new sparse/0/test.txt"
+    for period, (train, _test) in _views(scene).items():
+        if train == 0:
+            remedy = default if scene.test is None else None
+            yield Hit(TEST, f"a training view in period {period}", "none", remedy)
+
+
+@rule(
+    "CS404",
+    "warning",
+    what="A period has no test view, so quality in it cannot be measured.",
+    bad="a `test.txt` with images of period 0 only",
+    remedy="add some of its images to test.txt",
+    needs=("tests",),
+)
+def period_without_test(scene: RawScene) -> Iterator[Hit]:
+    for period, (_train, test) in _views(scene).items():
+        if test == 0 and scene.tests:
+            yield Hit(TEST, f"a test view in period {period}", "none")
+
+
+@rule(
+    "CS405",
+    "warning",
+    what=f"A period has fewer than {MIN_TRAIN} training views.",
+    bad="a period of three photos",
+    remedy="register more images of this period",
+    needs=("tests",),
+)
+def period_few_views(scene: RawScene) -> Iterator[Hit]:
+    if len(scene.periods or ()) < len(scene.names):
+        return  # images without a period have their own rule; they may belong here
+    for period, (train, _test) in _views(scene).items():
+        if 0 < train < MIN_TRAIN:
+            found = counted(train, "training view")
+            yield Hit(f"period {period}", f"at least {MIN_TRAIN} training views", found)
+
+
+@rule(
+    "CS406",
+    "info",
+    what="All images are of one period, so nothing can change.",
+    bad="a `split.txt` with period 0 only",
+    remedy="nothing to do, unless split.txt should have more periods",
+)
+def single_period(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
+    if len(scene.period_ids) == 1 and len(periods) == len(scene.names):
+        yield Hit(SPLIT, "two or more periods", "one")
+
+
+@rule(
+    "CS407",
+    "error",
+    what="There is no test view at all, so nothing can be measured. Benchmarks refuse the scene.",
+    bad="an empty `test.txt`",
+    remedy="list images of every period in sparse/0/test.txt, or delete it for the default split",
+)
+def no_test_view(scene: RawScene, tests: set[str]) -> Iterator[Hit]:
+    if scene.periods and not tests:
+        yield Hit(TEST, "test views", "none that is an image of the model")
+
+
+@rule(
+    "CS408",
+    "warning",
+    what="The test views are spread unevenly: a period has far fewer or far more of them than its "
+    "share, so a mean over all views does not represent the periods of the scene.",
+    bad="20 of 100 images are test views in period 0, 2 of 100 in period 1",
+    remedy="put every n-th image of each period, with the same n, into test.txt (chronoscene split "
+    "writes such a list)",
+    needs=("tests",),
+)
+def test_share(scene: RawScene) -> Iterator[Hit]:
+    views = _views(scene)
+    if any(train == 0 for train, _ in views.values()):
+        return  # has its own rule
+    total, tests = sum(map(sum, views.values())), sum(test for _, test in views.values())
+    for period, (train, test) in views.items():
+        fair = tests * (train + test) / max(1, total)
+        uneven = test * UNEVEN < fair or test > fair * UNEVEN
+        if test and uneven and abs(test - fair) >= MIN_OFF:
+            expected = f"about {fair:.0f} test views of {train + test} images"
+            yield Hit(f"period {period}", expected, str(test))
+
+
+@rule(
+    "CS409",
+    "info",
+    what="A period has less than a tenth of the training views of another period.",
+    bad="900 images of 2023, 60 of 2016",
+    remedy="nothing to do; look at the scores of each period, not only at the mean over all views",
+    needs=("tests",),
+)
+def periods_unequal(scene: RawScene) -> Iterator[Hit]:
+    train = {period: views[0] for period, views in _views(scene).items()}
+    most = max(train.values(), default=0)
+    for period, number in train.items():
+        if 0 < number * UNEQUAL < most:
+            yield Hit(f"period {period}", f"a tenth of {most} training views", str(number))
+
+
+def _views(scene: RawScene) -> dict[int, tuple[int, int]]:
+    """Numbers of training and test views by period."""
+    assert scene.periods is not None and scene.tests is not None
+    views = {period: [0, 0] for period in scene.period_ids}
+    for name, period in scene.periods.items():
+        views[period][name in scene.tests] += 1
+    return {period: (train, test) for period, (train, test) in views.items()}

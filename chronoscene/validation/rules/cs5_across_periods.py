@@ -1,0 +1,259 @@
+"""CS506 to CS508, CS519 to CS521: how the periods relate to each other, and the scene to metres."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.errors import ChronoSceneError
+from chronoscene.formats.chronoscene import WORLD, read_world
+from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.validation.checks.observations import project
+from chronoscene.validation.checks.period_frames import own_frames
+from chronoscene.validation.checks.photo_metadata import fit_gps
+from chronoscene.validation.checks.reprojection import depth_percentiles
+from chronoscene.validation.finding import NOTHING, Hit
+from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene, derived
+
+Table = NDArray[np.bool_]
+"""Whether a point is seen in a period. [P, T]"""
+
+MIN_SHARED = 10
+"""Shared points from which a similarity between two periods can be told from chance."""
+
+MAX_BLOCK = 10_000_000
+"""Points times periods that are counted at a time."""
+
+DEPTH_RATIO = 10.0
+"""Between the median depths of two periods without shared points: nothing else indicates scale."""
+
+UNIT_TOLERANCE = 0.1
+"""Relative difference between the unit and the metre by GPS that its noise can explain."""
+
+NEAREST, FARTHEST = 0.01, 50_000.0
+"""Plausible range of metres between cameras and points."""
+
+APART = 0.05
+"""Share of a period's points that cameras of another period should at least see."""
+
+OWN = 0.5
+"""Share of a period's points that its own cameras must see."""
+
+MAX_PERIODS = 100
+"""All pairs are compared."""
+
+MAX_POINTS, MAX_IMAGES = 3000, 300
+"""Points and images of all periods together that are compared."""
+
+REACH = 3.0
+"""How far a camera sees, in units of the 95th percentile of the depths in its period."""
+
+
+@rule(
+    "CS506",
+    "warning",
+    what="No point is seen in any image of a period.",
+    bad="points of period 0 only; the images of period 1 were added later",
+    remedy="triangulate points with the images of this period",
+)
+def period_without_points(scene: RawScene, point_periods: Table) -> Iterator[Hit]:
+    if not point_periods.any():
+        return  # no tracks at all, or no points: CS501, CS514
+    for column, period in enumerate(scene.period_ids):
+        if not point_periods[:, column].any():
+            yield Hit(
+                f"period {period}", "points that its images see", f"0 of {len(point_periods)}"
+            )
+
+
+@rule(
+    "CS507",
+    "info",
+    what="Number of points seen in a single period, and in several.",
+    bad="(for information only)",
+    remedy=NOTHING,
+)
+def points_of_one_period(scene: RawScene, point_periods: Table) -> Iterator[Hit]:
+    total = len(point_periods)
+    if not total or point_periods.shape[1] < 2:
+        return
+    alone = point_periods[point_periods.sum(axis=1) == 1].sum(axis=0).tolist()
+    each = ", ".join(f"period {p} {n}" for p, n in zip(scene.period_ids, alone, strict=True))
+    found = f"{sum(alone)} of {total} in one only ({100 * sum(alone) / total:.1f} %): {each}"
+    yield Hit(scene.model_file("points3D"), "points of several periods", found)
+
+
+@rule(
+    "CS508",
+    "warning",
+    what=f"A period, or a group of periods, shares fewer than {MIN_SHARED} points with the other "
+    "periods, so nothing shows that they are in one frame.",
+    bad="two models merged by hand; periods 0 and 1 share points, 2 and 3 do, 1 and 2 do not",
+    remedy="match images across the periods; if they were aligned by other means, ignore this rule",
+)
+def period_unconnected(scene: RawScene, point_periods: Table) -> Iterator[Hit]:
+    points = point_periods.sum(axis=0)
+    groups = connected(common_points(point_periods), MIN_SHARED)
+    groups = [group for group in groups if points[group].any()]  # others have their own rule
+    groups.sort(key=lambda group: -int(points[group].sum()))
+    for group in groups[1:]:
+        own = point_periods[:, group].any(axis=1)
+        shared = np.count_nonzero(own & np.delete(point_periods, group, axis=1).any(axis=1))
+        ids = [str(scene.period_ids[i]) for i in group]
+        place = f"period {ids[0]}" if len(ids) == 1 else f"periods {', '.join(ids)}"
+        expected = f"at least {MIN_SHARED} points shared with the other periods"
+        yield Hit(place, expected, f"{shared} of {np.count_nonzero(own)}")
+
+
+def common_points(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Number of points seen in both of two periods; zero on the diagonal. [P, T] -> [T, T]"""
+    seen = seen[seen.sum(axis=1) > 1]
+    rows = max(1, MAX_BLOCK // max(1, seen.shape[1]))
+    common = np.zeros((seen.shape[1],) * 2, np.int64)
+    for first in range(0, len(seen), rows):
+        block = seen[first : first + rows].astype(np.float32)
+        common += (block.T @ block).astype(np.int64)
+    np.fill_diagonal(common, 0)
+    return common
+
+
+def connected(common: NDArray[np.int64], minimum: int) -> list[NDArray[np.int64]]:
+    """Groups of periods linked by chains of at least ``minimum`` common points, as indices."""
+    reach = (common >= minimum) | np.eye(len(common), dtype=bool)
+    for _ in range(len(common).bit_length()):  # doubles the steps each time
+        reach = (reach.astype(np.float32) @ reach.astype(np.float32)) > 0
+    first = [int(np.flatnonzero(row)[0]) for row in reach]  # of its group
+    return [np.flatnonzero(reach[period]) for period in sorted(set(first))]
+
+
+@rule(
+    "CS519",
+    "warning",
+    what="A period is in a frame of its own: mirrored, scaled, rotated or moved against the "
+    "others.",
+    bad="period 1 was reconstructed separately and scaled to metres; the other periods were not",
+    remedy="transform its poses into the frame of the others, or register all periods together",
+    needs=("reprojections", "point_periods"),
+)
+def period_frame(scene: RawScene) -> Iterator[Hit]:
+    for index, explained in own_frames(scene).items():
+        place = f"period {scene.period_ids[index]}"
+        yield Hit(place, "the frame of the other periods", explained)
+    for index, ratio in _other_depths(scene).items():
+        found = f"points {ratio:.3g} times as far from the cameras, and none shared"
+        place = f"period {scene.period_ids[index]}"
+        yield Hit(place, "a frame with the scale of the other periods", found)
+
+
+@derived
+def _other_depths(scene: RawScene) -> dict[int, float]:
+    """Periods without shared points whose depths are of another order than those of the rest.
+
+    Returns:
+        Ratio of the median depths by the index of the period.
+    """
+    ratios = {}
+    seen = scene.point_periods
+    assert seen is not None
+    shared = seen[seen.sum(axis=1) > 1].any(axis=0)
+    medians = depth_percentiles(scene, 50)
+    for index in range(len(scene.period_ids)):
+        others = [d for i, d in medians.items() if i != index]
+        if shared[index] or index not in medians or not others:
+            continue
+        ratio = medians[index] / float(np.median(others))
+        if not 1 / DEPTH_RATIO <= ratio <= DEPTH_RATIO:
+            ratios[index] = ratio
+    return ratios
+
+
+@rule(
+    "CS520",
+    "warning",
+    what="`sparse/world.json` says metres, but the world is not in metres.",
+    bad='`{"unit": "metre"}` with a model straight from COLMAP\'s mapper',
+    remedy="scale the model, or correct the unit in sparse/world.json",
+    needs=("cameras", "images"),
+)
+def frame_scale(scene: RawScene) -> Iterator[Hit]:
+    try:
+        if read_world(scene.root).unit != "metre":
+            return
+    except ChronoSceneError:
+        return  # has its own rule
+    fit = fit_gps(scene)
+    if fit is not None:
+        scale = fit.metres_from_world.scale
+        tolerance = max(UNIT_TOLERANCE, 3 * fit.sigma / (fit.spread * len(fit.images) ** 0.5))
+        if abs(np.log(scale)) > np.log1p(tolerance):
+            found = f"{scale:.4g} m per unit, by the GPS positions of {len(fit.images)} photos"
+            yield Hit(WORLD, "a world in metres", found)
+        return
+    for index, depth in depth_percentiles(scene, 50).items():
+        if index >= 0 and not NEAREST <= depth <= FARTHEST:
+            place = f"period {scene.period_ids[index]}"
+            yield Hit(place, "a world in metres", f"points {depth:.3g} m from the cameras (median)")
+
+
+@rule(
+    "CS521",
+    "warning",
+    what="A period shows a different place than the others: its cameras see hardly any of their "
+    "points, and their cameras hardly any of its points.",
+    bad="the photos of 2016 show the north side, those of 2023 the south side",
+    remedy="leave the period out, or make it a scene of its own; if the places are the same, its "
+    "frame is a different one: register the periods together",
+    needs=("reprojections", "point_periods"),
+)
+def period_apart(scene: RawScene) -> Iterator[Hit]:
+    if len(scene.period_ids) > MAX_PERIODS:
+        return
+    share = common_view(scene)
+    share[~(np.diag(share) >= OWN)] = np.nan  # cameras that miss their own points tell nothing
+    for index in own_frames(scene).keys() | _other_depths(scene).keys():
+        share[index], share[:, index] = np.nan, np.nan  # a wrong frame tells nothing of places
+    for index, period in enumerate(scene.period_ids):
+        both = np.fmax(np.delete(share[index], index), np.delete(share[:, index], index))
+        if np.isfinite(both).any() and np.nanmax(both) < APART:
+            found = f"at most {100 * np.nanmax(both):.1f} % of the points in common view"
+            yield Hit(f"period {period}", "views of the place that the others show", found)
+
+
+def common_view(scene: RawScene) -> NDArray[np.float64]:
+    """Share of the points of a period (columns) in the view of a camera of another (rows). [T, T]
+
+    Points and images are sampled. NaN for periods without points or without cameras.
+    """
+    images, points, seen = scene.images, scene.points, scene.point_periods
+    assert images is not None and points is not None and seen is not None
+    count = len(scene.period_ids)
+    share = np.full((count, count), np.nan)
+    reach = depth_percentiles(scene, 95)
+    finite = np.isfinite(points.xyz).all(axis=1)
+    owners = [_sample(finite & seen[:, i], MAX_POINTS // count) for i in range(count)]
+    xyz = points.xyz[np.concatenate([np.zeros(0, np.int64), *owners])]
+    owner = np.repeat(np.arange(count), list(map(len, owners)))
+    known = np.isin(images.camera_ids, list(scene.usable_cameras))
+    known &= scene.is_posed
+    rotations = rotation_from_quaternion(images.quaternions)
+    for row in sorted(reach.keys() - {-1}):
+        viewed = np.zeros(len(xyz), bool)
+        for image in _sample(known & (scene.image_periods == row), MAX_IMAGES // count).tolist():
+            camera = scene.usable_cameras[int(images.camera_ids[image])]
+            rotation, translation = rotations[image], images.translations[image]
+            depth, x, y = project(rotation, translation, camera, *xyz.T)
+            inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
+            viewed |= inside & (depth > 0) & (depth < REACH * reach[row])
+        for column in range(count):
+            if len(owners[column]):
+                share[row, column] = viewed[owner == column].mean()
+    return share
+
+
+def _sample(mask: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
+    """Indices where a mask is true, about ``count`` of them, evenly spread."""
+    index = np.flatnonzero(mask)
+    return index[:: len(index) // max(1, count) + 1]

@@ -1,0 +1,295 @@
+"""CS501 to CS505, CS509, CS510, CS514, CS517, CS518, CS522, CS525: sparse points and their
+tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.io.wording import counted, shown
+from chronoscene.validation.checks.observations import Observations
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene
+
+MAX_SHORT = 0.01
+"""Share of the points up to which short tracks do not matter."""
+
+MIN_COLOURED = 100
+"""Points from which their colours are judged."""
+
+SAME_COLOUR = 0.95
+"""Share of points of one colour; snow and night skies have many shades."""
+
+COLOURED_SAMPLE = 50_000
+"""Points whose colours are looked at."""
+
+MAX_DUPLICATES = 0.05
+"""Share of points on top of another one. Up to one percent was seen in COLMAP's models."""
+
+SAME_POINT = 1e-6
+"""Edge of the cells in which points are one, in median distances of the points from their centre:
+copies that went through single precision differ by a tenth of that."""
+
+SAMPLE = 10_000
+"""Points from which that distance is taken."""
+
+FAR = 100.0
+"""Distance of a point from the centre, in units of the median distance of points and cameras."""
+
+
+@rule(
+    "CS501",
+    "error",
+    what="The model has no points, but methods start from them. Benchmarks refuse the scene.",
+    bad="an empty `points3D.txt`",
+    remedy="triangulate points (colmap point_triangulator)",
+)
+def no_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    if not len(points):
+        yield Hit(scene.model_file("points3D"), "sparse points", "none")
+
+
+@rule(
+    "CS502",
+    "error",
+    what="The coordinates of a point are NaN or infinite.",
+    bad="`nan` in `points3D.txt`",
+    remedy="remove the points from the model",
+)
+def point_not_finite(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    bad = np.asarray(~np.isfinite(points.xyz).all(axis=1))
+    yield from _some_points(scene, points, bad, "finite coordinates", "NaN or infinity")
+
+
+@rule(
+    "CS503",
+    "warning",
+    what="Points are seen in one image or none, so their positions are not measured.",
+    bad="points of a laser scan, without tracks",
+    remedy="filter the points, or write the tracks with the points",
+)
+def short_track(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    return _short_tracks(scene, points, few=False)
+
+
+@rule(
+    "CS525",
+    "info",
+    what=f"Up to {100 * MAX_SHORT:g} % of the points are seen in one image or none, so their "
+    "positions are not measured.",
+    bad="a point that lost an observation when its image was cropped",
+    remedy="nothing to do; chronoscene validate --fix removes them",
+)
+def few_short_tracks(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    return _short_tracks(scene, points, few=True)
+
+
+def _short_tracks(scene: RawScene, points: RawPoints, *, few: bool) -> Iterator[Hit]:
+    lengths = np.diff(points.track_start)
+    short = int(np.count_nonzero(lengths < 2))
+    if few != (short <= MAX_SHORT * len(points)):
+        return
+    if short and not lengths.any() and scene.tests is not None:
+        return  # no tracks at all: CS514
+    for number, found in ((0, "no observation"), (1, "one observation")):
+        yield from _some_points(scene, points, lengths == number, "two or more", found)
+
+
+@rule(
+    "CS504",
+    "error",
+    what="A track refers to an image, or a keypoint of an image, that does not exist.",
+    bad="`images.bin` and `points3D.bin` of two different runs",
+    remedy="write images and points again together, from one model",
+)
+def broken_track(scene: RawScene, points: RawPoints, observations: Observations) -> Iterator[Hit]:
+    place, missing = scene.model_file("points3D"), observations.image < 0
+    if lost := int(np.count_nonzero(missing)):
+        ids = _listed(np.unique(points.track_image[missing]).tolist())
+        found = f"{counted(lost, 'observation')} in image ids {ids}"
+        yield Hit(place, "tracks of registered images", found, count=lost)
+    if lost := int(np.count_nonzero(~missing & ~observations.valid)):
+        found = f"{counted(lost, 'observation')} with an index beyond the keypoints of the image"
+        yield Hit(place, "tracks of existing keypoints", found, count=lost)
+
+
+@rule(
+    "CS505",
+    "error",
+    what="Images and points disagree on which keypoint belongs to which point.",
+    bad="a keypoint refers to point 5, but the track of point 5 does not list it",
+    remedy="write images and points again together, from one model",
+)
+def track_disagrees(
+    scene: RawScene, images: RawImages, points: RawPoints, observations: Observations
+) -> Iterator[Hit]:
+    rows = np.flatnonzero(observations.valid)
+    keypoints = observations.keypoint[rows]
+    agree = images.keypoint_point[keypoints] == points.ids[observations.point[rows]]
+    if wrong := int(np.count_nonzero(~agree)):
+        found = f"{counted(wrong, 'observation')} whose keypoint refers to another point or none"
+        yield Hit(scene.model_file("points3D"), "keypoints that agree", found, count=wrong)
+    claimed = images.keypoint_point >= 0
+    claimed[keypoints[agree]] = False
+    if lost := int(np.count_nonzero(claimed)):
+        found = f"{counted(lost, 'keypoint')} of points whose track does not list them"
+        yield Hit(scene.model_file("images"), "tracks that agree", found, count=lost)
+
+
+@rule(
+    "CS509",
+    "info",
+    what="An image sees no point of the model, so no point confirms its pose.",
+    bad="test images that were added with known poses",
+    remedy="nothing to do if the poses come from another source",
+)
+def image_without_points(
+    scene: RawScene, images: RawImages, observations: Observations
+) -> Iterator[Hit]:
+    counts = np.bincount(observations.image[observations.valid], minlength=len(images))
+    names = [images.names[i] for i in np.flatnonzero(counts == 0)]
+    if names:
+        found = f"{counted(len(names), 'image')} without points: {shown(sorted(names))}"
+        yield Hit(scene.model_file("images"), "points in every image", found, count=len(names))
+
+
+@rule(
+    "CS510",
+    "warning",
+    what="The position of an observation in its image is NaN or infinite.",
+    bad="a keypoint at `nan nan` in a track",
+    remedy="remove these observations; they come from pixels that cannot be undistorted",
+)
+def observation_not_finite(
+    scene: RawScene, images: RawImages, observations: Observations
+) -> Iterator[Hit]:
+    if np.isfinite(images.keypoint_xy).all():
+        return
+    xy = images.keypoint_xy[observations.keypoint[observations.valid]]
+    if bad := int(np.count_nonzero(~np.isfinite(xy).all(axis=1))):
+        found = f"NaN or infinity in {bad} of {len(xy)} observations"
+        yield Hit(scene.model_file("images"), "finite pixel positions", found, count=bad)
+
+
+@rule(
+    "CS514",
+    "error",
+    what="No point of the model is seen in a training image, but methods start from such points. "
+    "Benchmarks refuse the scene.",
+    bad="points without tracks; points seen only in test images",
+    remedy="triangulate points (colmap point_triangulator), or change the split",
+)
+def no_training_points(
+    scene: RawScene, images: RawImages, observations: Observations, tests: set[str]
+) -> Iterator[Hit]:
+    train = np.array([name not in tests for name in images.names], bool)
+    total = len(scene.points or ())
+    if total and not train[observations.image[observations.valid]].any():
+        yield Hit(scene.model_file("points3D"), "points seen in training images", f"0 of {total}")
+
+
+@rule(
+    "CS517",
+    "warning",
+    what=f"More than {MAX_DUPLICATES:.0%} of the points coincide with another point, to within a "
+    "millionth of the scene.",
+    bad="the points of two runs in one file",
+    remedy="merge the duplicates, or triangulate the points again (colmap point_triangulator "
+    "--clear_points 1)",
+)
+def duplicate_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    finite = np.isfinite(points.xyz).all(axis=1)
+    xyz = _cells(points.xyz[finite])
+    if _repeated(_hash(xyz)) <= MAX_DUPLICATES * len(xyz):
+        return  # sorting one number per point is much faster than sorting points
+    twice = len(xyz) - len(np.unique(xyz, axis=0))
+    if twice > MAX_DUPLICATES * len(xyz):
+        found = f"{twice} of {len(xyz)} that coincide with another one"
+        yield Hit(scene.model_file("points3D"), "distinct points", found, count=twice)
+
+
+def _cells(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The small cubes that points are in, as whole numbers; the points if they are all one."""
+    sample = xyz[:: len(xyz) // SAMPLE + 1]
+    if not len(sample):
+        return xyz
+    edge = SAME_POINT * float(np.median(np.abs(sample - np.median(sample, axis=0)).max(axis=1)))
+    cells = np.floor(xyz / edge) if 0 < edge < np.inf else xyz
+    return np.asarray(cells + 0.0)  # makes -0.0 positive, so that equal numbers have equal bits
+
+
+def _hash(xyz: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """A number per point: the same for equal points, almost never for different ones."""
+    mixed = np.zeros(len(xyz), np.uint64)
+    for bits in np.ascontiguousarray(xyz.T).view(np.uint64):
+        mixed = (mixed ^ bits ^ (bits >> np.uint64(32))) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+    return mixed
+
+
+def _repeated(values: NDArray[np.uint64]) -> int:
+    """How many values equal an earlier one."""
+    ordered = np.sort(values)
+    return int(np.count_nonzero(ordered[1:] == ordered[:-1]))
+
+
+@rule(
+    "CS518",
+    "warning",
+    what="Points are absurdly far from everything else; they blow up every bounding box.",
+    bad="a point 40 km away from a square of 100 m",
+    remedy="filter the points: they come from wrong matches, or from the sky",
+    needs=("images",),
+)
+def far_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    xyz, cameras = points.xyz, scene.centres[scene.is_posed]
+    usable = np.isfinite(xyz).all(axis=1)
+    if not usable.any():
+        return
+    middle = np.median(xyz[usable], axis=0)
+    distance = np.linalg.norm(xyz - middle, axis=1)
+    typical = np.median(distance[usable])
+    if len(cameras):
+        typical = max(typical, np.median(np.linalg.norm(cameras - middle, axis=1)))
+    far = usable & (distance > FAR * typical)
+    if number := int(np.count_nonzero(far)):
+        ids = _listed(points.ids[far])
+        found = f"{counted(number, 'point')} up to {distance[far].max():.3g} away (ids {ids})"
+        expected = f"points within {FAR * typical:.3g} of the centre"
+        yield Hit(scene.model_file("points3D"), expected, found, count=number)
+
+
+@rule(
+    "CS522",
+    "warning",
+    what="Nearly all points have the same colour, which is useless to methods that start from the "
+    "colours of the points.",
+    bad="a model triangulated without colours: all points are black",
+    remedy="extract the colours (colmap color_extractor) and write the model again",
+)
+def points_without_colours(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    if len(points) < MIN_COLOURED:
+        return
+    packed = points.rgb.astype(np.int64) @ [65536, 256, 1]
+    colours, numbers = np.unique(packed[:: len(packed) // COLOURED_SAMPLE + 1], return_counts=True)
+    most = int(numbers.argmax())
+    if numbers[most] > SAME_COLOUR * numbers.sum():
+        found = f"#{colours[most]:06x} for {100 * numbers[most] / numbers.sum():.1f} % of them"
+        yield Hit(scene.model_file("points3D"), "points in the colours of the photos", found)
+
+
+def _some_points(
+    scene: RawScene, points: RawPoints, bad: NDArray[np.bool_], expected: str, found: str
+) -> Iterator[Hit]:
+    """One hit for all bad points, with the first ids."""
+    if number := int(np.count_nonzero(bad)):
+        text = f"{found} for {number} of {len(points)} points (ids {_listed(points.ids[bad])})"
+        yield Hit(scene.model_file("points3D"), expected, text, count=number)
+
+
+def _listed(ids: Sequence[int] | NDArray[np.int64]) -> str:
+    return ", ".join(map(str, ids[:3])) + (" ..." if len(ids) > 3 else "")

@@ -1,0 +1,196 @@
+"""CS511 to CS513, CS515, CS516, CS524: whether points, poses and cameras fit each other."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.io.wording import shown
+from chronoscene.validation.checks.observations import Reprojection
+from chronoscene.validation.checks.period_frames import (
+    MIN_ERROR,
+    WORSE,
+    Rays,
+    focal_factor,
+    own_frames,
+    period_limit,
+)
+from chronoscene.validation.checks.reprojection import (
+    image_errors,
+    judged_images,
+    period_errors,
+    pose_limit,
+)
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import rule
+from chronoscene.validation.rules.cs1_poses import other_convention
+from chronoscene.validation.scene_folder import RawScene, derived
+
+MAX_OUTSIDE = 0.05
+"""Share of observations outside the image; undistortion leaves a few there."""
+
+MAX_BEHIND = 0.5
+"""Share of observations behind their camera. A consistent model has none."""
+
+MAX_WRONG = 0.5
+"""Share of the images of a period beyond which one finding reports all of them."""
+
+MIN_STORED = 0.9
+"""Share of the points that must have an error stored with them."""
+
+
+@rule(
+    "CS511",
+    "warning",
+    what=f"More than {MAX_OUTSIDE:.0%} of a camera's observations are outside its image.",
+    bad="a camera scaled to half the size, with keypoints still at full size",
+    remedy="give the camera the size at which the keypoints were found",
+)
+def observations_outside(
+    scene: RawScene, images: RawImages, reprojections: list[Reprojection]
+) -> Iterator[Hit]:
+    total: Counter[int] = Counter()
+    outside: Counter[int] = Counter()
+    for seen in reprojections:
+        camera_id = int(images.camera_ids[seen.image])
+        total[camera_id] += len(seen.rows)
+        outside[camera_id] += seen.outside
+    for camera_id, number in outside.items():
+        if number > MAX_OUTSIDE * total[camera_id]:
+            camera = scene.usable_cameras[camera_id]
+            expected = f"observations within {camera.width} x {camera.height}"
+            found = f"{number} of {total[camera_id]} outside"
+            yield Hit(scene.camera_place(camera), expected, found, count=number)
+
+
+@rule(
+    "CS512",
+    "error",
+    what="Most points are behind the cameras that see them: the poses use another convention.",
+    bad="poses with OpenGL axes",
+    remedy="store world-to-camera poses with +x right, +y down, +z forward (negate the y and z "
+    "axes of OpenGL cameras; invert camera-to-world poses)",
+)
+def points_behind_cameras(scene: RawScene, reprojections: list[Reprojection]) -> Iterator[Hit]:
+    total = sum(len(seen.depth) for seen in reprojections)
+    behind = sum(int(np.count_nonzero(~(seen.depth > 0))) for seen in reprojections)
+    if behind > MAX_BEHIND * total:
+        found = f"{behind} of {total} observations behind the camera"
+        yield Hit(scene.model_file("images"), "points in front of the cameras", found)
+
+
+@rule(
+    "CS513",
+    "warning",
+    what="The points that an image sees are reprojected far from where it sees them.",
+    bad="a camera-to-world pose; a focal length of another image size",
+    remedy="check pose, camera and image size of this image, or register it again",
+    needs=("reprojections",),
+)
+def pose_disagrees(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    errors, judged = image_errors(scene), judged_images(scene)
+    limits = {image: pose_limit(scene, image) for image in judged}
+    wrong = [image for image in judged if not errors[image] <= limits[image]]
+    if wrong and other_convention(scene):
+        return  # CS125 gives the reason for all of them
+    for index in sorted({int(scene.image_periods[image]) for image in wrong}):
+        if index in own_frames(scene):
+            continue  # CS519 gives the reason
+        mine = [image for image in wrong if scene.image_periods[image] == index]
+        total = sum(int(scene.image_periods[image]) == index for image in judged)
+        if index >= 0 and len(mine) > max(1, MAX_WRONG * total):
+            limit = float(np.median([limits[image] for image in mine]))
+            worst = sorted(mine, key=lambda image: -errors[image])
+            named = shown([images.names[image] for image in worst])
+            found = f"{np.median(errors[mine]):.3g} px in {len(mine)} of {total}: {named}"
+            expected = f"images with a median reprojection error below {limit:.3g} px"
+            yield Hit(f"period {scene.period_ids[index]}", expected, found, count=len(mine))
+            continue
+        for image in mine:
+            place = scene.image_place(images.names[image])
+            expected = f"a median reprojection error below {limits[image]:.3g} px"
+            yield Hit(place, expected, f"{errors[image]:.3g} px")
+
+
+@rule(
+    "CS515",
+    "warning",
+    what="The reprojection error of a period is far above that of another period.",
+    bad="medians of 0.5 px in period 0 and 3.1 px in period 1",
+    remedy="register the period again: refine its poses and its camera, or match more images",
+    needs=("periods", "reprojections"),
+)
+def period_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    errors = image_errors(scene)
+    for period, limit in _worse_periods(scene).items():
+        index = scene.period_ids.index(period)
+        known = np.flatnonzero((scene.image_periods == index) & ~np.isnan(errors))
+        worst = known[np.argsort(-errors[known])]
+        named = shown([images.names[i] for i in worst])
+        found = f"{period_errors(scene)[period]:.3g} px; the worst are {named}"
+        found += _other_focal(scene, index, limit)
+        yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
+
+
+@derived
+def _worse_periods(scene: RawScene) -> dict[int, float]:
+    """Periods that stand out, with the limit for their median error in pixels."""
+    limit, judged = period_limit(scene), judged_images(scene)
+    if not judged or limit > WORSE * np.median([pose_limit(scene, i) for i in judged]):
+        return {}  # no period fits: nothing to compare with
+    explained = {scene.period_ids[index] for index in own_frames(scene)}
+    worse = (period for period, median in period_errors(scene).items() if median > limit)
+    return {period: limit for period in worse if period not in explained}
+
+
+def _other_focal(scene: RawScene, index: int, limit: float) -> str:
+    """A hint that other focal lengths explain the errors of a period, if they do."""
+    if scene.point_periods is None:
+        return ""
+    factor = focal_factor(Rays(scene, index), limit)
+    return "" if factor is None else f"; it fits with focal lengths multiplied by {factor:.4g}"
+
+
+@rule(
+    "CS516",
+    "warning",
+    what="The reprojection error of an image is far above that of its period.",
+    bad="3.1 px in one image, 0.5 px in the others",
+    remedy="check pose and camera of this image, or register it again",
+    needs=("periods", "reprojections"),
+)
+def image_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    for image in judged_images(scene):
+        index, error = int(scene.image_periods[image]), float(image_errors(scene)[image])
+        period = scene.period_ids[index] if index >= 0 else -1
+        limit = max(MIN_ERROR, WORSE * period_errors(scene).get(period, np.inf))
+        if limit < error <= pose_limit(scene, image):  # CS513 reports larger ones
+            place = scene.image_place(images.names[image])
+            yield Hit(place, f"a median error below {limit:.3g} px", f"{error:.3g} px")
+
+
+@rule(
+    "CS524",
+    "warning",
+    what="The reprojection errors are far larger than the errors stored with the points: cameras, "
+    "poses or points were changed after the model was made.",
+    bad="a focal length replaced by that of the data sheet; stored 0.5 px, measured 3.2 px",
+    remedy="use cameras, images and points of one model, or refine them together (colmap "
+    "bundle_adjuster)",
+    needs=("reprojections",),
+)
+def error_outdated(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    stored = points.error[(points.error > 0) & np.isfinite(points.error)]
+    if len(stored) < MIN_STORED * len(points) or not len(stored):
+        return  # not every program stores them
+    errors, judged = image_errors(scene), judged_images(scene)
+    if not judged:
+        return
+    found, expected = float(np.median(errors[judged])), float(np.median(stored))
+    fits = all(errors[i] <= pose_limit(scene, i) for i in judged)
+    if fits and found > max(MIN_ERROR, WORSE * expected) and not _worse_periods(scene):
+        text = f"{found:.3g} px (median)"
+        yield Hit(scene.model_file("points3D"), f"errors around {expected:.3g} px", text)

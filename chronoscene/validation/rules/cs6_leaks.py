@@ -1,0 +1,278 @@
+"""CS6: one photo in train and test or in two periods, near copies, and test images seen in
+training.
+
+Equal bytes are always looked for, equal pixels and near copies with ``--decode``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.colmap.arrays import RawImages
+from chronoscene.io.wording import shown
+from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.validation.checks.pixels import THUMBNAIL, Pixels
+from chronoscene.validation.checks.reprojection import typical_depth
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import rule
+from chronoscene.validation.scene_folder import RawScene, derived
+
+SAME_PLACE = 1e-3
+"""Distance of two cameras, in typical depths of the scene, below which they are in one place: it
+moves points by a pixel or two in an image of 1600."""
+
+SAME_DIRECTION = 2e-3
+"""Difference of two rotation matrices; about a tenth of a degree."""
+
+MAX_DIFFERENCE = 3.0
+"""Root mean square difference of two thumbnails in grey levels 0..255. Measured: photos saved again
+as JPEG differ by 0.1 to 1.8 (quality 50 and more), neighbouring frames of a video by 9 and more,
+aerial photos of one flight by 30 and more."""
+
+FEATURELESS = 4.0
+"""Standard deviation of a thumbnail below which it looks like any other."""
+
+ROUNDING = 1.01
+"""Margin by which pairs pass to the exact comparison."""
+
+MAX_TRIED = 8
+"""Images compared pixel by pixel with one that looks like all of them."""
+
+MIN_CORRELATION = 0.997
+"""Correlation of grey thumbnails beyond which two photos are one. Measured: a photo made darker,
+brighter, warmer or with more contrast 0.9985 and more; neighbouring frames of a video 0.989 and
+less, aerial photos of one flight 0.9 and less."""
+
+PLAIN = 8.0
+"""Standard deviation of a grey thumbnail, in grey levels, below which rounding matters."""
+
+_BLOCK = 8
+_ROWS = 256
+
+
+@rule(
+    "CS601",
+    "error",
+    what="A test image is also a training image (same bytes or, with `--decode`, same pixels).",
+    bad="`a.jpg` and its copy `a_copy.jpg`, one of them in `test.txt`",
+    remedy="remove one of the images from the model",
+)
+def leak_train_test(scene: RawScene, tests: set[str]) -> Iterator[Hit]:
+    for kind, group in _equal(scene):
+        train = [n for n in group if n not in tests]
+        test = [n for n in group if n in tests]
+        if train and test:
+            found = f"the same {kind} in training: {shown(train)}"
+            expected = "a test image that is not a training image"
+            yield Hit(f"images/{test[0]}", expected, found, also=tuple(train))
+
+
+@rule(
+    "CS602",
+    "error",
+    what="One photo is in two periods (same bytes or, with `--decode`, same pixels).",
+    bad="a folder of 2016 copied into the folder of 2023",
+    remedy="keep the image in the period in which it was taken",
+)
+def leak_periods(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
+    for kind, group in _equal(scene):
+        listed = sorted({periods[n] for n in group})
+        if len(listed) > 1:
+            found = f"the same {kind} in periods {' and '.join(map(str, listed))}: {shown(group)}"
+            yield Hit(f"images/{group[0]}", "an image of one period", found, also=tuple(group[1:]))
+
+
+@rule(
+    "CS603",
+    "warning",
+    what="One photo is there twice, in one period and twice in train or twice in test.",
+    bad="`a.jpg` and `a_copy.jpg`",
+    remedy="remove one of the images from the model",
+)
+def image_twice(scene: RawScene, periods: dict[str, int], tests: set[str]) -> Iterator[Hit]:
+    for kind, group in _equal(scene):
+        if len({(periods[n], n in tests) for n in group}) == 1:
+            found = f"the same {kind} in {shown(group[1:])}"
+            yield Hit(f"images/{group[0]}", "a unique image", found, also=tuple(group[1:]))
+
+
+@rule(
+    "CS604",
+    "warning",
+    what="A test image looks the same as a training image or as an image of another period (needs "
+    "`--decode`).",
+    bad="a training image, and the same photo saved again as JPEG for testing",
+    remedy="look at both; remove one if it is a copy that was saved again",
+)
+def near_leak(
+    scene: RawScene, periods: dict[str, int], tests: set[str], pixels: dict[str, Pixels]
+) -> Iterator[Hit]:
+    role = {n: (period, n in tests) for n, period in periods.items()}
+    pixels = {n: p for n, p in pixels.items() if n in role}
+    near = {
+        (a, b): f"{difference:.2g} grey levels from that"
+        for a, b, difference in near_pairs(pixels, role)
+    }
+    for a, b, alike in relit_pairs(pixels, role):
+        if pixels[a].digest != pixels[b].digest:
+            near.setdefault((a, b), f"that is, up to brightness, {alike:.2%} that")
+    for (a, b), how in near.items():
+        place, other = (b, a) if role[b][1] and not role[a][1] else (a, b)
+        found = f"a thumbnail {how} of {shown([other])}{_apart(scene, a, b)}"
+        yield Hit(f"images/{place}", "a distinct image", found, also=(other,))
+
+
+def _apart(scene: RawScene, a: str, b: str) -> str:
+    """What the poses of two images say about their likeness."""
+    names = scene.images.names if scene.images else ()
+    if a not in names or b not in names:
+        return ""
+    shift = np.linalg.norm(scene.centres[names.index(a)] - scene.centres[names.index(b)])
+    extent = typical_depth(scene)
+    if not np.isfinite(shift) or not extent:
+        return ""
+    if shift <= SAME_PLACE * extent:
+        return ", taken from the same place"
+    return f", though their cameras are {shift / extent:.2g} times the depth of the scene apart"
+
+
+@rule(
+    "CS605",
+    "warning",
+    what="A test image has the pose of a training image of its period, so it measures memorisation "
+    "rather than new views.",
+    bad="a burst of three photos, the second of which is in `test.txt`",
+    remedy="remove one of the two, or make the test image a training image",
+)
+def pose_leak(scene: RawScene, images: RawImages, tests: set[str]) -> Iterator[Hit]:
+    posed = np.flatnonzero(scene.is_posed)
+    pairs = twins(
+        scene.centres[posed],
+        rotation_from_quaternion(images.quaternions[posed]),
+        scene.image_periods[posed],
+        np.array([images.names[i] in tests for i in posed.tolist()], bool),
+        near=SAME_PLACE * typical_depth(scene),
+    )
+    for a, b in pairs:
+        name, other = images.names[posed[a]], images.names[posed[b]]
+        found = f"the pose of {shown([other])}"
+        yield Hit(scene.image_place(name), "a pose of its own", found, also=(other,))
+
+
+def near_pairs(
+    pixels: Mapping[str, Pixels], role: Mapping[str, object]
+) -> Iterator[tuple[str, str, float]]:
+    """Pairs of images of different roles whose thumbnails differ by less than `MAX_DIFFERENCE`.
+
+    Pairs of equal pixels are left out. The difference of block means never exceeds that of the
+    pixels, so most pairs are settled with a sixty-fourth of the numbers. For each image there is at
+    most one pair with a later image: thousands of frames of a fixed camera must not yield millions
+    of pairs.
+    """
+    kept = {n: p.thumbnail for n, p in pixels.items() if p.thumbnail is not None}
+    names = [n for n, thumbnail in kept.items() if thumbnail.std(axis=(0, 1)).max() >= FEATURELESS]
+    if len(names) < 2:
+        return
+    full = np.stack([np.ravel(kept[n]) for n in names])
+    side = THUMBNAIL // _BLOCK
+    blocks = full.reshape(len(names), side, _BLOCK, side, _BLOCK, 3).mean(axis=(2, 4))
+    table = blocks.reshape(len(names), -1)
+    table = table - table.mean(axis=0)  # smaller numbers have smaller rounding errors below
+    norms = (table * table).sum(axis=1)
+    _, group = np.unique([repr(role[n]) for n in names], return_inverse=True)
+    for first in range(0, len(names), _ROWS):
+        rows = slice(first, first + _ROWS)
+        squares = norms[rows, None] + norms[first:] - 2 * table[rows] @ table[first:].T
+        near = squares < (MAX_DIFFERENCE**2 * table.shape[1]) * ROUNDING
+        near &= group[rows, None] != group[first:]
+        near = np.triu(near, 1)
+        for i in np.flatnonzero(near.any(axis=1)).tolist():
+            others = np.flatnonzero(near[i])
+            nearest = others[np.argsort(squares[i, others])[:MAX_TRIED]]
+            for a, b in ((first + i, first + j) for j in nearest.tolist()):
+                distance = _distance(full[a], full[b])
+                if distance < MAX_DIFFERENCE and pixels[names[a]].digest != pixels[names[b]].digest:
+                    yield names[a], names[b], distance
+                    break
+
+
+def _distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    return float(np.sqrt(np.mean((a - b) ** 2)))
+
+
+def relit_pairs(
+    pixels: Mapping[str, Pixels], role: Mapping[str, object]
+) -> Iterator[tuple[str, str, float]]:
+    """Pairs of images of different roles whose grey thumbnails correlate, and by how much.
+
+    For each image, the later image that is most alike.
+    """
+    grey = {n: p.thumbnail.mean(axis=2) for n, p in pixels.items() if p.thumbnail is not None}
+    names = [n for n, thumbnail in grey.items() if thumbnail.std() >= PLAIN]
+    if len(names) < 2:
+        return
+    table = np.stack([np.ravel(grey[n] - grey[n].mean()) for n in names])
+    table /= np.linalg.norm(table, axis=1, keepdims=True)
+    _, group = np.unique([repr(role[n]) for n in names], return_inverse=True)
+    for first in range(0, len(names), _ROWS):
+        alike = table[first : first + _ROWS] @ table[first:].T
+        alike[group[first : first + _ROWS, None] == group[first:]] = -1.0
+        alike = np.triu(alike, 1)
+        best = alike.argmax(axis=1)
+        for i in np.flatnonzero(alike[np.arange(len(best)), best] >= MIN_CORRELATION).tolist():
+            yield names[first + i], names[first + best[i]], float(alike[i, best[i]])
+
+
+def twins(
+    places: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    periods: NDArray[np.int64],
+    test: NDArray[np.bool_],
+    *,
+    near: float,
+) -> Iterator[tuple[int, int]]:
+    """Pairs of a test image and a training image of its period with the same pose.
+
+    Args:
+        places: Camera centres. [N, 3]
+        rotations: [N, 3, 3]
+        periods: Negative for none. [N]
+        test: Whether an image is a test image. [N]
+        near: Largest distance of two centres in one place.
+    """
+    order = np.argsort(places[:, 0], kind="stable")
+    x = places[order, 0]
+    for i in np.flatnonzero(test & (periods >= 0)).tolist():
+        begin = np.searchsorted(x, places[i, 0] - near)
+        others = order[begin : np.searchsorted(x, places[i, 0] + near, "right")]
+        others = others[(periods[others] == periods[i]) & ~test[others]]
+        close = np.linalg.norm(places[others] - places[i], axis=1) <= near
+        turned = np.linalg.norm(rotations[others] - rotations[i], axis=(1, 2))
+        if len(alike := others[close & (turned <= SAME_DIRECTION)]):
+            yield i, int(alike[0])
+
+
+@derived
+def _equal(scene: RawScene) -> list[tuple[str, list[str]]]:
+    """Groups of equal images that have a period, and what of them is equal."""
+    assert scene.periods is not None
+    digests = {n: d for n, d in scene.digests.items() if n in scene.periods}
+    equal = [("bytes", group) for group in _groups(digests.items())]
+    if scene.pixels is None:
+        return equal
+    decoded = {n: p.digest for n, p in scene.pixels.items() if n in scene.periods and p.digest}
+    for group in _groups(decoded.items()):
+        if len({digests.get(n, n.encode("utf-8", "surrogateescape")) for n in group}) > 1:
+            equal += [("pixels", group)]
+    return equal
+
+
+def _groups(items: Iterable[tuple[str, bytes]]) -> Iterator[list[str]]:
+    """Sorted names that share a digest; groups of two or more."""
+    found: dict[bytes, list[str]] = {}
+    for name, digest in items:
+        found.setdefault(digest, []).append(name)
+    yield from (sorted(group) for group in found.values() if len(group) > 1)

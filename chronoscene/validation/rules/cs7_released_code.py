@@ -1,0 +1,216 @@
+"""CS7: what the released ChronoGS code would fail on. ChronoScene itself is fine with it.
+
+`--ignore CS7` skips all of these rules. Facts on the released loader (commit e73bc9c): DATASET.md.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.colmap.arrays import RawPoints
+from chronoscene.formats.chronoscene import SPLIT, TEST
+from chronoscene.io.wording import counted, quote, shown
+from chronoscene.scene.splits import TEST_EVERY
+from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import rule
+from chronoscene.validation.rules.cs3_split import test_elsewhere
+from chronoscene.validation.scene_folder import RawScene, TextFile
+
+GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "I;16B", "I;16L", "I;16N")
+"""Pillow's modes without colour."""
+
+VOXEL, NEAR = 0.001, 0.2
+"""World units; constants of the released code, and of 3D Gaussian splatting."""
+
+MIN_LOST = 0.1
+"""Share of points or observations worth reporting."""
+
+SAMPLE = 10_000
+"""Points from which the extent of the scene is estimated."""
+
+CROWDED = 10
+"""Points lie on surfaces: on a square of side a, n points are about a / sqrt(n) apart. If that is
+this many voxels, no two of them share one."""
+
+OFF_CENTRE = 0.5
+"""Pixels; half a pixel is a difference of convention, not of the lens."""
+
+
+@rule(
+    "CS701",
+    "warning",
+    what="The official loader would fail on a line of `split.txt`, or read a different period.",
+    bad="`a.jpg  0` (two spaces); a tab; an empty line; a name with a space",
+    remedy='write "<name> <period>" with one space, no other spaces, no tabs and no empty lines',
+)
+def official_split_line(scene: RawScene, split_text: TextFile) -> Iterator[Hit]:
+    if split_text.data[:3] == b"\xef\xbb\xbf":
+        found = "a byte order mark, which it takes for part of the first name"
+        yield Hit(f"{SPLIT}:1", "plain text", found)
+    if split_text.data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        yield Hit(SPLIT, "UTF-8 or ASCII", "UTF-16, which it cannot read")
+        return
+    wrong = {p.line for p in scene.split_problems if p.kind in ("fields", "period")}
+    flat = not any("/" in name for name in scene.names)
+    for number, line in enumerate(_lines(split_text.text), start=1):
+        problem = official_failure(line)
+        if problem is None and flat and "/" in line:  # otherwise CS703 reports it
+            problem = "a name with folders"
+        if problem is not None and number not in wrong:
+            yield Hit(f"{SPLIT}:{number}", "<file name> <period>", problem)
+
+
+def official_failure(line: str) -> str | None:
+    """Why the official parser fails on a line: it strips it, then splits at single spaces."""
+    fields = line.strip().split(" ")
+    if fields == [""]:
+        return "an empty line"
+    if len(fields) < 2:
+        return "a tab" if "\t" in line else "one field"
+    if not re.fullmatch("[0-9]+", fields[1].strip()):
+        return "two spaces" if fields[1] == "" else f"{quote(fields[1])} as the second field"
+    if len(fields) > 2:
+        return f"more than two fields; it reads period {fields[1]} for {quote(fields[0])}"
+    return None
+
+
+@rule(
+    "CS702",
+    "warning",
+    what="Two images are the same to the official loader, which identifies them by their file name "
+    "up to the first dot; the later line of `split.txt` overwrites the earlier one.",
+    bad="`x/0001.png` and `y/0001.png`; `a.1.png` and `a.2.png`; `0001.jpg` and `0001.png`",
+    remedy="give all images different file names up to the first dot",
+    needs=("images",),
+)
+def official_name_collision(scene: RawScene) -> Iterator[Hit]:
+    groups: dict[str, list[str]] = {}
+    for name in scene.names:
+        groups.setdefault(_cut(name), []).append(name)
+    for key, names in groups.items():
+        if len(names) > 1:
+            found = f"{shown(names)}, all of them {quote(key)} to it"
+            files = {PurePosixPath(name).name for name in names}
+            if len(files) == 1:
+                found += f", and all read from images/{files.pop()}"
+            place = scene.model_file("images")
+            yield Hit(place, "file names that differ before the first dot", found)
+
+
+@rule(
+    "CS703",
+    "info",
+    what="Images are in folders below `images/`; the official loader looks for all of them "
+    "directly in `images/`, and fails on names with folders in `split.txt`.",
+    bad="`images/2016/a.jpg`",
+    remedy="nothing to do here; flatten the folders to use the scene with the official code, too",
+    needs=("images",),
+)
+def official_folders(scene: RawScene) -> Iterator[Hit]:
+    inside = [name for name in scene.names if "/" in name]
+    if inside:
+        found = f"{counted(len(inside), 'image')} in folders: {shown(inside)}"
+        yield Hit("images", "no folders", found, count=len(inside))
+
+
+@rule(
+    "CS704",
+    "warning",
+    what="The official loader would fail on a greyscale image.",
+    bad="an 8 bit greyscale PNG",
+    remedy="save the image with three channels",
+    needs=("images",),
+)
+def official_grey(scene: RawScene) -> Iterator[Hit]:
+    for name in scene.readable:
+        mode = scene.headers[name].mode
+        if mode in GREY_MODES:
+            yield Hit(f"images/{name}", "an image with colours", f"pixels of mode {mode}")
+
+
+@rule(
+    "CS705",
+    "info",
+    what="The principal point is not in the centre of the image; ChronoScene uses it, the official "
+    "code ignores it.",
+    bad="cx = 140.8 with a width of 320",
+    remedy="nothing to do here; expect worse results from the official code, or crop the images "
+    "with chronoscene undistort --center",
+    needs=("cameras",),
+)
+def official_principal_point(scene: RawScene) -> Iterator[Hit]:
+    for camera in scene.usable_cameras.values():
+        dx, dy = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
+        if max(abs(dx), abs(dy)) > OFF_CENTRE:
+            found = f"an offset of ({dx:+.4g}, {dy:+.4g}) px"
+            yield Hit(scene.camera_place(camera), "a principal point in the centre", found)
+
+
+@rule(
+    "CS706",
+    "info",
+    what="Without `test.txt` the official loader takes every 8th of all images, whatever their "
+    "period: a different split from that of ChronoScene.",
+    bad="a scene without `test.txt`",
+    remedy="write sparse/0/test.txt, so that everybody uses the same split",
+)
+def official_default_split(
+    scene: RawScene, periods: dict[str, int], tests: set[str]
+) -> Iterator[Hit]:
+    if scene.test is not None or test_elsewhere(scene):
+        return  # there is a list, perhaps in the wrong place, which has its own rule
+    theirs = set(sorted(periods, key=_cut)[::TEST_EVERY])
+    if theirs == tests:
+        return
+    empty = sorted(set(scene.period_ids) - {periods[n] for n in theirs})
+    without = f", none in period {', '.join(map(str, empty))}" if empty else ""
+    found = f"{counted(len(theirs), 'other test image')}{without}"
+    yield Hit(TEST, "the same split in the official code", found)
+
+
+@rule(
+    "CS707",
+    "info",
+    what="The units of the scene are too small for the released code, whose voxels have an edge of "
+    "0.001 world units; the code of 3D Gaussian splatting drops everything nearer to the camera "
+    "than 0.2.",
+    bad="a city in units of 100 m",
+    remedy="nothing to do here; for the released code, scale the scene up, or set the voxel size",
+)
+def official_units(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    xyz = points.xyz[np.isfinite(points.xyz).all(axis=1)]
+    if _is_small(xyz):
+        cells = len(np.unique(np.round(xyz / VOXEL), axis=0))
+        if cells < (1 - MIN_LOST) * len(xyz):
+            found = f"{cells} for {len(xyz)} points"
+            yield Hit(scene.model_file("points3D"), f"a voxel of {VOXEL:g} for each point", found)
+    depth = np.concatenate([np.zeros(0), *(s.depth for s in scene.reprojections or ())])
+    near = int(np.count_nonzero((depth > 0) & (depth < NEAR)))
+    if near > MIN_LOST * len(depth):
+        found = f"{near} of {len(depth)} nearer"
+        expected = f"observations at least {NEAR:g} world units from the camera"
+        yield Hit(scene.model_file("points3D"), expected, found, count=near)
+
+
+def _is_small(xyz: NDArray[np.float64]) -> bool:
+    """Whether this many points could share voxels at all: avoids sorting large scenes."""
+    if len(xyz) < 2:
+        return False
+    low, high = np.percentile(xyz[:: len(xyz) // SAMPLE + 1], [5, 95], axis=0)
+    return bool(np.max(high - low) < VOXEL * len(xyz) ** 0.5 * CROWDED)
+
+
+def _cut(name: str) -> str:
+    """The name by which the official loader identifies an image."""
+    return PurePosixPath(name).name.split(".")[0]
+
+
+def _lines(text: str) -> list[str]:
+    """Lines as Python iterates over a file: no empty one after the last line break."""
+    lines = re.split("\r\n|\r|\n", text)
+    return lines[:-1] if lines[-1] == "" else lines

@@ -1,0 +1,165 @@
+import numpy as np
+import pytest
+
+from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import fit_robustly
+
+IMAGES, POINTS, WORLD = "sparse/0/images.txt", "sparse/0/points3D.txt", "sparse/world.json"
+PERIOD_1 = range(7, 14)
+
+
+def turn(axis, degrees):
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
+
+
+def in_frame_of_its_own(scene, similarity):
+    """Express the poses of period 1 in another frame; the points stay in that of period 0."""
+
+    def change(rotation, translation):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, translation
+        moved = similarity.apply_to_pose(pose)
+        return moved[:3, :3], moved[:3, 3]
+
+    scene.change_poses(change, PERIOD_1)
+
+
+def separate(scene, shift=(0.0, 0.0, 0.0), scale=1.0):
+    """Give period 1 its own half of the points, moved and scaled with its poses."""
+    in_frame_of_its_own(scene, Sim3(scale, np.eye(3), np.array(shift)))
+    lines = scene.lines(POINTS)
+    for row, line in enumerate(lines):
+        words = line.split()
+        mine = range(7) if row < 20 else PERIOD_1
+        if row >= 20:
+            moved = scale * np.array(words[1:4], float) + shift
+            words[1:4] = [f"{x:.17g}" for x in moved]
+        lines[row] = " ".join(words[:8] + [f"{i + 1} {row}" for i in mine])
+    scene.write(POINTS, lines)
+    lines = scene.lines(IMAGES)
+    for image in range(14):
+        words = lines[2 * image + 1].split()
+        for row in range(40):
+            if (row < 20) != (image < 7):
+                words[3 * row + 2] = "-1"
+        lines[2 * image + 1] = " ".join(words)
+    scene.write(IMAGES, lines)
+
+
+@pytest.mark.parametrize(
+    ("similarity", "found"),
+    [
+        (Sim3(4.0, np.eye(3), np.zeros(3)), "scaled by 0.25, rotated by 0 degrees"),
+        (Sim3(1.0, turn("y", 40), np.array([3.0, 0, 1])), "scaled by 1, rotated by 40 degrees"),
+    ],
+)
+def test_period_in_a_frame_of_its_own(scene, similarity, found):
+    in_frame_of_its_own(scene, similarity)
+    # What its cameras see in the wrong frame depends on the frame.
+    seen = {f.code for f in scene.validate().findings}
+    also = seen & {"CS512", "CS521"}
+    scene.expect("CS519", place="period 1", found=found, also=also)
+
+
+def test_mirrored_period(scene):
+    mirror = np.diag([1.0, 1.0, -1.0])
+    flip = np.diag([-1.0, 1.0, 1.0])
+    scene.change_poses(lambda r, t: (flip @ r @ mirror, flip @ t), PERIOD_1)
+    seen = {f.code for f in scene.validate().findings}
+    found = "a period that fits mirrored, with z of the world negated, x of the camera negated"
+    scene.expect("CS519", place="period 1", found=found, also=seen & {"CS512"})
+
+
+@pytest.mark.parametrize(
+    ("similarity", "found"),
+    [
+        (Sim3(1.25, np.eye(3), np.zeros(3)), "scaled by 0.8, rotated by 0 degrees"),
+        (Sim3(1.0, turn("x", 12), np.zeros(3)), "scaled by 1, rotated by 12 degrees"),
+        (Sim3(1.0, np.eye(3), np.array([0.2, 0, 0])), "rotated by 0 degrees and moved by 0.2"),
+    ],
+)
+def test_period_that_is_a_little_off(scene, similarity, found):
+    """Far less than what makes a single pose wrong, and still not the frame of the others."""
+    in_frame_of_its_own(scene, similarity)
+    scene.expect("CS519", place="period 1", found=found)
+
+
+def test_focal_length_of_one_period(scene):
+    """Not the frame is wrong, although nearly every error can be explained by one."""
+    scene.write(
+        "sparse/0/cameras.txt", ["1 PINHOLE 64 48 50 50 32 24", "2 PINHOLE 64 48 62.5 62.5 32 24"]
+    )
+    for row in range(14, 28, 2):
+        scene.edit_fields(IMAGES, row, {8: "2"})
+    scene.expect("CS515", place="period 1", found="it fits with focal lengths multiplied by 0.8")
+
+
+def test_opengl_axes_in_one_period(scene):
+    flip = np.diag([1.0, -1.0, -1.0])
+    scene.change_poses(lambda r, t: (flip @ r, flip @ t), PERIOD_1)
+    scene.expect("CS519", place="period 1", found="y and z of the camera negated")
+
+
+@pytest.mark.parametrize("number", ["1e308", "-1e200", "5e-324"])
+@pytest.mark.parametrize("what", ["keypoint", "translation", "point"])
+def test_absurd_numbers_in_a_period_of_another_frame(scene, what, number):
+    in_frame_of_its_own(scene, Sim3(4.0, np.eye(3), np.zeros(3)))
+    if what == "point":
+        scene.edit_fields(POINTS, 5, {2: number})
+    elif what == "keypoint":
+        scene.edit_fields(IMAGES, 21, {0: number})
+    else:
+        scene.edit_fields(IMAGES, 20, {6: number})
+    codes = {f.code for f in scene.validate().findings}
+    assert "CS519" in codes and "CS000" not in codes
+
+
+def test_scale_of_a_period_without_shared_points(scene):
+    separate(scene, scale=30.0)
+    found = "times as far from the cameras, and none shared"
+    scene.expect("CS519", place="period 1", found=found, also={"CS508"}, times=2)
+
+
+def test_separate_points_in_one_frame_need_a_match_only(scene):
+    separate(scene)
+    scene.expect("CS508")
+
+
+def test_period_at_another_place(scene):
+    separate(scene, shift=(500.0, 0.0, 0.0))
+    found = "at most 0.0 % of the points in common view"
+    scene.expect("CS521", place="period 0", found=found, also={"CS508"}, times=2)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e6])
+def test_absurd_metres(scene, scale):
+    scene.change_poses(lambda r, t: (r, t * scale), range(14))
+    lines = scene.lines(POINTS)
+    for row, line in enumerate(lines):
+        words = line.split()
+        words[1:4] = [f"{float(x) * scale:.17g}" for x in words[1:4]]
+        lines[row] = " ".join(words)
+    scene.write(POINTS, lines)
+    scene.write(WORLD, '{"unit": "metre"}')
+    also = {"CS707"} if scale < 1 else ()
+    scene.expect("CS520", place="period 0", found="m from the cameras", also=also, times=2)
+
+
+def test_robust_fit_with_outliers():
+    rng = np.random.default_rng(0)
+    truth = Sim3(3.0, turn("xyz", [20, 30, 40]), np.array([5.0, 6, 7]))
+    source = rng.normal(size=(200, 3))
+    target = truth.apply(source)
+    target[:90] += rng.normal(size=(90, 3)) * 50
+    found, distance = fit_robustly(source, target)
+    assert found.scale == pytest.approx(3.0, rel=1e-9)
+    np.testing.assert_allclose(found.matrix, 3 * truth.rotation, atol=1e-9)
+    assert distance[90:].max() < 1e-8 and not found.mirrored
+    assert fit_robustly(source, source * [1, 1, -1], mirror=True)[0].mirrored
+
+
+def test_points_on_a_line_fix_nothing():
+    line = np.linspace(0, 1, 20)[:, None] * [1.0, 2.0, 3.0]
+    assert fit_robustly(line, line) is None

@@ -1,0 +1,192 @@
+import math
+import struct
+
+import pytest
+
+IMAGES, POINTS = "sparse/0/images.txt", "sparse/0/points3D.txt"
+
+
+def set_track(scene, row, track):
+    """Replace the track of a point, in the points and in the images."""
+    words = scene.lines(POINTS)[row].split()
+    point_id = words[0]
+    old = {(int(i), int(k)) for i, k in zip(words[8::2], words[9::2], strict=True)}
+    lines = scene.lines(POINTS)
+    lines[row] = " ".join(words[:8] + [f"{i} {k}" for i, k in track])
+    scene.write(POINTS, lines)
+    images = scene.lines(IMAGES)
+    for image_id, keypoint in old - set(track):
+        keypoints = images[2 * image_id - 1].split()
+        assert keypoints[3 * keypoint + 2] == point_id
+        keypoints[3 * keypoint + 2] = "-1"
+        images[2 * image_id - 1] = " ".join(keypoints)
+    scene.write(IMAGES, images)
+
+
+def keep_images(scene, rows, kept):
+    """Let the points of some rows be seen by some images (ids) only."""
+    for row in rows:
+        set_track(scene, row, [(i, row) for i in kept])
+
+
+def test_no_points(scene):
+    scene.write(POINTS, "# nothing\n")
+    scene.write(IMAGES, ["" if i % 2 else line for i, line in enumerate(scene.lines(IMAGES))])
+    report = scene.validate()
+    assert {f.code for f in report.findings} == {"CS501", "CS509"}
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
+def test_point_not_finite(scene, value):
+    scene.edit_fields(POINTS, 3, {2: value})
+    scene.edit_fields(POINTS, 7, {1: value})
+    report = scene.expect("CS502", place=POINTS, found="2 of 40 points (ids 4, 8)")
+    assert next(f for f in report.findings if f.code == "CS502").count == 2
+
+
+@pytest.mark.parametrize(
+    ("track", "found"), [([], "no observation"), ([(3, 4)], "one observation")]
+)
+def test_short_track(scene, track, found):
+    set_track(scene, 4, track)
+    scene.expect("CS503", place=POINTS, found=f"{found} for 1 of 40 points (ids 5)")
+
+
+def test_track_over_a_missing_image(scene):
+    scene.edit_fields(POINTS, 4, {8: "77"})
+    scene.expect("CS504", place=POINTS, found="1 observation in image ids 77", also={"CS505"})
+
+
+@pytest.mark.parametrize("keypoint", ["40", "-1", "999999999"])
+def test_track_over_a_missing_keypoint(scene, keypoint):
+    scene.edit_fields(POINTS, 4, {9: keypoint})
+    scene.expect("CS504", place=POINTS, found="beyond the keypoints", also={"CS505"})
+
+
+def test_keypoint_names_another_point(scene):
+    keypoints = scene.lines(IMAGES)
+    words = keypoints[1].split()
+    words[2] = "30"
+    scene.write(IMAGES, [keypoints[0], " ".join(words), *keypoints[2:]])
+    report = scene.expect("CS505", found="whose keypoint refers to another point", times=2)
+    assert any("1 keypoint of points" in f.found for f in report.findings)
+
+
+def test_keypoint_of_no_point_in_a_track(scene):
+    keypoints = scene.lines(IMAGES)
+    words = keypoints[1].split()
+    words[2] = "-1"
+    scene.write(IMAGES, [keypoints[0], " ".join(words), *keypoints[2:]])
+    scene.expect("CS505", place=POINTS, found="1 observation whose keypoint")
+
+
+def test_period_without_points(scene):
+    keep_images(scene, range(40), range(1, 8))
+    scene.expect("CS506", place="period 1", found="0 of 40", also={"CS509"})
+
+
+def test_points_of_one_period(scene):
+    keep_images(scene, range(10), range(8, 15))
+    scene.expect(
+        "CS507", place=POINTS, found="10 of 40 in one only (25.0 %): period 0 0, period 1 10"
+    )
+
+
+def test_period_unconnected(scene):
+    keep_images(scene, range(10), range(8, 15))
+    keep_images(scene, range(10, 40), range(1, 8))
+    scene.expect("CS508", place="period 1", found="0 of 10")
+
+
+def test_period_hardly_connected(scene):
+    """Nine points in common are too few, ten are enough."""
+    keep_images(scene, range(9, 25), range(8, 15))
+    keep_images(scene, range(25, 40), range(1, 8))
+    scene.expect("CS508", place="period 0", found="9 of 24")
+
+
+def test_period_barely_connected(scene):
+    keep_images(scene, range(10, 25), range(8, 15))
+    keep_images(scene, range(25, 40), range(1, 8))
+    assert "CS508" not in {f.code for f in scene.validate().findings}
+
+
+def test_groups_of_periods_unconnected(scene):
+    """Periods 0 and 1 share points, 2 and 3 share points, no others do."""
+    names = sorted(p.name for p in scene.path("images").iterdir())
+    scene.write(
+        "sparse/split.txt",
+        [f"{n} {[0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 3, 3, 3, 3][i]}" for i, n in enumerate(names)],
+    )
+    keep_images(scene, range(15), range(8, 15))
+    keep_images(scene, range(15, 40), range(1, 8))
+    found = [f for f in scene.validate().findings if f.code == "CS508"]
+    assert [(f.place, f.found) for f in found] == [("periods 2, 3", "0 of 15")]
+
+
+def test_periods_connected_by_a_chain(scene):
+    """Periods 0 and 2 share nothing, but both share points with period 1."""
+    names = sorted(p.name for p in scene.path("images").iterdir())
+    scene.write("sparse/split.txt", [f"{n} {min(2, i // 5)}" for i, n in enumerate(names)])
+    keep_images(scene, range(20), range(1, 11))
+    keep_images(scene, range(20, 40), range(6, 15))
+    assert "CS508" not in {f.code for f in scene.validate().findings}
+
+
+def test_image_without_points(scene):
+    keep_images(scene, range(40), [i for i in range(1, 15) if i != 3])
+    scene.expect("CS509", place=IMAGES, found="1 image without points: 'a002.png'")
+
+
+def test_keypoint_not_finite_in_text(scene):
+    scene.edit_fields(IMAGES, 3, {3: "nan"})
+    scene.expect("CS103", place=f"{IMAGES}:4", found="nan")
+
+
+def test_observation_not_finite(scene):
+    x = float(scene.lines(IMAGES)[3].split()[3])
+    scene.to_binary()
+    path = scene.path("sparse/0/images.bin")
+    data = path.read_bytes()
+    assert data.count(struct.pack("<d", x)) == 1
+    path.write_bytes(data.replace(struct.pack("<d", x), struct.pack("<d", math.nan)))
+    scene.expect("CS510", place="sparse/0/images.bin", found="1 of 560 observations")
+
+
+def test_no_training_points(scene):
+    """All points are seen by the two test images alone."""
+    keep_images(scene, range(40), (4, 11))
+    scene.expect("CS514", place=POINTS, found="0 of 40", also={"CS509"})
+
+
+def test_points_without_colours(make_scene):
+    """As COLMAP triangulates them: black, but for a few."""
+    scene = make_scene(points=200, form="text")
+    lines = [line.split() for line in scene.lines(POINTS) if not line.startswith("#")]
+    for words in lines[:-5]:
+        words[4:7] = ["0", "0", "0"]
+    scene.write(POINTS, [" ".join(words) for words in lines])
+    (finding,) = [f for f in scene.validate().findings if f.code == "CS522"]
+    assert (finding.place, finding.found) == (POINTS, "#000000 for 97.5 % of them")
+
+
+def test_points_with_colours(make_scene):
+    scene = make_scene(points=200, form="text")
+    assert "CS522" not in {f.code for f in scene.validate().findings}
+
+
+def test_a_few_short_tracks_are_a_remark(scene, monkeypatch):
+    monkeypatch.setattr("chronoscene.validation.rules.cs5_points.MAX_SHORT", 1 / 40)
+    words = scene.lines(POINTS)[4].split()
+    lines = scene.lines(POINTS)
+    lines[4] = " ".join(words[:10])
+    scene.write(POINTS, lines)
+    assert "CS525" in {f.code for f in scene.validate().findings}
+    assert "CS503" not in {f.code for f in scene.validate().findings}
+
+
+def test_points_without_any_track_are_one_finding(scene):
+    """Not one for the points, one for each period, and one for the scene."""
+    scene.write(POINTS, [" ".join(line.split()[:8]) for line in scene.lines(POINTS)])
+    found = {f.code for f in scene.validate().findings}
+    assert "CS514" in found and not found & {"CS503", "CS506", "CS525"}

@@ -1,0 +1,177 @@
+import numpy as np
+import pytest
+
+from chronoscene.scene.cameras import Camera, project_points
+from chronoscene.validation.checks.reprojection import image_errors
+from chronoscene.validation.scene_folder import RawScene
+
+CAMERAS, IMAGES = "sparse/0/cameras.txt", "sparse/0/images.txt"
+
+
+def test_observations_outside(scene):
+    scene.write(CAMERAS, ["1 PINHOLE 32 24 25 25 16 12"])
+    report = scene.validate()
+    finding = next(f for f in report.findings if f.code == "CS511")
+    assert finding.place == f"{CAMERAS} (camera 1)"
+    assert finding.expected == "observations within 32 x 24"
+    assert {f.code for f in report.findings} == {"CS205", "CS507", "CS511", "CS513"}
+
+
+def test_opengl_poses(scene):
+    flip = np.diag([1.0, -1.0, -1.0])
+    scene.change_poses(lambda r, t: (flip @ r, flip @ t), range(14))
+    scene.expect("CS512", place=IMAGES, found="560 of 560 observations behind")
+
+
+def test_camera_to_world_pose_of_one_image(scene):
+    scene.change_poses(lambda r, t: (r.T, -r.T @ t), [4])
+    report = scene.validate()
+    found = [f for f in report.findings if f.code == "CS513"]
+    assert [f.place for f in found] == [f"{IMAGES} (a004.png)"]
+    assert found[0].expected == "a median reprojection error below 4 px"
+
+
+def test_small_errors_are_silent(scene):
+    scene.change_poses(lambda r, t: (r, t + np.array([0.1, 0, 0])), [4])
+    assert "CS513" not in {f.code for f in scene.validate().findings}
+
+
+def test_wrong_focal_length(scene):
+    scene.write(CAMERAS, ["1 PINHOLE 64 48 150 150 32 24"])
+    scene.expect("CS513", place="period 0", found="px in 7 of 7: 'a0", times=2)
+
+
+LENSES = [
+    "1 SIMPLE_RADIAL 64 48 50 32 24 -0.3",
+    "1 OPENCV 64 48 50 50 32 24 -0.3 0.05 0.01 -0.02",
+    "1 OPENCV_FISHEYE 64 48 50 50 32 24 0.1 0.01 0 0",
+]
+
+
+def through_a_lens(scene, line):
+    """Give all images a camera with distortion, and move the keypoints as it does."""
+    camera_id, model, width, height, *params = line.split()
+    camera = Camera(int(camera_id), model, int(width), int(height), tuple(map(float, params)))
+    lines = scene.lines(IMAGES)
+    for row in range(1, len(lines), 2):
+        words = np.array(lines[row].split(), dtype=object)
+        x, y = (words[0::3].astype(float) - 32) / 50, (words[1::3].astype(float) - 24) / 50
+        local = np.stack([x, y, np.ones(len(x))], axis=1)
+        for start, values in enumerate(project_points(camera, local).T):
+            words[start::3] = [f"{v:.17g}" for v in values]
+        lines[row] = " ".join(words)
+    scene.write(IMAGES, lines)
+    scene.write(CAMERAS, [line])
+    return {"CS132" if model == "OPENCV_FISHEYE" else "CS133"}
+
+
+@pytest.mark.parametrize("line", LENSES)
+def test_distortion_is_part_of_the_projection(scene, line):
+    known = through_a_lens(scene, line)
+    assert {f.code for f in scene.validate().findings} == known | {"CS507"}
+    assert np.max(image_errors(RawScene(scene.root))) < 1e-6
+    scene.write(CAMERAS, ["1 PINHOLE 64 48 50 50 32 24"])  # as if the lens were forgotten
+    assert np.min(image_errors(RawScene(scene.root))) > 0.02
+
+
+@pytest.mark.parametrize("line", LENSES)
+def test_wrong_pose_behind_a_lens(scene, line):
+    known = through_a_lens(scene, line)
+    scene.change_poses(lambda r, t: (r, t + np.array([0.5, 0, 0])), [4])
+    scene.expect("CS513", place=f"{IMAGES} (a004.png)", found="px", also=known)
+
+
+@pytest.mark.parametrize("line", LENSES)
+def test_period_in_a_frame_of_its_own_behind_a_lens(scene, line):
+    through_a_lens(scene, line)
+    scene.change_poses(lambda r, t: (r, 3 * t), range(7, 14))
+    (finding,) = [f for f in scene.validate().findings if f.code == "CS519"]
+    assert finding.place == "period 1" and "scaled by 0.3333" in finding.found
+
+
+IMAGES, POINTS = "sparse/0/images.txt", "sparse/0/points3D.txt"
+
+
+def move_keypoints(scene, rows, pixels):
+    """Shift the keypoints of some images along x to both sides, and those of all a little."""
+    lines = scene.lines(IMAGES)
+    for row in range(14):
+        words = np.array(lines[2 * row + 1].split(), dtype=object)
+        shift = pixels if row in rows else 0.3
+        shifts = shift * (-1.0) ** np.arange(len(words) // 3)
+        words[0::3] = [f"{float(x) + s:.17g}" for x, s in zip(words[0::3], shifts, strict=True)]
+        lines[2 * row + 1] = " ".join(words)
+    scene.write(IMAGES, lines)
+
+
+def test_period_error(scene):
+    move_keypoints(scene, range(7, 14), 2.0)
+    scene.expect("CS515", place="period 1", found="2 px; the worst are 'b0")
+
+
+def test_small_errors_of_a_period_are_silent(scene):
+    move_keypoints(scene, range(7, 14), 0.9)
+    assert {f.code for f in scene.validate().findings} == {"CS507"}
+
+
+def test_image_error(scene):
+    move_keypoints(scene, [2], 2.0)
+    scene.expect("CS516", place=f"{IMAGES} (a002.png)", found="2 px")
+
+
+def test_image_beyond_the_limit_is_left_to_the_other_rule(scene):
+    move_keypoints(scene, [2], 6.0)
+    scene.expect("CS513", place=f"{IMAGES} (a002.png)")
+
+
+def test_duplicate_points(scene):
+    lines = scene.lines(POINTS)
+    shared = lines[0].split()[1:4]
+    for row in range(1, 4):
+        scene.edit_fields(POINTS, row, {1: shared[0], 2: shared[1], 3: shared[2]})
+    scene.expect("CS517", place=POINTS, found="3 of 40")
+
+
+def test_points_that_were_rounded_are_the_same_points(scene):
+    """Copies that went through single precision."""
+    shared = [f"{np.float32(x):.9g}" for x in scene.lines(POINTS)[0].split()[1:4]]
+    for row in range(1, 4):
+        scene.edit_fields(POINTS, row, dict(enumerate(shared, start=1)))
+    found = [f.found for f in scene.validate().findings if f.code == "CS517"]
+    assert found in ([f"{n} of 40 that coincide with another one"] for n in (2, 3))
+
+
+def test_two_points_in_one_place_are_silent(scene):
+    x, y, z = scene.lines(POINTS)[0].split()[1:4]
+    scene.edit_fields(POINTS, 1, {1: x, 2: y, 3: z})
+    assert {f.code for f in scene.validate().findings} == {"CS507"}
+
+
+def test_points_with_one_equal_coordinate_are_silent(scene):
+    for row in range(20):
+        scene.edit_fields(POINTS, row, {1: "0.25"})
+    assert "CS517" not in {f.code for f in scene.validate().findings}
+
+
+def test_far_points(scene):
+    scene.edit_fields(POINTS, 5, {2: "4e4"})
+    scene.expect("CS518", place=POINTS, found="1 point up to 4e+04 away (ids 6)")
+
+
+def test_far_points_of_absurd_size(scene):
+    scene.edit_fields(POINTS, 5, {2: "1e300"})
+    scene.expect("CS518", place=POINTS, found="(ids 6)")
+
+
+def test_error_outdated(scene):
+    """A camera replaced by that of the data sheet: all periods are worse, none stands out."""
+    scene.write("sparse/0/cameras.txt", ["1 PINHOLE 64 48 62.5 62.5 32 24"])
+    scene.expect("CS524", place=POINTS, found="px (median)")
+
+
+@pytest.mark.parametrize("stored", ["0", "-1"])
+def test_errors_that_are_not_stored_say_nothing(scene, stored):
+    scene.write("sparse/0/cameras.txt", ["1 PINHOLE 64 48 62.5 62.5 32 24"])
+    for row in range(40):
+        scene.edit_fields(POINTS, row, {7: stored})
+    assert {f.code for f in scene.validate().findings} == {"CS507"}
