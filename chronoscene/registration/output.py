@@ -23,7 +23,8 @@ from chronoscene.registration.quality.certificate_json import to_json
 from chronoscene.registration.quality.verdict import Verdict, judge
 from chronoscene.registration.report.page import write_report
 from chronoscene.registration.result import Registered
-from chronoscene.registration.ties.tie_alignment import TieAlignment, with_tie_tracks
+from chronoscene.registration.ties.residuals import with_tie_tracks
+from chronoscene.registration.ties.tie_alignment import TieAlignment
 from chronoscene.registration.ties.tie_points import TiePoints
 from chronoscene.scene import Frame, Period, Points, Scene, WorldFrame
 from chronoscene.scene.cameras import project_points

@@ -18,8 +18,7 @@ from chronoscene.registration.photos.inputs import Inputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.result import Registered
 from chronoscene.registration.stages import Stages, work_folder
-from chronoscene.registration.ties.apply import tie
-from chronoscene.registration.ties.tie_alignment import TieAlignment
+from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
 from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
 from chronoscene.scene import Scene
 

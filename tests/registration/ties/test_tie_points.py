@@ -18,11 +18,11 @@ from generated_registrations import (
 from chronoscene.errors import SceneError
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.verdict import judge
+from chronoscene.registration.ties.residuals import with_tie_tracks
 from chronoscene.registration.ties.tie_alignment import (
     align_with_tie_points,
     move_periods,
     robust_similarity,
-    with_tie_tracks,
 )
 from chronoscene.registration.ties.tie_points import TiePoints, match_images, read_tie_points
 from chronoscene.scene.geometry import Sim3

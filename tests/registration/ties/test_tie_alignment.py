@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chronoscene.registration.ties.apply import control_frame
+from chronoscene.registration.ties.tie_alignment import control_frame
 from chronoscene.registration.ties.tie_points import read_tie_points
 
 
