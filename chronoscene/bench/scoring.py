@@ -29,8 +29,7 @@ from chronoscene.bench.results import (
     write_summary,
 )
 from chronoscene.errors import CheckpointError, ChronoSceneError, ShapeError
-from chronoscene.metrics.names import METRICS
-from chronoscene.metrics.scorers import Scorers
+from chronoscene.metrics.registry import METRICS, Scorers
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from chronoscene.bench.results import Failure, RunRecord, read_failures, read_ru
 from chronoscene.errors import CheckpointError
 from chronoscene.io import tables
 from chronoscene.io.tables import Table
-from chronoscene.metrics.names import METRICS, MetricInfo, metric_info
+from chronoscene.metrics.registry import METRICS, MetricInfo, metric_info
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series

@@ -51,7 +51,7 @@ from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
-from chronoscene.metrics.scorers import make_scorers
+from chronoscene.metrics.registry import make_scorers
 from chronoscene.scene import Scene
 
 

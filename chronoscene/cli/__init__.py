@@ -16,11 +16,11 @@ COMMANDS = {
     "convert": "chronoscene.cli.convert:command",
     "methods": "chronoscene.cli.methods:command",
     "register": "chronoscene.cli.register:command",
-    "score": "chronoscene.cli.score:command",
+    "score": "chronoscene.cli.results:score",
     "split": "chronoscene.cli.split:command",
     "stats": "chronoscene.cli.stats:command",
     "synth": "chronoscene.cli.synth:command",
-    "table": "chronoscene.cli.table:command",
+    "table": "chronoscene.cli.results:table",
     "undistort": "chronoscene.cli.undistort:command",
     "validate": "chronoscene.cli.validate:command",
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -12,7 +13,7 @@ from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.strategies import STRATEGIES
 from chronoscene.checks import check_choice
 from chronoscene.cli.output import check_place, emit
-from chronoscene.cli.table import split_list
+from chronoscene.cli.results import split_list
 from chronoscene.errors import ConfigError
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.staging import check_outside
@@ -62,22 +63,14 @@ EXISTING = click.Path(path_type=Path, exists=True)
 @click.option("--out", type=FOLDER, default=Path("runs"), show_default=True, help="Folder of runs.")
 @click.option("--overwrite", is_flag=True, help="Replace finished runs made with other settings.")
 def command(
-    scenes: tuple[Path, ...],
     methods: str,
     strategies: str,
-    preset: str,
     budget: str | None,
-    iterations: int | None,
-    separate_iterations: str,
     seeds: int,
     seed: int,
     assignments: tuple[str, ...],
-    max_width: int,
-    threads: int | None,
-    device: str,
-    lpips_weights: Path | None,
     out: Path,
-    overwrite: bool,
+    **options: Any,
 ) -> None:
     """Train, render and score methods on scenes.
 
@@ -85,29 +78,21 @@ def command(
     predictions and its scores. Finished runs are kept, so the same command goes on after an
     interruption.
     """
-    check_outside(out, scenes, option="--out")
+    check_outside(out, options["scenes"], option="--out")
     check_place("--out", out)
     names = split_list("--method", methods)
     if any(":" in name for name in names) and str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))  # a plug-in under development, named module:SPEC
     settings = BenchSettings(
-        scenes=scenes,
         methods=names,
         runs=out,
         strategies=tuple(
             check_choice("--strategy", s, STRATEGIES) for s in split_list("--strategy", strategies)
         ),
-        preset=preset,
         overrides=parse_assignments(assignments),
-        iterations=iterations,
         budget_seconds=None if budget is None else parse_duration(budget),
-        separate_iterations=separate_iterations,
         seeds=tuple(range(seed, seed + seeds)),
-        max_width=max_width,
-        threads=threads,
-        device=device,
-        lpips_weights=lpips_weights,
-        overwrite=overwrite,
+        **options,
     )
     outcome = run_bench(settings, lambda line: click.echo(line, err=True))
     report(outcome, out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -10,12 +11,12 @@ from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
-from chronoscene.registration.context import CALIBRATIONS, Calibration
+from chronoscene.registration.context import CALIBRATIONS
 from chronoscene.registration.features.matching import MIN_PHOTOS
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.pipeline import Options, run, run_into
-from chronoscene.registration.result import ROUTES, Registered, Route
+from chronoscene.registration.result import ROUTES, Registered
 
 DEFAULTS = Options()
 
@@ -117,19 +118,7 @@ def command(
     out: Path,
     table: Path | None,
     scene: Path | None,
-    route: Route | None,
-    work: Path | None,
-    overwrite: bool,
-    max_image_size: int,
-    max_features: int,
-    exhaustive_limit: int,
-    held_out: float,
-    camera_model: str,
-    calibration: Calibration,
-    threads: int | None,
-    tie_points: Path | None,
-    tie_scale: float,
-    page: bool,
+    **settings: Any,
 ) -> None:
     """Register photos of several dates into one frame and write the scene OUT.
 
@@ -140,28 +129,14 @@ def command(
     Exit status: 0 unless the verdict is fail, 1 if it is (the scene is written), 2 if the photos
     cannot be registered, or wrong usage.
     """
-    for option, place in (("OUT", out), ("--work", work)):
+    for option, place in (("OUT", out), ("--work", settings["work"])):
         if place is not None:
             check_outside(
                 place, [captures if captures.is_dir() else captures.parent], option=option
             )
             check_place(option, place)
     found = read_captures(captures, table=table)
-    options = Options(
-        route=route,
-        work=work,
-        overwrite=overwrite,
-        max_image_size=max_image_size,
-        max_features=max_features,
-        exhaustive_limit=exhaustive_limit,
-        held_out=held_out,
-        camera_model=camera_model,
-        calibration=calibration,
-        threads=threads,
-        tie_points=tie_points,
-        tie_scale=tie_scale,
-        page=page,
-    )
+    options = Options(**settings)
     inspections: list[Inspection] = []
     with progress_bar(log=True) as report:
         if scene is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -20,7 +21,6 @@ from chronoscene.scene.split_making import (
     STRATEGIES,
     NewSplit,
     SplitSettings,
-    Strategy,
     make_split,
 )
 
@@ -68,15 +68,11 @@ from chronoscene.scene.split_making import (
 def command(
     source: Path,
     out: Path | None,
-    strategy: Strategy,
     fraction: float | None,
     every: int | None,
-    offset: int,
-    seed: int | None,
-    blocks: int | None,
-    periods: tuple[int, ...],
     scene_out: Path | None,
     scene_format: str | None,
+    **options: Any,
 ) -> None:
     """Choose new test images of SCENE and write their names to the file OUT.
 
@@ -85,17 +81,7 @@ def command(
     """
     _check_targets(source, out, scene_out)
     scene = read_scene(source, format=scene_format)
-    split = make_split(
-        scene,
-        SplitSettings(
-            strategy=strategy,
-            fraction=_fraction(fraction, every),
-            offset=offset,
-            seed=seed,
-            blocks=blocks,
-            periods=periods,
-        ),
-    )
+    split = make_split(scene, SplitSettings(fraction=_fraction(fraction, every), **options))
     for frame in split.scene.frames:
         our_format.check_writable_name(source, frame)
     if scene_out is not None:

@@ -1,1 +1,5 @@
-"""Image metrics. `table` names them all; `image` and `lpips` hold the formulas."""
+"""Image metrics: two images go in, a number comes out.
+
+`registry` names them all and says which this machine can compute; the formulas are in `psnr_ssim`
+and `lpips`.
+"""

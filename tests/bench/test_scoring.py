@@ -10,7 +10,7 @@ from chronoscene.bench.predictions import ImageWriter, encode_png
 from chronoscene.bench.results import Row, read_rows, read_run, run_folders, write_run
 from chronoscene.bench.scoring import aggregate, changes, rescore, score_folder
 from chronoscene.errors import CheckpointError
-from chronoscene.metrics.scorers import Scorers, make_scorers
+from chronoscene.metrics.registry import Scorers, make_scorers
 
 
 def rows(metric, values):

@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 from chronoscene.errors import MetricUnavailableError, ShapeError
 from chronoscene.metrics.lpips import Lpips, unit_length
 from chronoscene.metrics.lpips_weights import ENVIRONMENT, candidate_files, load_weights
-from chronoscene.metrics.scorers import make_scorers
+from chronoscene.metrics.registry import make_scorers
 
 # lpips 0.1.4 with torchvision 0.28.0 and torch 2.13.0 on a CPU, fed with the weights and images of
 # the fixture `random_lpips`: inputs scaled to [-1, 1], and inputs left in [0, 1].
@@ -136,7 +136,7 @@ def test_without_weights_the_reason_says_what_to_put_where(no_weights):
 
 def test_without_weights_torch_is_not_imported(no_weights):
     code = (
-        "import sys\nfrom chronoscene.metrics.scorers import make_scorers\n"
+        "import sys\nfrom chronoscene.metrics.registry import make_scorers\n"
         "assert make_scorers().skipped.keys() == {'lpips_vgg', 'lpips_vgg_3dgs'}\n"
         "assert 'torch' not in sys.modules"
     )

@@ -172,7 +172,7 @@ def test_image_metrics_need_no_torch():
     code = (
         "import sys, numpy as np\n"
         "from chronoscene.metrics.psnr_ssim import ssim, psnr\n"
-        "from chronoscene.metrics.scorers import make_scorers\n"
+        "from chronoscene.metrics.registry import make_scorers\n"
         "make_scorers(['psnr', 'ssim']); ssim(np.zeros((12, 12, 3)), np.zeros((12, 12, 3)))\n"
         "assert 'torch' not in sys.modules"
     )

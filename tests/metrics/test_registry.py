@@ -3,8 +3,7 @@
 import pytest
 
 from chronoscene.errors import ConfigError
-from chronoscene.metrics.names import METRICS, metric_info
-from chronoscene.metrics.scorers import make_scorers
+from chronoscene.metrics.registry import METRICS, make_scorers, metric_info
 
 
 def test_names_carry_their_variant():

@@ -1,16 +1,51 @@
-"""``chronoscene table``: results as a table for a terminal, a paper or a program."""
+"""``chronoscene table`` and ``score``: what finished runs say, and scoring them again."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
 
+from chronoscene.bench.scoring import rescore
 from chronoscene.bench.tables import format_runs, read_runs
 from chronoscene.cli.output import emit
+from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.io.tables import FORMATS
-from chronoscene.metrics.names import metric_info
+from chronoscene.metrics.registry import make_scorers, metric_info
+
+SOME_FAILED = 1
+"""Exit status when a run could not be scored."""
+
+
+@click.command("score")
+@click.argument("runs", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option(
+    "--lpips-weights",
+    type=click.Path(path_type=Path, exists=True),
+    help="Folder or file with the weights of LPIPS.",
+)
+def score(runs: Path, lpips_weights: Path | None) -> None:
+    """Score the predictions of all finished runs in RUNS again and say what changed.
+
+    Only the images of each run and the frozen ground truth are read; their hashes are checked.
+    """
+    scorers = make_scorers(lpips_weights=lpips_weights)
+    with progress_bar() as bar:
+        outcomes = rescore(runs, scorers, progress=partial(bar, "runs"))
+    for outcome in outcomes:
+        name = outcome.folder.relative_to(runs)
+        if outcome.error is not None:
+            click.secho(f"{name}: error: {outcome.error}", fg="red", err=True)
+            continue
+        click.echo(f"{name}: {'; '.join(outcome.changes) or 'unchanged'}")
+        for metric in outcome.kept:
+            click.echo(f"{name}: {metric} kept from an earlier scoring")
+    for metric, reason in scorers.skipped.items():
+        click.echo(f"{metric} not computed: {reason}")
+    if any(outcome.error is not None for outcome in outcomes):
+        click.get_current_context().exit(SOME_FAILED)
 
 
 @click.command("table")
@@ -24,7 +59,7 @@ from chronoscene.metrics.names import metric_info
 @click.option("--format", "style", type=click.Choice(FORMATS), default="table", show_default=True)
 @click.option("--metric", "metrics", multiple=True, help="NAME[,NAME...]; default: all there are.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="File to write.")
-def command(
+def table(
     folders: tuple[Path, ...], style: str, metrics: tuple[str, ...], out: Path | None
 ) -> None:
     """Show the results of one or several folders of runs.
