@@ -10,7 +10,7 @@ import numpy as np
 
 from chronoscene.checks import check_choice
 from chronoscene.formats import load_format, read_scene, writable_formats
-from chronoscene.formats.shared.writing import ImageSource, Progress
+from chronoscene.images.store import ImageSource, Progress
 from chronoscene.io.staging import check_outside
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import IMAGE_SUFFIXES

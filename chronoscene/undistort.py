@@ -18,14 +18,13 @@ from PIL import Image
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats.shared.writing import ImageSource, Progress, place_image
-from chronoscene.images.resampling import warp
-from chronoscene.images.store import load_rgb
+from chronoscene.images.store import ImageSource, Progress, load_rgb, place_image
 from chronoscene.images.undistortion import (
     CameraChange,
     move_observations,
     plan_cameras,
     sampling_map,
+    warp,
 )
 from chronoscene.io.staging import staged_folder
 from chronoscene.kernels.runtime import available_threads

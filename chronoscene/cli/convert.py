@@ -11,7 +11,7 @@ from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import convert
 from chronoscene.formats import format_names, load_format, writable_formats
-from chronoscene.formats.shared.writing import ImageSource
+from chronoscene.images.store import ImageSource
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
 

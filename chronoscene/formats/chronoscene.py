@@ -17,7 +17,7 @@ from chronoscene.formats.shared.json_values import (
     read_json,
     world_item,
 )
-from chronoscene.formats.shared.writing import ImageSource, Progress, place_images
+from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame
 from chronoscene.scene.splits import (

@@ -42,7 +42,7 @@ from chronoscene.formats.shared.transforms import (
     read_frames,
 )
 from chronoscene.formats.shared.transforms import make_scene as scene_from_shots
-from chronoscene.formats.shared.writing import ImageSource, Progress
+from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Camera, Points, Scene
 from chronoscene.scene.cameras import PINHOLE_MODELS
 from chronoscene.scene.splits import DEFAULT_RULE, TEST_EVERY, default_tests

@@ -31,7 +31,7 @@ from chronoscene.formats.shared.grouping import (
     natural_key,
     rule_error,
 )
-from chronoscene.formats.shared.writing import ImageSource, Progress
+from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import (
     DEFAULT_RULE,

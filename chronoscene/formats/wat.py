@@ -35,7 +35,7 @@ from chronoscene.formats.shared.colmap_layout import (
     write_renamed,
 )
 from chronoscene.formats.shared.grouping import group_labels
-from chronoscene.formats.shared.writing import ImageSource, Progress
+from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Camera, Scene
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 

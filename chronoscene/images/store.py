@@ -10,25 +10,37 @@ Orientation tags are not applied: COLMAP works on the pixels as stored, and so d
 
 from __future__ import annotations
 
+import os
+import shutil
 import struct
 import threading
 import zlib
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from chronoscene.checks import check_choice
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.cameras import CAMERA_MODELS
 
 MAX_WIDTH = 1600
 """Pixels; the limit that the field's loaders use."""
+
+ImageSource = Literal["copy", "link", "symlink", "none"]
+
+IMAGE_SOURCES: tuple[ImageSource, ...] = ("copy", "link", "symlink", "none")
+"""``copy``; hard ``link`` where the disk can, else copy; absolute ``symlink``; no images."""
+
+Progress = Callable[[int, int], None]
+"""Called with the number of images done and their total."""
 
 _ORIENTATION_TAG = 0x0112
 _UNDO_ORIENTATION = {
@@ -270,3 +282,54 @@ class ImageStore:
             while self._bytes > self._limit:
                 self._bytes -= self._cache.popitem(last=False)[1].nbytes
         return image
+
+
+def place_images(
+    scene: Scene,
+    root: Path,
+    *,
+    names: Mapping[str, str] | None = None,
+    image_source: ImageSource = "copy",
+    progress: Progress | None = None,
+) -> None:
+    """Put the images of a scene below ``root``, under their names or the given new ones.
+
+    Raises:
+        SceneError: If an image is missing.
+        ConfigError: If there is no such image source.
+    """
+    check_choice("image_source", image_source, IMAGE_SOURCES)
+    for done, frame in enumerate(scene.frames, start=1):
+        if image_source != "none":
+            name = names[frame.name] if names is not None else frame.name
+            place_image(scene.image_path(frame), root / name, image_source)
+        if progress is not None:
+            progress(done, len(scene.frames))
+
+
+def place_image(source: Path, target: Path, image_source: ImageSource) -> None:
+    """Copy or link one image.
+
+    Raises:
+        SceneError: If it is missing, or its place is taken.
+    """
+    if not source.is_file():
+        raise SceneError(source, expected="an image", found="nothing", todo="copy it there")
+    if os.path.lexists(target):  # a/b and a//b; or a and A on a disk that takes them for one
+        raise SceneError(
+            target,
+            expected="a file of its own for each image",
+            found="one that another image has",
+            todo="rename the image",
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if image_source == "symlink":
+        target.symlink_to(source.resolve())
+        return
+    if image_source == "link":
+        try:
+            os.link(source.resolve(), target)
+            return
+        except OSError:
+            pass  # another disk, or one without links
+    shutil.copyfile(source, target)

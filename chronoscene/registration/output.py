@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats.shared.writing import Progress
+from chronoscene.images.store import Progress
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, certify
 from chronoscene.registration.quality.certificate_json import to_json

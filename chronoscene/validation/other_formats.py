@@ -14,7 +14,7 @@ from chronoscene.colmap.raw_model import model_files
 from chronoscene.convert import remarks_on
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats.shared.writing import place_image
+from chronoscene.images.store import place_image
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import colmap_folders, detect_format, read_scene
-from chronoscene.formats.shared.grouping import natural_key
+from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.scene import Period
 
 DATED = ["2016/a.png", "2016/b.png", "2023-04/a.png", "2023-04/c/d.png"]
@@ -175,3 +175,12 @@ def test_written_labels_are_read_again(make_scene_folder, tmp_path):
     named = dataclasses.replace(scene, periods=(Period(0, "2016-09"), Period(1, "2023")))
     again = read_scene(colmap_folders.write(named, tmp_path / "out"))
     assert [p.label for p in again.periods] == ["2016-09", "2023"]
+
+
+def test_lines_of_a_table_are_counted_as_an_editor_does(tmp_path):
+    (tmp_path / "t.csv").write_text("\n\nperiod,file\n \n2016,a.png\n\n2017,b.png\n")
+    rows = read_table(tmp_path / "t.csv")
+    assert rows == [
+        (f"{tmp_path}/t.csv:5", "a.png", "2016"),
+        (f"{tmp_path}/t.csv:7", "b.png", "2017"),
+    ]

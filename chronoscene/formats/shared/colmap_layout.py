@@ -27,7 +27,7 @@ from chronoscene.formats.chronoscene import (
     make_frames,
 )
 from chronoscene.formats.shared.grouping import label_date, natural_key
-from chronoscene.formats.shared.writing import ImageSource, Progress, place_image
+from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Scene, WorldFrame
 from chronoscene.scene.splits import IMAGE_SUFFIXES
@@ -166,12 +166,9 @@ def write_renamed(
             tests = "".join(f"{f.name}\n" for f in new.frames if f.split == "test")
             (staged / TEST).write_text(tests, encoding="utf-8", newline="\n")
         (staged / "images").mkdir()
-        for done, frame in enumerate(scene.frames, start=1):
-            if image_source != "none":
-                target = staged / "images" / names[frame.name]
-                place_image(scene.image_path(frame), target, image_source)
-            if progress is not None:
-                progress(done, len(scene.frames))
+        place_images(
+            scene, staged / "images", names=names, image_source=image_source, progress=progress
+        )
     return out
 
 

@@ -86,6 +86,32 @@ def label_date(label: str) -> str | None:
     return label if label[:2] in ("19", "20") and is_iso_date(label) else None
 
 
+def read_table(path: Path, images: Sequence[str] = ("file",)) -> list[tuple[str, str, str]]:
+    """Place for messages, image and label of each row of a CSV file.
+
+    Args:
+        path: Of the file.
+        images: Names that the column of the images may have; the other one is ``period``.
+
+    Raises:
+        SceneError: If it is no CSV file, has no row, or lacks a column.
+    """
+    text = enumerate(read_text(path).splitlines(), start=1)
+    lines = [(number, line) for number, line in text if line.strip()]
+    try:
+        reader = csv.DictReader(line for _, line in lines)
+        rows = [(f"{path}:{lines[reader.line_num - 1][0]}", row) for row in reader]
+    except csv.Error as error:
+        raise _table_error(path, "a CSV file", str(error)) from error
+    columns = rows[0][1] if rows else {}
+    column = next((name for name in images if name in columns), None)
+    if column is None or "period" not in columns:
+        found = lines[0][1] if lines else "an empty file"
+        expected = f"the columns {images[0]} and period, and at least one row"
+        raise _table_error(path, expected, found[:80])
+    return [(at, (row[column] or "").strip(), (row["period"] or "").strip()) for at, row in rows]
+
+
 def group_by_table(names: Sequence[str], path: Path) -> Grouped:
     """Periods from a CSV file; labels are sorted naturally, so numbers and dates are in order.
 
@@ -94,19 +120,12 @@ def group_by_table(names: Sequence[str], path: Path) -> Grouped:
     """
     index = NameIndex(names)
     labels: dict[str, str] = {}
-    try:
-        rows = list(csv.DictReader(read_text(path).splitlines()))
-    except csv.Error as error:
-        raise _table_error(path, "a CSV file", str(error)) from error
-    if not rows or not {"file", "period"} <= rows[0].keys():
-        raise _table_error(path, "the columns file and period, and at least one row", "others")
-    for number, row in enumerate(rows, start=2):
-        name, label = (row["file"] or "").strip(), (row["period"] or "").strip()
+    for place, name, label in read_table(path):
         found = index.find(name)
         if len(found) > 1:
-            raise _table_error(f"{path}:{number}", "a name that fits one image", repr(name))
+            raise _table_error(place, "a name that fits one image", repr(name))
         if found and label and labels.setdefault(found[0], label) != label:
-            raise _table_error(f"{path}:{number}", f"one period of {name!r}", "two")
+            raise _table_error(place, f"one period of {name!r}", "two")
     if lost := [name for name in names if name not in labels]:
         raise _table_error(path, f"a period of every image, {lost[0]!r} too", "none")
     return group_labels(labels, sorted(set(labels.values()), key=natural_key))

@@ -6,7 +6,6 @@ proposed from their dates), and a CSV table of image and period.
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,11 +14,12 @@ from datetime import date, datetime
 from pathlib import Path, PurePosixPath
 
 from chronoscene.errors import SceneError
+from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.formats.shared.json_values import is_iso_date
 from chronoscene.images.exif import read_exif
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.photos.photo import Capture, open_photo, taken_at
-from chronoscene.scene.splits import IMAGE_SUFFIXES, read_text
+from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 PERIOD_GAP_DAYS = 14
 """Photos in one folder that were taken this many days after the previous one begin a new period."""
@@ -109,31 +109,19 @@ def _period_folders(root: Path) -> list[_Listed]:
 
 def _from_table(root: Path, table: Path) -> list[_Listed]:
     """Rows ``image, period`` of a CSV, in any order of columns."""
-    lines = [line for line in read_text(table).splitlines() if line.strip()]
-    rows = list(csv.DictReader(lines))
-    columns = rows[0].keys() if rows else ()
-    image_key = next((k for k in ("image", "file", "name") if k in columns), None)
-    if image_key is None or "period" not in columns:
-        raise SceneError(
-            table,
-            expected="a header line with the columns image and period",
-            found=lines[0][:80] if lines else "an empty file",
-            todo="write lines such as: 2016/IMG_0001.jpg,2016",
-        )
     listed: dict[str, _Listed] = {}
-    for number, row in enumerate(rows, start=2):
-        name, label = (row[image_key] or "").strip(), (row["period"] or "").strip()
+    for place, name, label in read_table(table, ("image", "file", "name")):
         file = _in_root(root, name)
         if not name or not label or file is None:
             raise SceneError(
-                f"{table}:{number}",
+                place,
                 expected="an image below the folder of the captures, and its period",
                 found=f"{name!r}, {label!r}",
                 todo="correct the line; paths are relative to the folder of the captures",
             )
         if name in listed and listed[name].label != label:
             raise SceneError(
-                f"{table}:{number}",
+                place,
                 expected=f"one period of {name!r}",
                 found=f"{listed[name].label!r} and {label!r}",
                 todo="keep one of the two lines",
@@ -211,13 +199,7 @@ def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
             first[label] = sorted(times)[len(times) // 2]
     if len(first) == len(by_label):
         return sorted(by_label, key=lambda label: (first[label], label))
-    return sorted(by_label, key=_natural)
-
-
-def _natural(label: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Sorts t2 before t10."""
-    parts = re.findall(r"\d+|\D+", label)
-    return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts], label
+    return sorted(by_label, key=natural_key)
 
 
 def _period_date(label: str, captures: Sequence[Capture]) -> str | None:

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.images.resampling import warp
+from chronoscene.images.undistortion import warp
 
 
 def places(*values):
