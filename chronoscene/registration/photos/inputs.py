@@ -1,33 +1,59 @@
-"""First stage: which photos there are, under which names, of which periods, and where."""
+"""First stage: the photos with their final names, periods and positions, where the steps find them.
+
+COLMAP and our format use the pixels as stored. An orientation tag would make viewers and other
+loaders rotate them, so it is set to 1 in a copy, without touching the pixels. Files that COLMAP
+does not read in colour are written as PNG. All others are links to the originals.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import os
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 from typing import Any
+
+from PIL import Image
 
 from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.geodesy import Georeference, from_crs
-from chronoscene.images.store import image_size
+from chronoscene.images.exif import set_upright
+from chronoscene.images.store import image_size, load_rgb
+from chronoscene.io.staging import replacing
 from chronoscene.registration.context import Context
-from chronoscene.registration.photos import prepare
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.gps_priors import Positions, locate
 from chronoscene.registration.photos.photo import Capture
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
 
+_ORIENTATION = 0x0112
+_PLAIN_MODES = ("RGB", "L")
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """Captures without those that are copies of others."""
+
+    captures: tuple[Capture, ...]
+    digests: dict[str, str]
+    """SHA-256 of each file by name."""
+    refused: tuple[tuple[str, int, str], ...]
+    remarks: tuple[str, ...]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """Photos as they go into the features, those of a scene that grows among them."""
+    """Photos as they go into feature extraction, including those of a scene that is extended."""
 
     captures: Captures
     scene: Scene | None
     """The scene that gets a new period."""
     images: tuple[Capture, ...]
-    """New photos under the names that they have from now on, sorted."""
+    """New photos under their final names, sorted."""
     periods: dict[str, int]
     """Of all photos, by name."""
     labels: tuple[str, ...]
@@ -40,7 +66,7 @@ class Inputs:
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """Those of the scene that grows."""
+        """Those of the scene that is extended."""
         return self.scene.frames if self.scene else ()
 
     def totals(self) -> list[int]:
@@ -51,7 +77,7 @@ class Inputs:
         return counts
 
     def priors(self) -> dict[str, Any]:
-        """Positions that are believed: ``enu`` and ``sigma`` by name."""
+        """Plausible positions: ``enu`` and ``sigma`` by name."""
         found = self.positions
         rows = [
             (capture.name, enu.tolist(), sigma.tolist())
@@ -80,7 +106,7 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
     stages = context.stages
     told = [f"{name}: {reason}" for name, _, reason in captures.refused]
     stages.remark("captures", *captures.remarks, *told)
-    unique = prepare.drop_copies(captures.images, prepare.content_digests(captures.images))
+    unique = drop_copies(captures.images, content_digests(captures.images))
     _check_enough(captures, unique.captures, scene, context)
     label, date = _new_period(captures)
     source = unique.captures
@@ -91,7 +117,7 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
     if scene is not None:
         inputs += [[f.name, str(scene.image_path(f))] for f in scene.frames]
     names = stages.run("photos", inputs, lambda: _place(source, scene, unique.remarks, context))
-    images = prepare.renamed(source, names)
+    images = renamed(source, names)
     periods = {f.name: f.period for f in (scene.frames if scene else ())}
     positions, georeference = _locate(images, scene, context)
     last = scene.num_periods if scene else None
@@ -158,20 +184,20 @@ def _as_new_period(captures: Sequence[Capture], scene: Scene, label: str) -> tup
 def _place(
     captures: Sequence[Capture], scene: Scene | None, remarks: Sequence[str], context: Context
 ) -> tuple[list[str], list[str]]:
-    """Put photos, and those of the scene, where the steps look for them."""
+    """Put photos, and those of the scene, where the steps find them."""
     shutil.rmtree(context.photos, ignore_errors=True)
-    names, told = prepare.place_photos(captures, context.photos)
+    names, told = place_photos(captures, context.photos)
     for frame in scene.frames if scene else ():
         assert scene is not None
         _check_pinhole(scene, frame)
-        prepare.link(scene.image_path(frame), context.photos / frame.name)
+        link(scene.image_path(frame), context.photos / frame.name)
     return names, [*remarks, *told]
 
 
 def _locate(
     images: Sequence[Capture], scene: Scene | None, context: Context
 ) -> tuple[Positions, Georeference | None]:
-    """Positions in the frame of the scene if it has a place, else in one of their own."""
+    """Positions in the frame of the scene if it is georeferenced, else in one of their own."""
     frame = from_crs(scene.world.crs) if scene and scene.world.unit == "metre" else None
     positions = locate(images, frame)
     context.stages.remark("positions", *positions.remarks)
@@ -185,7 +211,120 @@ def _check_pinhole(scene: Scene, frame: Frame) -> None:
     if not camera.is_pinhole or size != (camera.width, camera.height):
         raise SceneError(
             scene.image_path(frame),
-            expected="an image of the size of its camera, without distortion",
+            expected="an image without distortion, of the size of its camera",
             found=f"{camera.model} {camera.width} x {camera.height}, file {size[0]} x {size[1]}",
-            todo="write the scene with chronoscene undistort first",
+            todo="undistort the scene first: chronoscene undistort",
         )
+
+
+def content_digests(captures: Sequence[Capture]) -> dict[str, str]:
+    """SHA-256 of each file by name."""
+    digests = {}
+    for capture in captures:
+        with capture.path.open("rb") as file:
+            digests[capture.name] = hashlib.file_digest(file, "sha256").hexdigest()
+    return digests
+
+
+def drop_copies(captures: Sequence[Capture], digests: dict[str, str]) -> Prepared:
+    """Keep one of each photo: the one of the earliest period.
+
+    A photo belongs to one date. The same file in two periods would link them by meaningless
+    matches.
+    """
+    first: dict[str, Capture] = {}
+    kept, refused = [], []
+    for capture in sorted(captures, key=lambda c: (c.period, c.name)):
+        original = first.setdefault(digests[capture.name], capture)
+        if original is capture:
+            kept.append(capture)
+            continue
+        where = "in an earlier period" if original.period != capture.period else "in this period"
+        reason = f"the same file as {original.name} {where}: a photo belongs to one date"
+        refused.append((capture.name, capture.period, reason))
+    kept.sort(key=lambda c: c.name)
+    across = sum("earlier period" in reason for *_, reason in refused)
+    remarks = [f"{across} photos are copies of photos of an earlier period"] if across else []
+    return Prepared(tuple(kept), digests, tuple(refused), tuple(remarks))
+
+
+def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], list[str]]:
+    """Put all captures below a folder.
+
+    Returns:
+        The name of each capture there, and remarks. Names differ only where a file is converted,
+        or has blanks in its name.
+    """
+    names, turned, converted = [], 0, 0
+    plain = plain_names([c.name for c in captures])
+    for capture, name in zip(captures, plain, strict=True):
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        kind = _kind(capture.path)
+        if kind == "convert":
+            target = _convert(capture.path, target)
+            converted += 1
+        elif capture.exif.orientation != 1 and capture.path.suffix.lower() in (".jpg", ".jpeg"):
+            _copy_upright(capture.path, target)
+            turned += 1
+        else:
+            link(capture.path, target)
+        names.append(target.relative_to(folder).as_posix())
+    remarks = []
+    if turned:
+        remarks.append(f"{turned} photos have an orientation tag: set to 1, pixels left as stored")
+    if converted:
+        remarks.append(f"{converted} files converted to PNG: no plain 8-bit colours")
+    if renamings := sum(a != c.name for a, c in zip(plain, captures, strict=True)):
+        remarks.append(f"blanks in {renamings} names replaced by underscores")
+    return names, remarks
+
+
+def plain_names(names: Sequence[str]) -> list[str]:
+    """Names without blanks, which COLMAP's lists and other loaders cannot hold; still unique."""
+    taken, plain = set(names), []
+    for name in names:
+        new = re.sub(r"\s", "_", name)
+        path = PurePosixPath(new)
+        number = 2
+        while new != name and new in taken:
+            new = str(path.with_stem(f"{path.stem}_{number}"))
+            number += 1
+        taken.add(new)
+        plain.append(new)
+    return plain
+
+
+def renamed(captures: Sequence[Capture], names: Sequence[str]) -> tuple[Capture, ...]:
+    """Captures under the names that `place_photos` gave, sorted."""
+    changed = [replace(c, name=name) for c, name in zip(captures, names, strict=True)]
+    return tuple(sorted(changed, key=lambda c: c.name))
+
+
+def _kind(path: Path) -> str:
+    with Image.open(path) as image:
+        plain = image.mode in _PLAIN_MODES and getattr(image, "n_frames", 1) == 1
+        turned_tiff = image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) != 1
+    return "keep" if plain and not turned_tiff else "convert"
+
+
+def _convert(source: Path, target: Path) -> Path:
+    target = target.with_name(f"{target.name}.png")
+    with replacing(target) as partial:
+        Image.fromarray(load_rgb(source)).save(partial, format="PNG")
+    return target
+
+
+def link(source: Path, target: Path) -> None:
+    """Make a symbolic link, replacing what is there."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    partial.unlink(missing_ok=True)
+    partial.symlink_to(source.resolve())
+    partial.replace(target)
+
+
+def _copy_upright(source: Path, target: Path) -> None:
+    data = source.read_bytes()
+    with replacing(target) as partial:
+        partial.write_bytes(set_upright(data) or data)

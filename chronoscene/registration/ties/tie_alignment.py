@@ -124,8 +124,8 @@ def _too_few(model: Registered, tie_points: TiePoints, period: int, count: int) 
     also += ", ".join(missing[:5]) + (" ..." if len(missing) > 5 else "")
     return SceneError(
         tie_points.path,
-        """Align every period to the one that places most points, the best linked first."""
-        f"{model.labels[period]} and in two of another period",
+        expected="three points or more that are not collinear, each clicked in two images of "
+        f"period {model.labels[period]} and in two of another period",
         found=f"{count} such points{also}",
         todo="click more points, spread over the scene, each in two images of both periods",
     )

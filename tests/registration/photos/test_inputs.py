@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.registration.photos import prepare
+from chronoscene.registration.photos import inputs
 from chronoscene.registration.photos.captures import read_captures
 
 
@@ -32,7 +32,7 @@ def test_orientation_is_set_to_upright_without_touching_a_pixel(
     save(folder / "turned.jpg", 0, exif=exif, quality=90)
     save(folder / "plain.jpg", 1, quality=90)
     before = (folder / "turned.jpg").read_bytes()
-    names, remarks = prepare.place_photos(read_captures(folder).images, tmp_path / "photos")
+    names, remarks = inputs.place_photos(read_captures(folder).images, tmp_path / "photos")
     assert names == ["plain.jpg", "turned.jpg"]
     assert "1 photos have an orientation tag" in remarks[0]
     assert (folder / "turned.jpg").read_bytes() == before
@@ -47,18 +47,18 @@ def test_files_without_plain_colours_become_png(folder: Path, tmp_path: Path) ->
     save(folder / "print.jpg", 0, mode="CMYK")
     save(folder / "clear.png", 1, mode="RGBA")
     captures = read_captures(folder).images
-    names, remarks = prepare.place_photos(captures, tmp_path / "photos")
+    names, remarks = inputs.place_photos(captures, tmp_path / "photos")
     assert names == ["clear.png.png", "print.jpg.png"]
     assert "2 files converted" in remarks[0]
     for name in names:
         with Image.open(tmp_path / "photos" / name) as image:
             assert image.mode == "RGB"
-    assert [c.name for c in prepare.renamed(captures, names)] == names
+    assert [c.name for c in inputs.renamed(captures, names)] == names
 
 
 def test_blanks_in_names_are_replaced_and_names_stay_unique() -> None:
     names = ["t 1/a b.jpg", "t_1/a_b.jpg", "t 1/c.jpg"]
-    assert prepare.plain_names(names) == ["t_1/a_b_2.jpg", "t_1/a_b.jpg", "t_1/c.jpg"]
+    assert inputs.plain_names(names) == ["t_1/a_b_2.jpg", "t_1/a_b.jpg", "t_1/c.jpg"]
 
 
 def test_a_photo_belongs_to_one_period(folder: Path) -> None:
@@ -67,10 +67,10 @@ def test_a_photo_belongs_to_one_period(folder: Path) -> None:
     save(folder / "1/copy.jpg", 0)
     save(folder / "1/own.jpg", 2)
     captures = read_captures(folder).images
-    digests = prepare.content_digests(captures)
+    digests = inputs.content_digests(captures)
     data = (folder / "0/a.jpg").read_bytes()
     assert digests["0/a.jpg"] == hashlib.sha256(data).hexdigest()
-    found = prepare.drop_copies(captures, digests)
+    found = inputs.drop_copies(captures, digests)
     assert [c.name for c in found.captures] == ["0/a.jpg", "0/b.jpg", "1/own.jpg"]
     ((name, period, reason),) = found.refused
     assert (name, period) == ("1/copy.jpg", 1)
