@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from chronoscene.colmap.arrays import RawPoints
+from chronoscene.colmap.raw_model import RawPoints
 from chronoscene.colmap.write import posed_images, write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as scene_format

@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import (
+from chronoscene.colmap.raw_model import (
     IDENTITY,
     Pose,
     RawFrame,

@@ -10,16 +10,25 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap import binary
-from chronoscene.colmap.arrays import RawImages, RawPoints
-from chronoscene.colmap.raw_model import model_kind, read_raw_model
+from chronoscene.colmap import binary, text
+from chronoscene.colmap.raw_model import (
+    MODEL_FILES,
+    Damage,
+    DamagedError,
+    RawImages,
+    RawModel,
+    RawPoints,
+    model_files,
+    model_kind,
+)
 from chronoscene.colmap.write import posed_images, write_raw_model, write_without_observations
 from chronoscene.errors import SceneError
 from chronoscene.io.pycolmap import pycolmap
@@ -50,6 +59,43 @@ class Model:
     """Registered images, sorted by name."""
     points: Points
     """Sorted by id; ``track_frame`` is an index into `images`."""
+
+
+def read_raw_model(folder: Path) -> RawModel:
+    """Read what can be read; never raises for what is in the files."""
+    files = model_files(folder)
+    readers: dict[str, Callable[[Path], Any]] = {
+        "cameras.bin": binary.read_cameras,
+        "images.bin": binary.read_images,
+        "points3D.bin": binary.read_points,
+        "cameras.txt": text.read_cameras,
+        "images.txt": text.read_images,
+        "points3D.txt": text.read_points,
+    }
+    parts: dict[str, Any] = {}
+    damages: list[Damage] = []
+    for stem, file in files.items():
+        try:
+            parts[stem] = readers[file](folder / file)
+        except DamagedError as error:
+            damages.extend(error.damages)
+        except (OSError, SceneError) as error:
+            damages.append(_damage(file, error))
+    rigs = None
+    try:
+        is_text = files.get("cameras") == "cameras.txt"
+        rigs = text.read_rigs(folder) if is_text else binary.read_rigs(folder)
+    except SceneError as error:
+        if "cameras" in parts:
+            damages.append(_damage(Path(error.place).name, error))
+    cameras, images, points = (parts.get(stem) for stem in MODEL_FILES)
+    return RawModel(folder, files, cameras, images, points, rigs, tuple(damages))
+
+
+def _damage(file: str, error: OSError | SceneError) -> Damage:
+    if isinstance(error, SceneError):
+        return Damage(file, error.expected, error.found)
+    return Damage(file, "a file that can be read", error.strerror or "an error")
 
 
 def read_model(folder: Path) -> Model:

@@ -1,29 +1,142 @@
-"""A COLMAP model as its files say it, with nothing checked or repaired.
+"""A COLMAP model as its files have it, in arrays, with nothing checked or repaired.
 
-Unlike `chronoscene.colmap.model` this keeps what contradicts itself (two images of one name,
-tracks over missing images, poses that are not numbers), and reads each file by itself, so that one
-damaged file does not hide the problems in the others. No length in a file is trusted before it was
-compared with the size of the file.
+What contradicts itself is kept: two images of one name, tracks over missing images, poses that are
+not numbers. `chronoscene.colmap.model` reads and checks models.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from chronoscene.colmap import binary, text
-from chronoscene.colmap.arrays import Damage, DamagedError, RawImages, RawPoints, RawRigs
-from chronoscene.errors import SceneError
+import numpy as np
+from numpy.typing import NDArray
+
 from chronoscene.scene import Camera
+from chronoscene.scene.tracks import select_tracks
 
 MODEL_FILES = ("cameras", "images", "points3D")
 """Stems of the files that every model has."""
 
 FORMS = (".bin", ".txt")
 """Suffixes of model files."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawImages:
+    """Registered images in the order of the file (I images, K keypoints)."""
+
+    ids: NDArray[np.int64]
+    """[I]"""
+    names: tuple[str, ...]
+    """Bytes that are not UTF-8 as lone surrogates, as Python has them in file names."""
+    quaternions: NDArray[np.float64]
+    """wxyz, as stored. [I, 4]"""
+    translations: NDArray[np.float64]
+    """[I, 3]"""
+    camera_ids: NDArray[np.int64]
+    """[I]"""
+    keypoint_start: NDArray[np.int64]
+    """Keypoints of image i are ``keypoint_start[i]:keypoint_start[i + 1]``. [I + 1]"""
+    keypoint_xy: NDArray[np.float64]
+    """Pixels. [K, 2]"""
+    keypoint_point: NDArray[np.int64]
+    """Point id, negative for none. [K]"""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawPoints:
+    """Sparse points sorted by id (P points, M observations)."""
+
+    ids: NDArray[np.int64]
+    """[P]"""
+    xyz: NDArray[np.float64]
+    """World units. [P, 3]"""
+    rgb: NDArray[np.uint8]
+    """[P, 3]"""
+    error: NDArray[np.float64]
+    """As stored, in pixels. [P]"""
+    track_start: NDArray[np.int64]
+    """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
+    track_image: NDArray[np.int64]
+    """Image id. [M]"""
+    track_keypoint: NDArray[np.int64]
+    """Index among the keypoints of the image. [M]"""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, keep: NDArray[np.bool_]) -> RawPoints:
+        """Some of the points, in the same order, each with all of its observations.
+
+        Args:
+            keep: Which points. [P]
+        """
+        track_start, observed = select_tracks(self.track_start, keep)
+        return RawPoints(
+            ids=self.ids[keep],
+            xyz=self.xyz[keep],
+            rgb=self.rgb[keep],
+            error=self.error[keep],
+            track_start=track_start,
+            track_image=self.track_image[observed],
+            track_keypoint=self.track_keypoint[observed],
+        )
+
+
+Pose = tuple[float, ...]
+"""Quaternion wxyz and translation."""
+
+IDENTITY: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+Sensor = tuple[int, int]
+"""Type and id."""
+
+CAMERA = 0
+"""Type of the sensors that are cameras."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawFrame:
+    """Where a rig was when its images were taken."""
+
+    frame_id: int
+    rig_id: int
+    rig_from_world: Pose
+    data: tuple[tuple[Sensor, int], ...]
+    """Sensors, and the ids of what they took: of cameras, image ids."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawRigs:
+    """``rigs`` and ``frames``, which COLMAP writes beside the three other files since 3.12."""
+
+    rigs: dict[int, dict[Sensor, Pose | None]]
+    """By rig id, the poses of its sensors (``sensor_from_rig``), None if not known."""
+    frames: tuple[RawFrame, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Why a file of the model, or a line of it, cannot be read."""
+
+    file: str
+    """Name of the file, with a line number for text (``cameras.txt:3``)."""
+    expected: str
+    found: str
+
+
+class DamagedError(Exception):
+    """Carries damages out of a reader."""
+
+    def __init__(self, *damages: Damage) -> None:
+        super().__init__("; ".join(f"{d.file}: {d.found}" for d in damages))
+        self.damages = damages
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,40 +180,3 @@ def model_kind(folder: Path) -> Literal["binary", "text"] | None:
     if len(files) < len(MODEL_FILES) or len(forms) > 1:
         return None
     return "binary" if forms == {".bin"} else "text"
-
-
-def read_raw_model(folder: Path) -> RawModel:
-    """Read what can be read; never raises for what is in the files."""
-    files = model_files(folder)
-    readers: dict[str, Callable[[Path], Any]] = {
-        "cameras.bin": binary.read_cameras,
-        "images.bin": binary.read_images,
-        "points3D.bin": binary.read_points,
-        "cameras.txt": text.read_cameras,
-        "images.txt": text.read_images,
-        "points3D.txt": text.read_points,
-    }
-    parts: dict[str, Any] = {}
-    damages: list[Damage] = []
-    for stem, file in files.items():
-        try:
-            parts[stem] = readers[file](folder / file)
-        except DamagedError as error:
-            damages.extend(error.damages)
-        except (OSError, SceneError) as error:
-            damages.append(_damage(file, error))
-    rigs = None
-    try:
-        is_text = files.get("cameras") == "cameras.txt"
-        rigs = text.read_rigs(folder) if is_text else binary.read_rigs(folder)
-    except SceneError as error:
-        if "cameras" in parts:
-            damages.append(_damage(Path(error.place).name, error))
-    cameras, images, points = (parts.get(stem) for stem in MODEL_FILES)
-    return RawModel(folder, files, cameras, images, points, rigs, tuple(damages))
-
-
-def _damage(file: str, error: OSError | SceneError) -> Damage:
-    if isinstance(error, SceneError):
-        return Damage(file, error.expected, error.found)
-    return Damage(file, "a file that can be read", error.strerror or "an error")

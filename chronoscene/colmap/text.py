@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import (
+from chronoscene.colmap.raw_model import (
     CAMERA,
     IDENTITY,
     Damage,

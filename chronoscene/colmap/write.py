@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawImages, RawPoints
 from chronoscene.colmap.binary import KEYPOINT, POINT_HEAD
+from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.scene.cameras import MODEL_NAMES, Camera
 from chronoscene.scene.geometry import quaternion_from_rotation
 

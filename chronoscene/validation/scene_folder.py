@@ -16,13 +16,14 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.colmap.model import read_raw_model
 from chronoscene.colmap.raw_model import (
     FORMS,
     MODEL_FILES,
+    RawImages,
     RawModel,
+    RawPoints,
     numbered_models,
-    read_raw_model,
 )
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST
 from chronoscene.scene import Camera

@@ -12,8 +12,14 @@ import numpy as np
 import pytest
 
 from chronoscene.colmap.binary import read_images, read_points
-from chronoscene.colmap.model import copy_poses, read_model, read_reconstruction, write_model
-from chronoscene.colmap.raw_model import model_kind, read_raw_model
+from chronoscene.colmap.model import (
+    copy_poses,
+    read_model,
+    read_raw_model,
+    read_reconstruction,
+    write_model,
+)
+from chronoscene.colmap.raw_model import model_kind
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap

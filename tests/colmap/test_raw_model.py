@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.colmap.model import read_model, read_reconstruction
-from chronoscene.colmap.raw_model import model_files, read_raw_model
+from chronoscene.colmap.model import read_model, read_raw_model, read_reconstruction
+from chronoscene.colmap.raw_model import model_files
 from chronoscene.colmap.text import read_points, read_rigs
 from chronoscene.scene.geometry import rotation_from_quaternion
 

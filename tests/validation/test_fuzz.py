@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from chronoscene.colmap.raw_model import read_raw_model
+from chronoscene.colmap.model import read_raw_model
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.validation.checks.pixels import read_header, read_pixels_of

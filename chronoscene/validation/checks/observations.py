@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.scene.cameras import Camera, project_points
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.tracks import track_owners

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import counted
 from chronoscene.scene.splits import NameEntry, NameIndex, SplitEntry
 from chronoscene.validation.checks.names import PUNCTUATION, Spellings, spelling

@@ -6,9 +6,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from chronoscene.colmap.arrays import RawImages
 from chronoscene.colmap.model import Model, read_poses
-from chronoscene.colmap.raw_model import RawModel, model_kind, numbered_models
+from chronoscene.colmap.raw_model import RawImages, RawModel, model_kind, numbered_models
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.io.wording import shown

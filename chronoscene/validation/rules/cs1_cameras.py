@@ -8,8 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chronoscene.colmap.arrays import CAMERA, RawFrame, RawImages
-from chronoscene.colmap.raw_model import RawModel
+from chronoscene.colmap.raw_model import CAMERA, RawFrame, RawImages, RawModel
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.cameras import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
 from chronoscene.scene.geometry import camera_centre, rotation_from_quaternion

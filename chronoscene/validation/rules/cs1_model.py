@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from chronoscene.colmap.arrays import RawImages
-from chronoscene.colmap.raw_model import MODEL_FILES, RawModel
+from chronoscene.colmap.raw_model import MODEL_FILES, RawImages, RawModel
 from chronoscene.formats.chronoscene import MODEL
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera

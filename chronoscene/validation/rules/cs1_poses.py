@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawImages
+from chronoscene.colmap.raw_model import RawImages
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation.checks.observations import good_poses
 from chronoscene.validation.checks.reprojection import image_errors, pose_limit

@@ -8,7 +8,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from chronoscene.colmap.arrays import RawImages
+from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import quote
 from chronoscene.scene import Camera
 from chronoscene.validation.checks.names import Spellings

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from chronoscene.colmap.arrays import RawImages
+from chronoscene.colmap.raw_model import RawImages
 from chronoscene.formats.chronoscene import PERIODS, SPLIT
 from chronoscene.io.wording import counted, shown
 from chronoscene.validation.checks.photo_metadata import (

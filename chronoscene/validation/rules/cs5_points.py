@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import counted, shown
 from chronoscene.validation.checks.observations import Observations
 from chronoscene.validation.finding import Hit

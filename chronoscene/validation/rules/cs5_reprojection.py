@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chronoscene.colmap.arrays import RawImages, RawPoints
+from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import shown
 from chronoscene.validation.checks.observations import Reprojection
 from chronoscene.validation.checks.period_frames import (

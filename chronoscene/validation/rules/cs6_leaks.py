@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawImages
+from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import shown
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation.checks.pixels import THUMBNAIL, Pixels

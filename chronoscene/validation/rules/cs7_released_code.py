@@ -12,7 +12,7 @@ from pathlib import PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.colmap.arrays import RawPoints
+from chronoscene.colmap.raw_model import RawPoints
 from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene.splits import TEST_EVERY

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.colmap.raw_model import read_raw_model
+from chronoscene.colmap.model import read_raw_model
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.io.processes import stoppable
