@@ -19,8 +19,8 @@ from chronoscene.registration.quality.misalignment import measure, transfers
 from chronoscene.registration.quality.rays import Rays, place, rays_at
 from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered
 from chronoscene.scene import Camera
-from chronoscene.scene.geometry import Sim3, camera_centre, pose_from_rotation_translation
-from chronoscene.scene.similarity import fit_robustly
+from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
+from chronoscene.scene.similarity import Sim3, fit_robustly
 from chronoscene.scene.tracks import track_owners
 
 Array = NDArray[np.float64]
@@ -362,10 +362,7 @@ def _random_frame(rng: np.random.Generator) -> Sim3:
 
 def _by_gps(poses: Array, gps: Array) -> Sim3 | None:
     fitted = fit_robustly(camera_centre(poses), gps)
-    if fitted is None:
-        return None
-    scale = fitted[0].scale
-    return Sim3(scale, fitted[0].matrix / scale, fitted[0].translation)
+    return None if fitted is None else fitted[0].to_sim3()
 
 
 def _by_ties(model: Registered, seen: _Sightings, a: int, b: int) -> Sim3 | None:
@@ -379,8 +376,7 @@ def _by_ties(model: Registered, seen: _Sightings, a: int, b: int) -> Sim3 | None
     fitted = fit_robustly(placed_b.xyz[slot], placed_a.xyz[found])
     if fitted is None:
         return None
-    scale = fitted[0].scale
-    first = Sim3(scale, fitted[0].matrix / scale, fitted[0].translation)
+    first = fitted[0].to_sim3()
     poses = model.cam_from_world.copy()
     mine = model.periods == b
     poses[mine] = first.apply_to_pose(poses[mine])
@@ -388,21 +384,12 @@ def _by_ties(model: Registered, seen: _Sightings, a: int, b: int) -> Sim3 | None
     refined = measure(moved, placed_a, placed_b, camera_centre(poses[mine]))
     if refined is None:
         return first
-    return chain(refined.similarity.inverse(), first)
+    return refined.similarity.inverse() @ first
 
 
 def replace_poses(rays: Rays, poses: Array) -> Rays:
     """The same observations by cameras that were moved."""
     return replace(rays, pose=poses[rays.image])
-
-
-def chain(second: Sim3, first: Sim3) -> Sim3:
-    """``x -> second(first(x))``."""
-    return Sim3(
-        second.scale * first.scale,
-        second.rotation @ first.rotation,
-        second.apply(first.translation),
-    )
 
 
 def _error(rng: np.random.Generator, settings: CaseSettings) -> Sim3:

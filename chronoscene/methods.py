@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
-from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Sim3
 
 PeriodInput = Literal["none", "label", "continuous"]
 ENTRY_POINT_GROUP = "chronoscene.methods"

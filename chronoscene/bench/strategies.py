@@ -14,7 +14,8 @@ from chronoscene.images.store import ImageStore
 from chronoscene.methods import MethodSpec, TrainingSet, TrainingView, View
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.cameras import PINHOLE_MODELS
-from chronoscene.scene.geometry import Sim3, camera_centre
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.similarity import Sim3
 
 STRATEGIES = ("joint", "pooled", "separate")
 """``joint``: one model, told the period. ``pooled``: one model, the period hidden from it.

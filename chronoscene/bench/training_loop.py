@@ -28,7 +28,8 @@ from chronoscene.methods import (
 )
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame
-from chronoscene.scene.geometry import Sim3, camera_centre
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.similarity import Sim3
 
 PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 """Shares of the training at which the probe views are rendered."""

@@ -63,7 +63,7 @@ from chronoscene.formats.shared.transforms import (
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Points, Scene, WorldFrame
-from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Sim3
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "nerfstudio"

@@ -1,4 +1,4 @@
-"""Poses, similarity transforms and intrinsics.
+"""Rotations and poses.
 
 Frames and pixels are stated in CONVENTIONS.md: ``cam_from_world`` maps world to camera, +x right,
 +y down, +z forward; pixel (0, 0) is centred at (0.5, 0.5); quaternions are wxyz. Everything here
@@ -6,8 +6,6 @@ is float64 numpy.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -63,45 +61,3 @@ def camera_centre(cam_from_world: Array) -> Array:
     """Camera centres in the world of poses [..., 4, 4] -> [..., 3]."""
     rotation, translation = cam_from_world[..., :3, :3], cam_from_world[..., :3, 3]
     return -np.einsum("...ji,...j->...i", rotation, translation)
-
-
-@dataclass(frozen=True, slots=True)
-class Sim3:
-    """Similarity ``x -> scale * rotation @ x + translation``, named ``target_from_source``."""
-
-    scale: float
-    rotation: Array
-    translation: Array
-
-    @classmethod
-    def identity(cls) -> Sim3:
-        return cls(1.0, np.eye(3), np.zeros(3))
-
-    def apply(self, points: ArrayLike) -> Array:
-        """Transform points. [..., 3]"""
-        points = np.asarray(points, dtype=np.float64)
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def apply_to_pose(self, cam_from_source: Array) -> Array:
-        """Express a camera pose in the target frame; depths grow by ``scale``. [..., 4, 4]"""
-        pose = np.array(cam_from_source, dtype=np.float64)
-        rotation = pose[..., :3, :3] @ self.rotation.T
-        pose[..., :3, 3] = self.scale * pose[..., :3, 3] - rotation @ self.translation
-        pose[..., :3, :3] = rotation
-        return pose
-
-    def inverse(self) -> Sim3:
-        return Sim3(
-            1.0 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale
-        )
-
-    def to_matrix(self) -> Array:
-        """The 4x4 matrix [[scale * rotation, translation], [0, 1]]."""
-        return pose_from_rotation_translation(self.scale * self.rotation, self.translation)
-
-    @classmethod
-    def from_matrix(cls, matrix: ArrayLike) -> Sim3:
-        """Inverse of `to_matrix`."""
-        m = np.asarray(matrix, dtype=np.float64)
-        scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
-        return cls(scale, m[:3, :3] / scale, m[:3, 3].copy())

@@ -1,28 +1,87 @@
-"""Similarities between two sets of points, also mirrored ones, robust against outliers."""
+"""Similarity transforms, Sim(3), and fits of them to corresponding points."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations, islice
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from chronoscene.scene.geometry import pose_from_rotation_translation
 
 Array = NDArray[np.float64]
 
-SAMPLES = 200
+NUM_SAMPLES = 200
 """Triples of points that are tried. With half of the points wrong, all of them would be useless
 once in 10^11 times."""
 
-MOST_JUDGED = 1000
+MAX_JUDGED = 1000
 """Points by which a triple is judged."""
+
+MAX_TRIPLES = 5000
+"""Triples that are tried where points are few."""
+
+MIN_THICKNESS = 0.02
+"""Spread across a line as a share of that along it, below which points do not fix a rotation."""
 
 SIGMA = 1.4826
 """Standard deviation of normal numbers in units of the median of their absolute values."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sim3:
+    """Similarity ``x -> scale * rotation @ x + translation``, named ``target_from_source``."""
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    @classmethod
+    def identity(cls) -> Sim3:
+        return cls(1.0, np.eye(3), np.zeros(3))
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Transform points. [..., 3]"""
+        points = np.asarray(points, dtype=np.float64)
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def __matmul__(self, first: Sim3) -> Sim3:
+        """First ``first``, then this: ``c_from_b @ b_from_a`` is ``c_from_a``."""
+        return Sim3(
+            self.scale * first.scale,
+            self.rotation @ first.rotation,
+            self.scale * self.rotation @ first.translation + self.translation,
+        )
+
+    def apply_to_pose(self, cam_from_source: Array) -> Array:
+        """Express a camera pose in the target frame; depths grow by ``scale``. [..., 4, 4]"""
+        pose = np.array(cam_from_source, dtype=np.float64)
+        rotation = pose[..., :3, :3] @ self.rotation.T
+        pose[..., :3, 3] = self.scale * pose[..., :3, 3] - rotation @ self.translation
+        pose[..., :3, :3] = rotation
+        return pose
+
+    def inverse(self) -> Sim3:
+        return Sim3(
+            1.0 / self.scale, self.rotation.T, -self.rotation.T @ self.translation / self.scale
+        )
+
+    def to_matrix(self) -> Array:
+        """The 4x4 matrix [[scale * rotation, translation], [0, 1]]."""
+        return pose_from_rotation_translation(self.scale * self.rotation, self.translation)
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Sim3:
+        """Inverse of `to_matrix`."""
+        m = np.asarray(matrix, dtype=np.float64)
+        scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
+        return cls(scale, m[:3, :3] / scale, m[:3, 3].copy())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:
-    """``x -> matrix @ x + translation``."""
+    """``x -> matrix @ x + translation``: the result of a fit, which may be a reflection."""
 
     matrix: Array
     """Scale times a rotation or a reflection. [3, 3]"""
@@ -39,6 +98,11 @@ class Similarity:
     def apply(self, points: Array) -> Array:
         """Transform points. [N, 3]"""
         return points @ self.matrix.T + self.translation
+
+    def to_sim3(self) -> Sim3:
+        """The same transformation, which must not be a reflection."""
+        scale = self.scale
+        return Sim3(scale, self.matrix / scale, self.translation)
 
 
 def fit(source: Array, target: Array, *, mirror: bool = False) -> Similarity | None:
@@ -84,9 +148,9 @@ def fit_robustly(
     Source: least median of squares, Rousseeuw 1984.
     """
     rng = np.random.default_rng(0)
-    judges = rng.permutation(len(source))[:MOST_JUDGED]
+    judges = rng.permutation(len(source))[:MAX_JUDGED]
     best, least = None, np.inf
-    for _ in range(SAMPLES):
+    for _ in range(NUM_SAMPLES):
         triple = rng.choice(len(source), 3, replace=False)
         candidate = fit(source[triple], target[triple], mirror=mirror)
         if candidate is not None:
@@ -104,3 +168,43 @@ def fit_robustly(
 
 def _distances(similarity: Similarity, source: Array, target: Array, axes: int) -> Array:
     return np.asarray(np.linalg.norm((similarity.apply(source) - target)[:, :axes], axis=1))
+
+
+def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | None:
+    """Similarity of a few points, and which of them it rests on; None where they do not fix one.
+
+    With five points or more, wrong ones are left out: of the similarities of all triples the one
+    with the smallest median distance is taken, then all points within three deviations of it.
+
+    Args:
+        source: [N, 3]
+        target: [N, 3]
+    """
+    count = len(source)
+    if count < 3 or _thickness(source) < MIN_THICKNESS or _thickness(target) < MIN_THICKNESS:
+        return None
+    used = np.ones(count, bool)
+    if count >= 5:
+        best, least = None, np.inf
+        for triple in islice(combinations(range(count), 3), MAX_TRIPLES):
+            rows = list(triple)
+            if _thickness(source[rows]) < MIN_THICKNESS:
+                continue
+            if (trial := fit(source[rows], target[rows])) is not None:
+                # The three points of the trial fit by construction.
+                middle = float(np.sort(_distances(trial, source, target, 3))[(count + 3) // 2])
+                if middle < least:
+                    best, least = trial, middle
+        if best is not None:
+            distance = _distances(best, source, target, 3)
+            spread = 3 * SIGMA * max(least, 1e-4 * float(np.ptp(target, axis=0).max()))
+            if (distance <= spread).sum() >= 3:
+                used = distance <= spread
+    whole = fit(source[used], target[used])
+    return None if whole is None else (whole.to_sim3(), np.asarray(used))
+
+
+def _thickness(points: Array) -> float:
+    """Second singular value over the first: 0 on a line."""
+    values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return float(values[1] / values[0]) if values[0] > 0 else 0.0

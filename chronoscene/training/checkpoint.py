@@ -19,7 +19,7 @@ from torch import Tensor
 
 from chronoscene.errors import CheckpointError
 from chronoscene.io.staging import replacing, write_text_atomic
-from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Sim3
 
 TENSOR_FILE = "model.safetensors"
 META_FILE = "model.json"

@@ -15,7 +15,7 @@ from baselines.scaffold_gs.method import ScaffoldGS
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.methods import TrainingSet, TrainingView, build_config
-from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Sim3
 
 GROWING: dict[str, Any] = {
     "iterations": 20,

@@ -11,7 +11,8 @@ import torch
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.methods import TrainingSet, TrainingView
-from chronoscene.scene.geometry import Sim3, rotation_from_quaternion
+from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.scene.similarity import Sim3
 
 WIDTH, HEIGHT = 40, 30
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.methods import TrainingSet, TrainingView
-from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Sim3
 
 pytestmark = pytest.mark.slow
 

@@ -12,11 +12,8 @@ from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import nerfstudio, read_scene
 from chronoscene.formats.shared.transforms import CameraTable, opengl_from_pose, pose_from_opengl
 from chronoscene.scene import Camera, Period
-from chronoscene.scene.geometry import (
-    Sim3,
-    pose_from_rotation_translation,
-    rotation_from_quaternion,
-)
+from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
+from chronoscene.scene.similarity import Sim3
 
 NAMES = [f"{i}.png" for i in range(4)]
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from chronoscene.errors import CheckpointError
-from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Sim3
 from chronoscene.training.checkpoint import (
     META_FILE,
     TENSOR_FILE,

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.registration.quality.rays import Array, Ints, Placed, Rays, place, project
-from chronoscene.scene.geometry import Sim3
-from chronoscene.scene.similarity import fit_robustly
+from chronoscene.scene.similarity import Sim3, fit_robustly
 
 MIN_TRACKS = 12
 """Fewer tracks do not determine seven unknowns and their spread."""
@@ -170,10 +169,7 @@ def _begin(moved: Transfers, placed_a: Placed, placed_b: Placed) -> Sim3:
     if found.sum() < MIN_TRACKS:
         return Sim3.identity()
     fitted = fit_robustly(placed_a.xyz[found], placed_b.xyz[slot])
-    if fitted is None:
-        return Sim3.identity()
-    scale = fitted[0].scale
-    return Sim3(scale, fitted[0].matrix / scale, fitted[0].translation)
+    return Sim3.identity() if fitted is None else fitted[0].to_sim3()
 
 
 def _residuals(

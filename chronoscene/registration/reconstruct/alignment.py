@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.scene.geometry import Sim3
-from chronoscene.scene.similarity import Similarity, fit
+from chronoscene.scene.similarity import Sim3, fit
 
 TRIALS = 1_000
 MAX_JUDGED = 4_000
@@ -150,13 +149,7 @@ def _reprojection(
 def fit_sim3(source: NDArray[np.float64], target: NDArray[np.float64]) -> Sim3 | None:
     """Least-squares similarity of points; None where they do not determine one. [N, 3]"""
     found = fit(source, target)
-    return None if found is None else as_sim3(found)
-
-
-def as_sim3(similarity: Similarity) -> Sim3:
-    """The same transformation as scale, rotation and translation."""
-    scale = similarity.scale
-    return Sim3(scale, similarity.matrix / scale, similarity.translation)
+    return None if found is None else found.to_sim3()
 
 
 def cells(points: NDArray[np.float64]) -> NDArray[np.int64]:

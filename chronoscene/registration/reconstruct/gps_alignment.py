@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.reconstruct.alignment import as_sim3, fit_sim3
+from chronoscene.registration.reconstruct.alignment import fit_sim3
 from chronoscene.registration.reconstruct.models import as_pycolmap, image_pose, sorted_ids
-from chronoscene.scene.geometry import Sim3, camera_centre
-from chronoscene.scene.similarity import fit_robustly
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.similarity import Sim3, fit_robustly
 
 MAX_SCALE_ERROR = 0.1
 """Relative standard deviation of the scale above which GPS says nothing useful about it."""
@@ -103,7 +103,7 @@ def _first_guess(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 |
     centres = camera_centre(poses)
     result = fit_robustly(centres, enu)
     if result is not None:
-        return as_sim3(result[0])
+        return result[0].to_sim3()
     best: Sim3 | None = None
     for i in range(len(enu)):  # all on one line exactly: any two fix scale and direction
         pair = [i, (i + len(enu) // 2) % len(enu)]

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.scene.geometry import Sim3, pose_from_rotation_translation
+from chronoscene.scene.geometry import pose_from_rotation_translation
+from chronoscene.scene.similarity import Sim3
 
 
 def image_pose(image: pycolmap.Image) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ from chronoscene.registration.reconstruct.models import (
     set_pose,
     sorted_ids,
 )
-from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Sim3
 
 MIN_POSITIONS = 6
 """Consistent positions of a submodel that is placed by GPS alone: any three fit."""
@@ -228,19 +228,10 @@ def place_by_links(
             return placed
         i, j, link, forward = best
         if forward:
-            placed[j] = chain(placed[i], link.target_from_source)
+            placed[j] = placed[i] @ link.target_from_source
         else:
-            placed[i] = chain(placed[j], link.target_from_source.inverse())
+            placed[i] = placed[j] @ link.target_from_source.inverse()
     return placed
-
-
-def chain(a: Sim3, b: Sim3) -> Sim3:
-    """First ``b``, then ``a``."""
-    return Sim3(
-        a.scale * b.scale,
-        a.rotation @ b.rotation,
-        a.scale * a.rotation @ b.translation + a.translation,
-    )
 
 
 def _place_by_gps(
@@ -263,7 +254,7 @@ def _place_by_gps(
         if found is None or not _places_alone(found):
             remarks.append(f"{submodels[i].label}: its GPS does not determine a frame")
             continue
-        placed[i] = chain(base.enu_from_model.inverse(), found.enu_from_model)
+        placed[i] = base.enu_from_model.inverse() @ found.enu_from_model
         remarks.append(
             f"{submodels[i].label}: not linked to the others by matches; placed by GPS alone, rms "
             f"residual {found.rms:.2f} m"

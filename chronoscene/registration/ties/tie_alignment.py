@@ -15,7 +15,7 @@ import numpy as np
 
 from chronoscene.errors import SceneError
 from chronoscene.geodesy import Georeference
-from chronoscene.registration.quality.rays import Array, Mask, model_rays, place
+from chronoscene.registration.quality.rays import Array, model_rays, place
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import (
     Clicks,
@@ -28,8 +28,7 @@ from chronoscene.registration.ties.residuals import (
     with_tie_tracks,
 )
 from chronoscene.registration.ties.tie_points import TiePoints, match_images
-from chronoscene.scene.geometry import Sim3
-from chronoscene.scene.similarity import SIGMA, fit
+from chronoscene.scene.similarity import Sim3, fit_few
 from chronoscene.scene.tracks import track_owners
 
 Mode = Literal["auto", "check", "replace"]
@@ -106,7 +105,7 @@ def _align_periods(
         p = max(left, key=lambda p: len(shared[p]))
         source = own[p].xyz[np.isin(own[p].track, shared[p])]
         goal = np.array([target[t] for t in shared[p]]).reshape(-1, 3)
-        found = robust_similarity(source, goal)
+        found = fit_few(source, goal)
         if found is None:
             raise _too_few(model, tie_points, p, len(shared[p]))
         moves[p], used = found
@@ -129,48 +128,6 @@ def _too_few(model: Registered, tie_points: TiePoints, period: int, count: int) 
         found=f"{count} such points{also}",
         todo="click more points, spread over the scene, each in two images of both periods",
     )
-
-
-def robust_similarity(source: Array, target: Array) -> tuple[Sim3, Mask] | None:
-    """Similarity of a few points, and which of them it uses; None if they do not determine one.
-
-    With five points or more, wrong ones are left out: of the similarities of all triples, the one
-    with the smallest median distance selects the points within three standard deviations.
-    """
-    from itertools import combinations, islice
-
-    count = len(source)
-    if count < 3 or _thickness(source) < 0.02 or _thickness(target) < 0.02:
-        return None
-    used = np.ones(count, bool)
-    if count >= 5:
-        best, least = None, np.inf
-        for triple in islice(combinations(range(count), 3), 5000):
-            rows = list(triple)
-            if _thickness(source[rows]) < 0.02:
-                continue
-            if (trial := fit(source[rows], target[rows])) is not None:
-                distance = np.linalg.norm(trial.apply(source) - target, axis=1)
-                # The three points of the trial fit by construction.
-                middle = float(np.sort(distance)[(count + 3) // 2])
-                if middle < least:
-                    best, least = trial, middle
-        if best is not None:
-            distance = np.linalg.norm(best.apply(source) - target, axis=1)
-            spread = 3 * SIGMA * max(least, 1e-4 * float(np.ptp(target, axis=0).max()))
-            if (distance <= spread).sum() >= 3:
-                used = distance <= spread
-    whole = fit(source[used], target[used])
-    if whole is None:
-        return None
-    scale = whole.scale
-    return Sim3(scale, whole.matrix / scale, whole.translation), np.asarray(used)
-
-
-def _thickness(points: Array) -> float:
-    """Second singular value over the first: 0 on a line."""
-    values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return float(values[1] / values[0]) if values[0] > 0 else 0.0
 
 
 def move_periods(model: Registered, moves: dict[int, Sim3]) -> Registered:
@@ -213,7 +170,7 @@ def _to_control(
     known = [(i, clicks.names[t]) for i, t in enumerate(placed.track) if clicks.names[t] in control]
     source = placed.xyz[[i for i, _ in known]].reshape(-1, 3)
     target = np.array([control[name] for _, name in known]).reshape(-1, 3)
-    found = robust_similarity(source, target)
+    found = fit_few(source, target)
     if found is None:
         remark = f"{len(known)} control points can be placed: three are needed, not collinear"
         return model, False, [remark]

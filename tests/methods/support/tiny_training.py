@@ -23,7 +23,7 @@ from chronoscene.methods import (
     import_object,
     load_spec,
 )
-from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Sim3
 
 WIDTH, HEIGHT = 40, 30
 STEPS = 120

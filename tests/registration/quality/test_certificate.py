@@ -21,7 +21,8 @@ from chronoscene.registration.quality.rays import Placed, gather
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.quality.verdict import THRESHOLDS, judge
 from chronoscene.registration.result import HeldOutTracks, Registered
-from chronoscene.scene.geometry import Sim3, camera_centre
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.similarity import Sim3
 
 GOOD = CaseSettings(ties=800, seed=21, held_out=0.3)
 

@@ -20,7 +20,8 @@ from chronoscene.registration.quality.misalignment import (
 )
 from chronoscene.registration.quality.rays import held_out_rays, model_rays, place, project
 from chronoscene.registration.result import Registered
-from chronoscene.scene.geometry import Sim3, camera_centre
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.similarity import Sim3
 
 QUIET = CaseSettings(
     points=1200, ties=400, held_out=0.5, noise=1e-9, outliers=0.0, gps_noise=None, views=10

@@ -13,7 +13,8 @@ from chronoscene.registration.reconstruct.alignment import (
     residual_pixels,
 )
 from chronoscene.registration.reconstruct.gps_alignment import align_to_gps, upright_direction
-from chronoscene.scene.geometry import Sim3, camera_centre, pose_from_rotation_translation
+from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
+from chronoscene.scene.similarity import Sim3
 
 Array = NDArray[np.float64]
 

@@ -22,10 +22,9 @@ from chronoscene.registration.ties.residuals import with_tie_tracks
 from chronoscene.registration.ties.tie_alignment import (
     align_with_tie_points,
     move_periods,
-    robust_similarity,
 )
 from chronoscene.registration.ties.tie_points import TiePoints, match_images, read_tie_points
-from chronoscene.scene.geometry import Sim3
+from chronoscene.scene.similarity import Sim3
 
 CORNERS = np.array(
     [[0, 0, 0], [25, 5, 8], [-20, 18, 3], [10, -24, 12], [-15, -12, 5], [18, 22, 1], [3, 9, 15.0]]
@@ -280,18 +279,3 @@ def test_moving_periods_splits_common_points() -> None:
     low = np.minimum.reduceat(moved.periods[moved.track_image], moved.track_start[:-1])
     assert (moved.periods[moved.track_image] == low[point]).all()
     assert certify(moved).periods[1].error == pytest.approx(0, abs=1e-3)
-
-
-def test_similarity_of_few_points() -> None:
-    rng = np.random.default_rng(0)
-    move = Sim3(2.0, np.eye(3)[[1, 2, 0]], np.array([1.0, 2.0, 3.0]))
-    source = rng.normal(size=(6, 3))
-    target = move.apply(source)
-    target[2] += 3.0
-    found = robust_similarity(source, target)
-    assert found is not None
-    np.testing.assert_allclose(found[0].to_matrix(), move.to_matrix(), atol=1e-6)
-    assert found[1].tolist() == [True, True, False, True, True, True]
-    line = np.outer(np.arange(5.0), [1.0, 2.0, 3.0])
-    assert robust_similarity(line, line) is None
-    assert robust_similarity(source[:2], target[:2]) is None

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from chronoscene.scene.geometry import Sim3
-from chronoscene.scene.similarity import fit_robustly
+from chronoscene.scene.similarity import Sim3
 
 IMAGES, POINTS, WORLD = "sparse/0/images.txt", "sparse/0/points3D.txt", "sparse/world.json"
 PERIOD_1 = range(7, 14)
@@ -145,21 +144,3 @@ def test_absurd_metres(scene, scale):
     scene.write(WORLD, '{"unit": "metre"}')
     also = {"CS707"} if scale < 1 else ()
     scene.expect("CS520", place="period 0", found="m from the cameras", also=also, times=2)
-
-
-def test_robust_fit_with_outliers():
-    rng = np.random.default_rng(0)
-    truth = Sim3(3.0, turn("xyz", [20, 30, 40]), np.array([5.0, 6, 7]))
-    source = rng.normal(size=(200, 3))
-    target = truth.apply(source)
-    target[:90] += rng.normal(size=(90, 3)) * 50
-    found, distance = fit_robustly(source, target)
-    assert found.scale == pytest.approx(3.0, rel=1e-9)
-    np.testing.assert_allclose(found.matrix, 3 * truth.rotation, atol=1e-9)
-    assert distance[90:].max() < 1e-8 and not found.mirrored
-    assert fit_robustly(source, source * [1, 1, -1], mirror=True)[0].mirrored
-
-
-def test_points_on_a_line_fix_nothing():
-    line = np.linspace(0, 1, 20)[:, None] * [1.0, 2.0, 3.0]
-    assert fit_robustly(line, line) is None
