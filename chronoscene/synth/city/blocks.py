@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.synth.city import furniture as fur
-from chronoscene.synth.city import history as stages
 from chronoscene.synth.city.buildings import SLAB, Building, finished, foundation, frame, rubble
 from chronoscene.synth.city.placing import (
     Rect,
@@ -26,7 +25,7 @@ from chronoscene.synth.city.placing import (
     scatter_trees,
 )
 from chronoscene.synth.city.vegetation import grown
-from chronoscene.synth.city.world import World
+from chronoscene.synth.city.world import World, renewal_stages, site_stages, visits
 from chronoscene.synth.render.mesh import Part
 from chronoscene.synth.seeds import rng_for
 
@@ -63,7 +62,7 @@ def square(world: World, name: str, rect: Rect) -> None:
         turn = float(rng.uniform(0, 6.28))
         make = fur.stall if i % 2 else fur.kiosk
         label = f"{name}/{'stall' if i % 2 else 'kiosk'}_{i}"
-        here = stages.visits(rng, world.periods, 0.5)
+        here = visits(rng, world.periods, 0.5)
         world.place(label, "kiosk", here, partial(make, label, at, turn, world.seed))
 
 
@@ -195,7 +194,7 @@ def site(world: World, name: str, rect: Rect) -> None:
     """A building site: empty lot, foundation, frame with crane, finished building."""
     rng = rng_for(world.seed, name)
     inner = paved_block(world, name, rect)
-    steps = stages.site_stages(world.periods)
+    steps = site_stages(world.periods)
     spec = _site_building(name, inner, rng)
     done = {p for p, s in enumerate(steps) if s == "finished"}
     surfaces: list[str | None] = [
@@ -259,7 +258,7 @@ def renewal(world: World, name: str, rect: Rect) -> None:
     dx, dy = inner.size
     left = Rect(inner.x0, inner.y0, inner.x0 + 0.6 * dx, inner.y1)
     right = Rect(left.x1, inner.y0, inner.x1, inner.y1)
-    steps = stages.renewal_stages(world.periods)
+    steps = renewal_stages(world.periods)
     spec = Building(
         f"{name}/old", left.x0 + 1.5, left.y0 + 0.1 * dy, left.x1 - 1.5, left.y0 + 0.72 * dy,
         int(rng.integers(3, 5)), "gable", "brick",

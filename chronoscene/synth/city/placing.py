@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.synth.city import furniture as fur
-from chronoscene.synth.city import history as stages
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.buildings import SLAB, Building, finished
 from chronoscene.synth.city.ground import PARKING, pavement
 from chronoscene.synth.city.vegetation import grown, hedge
-from chronoscene.synth.city.world import World
+from chronoscene.synth.city.world import World, looks, tree_heights
 from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
 from chronoscene.synth.render.textures import PAVING
 from chronoscene.synth.seeds import key_number, rng_for
@@ -123,7 +122,7 @@ def plant(
     broad: bool = False,
 ) -> None:
     """A tree that grows and changes with the seasons."""
-    heights = stages.tree_heights(rng, world.periods, float(rng.uniform(0.75, 1.25) * size))
+    heights = tree_heights(rng, world.periods, float(rng.uniform(0.75, 1.25) * size))
     states = [
         None if h is None else (h, season) for h, season in zip(heights, world.seasons, strict=True)
     ]
@@ -204,7 +203,7 @@ def put_house(
 ) -> None:
     """A finished building, which may get another facade."""
     rng = rng_for(world.seed, spec.name, "reclad")
-    states = stages.looks(rng, world.periods, chance)
+    states = looks(rng, world.periods, chance)
     walls = (spec.wall, str(rng.choice(["plaster", "panel", "brick"])))
     world.add(
         spec.name,

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from chronoscene.errors import BackendError
 from chronoscene.scene import Camera
-from chronoscene.synth.render.geometry_tables import MISS, Tables
-from chronoscene.synth.render.light import Light, sky_args
-from chronoscene.synth.render.mesh import Part
-from chronoscene.synth.render.probes import Probes, probe_values
+from chronoscene.synth.render.light import Light, Probes, probe_values, sky_args
+from chronoscene.synth.render.mesh import MISS, Part, Tables
 from chronoscene.synth.render.shade import albedo_at, camera_rays, shade, shadow_rays
 
 Array = NDArray[np.float64]

@@ -12,10 +12,9 @@ import numpy as np
 from numba import prange
 
 from chronoscene.kernels.compilation import inner, kernel
-from chronoscene.synth.render.geometry_tables import MISS, hit_normals
-from chronoscene.synth.render.light import sky_radiance
+from chronoscene.synth.render.light import probe_light, sky_radiance
+from chronoscene.synth.render.mesh import MISS, hit_normals
 from chronoscene.synth.render.noise import mix
-from chronoscene.synth.render.probes import probe_light
 from chronoscene.synth.render.textures import albedo
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.scene import Camera, Points
-from chronoscene.synth.render.geometry_tables import MISS
+from chronoscene.synth.render.mesh import MISS
 from chronoscene.synth.render.renderer import PeriodRenderer
 from chronoscene.synth.scene.flights import View
 from chronoscene.synth.seeds import rng_for

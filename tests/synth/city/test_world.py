@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError
 from chronoscene.synth import preset
-from chronoscene.synth.city import history as stages
 from chronoscene.synth.city.plan import make_world
-from chronoscene.synth.city.world import World
+from chronoscene.synth.city.world import SITE, World, renewal_stages, site_stages, tree_heights
 from chronoscene.synth.generation import make_periods
 from chronoscene.synth.render.light import make_lights
 from chronoscene.synth.render.mesh import Part, PartBuilder
@@ -48,9 +47,9 @@ def test_states_become_lifetimes_and_edits() -> None:
 
 @given(st.integers(1, 50))
 def test_a_site_grows_and_a_house_falls(periods: int) -> None:
-    site, house = stages.site_stages(periods), stages.renewal_stages(periods)
+    site, house = site_stages(periods), renewal_stages(periods)
     assert len(site) == len(house) == periods
-    order = [stages.SITE.index(s) for s in site]
+    order = [SITE.index(s) for s in site]
     assert order == sorted(order) and site[-1] == "finished"
     assert house[0] == "house"
     if periods > 1:
@@ -59,7 +58,7 @@ def test_a_site_grows_and_a_house_falls(periods: int) -> None:
 
 @given(st.integers(0, 10_000), st.integers(1, 50))
 def test_trees_grow(seed: int, periods: int) -> None:
-    heights = stages.tree_heights(np.random.default_rng(seed), periods, 6.0)
+    heights = tree_heights(np.random.default_rng(seed), periods, 6.0)
     there = [h for h in heights if h is not None]
     assert len(heights) == periods and there and there == sorted(there)
     assert max(there) < 6.0 * 3.5

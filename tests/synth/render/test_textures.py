@@ -10,8 +10,7 @@ from numba import njit
 
 from chronoscene.synth.render import noise
 from chronoscene.synth.render import textures as tex
-from chronoscene.synth.render.geometry_tables import Tables
-from chronoscene.synth.render.mesh import PartBuilder, srgb
+from chronoscene.synth.render.mesh import PartBuilder, Tables, srgb
 from chronoscene.synth.render.shade import albedo_at
 
 # Inner functions have no entry for Python; these give them one.
