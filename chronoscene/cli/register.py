@@ -1,4 +1,4 @@
-"""``chronoscene register``: several captures, years apart, into one frame."""
+"""``chronoscene register``: captures of several dates in one frame."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DEFAULTS = Options()
 
 
 FAILED = 1
-"""Exit status when something contradicts the registration."""
+"""Exit status if the verdict is fail."""
 
 
 @click.command("register")
@@ -37,7 +37,7 @@ FAILED = 1
     "--into",
     "scene",
     type=click.Path(path_type=Path),
-    help="Add CAPTURES as a new period to this scene, whose poses and cameras stay as they are.",
+    help="Add CAPTURES as a new period to this scene, whose poses and cameras do not change.",
 )
 @click.option(
     "--route",
@@ -48,7 +48,7 @@ FAILED = 1
 @click.option(
     "--work",
     type=click.Path(path_type=Path),
-    help="Folder for features, matches and models, from which a later run goes on.  "
+    help="Folder for features, matches and models, from which a later run continues.  "
     "[default: OUT.work]",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an earlier registration at OUT.")
@@ -57,7 +57,7 @@ FAILED = 1
     type=click.IntRange(200),
     default=DEFAULTS.max_image_size,
     show_default=True,
-    help="Pixels; larger photos are scaled down for finding features.",
+    help="Pixels; larger photos are downscaled for feature extraction.",
 )
 @click.option(
     "--max-features", type=click.IntRange(100), default=DEFAULTS.max_features, show_default=True
@@ -67,14 +67,14 @@ FAILED = 1
     type=click.IntRange(0),
     default=DEFAULTS.exhaustive_limit,
     show_default=True,
-    help="Number of photos up to which all pairs are matched.",
+    help="Up to so many photos, all pairs are matched.",
 )
 @click.option(
     "--held-out",
     type=click.FloatRange(0, 0.5),
     default=DEFAULTS.held_out,
     show_default=True,
-    help="Share of the tracks across periods that only test the result.",
+    help="Share of the tracks across periods that are used only to test the result.",
 )
 @click.option(
     "--camera-model",
@@ -87,13 +87,13 @@ FAILED = 1
     type=click.Choice(CALIBRATIONS),
     default=DEFAULTS.calibration,
     show_default=True,
-    help="Whether a camera that took photos of several periods is calibrated for each; auto: where "
-    f"they are more than a day apart and have {MIN_PHOTOS} of them or more.",
+    help="Whether a camera is calibrated for each period that it took photos of; auto: if the "
+    f"periods are more than a day apart and have at least {MIN_PHOTOS} of its photos.",
 )
 @click.option(
     "--threads",
     type=click.IntRange(1),
-    help="With 1, every run gives the same result bit by bit.  [default: one per processor]",
+    help="With 1, every run gives bit-identical results.  [default: one per processor]",
 )
 @click.option(
     "--tie-points",
@@ -106,10 +106,13 @@ FAILED = 1
     type=click.FloatRange(0, min_open=True),
     default=DEFAULTS.tie_scale,
     show_default=True,
-    help="Size of the photos here over that of those that were clicked in.",
+    help="Size of these photos divided by that of the photos that were clicked in.",
 )
 @click.option(
-    "--report", "page", is_flag=True, help="Write registration.html, for looking at the result."
+    "--report",
+    "page",
+    is_flag=True,
+    help="Also write registration.html, a page to inspect the result.",
 )
 @click.pass_context
 def command(
@@ -120,11 +123,11 @@ def command(
     scene: Path | None,
     **settings: Any,
 ) -> None:
-    """Register photos of several dates into one frame and write the scene OUT.
+    """Register photos of several dates in one frame and write the scene OUT.
 
-    CAPTURES is a folder with one folder of photos for each period; or a folder of photos, whose
-    periods are proposed from their dates; or a CSV of image and period. A run that was stopped goes
-    on where it was when the command is given again.
+    CAPTURES is a folder with a subfolder of photos for each period; or a folder of photos, whose
+    periods are proposed from their dates; or a CSV of image and period. A run that was stopped
+    continues where it was when the command is run again.
 
     Exit status: 0 unless the verdict is fail, 1 if it is (the scene is written), 2 if the photos
     cannot be registered, or wrong usage.
@@ -153,7 +156,7 @@ def command(
 
 
 def summary(registered: Registered, out: Path) -> str:
-    """What came out, for people."""
+    """The result in a few lines."""
     lines = [f"{out}: route {registered.route}, unit {registered.unit}"]
     for i, label in enumerate(registered.labels):
         placed = int((registered.periods == i).sum())

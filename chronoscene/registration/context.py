@@ -1,4 +1,4 @@
-"""What all stages of one run share: options, the work folder, and what was done in it."""
+"""What all stages of a run share: options, the work folder, and its state."""
 
 from __future__ import annotations
 
@@ -25,36 +25,36 @@ class Options:
     """How to register."""
 
     route: Route | None = None
-    """None to choose: joint where periods are connected by matches, else separate."""
+    """None to choose: joint if matches connect the periods, else separate."""
     work: Path | None = None
-    """Folder for what is kept between runs; None for ``<out>.work``."""
+    """Folder for intermediate results, kept between runs; None for ``<out>.work``."""
     overwrite: bool = False
-    """Whether an earlier registration at the place of the output may be replaced."""
+    """Whether an earlier registration at the output path may be replaced."""
     max_image_size: int = 1600
-    """Pixels; larger photos are scaled down for finding features."""
+    """Pixels; larger photos are downscaled for feature extraction."""
     max_features: int = 4096
     """Of each photo."""
     exhaustive_limit: int = EXHAUSTIVE_LIMIT
-    """Number of photos up to which all pairs are matched."""
+    """Up to so many photos, all pairs are matched."""
     held_out: float = 0.1
-    """Share of the tracks across periods that take no part in estimation."""
+    """Share of the tracks across periods that take no part in the estimation."""
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP's camera model for the photos."""
     calibration: Calibration = "auto"
-    """Whether periods that were taken with the same camera share its calibration."""
+    """Whether periods that used the same camera share its calibration."""
     threads: int | None = None
-    """None for one per processor. With 1, results are the same to the last bit in every run."""
+    """None for one per processor. With 1, every run gives bit-identical results."""
     seed: int = 0
     """Of the draw of held-out tracks."""
     tie_points: Path | None = None
     """File of tie points or ground control."""
     tie_scale: float = 1.0
-    """Size of the photos here over that of those which were clicked in."""
+    """Size of these photos divided by that of the photos that were clicked in."""
     page: bool = False
-    """Whether to write the page for people beside the scene."""
+    """Whether to write ``registration.html``."""
 
     def record(self) -> dict[str, Any]:
-        """What was asked for, for the log."""
+        """The options that are set, for the log."""
         values = {name: getattr(self, name) for name in self.__slots__}
         return {
             name: str(value) if isinstance(value, Path) else value
@@ -90,7 +90,7 @@ class Context:
 
     @property
     def mapping_database(self) -> Path:
-        """The same without what is held out."""
+        """The same without held-out matches."""
         return self.work / "mapping.db"
 
     @property
@@ -103,7 +103,7 @@ class Context:
         return run_step(step, arguments, log=log, report=self.report, inherited=(self.lock,))
 
     def places(self, name: str) -> dict[str, Any]:
-        """Where a step that estimates finds and leaves things."""
+        """Paths and threads of a step that estimates a model."""
         return {
             "database": str(self.mapping_database),
             "photos": str(self.photos),

@@ -109,7 +109,7 @@ def point_errors(registered: Registered) -> NDArray[np.float64]:
 
 
 def check_free(out: Path, *, overwrite: bool) -> None:
-    """Refuse a place that holds something else than a registration that may be replaced."""
+    """Refuse a path that is in use, unless it is a registration that may be replaced."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     if overwrite and out.is_dir() and (out / LOG).is_file():
@@ -123,7 +123,7 @@ def check_free(out: Path, *, overwrite: bool) -> None:
 
 
 def write_scene(scene: Scene, staged: Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Undistort a scene into a folder that is not its last place; counts for the log."""
+    """Undistort a scene into a staging folder; counts for the log."""
     shutil.rmtree(staged, ignore_errors=True)
     done = undistort(scene, staged, progress=progress)
     return {
@@ -279,14 +279,14 @@ def _misfits(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inspection:
-    """What came of looking at a registration."""
+    """Certificate and verdict of a registration."""
 
     certificate: Certificate
     verdict: Verdict
 
     @property
     def summary(self) -> str:
-        """For the end of a command: the verdict and what to do, without colours."""
+        """The verdict and what to do, for the end of the command."""
         lines = [f"verdict: {self.verdict.level}. {self.verdict.text}"]
         lines += [f"  to do: {todo}" for todo in self.verdict.todo[:3]]
         return "\n".join(lines) + "\n"
@@ -304,11 +304,11 @@ def inspect_registration(
     """Write ``registration.json`` and, if asked for, ``registration.html`` into a folder.
 
     Args:
-        model: The registration, after tie points were heeded.
-        folder: Exists.
+        model: The registration, after alignment by tie points.
+        folder: An existing folder.
         page: Whether to write the page.
-        ties: What tie points did to it.
-        tie_points: The file: its points then count as ties.
+        ties: Result of the alignment by tie points.
+        tie_points: Clicked points that count as ties.
         title: Of the page; None for the name of the folder.
     """
     model = model if tie_points is None else with_tie_tracks(model, tie_points)

@@ -1,4 +1,4 @@
-"""From captures to a registered scene: the stages, in order, each of which is done once."""
+"""From captures to a registered scene: the stages in order, each done once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from chronoscene.scene import Scene
 __all__ = ["Options", "run", "run_into"]
 
 SCHEMA_VERSION = 1
-"""Of the log."""
+"""Version of the log."""
 
 Inspected = Callable[[Inspection], None]
 """Called with the certificate and the verdict."""
@@ -43,13 +43,13 @@ def run(
 
     Args:
         captures: From `chronoscene.registration.photos.captures.read_captures`.
-        out: Folder that does not exist yet, or is empty.
-        options: How.
-        report: Called with the progress of what takes long.
+        out: Folder that does not exist or is empty.
+        options: Settings; None for the defaults.
+        report: Called with the progress.
         inspected: Called with the certificate and the verdict.
 
     Raises:
-        RegistrationError: If no model comes out; what was computed is kept in the work folder.
+        RegistrationError: If there is no model; what was computed is kept in the work folder.
         SceneError: If ``out`` is in use, or tie points do not suffice.
     """
     return _run(captures, None, Path(out), options or Options(), report, inspected)
@@ -64,7 +64,7 @@ def run_into(
     report: Report | None = None,
     inspected: Inspected | None = None,
 ) -> Registered:
-    """Add the captures to a scene as one new period, and write a new scene; the old poses stay.
+    """Add the captures to a scene as one new period and write a new scene; old poses do not change.
 
     Args as in `run`.
 
@@ -78,8 +78,8 @@ def run_into(
         raise ConfigError(
             "--tie-points",
             expected="a registration of all periods",
-            found="--into, which moves nothing that is there",
-            todo="leave one of the two out",
+            found="--into, which does not move existing poses",
+            todo="omit one of the two",
         )
     return _run(captures, scene, Path(out), options, report, inspected)
 
@@ -125,7 +125,7 @@ def _run(
 def _tie(
     registered: Registered, points: TiePoints | None, inputs: Inputs, context: Context
 ) -> tuple[Registered, TieAlignment | None]:
-    """Heed the tie points, if there are any."""
+    """Check and align with tie points, if there are any."""
     if points is None:
         return registered, None
 
@@ -154,13 +154,13 @@ def _stage_scene(registered: Registered, inputs: Inputs, name: str, context: Con
     told = [", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())]
     if old is not None:
         kept = copy_poses(old.root / "sparse/0", staged / "sparse/0")
-        told.append(f"poses of {kept} images copied bit by bit")
+        told.append(f"poses of {kept} images copied unchanged")
     context.stages.remark("scene", *told)
     return staged
 
 
 def _log(registered: Registered, inputs: Inputs, context: Context) -> dict[str, Any]:
-    """All decisions, as JSON holds them."""
+    """All decisions, as JSON."""
     return {
         "schema_version": SCHEMA_VERSION,
         "captures": str(inputs.captures.root),

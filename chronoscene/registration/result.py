@@ -1,4 +1,4 @@
-"""What a registration gives: poses of all periods in one frame, points, and what was held out."""
+"""The result of a registration: poses of all periods in one frame, points, held-out tracks."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class HeldOutTracks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Registered:
-    """What a route produced: one model of all periods, in metres where georeferenced.
+    """One model of all periods, in metres if georeferenced.
 
     N registered images, P points, O observations.
     """
@@ -82,17 +82,16 @@ class Registered:
     track_xy: NDArray[np.float64]
     """Pixels of the observations. [O, 2]"""
     unregistered: Mapping[str, str]
-    """Name of each image that has no pose, and why. A photo that was refused is under its path."""
+    """Name of each image that has no pose, and why. A refused photo is listed by its path."""
     unregistered_periods: Mapping[str, int]
     """Period of each of them."""
     route: Route
     gps_enu: NDArray[np.float64]
-    """Position by the photo's own GPS in the frame of the model, whether it was believed or not;
-    NaN where there is none. [N, 3]"""
+    """GPS position of each photo in the frame of the model, plausible or not; else NaN. [N, 3]"""
     gps_used: NDArray[np.bool_]
     """Whether the position took part in the estimation. [N]"""
     georeference: Georeference | None
-    """None where the frame has no known place; its scale is then arbitrary."""
+    """None if the frame is arbitrary, and with it its scale."""
     num_periods: int
     labels: tuple[str, ...]
     dates: tuple[str | None, ...]
@@ -100,9 +99,9 @@ class Registered:
     held_out: tuple[CrossMatches, ...]
     held_out_tracks: HeldOutTracks
     images_root: str
-    """Folder in which ``names`` are found: photos as the cameras above describe them."""
+    """Folder of the images: photos as ``cameras`` describe them."""
     unplaced: frozenset[str] = frozenset()
-    """Images of periods that lie in a frame of their own and wait for tie points."""
+    """Images of periods that are in a frame of their own, to be placed by tie points."""
 
     @property
     def unit(self) -> str:

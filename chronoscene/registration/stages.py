@@ -27,10 +27,10 @@ from chronoscene.io.processes import Report, run_worker
 from chronoscene.io.staging import write_text_atomic
 
 VERSION = 1
-"""Of what stages store; another version is not read."""
+"""Version of what stages store; other versions are not read."""
 
 PATIENCE = 5.0
-"""Seconds; a step notices within one second that its command was killed."""
+"""Seconds; a step ends within one second after its command was killed."""
 
 
 def fingerprint(*parts: Any) -> str:
@@ -41,7 +41,7 @@ def fingerprint(*parts: Any) -> str:
 
 @dataclass
 class Stages:
-    """The stages of one run, in the order in which they are done."""
+    """The stages of one run, in order."""
 
     folder: Path
     """The work folder."""
@@ -58,7 +58,7 @@ class Stages:
         *,
         chained: bool = True,
     ) -> Any:
-        """Do a stage unless it was done with the same inputs; return its result.
+        """Do a stage unless it was done with the same inputs before; return its result.
 
         Args:
             name: Of the stage, and of its record.
@@ -90,7 +90,7 @@ class Stages:
         return record["result"]
 
     def remark(self, stage: str, *remarks: str) -> None:
-        """Add a decision that no stage made."""
+        """Log a decision that was not made in a stage."""
         entry = {"stage": stage, "seconds": 0.0, "remarks": list(remarks)}
         self.log.append(entry | {"from_an_earlier_run": False})
 
@@ -113,7 +113,7 @@ def work_folder(path: Path, patience: float = PATIENCE) -> Iterator[int]:
 
     Yields:
         A file descriptor. A process that inherits it keeps others out as well: steps do, so that
-        what a killed command was doing ends before the next command begins.
+        those of a killed command end before the next command begins.
 
     Raises:
         RegistrationError: If another process works in it.
@@ -125,7 +125,7 @@ def work_folder(path: Path, patience: float = PATIENCE) -> Iterator[int]:
             if time.monotonic() > end:
                 raise RegistrationError(
                     path,
-                    expected="a work folder that nobody uses",
+                    expected="a work folder that is not in use",
                     found="another registration in it",
                     todo="wait for it to end, or choose another folder (--work)",
                 )
@@ -155,7 +155,7 @@ STEPS = {
 JSON can hold."""
 
 LOG_LINES = 4
-"""Of the step's own output, at the end of a message."""
+"""Lines of the step's own output in a message."""
 
 
 def run_step(

@@ -1,4 +1,4 @@
-"""What there is to register: photographs by period, with what they say about themselves.
+"""What to register: the photos of each period, with their metadata.
 
 Three forms are read: a folder with one folder for each period, one folder of photos (periods are
 proposed from their dates), and a CSV table of image and period.
@@ -22,21 +22,21 @@ from chronoscene.registration.photos.photo import Capture, open_photo, taken_at
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 PERIOD_GAP_DAYS = 14
-"""Photos in one folder that were taken this many days after the previous one begin a new period."""
+"""In one folder of photos, a gap of so many days begins a new period."""
 
 
 @dataclass(frozen=True, slots=True)
 class CapturePeriod:
-    """A date group."""
+    """A group of photos of one date."""
 
     label: str
     date: str | None
-    """ISO date of most of its photos, where they say."""
+    """ISO date of its photos, as far as they share it and state it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Captures:
-    """Everything that was found."""
+    """All photos that were found."""
 
     root: Path
     images: tuple[Capture, ...]
@@ -52,7 +52,7 @@ class Captures:
 
 @dataclass(frozen=True, slots=True)
 class _Listed:
-    """A file and the period that it is said to be of."""
+    """A file and the label of its period."""
 
     path: Path
     name: str
@@ -85,7 +85,7 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
 
 
 def _photos_in(folder: Path) -> list[Path]:
-    """Image files below a folder, sorted; hidden files and folders are passed over."""
+    """Image files below a folder, sorted; hidden files and folders are skipped."""
     found = [
         p
         for p in folder.rglob("*")
@@ -97,7 +97,7 @@ def _photos_in(folder: Path) -> list[Path]:
 
 
 def _period_folders(root: Path) -> list[_Listed]:
-    """Photos of the sub-folders; empty if photos lie in the root itself or in one folder only."""
+    """Photos in subfolders; empty if there are photos in the root, or only one subfolder."""
     photos = _photos_in(root)
     tops = {p.relative_to(root).parts[0] for p in photos if len(p.relative_to(root).parts) > 1}
     if len(tops) < 2 or any(p.parent == root for p in photos):
@@ -131,7 +131,7 @@ def _from_table(root: Path, table: Path) -> list[_Listed]:
 
 
 def _in_root(root: Path, name: str) -> Path | None:
-    """The file of a table's entry, in the folder or in its ``images/``; None if it leaves it."""
+    """The file of a table entry, in the folder or its ``images/``; None if it is outside."""
     pure = PurePosixPath(name)
     if pure.is_absolute() or ".." in pure.parts or not pure.parts:
         return None
@@ -140,12 +140,12 @@ def _in_root(root: Path, name: str) -> Path | None:
 
 
 def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str]]:
-    """Photos of one folder, cut into periods where `PERIOD_GAP_DAYS` lie between two dates."""
+    """Photos of one folder, split into periods at gaps of `PERIOD_GAP_DAYS` between dates."""
     times = {p: taken_at(p, read_exif(p)) for p in photos}
     dated = sorted((t, p) for p, t in times.items() if t is not None)
     if not dated or len(dated) < len(photos):
         undated = len(photos) - len(dated)
-        remark = f"{undated} of {len(photos)} photos have no date: all are taken as one period"
+        remark = f"{undated} of {len(photos)} photos have no date: all are treated as one period"
         return [_Listed(p, p.relative_to(root).as_posix(), root.name) for p in photos], [remark]
     groups: list[list[tuple[datetime, Path]]] = []
     for item in dated:
@@ -176,7 +176,7 @@ def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Capt
         else:
             images.append(capture)
     if not images:
-        raise _nothing(root, f"{len(refused)} files, none of which can be used: {refused[0][2]}")
+        raise _nothing(root, f"{len(refused)} files, none of them usable: {refused[0][2]}")
     images.sort(key=lambda c: c.name)
     periods = tuple(
         CapturePeriod(label, _period_date(label, [c for c in images if c.period == i]))
@@ -188,7 +188,7 @@ def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Capt
 
 
 def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
-    """Labels by the dates of their photos where all have some, else in natural order."""
+    """Labels by the dates of their photos if all have one, else in natural order."""
     by_label: dict[str, list[Path]] = {}
     for item in listed:
         by_label.setdefault(item.label, []).append(item.path)
@@ -225,12 +225,12 @@ def _date_remarks(periods: Sequence[CapturePeriod]) -> list[str]:
 
 
 def _check_names(root: Path, images: Sequence[Capture]) -> None:
-    """Refuse names that one line of split.txt cannot hold."""
+    """Refuse names that a line of split.txt cannot represent."""
     for capture in images:
         if capture.name != capture.name.strip() or re.search(r"[\r\n]", capture.name):
             raise SceneError(
                 root,
-                expected="image names without line breaks, and without blanks at their ends",
+                expected="image names without line breaks and without leading or trailing blanks",
                 found=repr(capture.name),
                 todo="rename the image",
             )
@@ -239,7 +239,7 @@ def _check_names(root: Path, images: Sequence[Capture]) -> None:
 def _nothing(path: Path, found: str) -> SceneError:
     return SceneError(
         path,
-        expected="a folder with a folder of photos for each period, or a CSV of image and period",
+        expected="a folder with a subfolder of photos per period, or a CSV of image and period",
         found=found,
         todo="copy the photos there",
     )

@@ -1,4 +1,4 @@
-"""Which GPS positions of photos deserve belief, and the local frame around them."""
+"""Which GPS positions of photos are plausible, and the local frame around them."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from chronoscene.geodesy import Georeference, HeightKind, median_longitude
 from chronoscene.registration.photos.photo import Capture
 
 GROSS_FACTOR = 20.0
-"""A position this many times farther from the median than the median distance is wrong, whatever
-the route says; nearer ones are judged when there are poses to compare with."""
+"""A position farther from the median position than this many times the median distance is wrong.
+Nearer ones are judged once there are poses to compare with."""
 
 GROSS_METRES = 200.0
-"""Nothing nearer to the median than this is called wildly wrong."""
+"""No position nearer to the median position is a gross error."""
 
 CONSTANT_METRES = 0.5
-"""Positions that all lie within this radius say nothing about the motion of the camera."""
+"""Positions that all lie within this distance do not describe the motion of the camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Positions:
-    """What the photos say about where they were taken, in a frame if there is one."""
+    """GPS positions of the photos in a local frame."""
 
     georeference: Georeference | None
-    """None without at least three photos with positions that differ."""
+    """None unless at least three photos have different positions."""
     enu: NDArray[np.float64]
     """NaN where a photo has none. [N, 3]"""
     sigma: NDArray[np.float64]
     """Standard deviation, metres, NaN where there is none. [N, 3]"""
     believed: NDArray[np.bool_]
-    """Not missing, not wildly wrong. [N]"""
+    """Neither missing nor a gross error. [N]"""
     remarks: tuple[str, ...]
-    """What was found out, for the log."""
+    """For the log."""
 
 
 def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Positions:
     """Put the positions of captures into one local frame.
 
-    Wildly wrong positions (kilometres off among hundreds of metres, or another continent) are
-    found by their distance from the median; subtler errors are left to the comparison with poses.
+    Gross errors (kilometres among hundreds of metres, or another continent) are found by their
+    distance from the median; smaller ones are left to the comparison with poses.
 
     Args:
         captures: Photos of all periods.
@@ -75,7 +75,7 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
     spread = np.ptp(enu[believed], axis=0) if believed.any() else np.zeros(3)
     if believed.sum() < 3 or spread.max() < CONSTANT_METRES:
         remarks.append(
-            f"all GPS positions lie within {CONSTANT_METRES} m: one fix for all photos, of no use"
+            f"all GPS positions lie within {CONSTANT_METRES} m: one fix for all photos, not usable"
         )
         return Positions(None, nothing, nothing, none, tuple(remarks))
     remarks.insert(0, f"{int(has.sum())} of {count} photos have a GPS position; frame {frame.crs}")
@@ -85,7 +85,7 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
 def _heights(
     captures: Sequence[Capture], has: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], HeightKind, list[str]]:
-    """One kind of height for all photos: mixing kinds would tilt or tear the frame."""
+    """One kind of height for all photos: mixing kinds would tilt or distort the frame."""
     count = len(captures)
     stated, relative = np.full(count, np.nan), np.full(count, np.nan)
     for i in np.flatnonzero(has).tolist():
@@ -96,24 +96,24 @@ def _heights(
     if np.isfinite(stated[has]).all():
         return stated, "as stated", []
     if np.isfinite(relative[has]).all():
-        return relative, "relative", ["heights are those above take-off: no others are stated"]
+        return relative, "relative", ["heights are relative to take-off: no others are stated"]
     known = np.isfinite(stated)
     if known.sum() >= 0.5 * has.sum():
         filled = np.where(known, stated, np.nanmedian(stated))
         missing = int((has & ~known).sum())
-        return filled, "as stated", [f"{missing} photos state no height and get the median"]
-    return np.zeros(count), "none", ["most photos state no height: all are taken as 0"]
+        return filled, "as stated", [f"{missing} photos state no height: the median is used"]
+    return np.zeros(count), "none", ["most photos state no height: 0 is used for all"]
 
 
 def _plausible(
     captures: Sequence[Capture], enu: NDArray[np.float64], has: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Which positions are not wildly wrong, and the names of the others."""
+    """Which positions are no gross errors, and remarks on the others."""
     distance = np.linalg.norm(enu[:, :2] - np.median(enu[has][:, :2], axis=0), axis=1)
     limit = max(GROSS_METRES, GROSS_FACTOR * float(np.median(distance[has])))
     wild = has & ~(np.nan_to_num(distance, nan=0.0) <= limit)
     remarks = [
-        f"{captures[i].name}: GPS is {distance[i] / 1000:.1f} km from the others: not believed"
+        f"{captures[i].name}: GPS is {distance[i] / 1000:.1f} km from the others: not used"
         for i in np.flatnonzero(wild).tolist()
     ]
     return has & ~wild, remarks

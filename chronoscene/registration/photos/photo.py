@@ -1,4 +1,4 @@
-"""One photograph: whether it can be used, and what it says about itself."""
+"""One photo: whether it is usable, and its metadata."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from PIL import Image
 from chronoscene.images.exif import ExifData, read_exif
 
 GPS_SIGMA = (5.0, 5.0, 10.0)
-"""Metres east, north, up, where the photo states none: a consumer receiver under open sky."""
+"""Metres east, north, up, if the photo states none: a consumer receiver under open sky."""
 
 MIN_SIDE = 64
-"""Pixels; smaller pictures are icons and previews."""
+"""Pixels; smaller images are icons and previews."""
 
 HEAD_BYTES = 200_000
-"""Of a file that are searched for metadata on panoramas."""
+"""Bytes of a file that are searched for panorama metadata."""
 
 MAX_ASPECT = 3.0
-"""Wider pictures are panoramas, which no perspective camera describes."""
+"""Wider images are panoramas, which no perspective camera model describes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gps:
-    """Where a photo says it was taken."""
+    """The position that a photo states."""
 
     latitude: float
     """Degrees."""
@@ -56,11 +56,11 @@ class Capture:
 
 
 def open_photo(path: Path, name: str, period: int) -> Capture | str:
-    """The capture, or why it cannot be used. Every file is decoded once: half a file is common."""
+    """The capture, or why it is unusable. Every file is decoded: truncated files are common."""
     try:
         with Image.open(path) as image:
             width, height = image.size
-            # A JPEG is then read to its end, but not computed in full.
+            # A JPEG is then read to its end, but decoded at a reduced size.
             image.draft("RGB", (width // 8, height // 8))
             image.load()
     except Exception as error:  # Pillow raises almost anything for damaged files
@@ -68,7 +68,7 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
     if min(width, height) < MIN_SIDE:
         return f"{width} x {height} pixels: too small"
     if is_panorama(path) or max(width, height) > MAX_ASPECT * min(width, height):
-        return f"{width} x {height} pixels: a panorama, which no perspective camera describes"
+        return f"{width} x {height} pixels: a panorama, which no perspective camera model describes"
     exif = read_exif(path)
     return Capture(
         name=name,
@@ -83,7 +83,7 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
 
 
 def is_panorama(path: Path) -> bool:
-    """Whether a file says that it is a sphere or cylinder unrolled (Google's GPano metadata)."""
+    """Whether GPano metadata declare an equirectangular or cylindrical projection."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     return re.search(rb"GPano:ProjectionType\W{1,4}(equirectangular|cylindrical)", head) is not None
@@ -99,13 +99,13 @@ def _position(exif: ExifData) -> Gps | None:
         relative = drone.relative_altitude
         if drone.rtk_std is not None and all(0 < s < 100 for s in drone.rtk_std):
             east, north, up = drone.rtk_std
-            # Stated deviations are those of the antenna at the fix, not of the shutter: 2 cm least.
+            # Stated deviations are of the antenna at the fix, not at the shutter: at least 2 cm.
             sigma = (max(east, 0.02), max(north, 0.02), max(up, 0.03))
     return Gps(exif.latitude, exif.longitude, exif.altitude, relative, sigma)
 
 
 def taken_at(path: Path, exif: ExifData) -> datetime | None:
-    """When a photo was taken: by its EXIF block, else by a date that begins its file name."""
+    """When a photo was taken: from EXIF, else from a date at the start of its file name."""
     if exif.date is not None:
         return exif.date
     found = re.match(r"((?:19|20)\d{2})[-_]?(\d{2})[-_]?(\d{2})(?!\d)", path.name, re.ASCII)

@@ -1,13 +1,13 @@
-"""``registration.html``: the certificate and what a person needs to see, in one page.
+"""``registration.html``: the certificate, comparisons and maps on one page.
 
-Styles, pictures and the map are in it; it loads nothing. Names are escaped by the template engine.
+Styles and pictures are embedded; it loads nothing. Names are escaped by the template engine.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from chronoscene import __version__
 from chronoscene.io.pages import render_page
@@ -22,10 +22,10 @@ from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 
 FLICKERS = 8
-"""Comparisons on the page, over all pairs of periods."""
+"""Comparisons on the page, for all pairs of periods together."""
 
 CLICKS = 6
-"""Spots that are suggested for clicking, for a pair of periods."""
+"""Spots suggested for clicking, for each pair of periods."""
 
 MAX_LINES = 120
 """Matches that are drawn between two photos."""
@@ -34,48 +34,6 @@ COLORS = (
     "#2f7ed8", "#d9622b", "#2a9d5c", "#a44bd1", "#b8860b", "#0f9aa7", "#d1477f", "#6b7280",
 )  # fmt: skip
 """Of the periods, in turn; each is legible on white and on near-black."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Line:
-    """A match on a drawn pair."""
-
-    x1: float
-    y1: float
-    x2: float
-    y2: float
-    level: Level
-
-
-@dataclass(frozen=True, slots=True)
-class _Pair:
-    """Two photos with their matches."""
-
-    title: str
-    names: tuple[str, str]
-    pictures: tuple[str, str]
-    heights: tuple[float, float]
-    lines: tuple[_Line, ...]
-    matches: int
-    median: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Flicker:
-    """One spot at two dates."""
-
-    names: tuple[str, str]
-    labels: tuple[str, str]
-    pictures: tuple[str, str]
-    tied: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _Click:
-    """Images and pixels in which one spot should be clicked."""
-
-    places: tuple[tuple[str, str, float, float], ...]
-    """Label of the period, image, x, y."""
 
 
 def write_report(
@@ -87,16 +45,7 @@ def write_report(
     ties: TieAlignment | None = None,
     title: str = "Registration",
 ) -> None:
-    """Write the page.
-
-    Args:
-        path: File to write.
-        model: The registration; its photos are read from ``images_root`` where they exist.
-        certificate: Of this model.
-        verdict: On this certificate.
-        ties: Result of clicked tie points, if there were any.
-        title: Of the page.
-    """
+    """Write the page; arguments as in `render_report`."""
     page = render_report(model, certificate, verdict, ties=ties, title=title)
     write_text_atomic(path, page)
 
@@ -109,7 +58,15 @@ def render_report(
     ties: TieAlignment | None = None,
     title: str = "Registration",
 ) -> str:
-    """The page as text; see `write_report`."""
+    """The page as text.
+
+    Args:
+        model: The registration; its photos are read from ``images_root`` where they exist.
+        certificate: Of this model.
+        verdict: On this certificate.
+        ties: Result of clicked tie points, if there were any.
+        title: Of the page.
+    """
     photos = Photos(model)
     return render_page(
         "registration",
@@ -139,8 +96,8 @@ def _pair_section(
     return names, verdict.pairs.get((pair.a, pair.b)), list(pair_figures(certificate, pair))
 
 
-def _drawn(model: Registered, certificate: Certificate, photos: Photos) -> list[_Pair]:
-    """The pair with the largest held-out error, and that with the smallest."""
+def _drawn(model: Registered, certificate: Certificate, photos: Photos) -> list[dict[str, Any]]:
+    """The pairs of images with the largest and the smallest held-out error."""
     found = drawn_pairs(model, certificate.evidence)
     chosen = [("Worst pair", found[-1])] if found else []
     if len(found) > 1:
@@ -149,7 +106,9 @@ def _drawn(model: Registered, certificate: Certificate, photos: Photos) -> list[
     return [d for d in drawn if d is not None]
 
 
-def _draw_pair(model: Registered, photos: Photos, title: str, pair: DrawnPair) -> _Pair | None:
+def _draw_pair(
+    model: Registered, photos: Photos, title: str, pair: DrawnPair
+) -> dict[str, Any] | None:
     first, second = photos.reduced(pair.a), photos.reduced(pair.b)
     if first is None or second is None:
         return None
@@ -157,18 +116,18 @@ def _draw_pair(model: Registered, photos: Photos, title: str, pair: DrawnPair) -
     heights = [model.cameras[i].height * s for i, s in zip((pair.a, pair.b), scales, strict=True)]
     step = len(pair.error) // MAX_LINES + 1
     lines = [
-        _Line(*_scaled(a, scales[0]), *_scaled(b, scales[1]), _level(e))
+        (*_scaled(a, scales[0]), *_scaled(b, scales[1]), _level(e))
         for a, b, e in zip(pair.xy_a[::step], pair.xy_b[::step], pair.error[::step], strict=True)
     ]
-    return _Pair(
-        title=title,
-        names=(model.names[pair.a], model.names[pair.b]),
-        pictures=(first, second),
-        heights=(heights[0], heights[1]),
-        lines=tuple(lines),
-        matches=len(pair.error),
-        median=pair.median,
-    )
+    return {
+        "title": title,
+        "names": (model.names[pair.a], model.names[pair.b]),
+        "pictures": (first, second),
+        "heights": heights,
+        "lines": lines,
+        "matches": len(pair.error),
+        "median": pair.median,
+    }
 
 
 def _scaled(xy: Array, scale: float) -> tuple[float, float]:
@@ -179,10 +138,10 @@ def _level(error: float) -> Level:
     return "pass" if error < 2 else "doubtful" if error < 5 else "fail"
 
 
-def _flickers(model: Registered, certificate: Certificate, photos: Photos) -> list[_Flicker]:
-    """Comparisons of all pairs of periods in turn: at tie points, and where there are none."""
+def _flickers(model: Registered, certificate: Certificate, photos: Photos) -> list[dict[str, Any]]:
+    """Comparisons of each pair of periods, at tie points and where there are none."""
     each = max(2, FLICKERS // max(len(certificate.pairs), 1))
-    found: list[_Flicker] = []
+    found: list[dict[str, Any]] = []
     seen = certificate.evidence.seen
     for pair in certificate.pairs:
         gaps = spots(model, seen, pair, each // 2, gaps=True)
@@ -192,13 +151,15 @@ def _flickers(model: Registered, certificate: Certificate, photos: Photos) -> li
             if pictures is not None and len(found) < FLICKERS:
                 names = model.names[spot.a], model.names[spot.b]
                 labels = certificate.labels[pair.a], certificate.labels[pair.b]
-                found.append(_Flicker(names, labels, pictures, spot.tied))
+                found.append(
+                    {"names": names, "labels": labels, "pictures": pictures, "tied": spot.tied}
+                )
     return found
 
 
 def _clicks(
     model: Registered, certificate: Certificate, verdict: Verdict
-) -> list[tuple[str, list[_Click]]]:
+) -> list[tuple[str, list[list[tuple[str, str, float, float]]]]]:
     """For each pair of periods that did not pass: where to click next."""
     found = []
     seen = certificate.evidence.seen
@@ -214,17 +175,18 @@ def _clicks(
     return found
 
 
-def _click(model: Registered, certificate: Certificate, pair: PairFigures, spot: Spot) -> _Click:
+def _click(
+    model: Registered, certificate: Certificate, pair: PairFigures, spot: Spot
+) -> list[tuple[str, str, float, float]]:
+    """Images and pixels in which one spot should be clicked: label of the period, image, x, y."""
     views: Sequence[tuple[int, tuple[int, Array] | None]] = (
         (pair.a, (spot.a, spot.xy_a)),
         (pair.a, spot.more_a),
         (pair.b, (spot.b, spot.xy_b)),
         (pair.b, spot.more_b),
     )
-    return _Click(
-        tuple(
-            (certificate.labels[p], model.names[v[0]], float(v[1][0]), float(v[1][1]))
-            for p, v in views
-            if v is not None
-        )
-    )
+    return [
+        (certificate.labels[p], model.names[v[0]], float(v[1][0]), float(v[1][1]))
+        for p, v in views
+        if v is not None
+    ]

@@ -1,4 +1,4 @@
-"""What the report page shows of places: spots seen at two dates, and pairs of images."""
+"""What the page shows of the scene: spots seen on two dates, and pairs of images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from chronoscene.scene.cameras import project_points
 from chronoscene.scene.geometry import camera_centre
 
 MARGIN = 0.06
-"""Of the image: spots nearer to its edge are not shown."""
+"""Share of the image size; spots nearer to the edge are not shown."""
 
 MIN_MATCHES = 5
 """Matches of a pair of images that is drawn."""
@@ -30,7 +30,7 @@ MIN_MATCHES = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spot:
-    """A place, and the best image of it from either of two periods."""
+    """A place, and the best image of it of each of two periods."""
 
     xyz: Array
     normal: Array
@@ -67,15 +67,15 @@ class DrawnPair:
 def spots(
     model: Registered, seen: Mask, pair: PairFigures, count: int, *, gaps: bool, twice: bool = False
 ) -> list[Spot]:
-    """Places of two periods, spread over the scene.
+    """Places that two periods see, spread over the scene.
 
     Args:
         model: The registration.
         seen: Whether an image of the period sees the point. [P, T]
         pair: Figures of the two periods.
-        count: Places at most.
+        count: Maximum number of places.
         gaps: Whether to take places without tie points; else tie points.
-        twice: Whether two images of either period must show a place.
+        twice: Whether two images of each period must show a place.
     """
     if gaps:
         places = pair.ties.gaps
@@ -113,7 +113,7 @@ def _spot(
     if not all(len(v[0]) for v in views.values()):
         return None
     (in_a, xy_a, to_a), (in_b, xy_b, to_b) = views[pair.a], views[pair.b]
-    # Alike in direction and in size: cosine, less the difference of the logarithms of distances.
+    # Similar direction and scale: cosine minus the difference of the logarithms of distances.
     far_a, far_b = np.linalg.norm(to_a, axis=1), np.linalg.norm(to_b, axis=1)
     cosine = (to_a / far_a[:, None]) @ (to_b / far_b[:, None]).T
     alike = cosine - 0.3 * np.abs(np.log(far_a)[:, None] - np.log(far_b)[None])
@@ -133,7 +133,7 @@ def _spot(
 
 
 def _views(model: Registered, period: int, xyz: Array) -> tuple[Ints, Array, Array]:
-    """Images of a period that have a place well inside, where, and the way to their cameras."""
+    """Images of a period that see a place well inside, its pixels, and vectors to the cameras."""
     images, pixels = [], []
     for i in np.flatnonzero(model.periods == period):
         camera, pose = model.cameras[i], model.cam_from_world[i]
@@ -151,7 +151,7 @@ def _views(model: Registered, period: int, xyz: Array) -> tuple[Ints, Array, Arr
 
 
 def _another(images: Ints, xy: Array, to: Array, first: int) -> tuple[int, Array] | None:
-    """A second image from a direction neither the same nor quite another: near 15 degrees."""
+    """A second image from a direction that differs by about 15 degrees."""
     if len(images) < 2:
         return None
     unit = to / np.linalg.norm(to, axis=1, keepdims=True)
@@ -169,7 +169,7 @@ def _normal(points: Array, xyz: Array, towards: Array) -> Array:
         return np.asarray(towards)
     values, vectors = np.linalg.eigh(np.cov(near.T))
     normal = vectors[:, 0] * np.sign(vectors[:, 0] @ towards or 1.0)
-    # A bush has no plane, and a plane seen from its edge shows nothing.
+    # A bush is not planar, and a plane seen edge-on shows nothing.
     flat = values[0] < 0.05 * values[1] and normal @ towards > 0.4
     return np.asarray(normal if flat else towards)
 
