@@ -1,4 +1,4 @@
-"""The ``chronoscene`` command: one file per noun, imported only when it is called."""
+"""The ``chronoscene`` command. The module of a subcommand is imported only when it is called."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class LazyGroup(click.Group):
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="chronoscene")
 def cli() -> None:
-    """Datasets and benchmarks for multi-period scene reconstruction."""
+    """Prepare datasets of multi-period scenes and benchmark reconstruction methods on them."""
 
 
 def main() -> None:
     """Run the command line; turns our errors into one line and exit status 2.
 
-    A command that is asked to end by SIGTERM cleans up, as one that is interrupted does.
+    A command that SIGTERM ends cleans up like one that is interrupted.
     """
     try:
         with stoppable():

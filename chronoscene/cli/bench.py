@@ -27,41 +27,64 @@ EXISTING = click.Path(path_type=Path, exists=True)
 
 @click.command("bench")
 @click.argument("scenes", metavar="DIR...", nargs=-1, required=True, type=FOLDER)
-@click.option("--method", "methods", required=True, help="NAME[,NAME...], or module:SPEC.")
+@click.option(
+    "--method", "methods", required=True, help="Methods to run, as NAME[,NAME...] or module:SPEC."
+)
 @click.option(
     "--strategy",
     "strategies",
     default="joint",
     show_default=True,
-    help=f"One or several of {', '.join(STRATEGIES)}.",
+    help=f"One or several of {', '.join(STRATEGIES)}, separated by commas.",
 )
-@click.option("--preset", default="balanced", show_default=True, help="Preset of the method.")
-@click.option("--budget", help="Stop by the training clock: 90s, 5m, 1h30m.")
+@click.option("--preset", default="balanced", show_default=True, help="Preset of the methods.")
+@click.option(
+    "--budget", help="Stop after this time on the training clock, such as 90s, 5m or 1h30m."
+)
 @click.option("--iterations", type=click.IntRange(min=1), help="Stop after this many iterations.")
 @click.option(
     "--separate-iterations",
     type=click.Choice(["total", "each"]),
     default="total",
     show_default=True,
-    help="Strategy separate: whether the models share iterations and budget or get them each.",
+    help="Whether the models of strategy separate share iterations and budget or each get them.",
 )
-@click.option("--seeds", type=click.IntRange(min=1), default=1, help="Number of seeds.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, help="The first seed.")
 @click.option(
-    "--set", "assignments", multiple=True, help="KEY=VALUE or METHOD.KEY=VALUE of the config."
+    "--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Number of seeds."
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="First seed."
+)
+@click.option(
+    "--set",
+    "assignments",
+    multiple=True,
+    help="Set an option of the methods, as KEY=VALUE or METHOD.KEY=VALUE. May be repeated.",
 )
 @click.option(
     "--max-width",
     type=click.IntRange(min=1),
     default=MAX_WIDTH,
     show_default=True,
-    help="Images wider than this are scaled down, for training and evaluation. [pixels]",
+    help="Scale wider images down to this width in pixels, for training and evaluation.",
 )
-@click.option("--threads", type=click.IntRange(min=1), help="Threads; default: all processors.")
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto")
+@click.option(
+    "--threads", type=click.IntRange(min=1), help="Number of threads.  [default: one per processor]"
+)
+@click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    default="auto",
+    show_default=True,
+    help="Device to train and render on.",
+)
 @click.option("--lpips-weights", type=EXISTING, help="Folder or file with the weights of LPIPS.")
-@click.option("--out", type=FOLDER, default=Path("runs"), show_default=True, help="Folder of runs.")
-@click.option("--overwrite", is_flag=True, help="Replace finished runs made with other settings.")
+@click.option(
+    "--out", type=FOLDER, default=Path("runs"), show_default=True, help="Folder for the runs."
+)
+@click.option(
+    "--overwrite", is_flag=True, help="Replace finished runs that were made with other settings."
+)
 def command(
     methods: str,
     strategies: str,
@@ -74,9 +97,9 @@ def command(
 ) -> None:
     """Train, render and score methods on scenes.
 
-    Every run (method, strategy, scene, seed) gets a folder below --out with its checkpoint, its
-    predictions and its scores. Finished runs are kept, so the same command goes on after an
-    interruption.
+    Each run (one method, strategy, scene and seed) gets a folder below --out with its checkpoint,
+    predictions and scores. Finished runs are kept, so the same command resumes after an
+    interruption. docs/benchmark.md describes strategies, budget, seeds and files.
     """
     check_outside(out, options["scenes"], option="--out")
     check_place("--out", out)

@@ -21,7 +21,7 @@ LINKS: dict[str | None, ImageSource] = {None: "copy", "hard": "link", "sym": "sy
 def _period_help() -> str:
     known = {name: getattr(load_format(name), "PERIOD_BY", ()) for name in format_names()}
     rules = "; ".join(f"{name}: {', '.join(by)}" for name, by in known.items() if by)
-    return f"How images become periods, where the format leaves a choice. {rules}."
+    return f"How images are grouped into periods, where the format leaves a choice. {rules}."
 
 
 @click.command("convert")
@@ -31,7 +31,7 @@ def _period_help() -> str:
     "--format",
     "source_format",
     type=click.Choice(format_names()),
-    help="Format of SRC.  [default: found out]",
+    help="Format of SRC.  [default: detected]",
 )
 @click.option(
     "--to",
@@ -55,10 +55,10 @@ def command(
     period_by: str | None,
     link: str | None,
 ) -> None:
-    """Write the scene SRC, of any known format, into the new folder OUT.
+    """Convert the scene SRC from any supported format and write it to the new folder OUT.
 
-    SRC is left alone; OUT appears complete or not at all. What gets lost on the way is said.
-    DATASET.md describes the formats.
+    SRC is not changed. OUT appears complete or not at all. Notes say what the target format cannot
+    hold. DATASET.md describes the formats.
     """
     with progress_bar() as bar:
         done = convert(

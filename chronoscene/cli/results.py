@@ -27,9 +27,9 @@ SOME_FAILED = 1
     help="Folder or file with the weights of LPIPS.",
 )
 def score(runs: Path, lpips_weights: Path | None) -> None:
-    """Score the predictions of all finished runs in RUNS again and say what changed.
+    """Score all finished runs in the folder RUNS again and print what changed.
 
-    Only the images of each run and the frozen ground truth are read; their hashes are checked.
+    Only the predictions of each run and the frozen ground truth are read; their hashes are checked.
     """
     scorers = make_scorers(lpips_weights=lpips_weights)
     with progress_bar() as bar:
@@ -56,16 +56,33 @@ def score(runs: Path, lpips_weights: Path | None) -> None:
     required=True,
     type=click.Path(path_type=Path, exists=True, file_okay=False),
 )
-@click.option("--format", "style", type=click.Choice(FORMATS), default="table", show_default=True)
-@click.option("--metric", "metrics", multiple=True, help="NAME[,NAME...]; default: all there are.")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="File to write.")
+@click.option(
+    "--format",
+    "style",
+    type=click.Choice(FORMATS),
+    default="table",
+    show_default=True,
+    help="Output format.",
+)
+@click.option(
+    "--metric",
+    "metrics",
+    multiple=True,
+    help="Metrics to show, as NAME[,NAME...]. May be repeated.  [default: all]",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write to this file instead of the terminal.",
+)
 def table(
     folders: tuple[Path, ...], style: str, metrics: tuple[str, ...], out: Path | None
 ) -> None:
-    """Show the results of one or several folders of runs.
+    """Print the results in one or several folders of runs.
 
-    Per metric: every period, then macro (mean over periods), micro (mean over views) and the worst
-    period. Over several seeds: mean, standard deviation and number.
+    There is a table per metric, with each period, macro (the mean over periods), micro (the mean
+    over views) and the worst period. Several seeds give the mean, the sample standard deviation and
+    the number of runs.
     """
     wanted = [metric_info(m).name for text in metrics for m in split_list("--metric", text)]
     records, failures = read_runs(folders)

@@ -33,37 +33,48 @@ from chronoscene.scene.split_making import (
     type=click.Choice(STRATEGIES),
     default="stratified",
     show_default=True,
-    help="stratified: one of every 8 images in name order, in each period. blocked: all cameras of "
-    "some blocks of space, the same in all periods. date: the images of each period that were "
-    "taken last. periods: all images of some periods.",
+    help="How to choose. stratified: one of every 8 images in name order, in each period. blocked: "
+    "all cameras in some blocks of space, the same in all periods. date: the images of each period "
+    "that were taken last. periods: all images of some periods.",
 )
-@click.option("--fraction", type=float, help=f"Share of test images.  [default: {FRACTION}]")
-@click.option("--every", type=int, metavar="N", help="The same as --fraction 1/N.")
+@click.option(
+    "--fraction", type=float, help=f"Share of test images, 0 to 1.  [default: {FRACTION}]"
+)
+@click.option(
+    "--every", type=int, metavar="N", help="Take one of N images as a test image: --fraction 1/N."
+)
 @click.option(
     "--offset",
     type=int,
     default=0,
     show_default=True,
-    help="stratified: index of the first test image in each period.",
+    help="For stratified: index of the first test image in each period.",
 )
 @click.option(
     "--seed",
     type=int,
-    help="stratified: draw one image of each run instead of its first. blocked: which blocks.",
+    help="For stratified: draw a random image of each run instead of the first. For blocked: "
+    "choose other blocks.",
 )
-@click.option("--blocks", type=int, metavar="N", help="blocked: number of blocks in all.")
-@click.option("--period", "periods", type=int, multiple=True, help="periods: id to hold out.")
+@click.option("--blocks", type=int, metavar="N", help="For blocked: total number of blocks.")
+@click.option(
+    "--period",
+    "periods",
+    type=int,
+    multiple=True,
+    help="For periods: id of a period to hold out. May be repeated.",
+)
 @click.option(
     "--scene-out",
     type=click.Path(path_type=Path),
-    help="Also write the scene with the new split into this new folder, its images hard-linked "
-    "where the disk can.",
+    help="Also write the scene with the new split to this new folder. Images are hard-linked where "
+    "the file system allows it.",
 )
 @click.option(
     "--format",
     "scene_format",
     type=click.Choice(format_names()),
-    help="Format of the scene.  [default: found out]",
+    help="Format of SCENE.  [default: detected]",
 )
 def command(
     source: Path,
@@ -76,8 +87,8 @@ def command(
 ) -> None:
     """Choose new test images of SCENE and write their names to the file OUT.
 
-    OUT is a test.txt as DATASET.md describes it; what made it stands beside it as JSON. SCENE is
-    left alone: --scene-out writes a copy that has the split.
+    OUT is a test.txt as described in DATASET.md; a JSON file beside it records how it was made.
+    SCENE is not changed: --scene-out writes a copy with the new split.
     """
     _check_targets(source, out, scene_out)
     scene = read_scene(source, format=scene_format)

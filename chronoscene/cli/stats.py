@@ -66,14 +66,15 @@ class Request:
     type=click.Choice(["full", "paper"]),
     default="full",
     show_default=True,
-    help="full: all that is measured, by period; paper: the paper's table of images and points.",
+    help="full: everything that is measured, by period. paper: the table of images and points in "
+    "the paper.",
 )
 @click.option(
     "--count",
     type=click.Choice(COUNT_RULES),
     default="assigned",
     show_default=True,
-    help="assigned: each point once; seen: in every period whose images see it.",
+    help="How to count points. assigned: each once. seen: in every period whose images see it.",
 )
 @click.option(
     "--format",
@@ -81,33 +82,35 @@ class Request:
     type=click.Choice(sorted(FORMATS)),
     default="table",
     show_default=True,
-    help="What to write.",
+    help="Output format.",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal."
+)
 @click.option(
     "--figures",
     type=click.Path(path_type=Path),
     metavar="OUT",
-    help="Draw images and points of all scenes, and the points of each, into this folder.",
+    help="Draw the counts of all scenes, and the points of each scene, into this folder.",
 )
 @click.option(
     "--figure-format",
     type=click.Choice(FIGURE_FORMATS),
     default="png",
     show_default=True,
-    help="Of the figures.",
+    help="File format of the figures.",
 )
-@click.option("--cameras", is_flag=True, help="Cameras in the figures, too.")
+@click.option("--cameras", is_flag=True, help="Also draw the cameras in the figures.")
 @click.option(
     "--pages",
     type=click.Path(path_type=Path),
     metavar="OUT",
-    help="Write a page for the browser into this folder, one per scene, to look around in it.",
+    help="Write an interactive page of each scene, for a browser, to this folder.",
 )
 @click.option(
     "--dataset-format",
     type=click.Choice(format_names()),
-    help="Format of the scenes.  [default: found out]",
+    help="Format of the scenes.  [default: detected]",
 )
 @click.pass_context
 def command(
@@ -117,24 +120,25 @@ def command(
     out: Path | None,
     **options: object,
 ) -> None:
-    """What is in a scene, by period: images, points, tracks, error, overlap, coverage.
+    """Print what a scene contains, by period: images, points, tracks, error, overlap, coverage.
 
-    DIR is a scene, or a folder of scenes. Periods are numbered from 0; "-" stands where there is
+    DIR is a scene or a folder of scenes. Periods are numbered from 0; "-" means that there is
     nothing to measure.
 
-    The point cloud of a scene is one for all periods, and the paper does not say how its table
-    splits it. As its periods add up to the total, each point is counted once: in the period with
-    the most observations of it, the earliest of several. A point may be seen in several periods;
-    --count seen counts it in each, and then the periods add up to more than the total.
+    All periods of a scene share one point cloud, and the paper does not say how its table splits
+    it. Since its periods add up to the total, each point is counted once, in the period with the
+    most observations of it, the earliest of several. With --count seen, a point counts in every
+    period that sees it, and the periods add up to more than the total.
 
     Tracks and observations of a period are those of its images. The error is the mean distance
     between observation and projection. The baseline is the distance from a camera to the nearest
-    of its period, relative to the median depth of what it sees. Coverage is the share of the space
-    with points in which a period sees some. "Also seen by" is the share of the points of a period
-    that another one sees, too; "In view of" the share that another one's cameras look at.
+    camera of its period, relative to the median depth of what it sees. The coverage is the share of
+    the occupied space in which a period sees points. "Also seen by" is the share of the points of a
+    period that another period sees, too; "In view of" is the share that lies in view of the cameras
+    of another period.
 
-    A scene that cannot be read is named, and the others are reported. Exit status: 0 all scenes
-    were read, 1 some, 2 none, or wrong usage.
+    A scene that cannot be read is named and the others are reported. Exit status: 0 if all scenes
+    were read, 1 if some were, 2 if none was or the command is used wrongly.
     """
     request = Request(**options)  # type: ignore[arg-type]
     paths = [p for f in folders for p in in_paper_order(_scenes(f, request.dataset_format))]

@@ -21,23 +21,23 @@ from chronoscene.undistort import Undistortion, undistort
 @click.argument("source", type=click.Path(path_type=Path), metavar="SCENE")
 @click.argument("out", type=click.Path(path_type=Path))
 @click.option(
-    "--center", is_flag=True, help="Crop the images so that the principal point is in the centre."
+    "--center", is_flag=True, help="Crop the images so that the principal point is in their centre."
 )
 @click.option(
     "--threads",
     type=click.IntRange(1),
-    help="Images worked on at the same time.  [default: one per processor]",
+    help="Number of images processed at the same time.  [default: one per processor]",
 )
 @click.option(
     "--link",
     type=click.Choice(["hard", "sym"]),
-    help="Link images that need no change instead of copying them.",
+    help="Link images that do not change instead of copying them.",
 )
 @click.option(
     "--format",
     "scene_format",
     type=click.Choice(format_names()),
-    help="Format of the scene.  [default: found out]",
+    help="Format of SCENE.  [default: detected]",
 )
 def command(
     source: Path,
@@ -47,11 +47,11 @@ def command(
     link: str | None,
     scene_format: str | None,
 ) -> None:
-    """Write SCENE into the new folder OUT with undistorted images and PINHOLE cameras.
+    """Undistort the images of SCENE and write it with PINHOLE cameras to the new folder OUT.
 
-    Observations of points move along; poses, periods and split stay. Images of cameras without
-    distortion are copied, others become RGB of 8 bits, on black where transparent. SCENE is left
-    alone. OUT is in the ChronoScene format.
+    Observations of points move with the images; poses, periods and split do not change. Images of
+    cameras without distortion are copied; others become 8-bit RGB, black where they were
+    transparent. SCENE is not changed. OUT is in the ChronoScene format.
     """
     check_outside(out, [source])
     with progress_bar() as bar:

@@ -46,35 +46,44 @@ def _explain(context: click.Context, option: click.Parameter, value: str | None)
     type=click.Choice(sorted(WRITERS)),
     default="text",
     show_default=True,
-    help="What to write.",
+    help="Output format.",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="Write to this file instead.")
-@click.option("--sarif", type=click.Path(path_type=Path), help="Write a SARIF report here, too.")
-@click.option("--html", type=click.Path(path_type=Path), help="Write an HTML page here, too.")
 @click.option(
-    "--select", multiple=True, metavar="CODES", help="Run these rules only: CS201,CS3,split-line."
+    "--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal."
 )
-@click.option("--ignore", multiple=True, metavar="CODES", help="Leave these rules out.")
+@click.option(
+    "--sarif", type=click.Path(path_type=Path), help="Also write a SARIF report to this file."
+)
+@click.option(
+    "--html", type=click.Path(path_type=Path), help="Also write an HTML page to this file."
+)
+@click.option(
+    "--select",
+    multiple=True,
+    metavar="CODES",
+    help="Run these rules only, such as CS201,CS3,split-line.",
+)
+@click.option("--ignore", multiple=True, metavar="CODES", help="Do not run these rules.")
 @click.option(
     "--explain",
     metavar="CODES",
     expose_value=False,
     is_eager=True,
     callback=_explain,
-    help="Print what these rules look for, and what to do, and end; CS for all.",
+    help="Print what these rules check and what to do about findings. CS means all rules.",
 )
-@click.option("--strict", is_flag=True, help="Warnings make a scene not valid, too.")
+@click.option("--strict", is_flag=True, help="Warnings make a scene invalid, too.")
 @click.option(
     "--decode/--no-decode",
     default=False,
     show_default=True,
-    help="Decode all images: finds damaged pixels and copied images. Takes time.",
+    help="Decode all images, which finds damaged and duplicate ones but takes time.",
 )
 @click.option(
     "--fix",
     type=click.Path(path_type=Path),
     metavar="OUT",
-    help="Write a corrected copy to this new folder, and report what remains.",
+    help="Write a corrected copy to this new folder and report what remains.",
 )
 @click.pass_context
 def command(
@@ -92,9 +101,11 @@ def command(
 ) -> None:
     """Check a scene, or every scene in a folder, and report all problems.
 
-    Exit status: 0 valid, 1 there are errors (with --strict: or warnings), 2 there is no scene, or
-    wrong usage. --explain CS lists the rules. Nothing is written into the scene. With --fix, the
-    report and the exit status are of the corrected copy.
+    The scene itself is never changed. With --fix, the report and the exit status are those of the
+    corrected copy. --explain CS lists all rules.
+
+    Exit status: 0 if the scene is valid, 1 if there are errors (with --strict, also warnings), 2 if
+    there is no scene or the command is used wrongly.
     """
     check = partial(_check, _codes(select), _codes(ignore), decode)
     choose_rules(_codes(select), _codes(ignore))  # whatever is wrong with them is said first

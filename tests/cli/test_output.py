@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from chronoscene.cli import cli, table
+from chronoscene.cli import cli, results
 from chronoscene.cli.output import check_file, check_place, emit, writing_to
 from chronoscene.errors import ConfigError
 
@@ -60,8 +60,8 @@ def test_the_option_is_named(
 
 
 def test_a_table(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table, "read_runs", lambda folders: ([], []))
-    monkeypatch.setattr(table, "format_runs", lambda *_: "no runs\n")
+    monkeypatch.setattr(results, "read_runs", lambda folders: ([], []))
+    monkeypatch.setattr(results, "format_runs", lambda *_: "no runs\n")
     with pytest.raises(ConfigError, match=r"^--out .*file/t\.csv: expected a file that can be"):
         arguments = ["table", str(places), "--out", str(places / "file/t.csv")]
         CliRunner().invoke(cli, arguments, catch_exceptions=False)
