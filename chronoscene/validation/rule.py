@@ -1,21 +1,16 @@
 """What a rule is, and the table that rules register in.
 
-A rule is a small function in `chronoscene.validation.rules` with the decorator `rule`. Its
+A rule is a small function in `chronoscene.validation.rules` with a decorator for its severity. Its
 parameters name the attributes of `RawScene` that it looks at (``scene`` is the scene itself); it is
 skipped if one of them is None, and yields a `Hit` for each problem::
 
-    @rule(
-        "CS122",
-        "warning",
-        what="A quaternion does not have unit length.",
-        bad="quaternion `2 0 0 0`",
-        remedy="normalise the quaternion",
-    )
+    @rule.warning("CS122", bad="quaternion `2 0 0 0`", remedy="normalise the quaternion")
     def quaternion_not_unit(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+        '''A quaternion does not have unit length.'''
         ...
 
-The name of the rule is that of the function, here ``quaternion-not-unit``. Codes are stable and are
-never reused. ``docs/validation-rules.md`` lists all rules.
+The docstring says what is wrong; the name is that of the function, here ``quaternion-not-unit``.
+Codes are stable and are never reused. ``docs/validation-rules.md`` lists all rules.
 """
 
 from __future__ import annotations
@@ -24,9 +19,10 @@ import inspect
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
-from chronoscene.validation.finding import SEVERITIES, Hit, Severity
+from chronoscene.validation.finding import Hit, Severity
 from chronoscene.validation.scene_folder import RawScene
 
 Check = Callable[..., Iterable[Hit]]
@@ -54,7 +50,7 @@ class Rule:
     name: str
     severity: Severity
     what: str
-    """What is wrong, in one or two sentences. Markdown."""
+    """What is wrong, in one or two sentences: the docstring of ``check``. Markdown."""
     remedy: str
     """What to do, in the imperative, without a full stop."""
     bad: str
@@ -76,23 +72,23 @@ RULES: dict[str, Rule] = {}
 """Rules by code. Complete when `chronoscene.validation.rules` has been imported."""
 
 
-def rule(
-    code: str,
+def _register(
     severity: Severity,
+    code: str,
     *,
-    what: str,
     bad: str,
     remedy: str,
     needs: tuple[str, ...] = (),
     last: bool = False,
+    what: str = "",
 ) -> Callable[[C], C]:
     """Register the decorated function as a rule; see `Rule` for the arguments.
 
     Args:
         needs: Attributes that must not be None besides those that are parameters of the function.
+        what: Replaces the docstring if it needs a constant.
     """
     assert re.fullmatch("CS[0-9]{3}", code) and code[:3] in GROUPS, code
-    assert severity in SEVERITIES, severity
     assert code not in RULES, code
 
     def register(check: C) -> C:
@@ -100,7 +96,18 @@ def rule(
         assert name not in {r.name for r in RULES.values()}, name
         parameters = tuple(inspect.signature(check).parameters)
         needed = (*(p for p in parameters if p != "scene"), *needs)
-        RULES[code] = Rule(code, name, severity, what, remedy, bad, parameters, needed, last, check)
+        text = what or " ".join((check.__doc__ or "").split())
+        RULES[code] = Rule(code, name, severity, text, remedy, bad, parameters, needed, last, check)
         return check
 
     return register
+
+
+error = partial(_register, "error")
+"""Decorator of a rule of severity error; see `_register`."""
+
+warning = partial(_register, "warning")
+"""Decorator of a rule of severity warning; see `_register`."""
+
+info = partial(_register, "info")
+"""Decorator of a rule of severity info; see `_register`."""

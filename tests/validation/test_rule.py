@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from chronoscene.errors import ConfigError
-from chronoscene.validation.rule import RULES, rule
+from chronoscene.validation import rule
+from chronoscene.validation.rule import RULES
 from chronoscene.validation.rules import all_rules, choose_rules
 from chronoscene.validation.scene_folder import RawScene
 
@@ -42,7 +43,7 @@ def test_codes_are_sorted_and_names_unique():
 
 def test_a_code_cannot_be_given_twice():
     with pytest.raises(AssertionError, match="CS201"):
-        rule("CS201", "info", what="", remedy="", bad="")
+        rule.info("CS201", remedy="", bad="")
 
 
 def test_a_name_cannot_be_given_twice():
@@ -50,7 +51,7 @@ def test_a_name_cannot_be_given_twice():
         return ()
 
     with pytest.raises(AssertionError, match="image-missing"):
-        rule("CS299", "info", what="", remedy="", bad="")(image_missing)
+        rule.info("CS299", remedy="", bad="")(image_missing)
 
 
 def test_choose_all():

@@ -12,51 +12,46 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.io.wording import shown
 from chronoscene.scene import Points
+from chronoscene.validation import rule
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 
 RULES_ON_ORIGINS = ("CS006", "CS007")
 """Codes of the rules that run on folders in other formats even if they cannot be read."""
 
 
-@rule(
-    "CS001",
-    "error",
-    what="There is no `images/` folder.",
-    bad="photos in `photos/`",
-    remedy="put the images into images/ in the scene folder",
+@rule.error(
+    "CS001", bad="photos in `photos/`", remedy="put the images into images/ in the scene folder"
 )
 def no_images_folder(scene: RawScene) -> Iterator[Hit]:
+    """There is no `images/` folder."""
     if not (scene.root / "images").is_dir():
         inside = sorted(p.name for p in scene.root.iterdir() if p.is_dir())
         found = f"the folders {shown(inside, 5)}" if inside else "no folder at all"
         yield Hit("images", "a folder with the images", found)
 
 
-@rule(
+@rule.error(
     "CS002",
-    "error",
-    what="The COLMAP model is not in `sparse/0/`, where readers look for it.",
     bad="`sparse/cameras.bin`, as written by COLMAP's undistorter",
     remedy="move the model files to sparse/0/",
 )
 def model_misplaced(scene: RawScene) -> Iterator[Hit]:
+    """The COLMAP model is not in `sparse/0/`, where readers look for it."""
     place = scene.model_place
     if place is not None and place != our_format.MODEL:
         found = f"a model in {place}/" if place else "a model at the top of the folder"
         yield Hit(our_format.MODEL, "the COLMAP model", found)
 
 
-@rule(
+@rule.warning(
     "CS003",
-    "warning",
-    what="COLMAP built several models that it could not merge; only `sparse/0/` is read.",
     bad="`sparse/0/` and `sparse/1/`, each with one period",
     remedy="match images across the models and run the mapper again, or delete the models that "
     "are not needed",
 )
 def several_models(scene: RawScene) -> Iterator[Hit]:
+    """COLMAP built several models that it could not merge; only `sparse/0/` is read."""
     place = scene.model_place
     others = [
         f"sparse/{folder.name}"
@@ -67,15 +62,14 @@ def several_models(scene: RawScene) -> Iterator[Hit]:
         yield Hit("sparse", f"a single model, {place}", f"also {shown(others)}", count=len(others))
 
 
-@rule(
+@rule.error(
     "CS004",
-    "error",
-    what="`sparse/periods.json` is invalid.",
     bad='`[{"id": 1}]` in a scene with two periods',
     remedy="correct the file, or delete it: it only holds labels and dates",
     needs=("periods",),
 )
 def bad_periods_json(scene: RawScene) -> Iterator[Hit]:
+    """`sparse/periods.json` is invalid."""
     ids = scene.period_ids
     if ids != list(range(len(ids))):
         return  # has its own rule
@@ -87,67 +81,54 @@ def bad_periods_json(scene: RawScene) -> Iterator[Hit]:
         yield _relative_hit(scene.root, error, our_format.PERIODS)
 
 
-@rule(
-    "CS005",
-    "error",
-    what="`sparse/world.json` is invalid.",
-    bad='`{"unit": "feet"}`',
-    remedy="correct the file, or delete it",
-)
+@rule.error("CS005", bad='`{"unit": "feet"}`', remedy="correct the file, or delete it")
 def bad_world_json(scene: RawScene) -> Iterator[Hit]:
+    """`sparse/world.json` is invalid."""
     try:
         our_format.read_world(scene.root)
     except ChronoSceneError as error:
         yield _relative_hit(scene.root, error, our_format.WORLD)
 
 
-@rule(
+@rule.info(
     "CS006",
-    "info",
-    what="The folder is in another format. It is checked as `chronoscene convert` would write it; "
-    "places refer to the converted scene.",
     bad="`transforms.json` of nerfstudio",
     remedy="nothing to do; `chronoscene convert DIR OUT` converts it for other tools",
 )
 def other_format(scene: RawScene) -> Iterator[Hit]:
+    """The folder is in another format. It is checked as `chronoscene convert` would write it;
+    places refer to the converted scene."""
     if scene.origin is not None and scene.origin.error is None:
         yield Hit(".", "a scene in the ChronoScene format", f"a scene in {scene.origin.format}")
 
 
-@rule(
-    "CS007",
-    "error",
-    what="The folder is in another format, but cannot be read as such.",
-    bad="a `transforms.json` without poses",
-    remedy="correct the file named here",
-)
+@rule.error("CS007", bad="a `transforms.json` without poses", remedy="correct the file named here")
 def other_format_unreadable(scene: RawScene) -> Iterator[Hit]:
+    """The folder is in another format, but cannot be read as such."""
     if scene.origin is not None and scene.origin.error is not None:
         yield _relative_hit(scene.root, scene.origin.error, ".")
 
 
-@rule(
+@rule.warning(
     "CS008",
-    "warning",
-    what="Part of a folder in another format is left out by the conversion.",
     bad="frames in `transforms.json` whose image is missing",
     remedy="nothing to do if this is intended; otherwise add what is missing",
 )
 def other_format_left_out(scene: RawScene) -> Iterator[Hit]:
+    """Part of a folder in another format is left out by the conversion."""
     for remark in scene.origin.remarks if scene.origin is not None else ():
         yield Hit(".", "a folder that can be converted completely", remark)
 
 
-@rule(
+@rule.error(
     "CS009",
-    "error",
-    what="No other rule found an error, but the reader (or COLMAP itself) rejects the scene.",
     bad="a model that COLMAP cannot open although its records are complete",
     remedy="follow the message; if it makes no sense, report it",
     needs=("cameras", "points"),
     last=True,
 )
 def reader_refuses(scene: RawScene, model: RawModel, images: RawImages) -> Iterator[Hit]:
+    """No other rule found an error, but the reader (or COLMAP itself) rejects the scene."""
     try:
         if model_kind(model.folder) == "binary":  # the rules have checked points and tracks
             posed = read_poses(scene.root / our_format.MODEL, images)

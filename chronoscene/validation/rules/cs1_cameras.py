@@ -12,9 +12,9 @@ from chronoscene.colmap.raw_model import CAMERA, RawFrame, RawImages, RawModel
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.cameras import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
 from chronoscene.scene.geometry import camera_centre, rotation_from_quaternion
+from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import good_poses
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene, derived
 
 Array = NDArray[np.float64]
@@ -39,14 +39,9 @@ SAME_PLACE = 1e-3
 """The same for positions, as a share of the extent of the cameras."""
 
 
-@rule(
-    "CS131",
-    "error",
-    what="A camera has no size, an absurd size, or a focal length that is not positive and finite.",
-    bad="`1 PINHOLE 640 480 -500 500 320 240`",
-    remedy="correct the camera",
-)
+@rule.error("CS131", bad="`1 PINHOLE 640 480 -500 500 320 240`", remedy="correct the camera")
 def camera_unusable(scene: RawScene, cameras: Sequence[Camera]) -> Iterator[Hit]:
+    """A camera has no size, an absurd size, or a focal length that is not positive and finite."""
     for camera in cameras:
         if not camera.is_usable:
             expected = "a plausible size, positive focal lengths and finite parameters"
@@ -55,28 +50,17 @@ def camera_unusable(scene: RawScene, cameras: Sequence[Camera]) -> Iterator[Hit]
             yield Hit(scene.camera_place(camera), expected, found)
 
 
-@rule(
-    "CS132",
-    "error",
-    what="A camera model cannot be used as a pinhole camera.",
-    bad="`OPENCV_FISHEYE`",
-    remedy=UNDISTORT,
-)
+@rule.error("CS132", bad="`OPENCV_FISHEYE`", remedy=UNDISTORT)
 def camera_model(scene: RawScene, cameras: Sequence[Camera]) -> Iterator[Hit]:
+    """A camera model cannot be used as a pinhole camera."""
     for camera in cameras:
         if camera.model not in (*PINHOLE_MODELS, *POLYNOMIAL_MODELS):
             yield Hit(scene.camera_place(camera), NO_DISTORTION, camera.model)
 
 
-@rule(
-    "CS133",
-    "error",
-    what="A camera has lens distortion, which methods cannot train with. Benchmarks refuse it.",
-    bad="`SIMPLE_RADIAL` with k = -0.16",
-    remedy=UNDISTORT,
-    needs=("cameras",),
-)
+@rule.error("CS133", bad="`SIMPLE_RADIAL` with k = -0.16", remedy=UNDISTORT, needs=("cameras",))
 def camera_distorted(scene: RawScene) -> Iterator[Hit]:
+    """A camera has lens distortion, which methods cannot train with. Benchmarks refuse it."""
     for camera in _polynomial(scene):
         if not camera.is_pinhole:
             shift = displacement(camera)
@@ -85,32 +69,30 @@ def camera_distorted(scene: RawScene) -> Iterator[Hit]:
             yield Hit(scene.camera_place(camera), "a camera without distortion", found, remedy)
 
 
-@rule(
+@rule.info(
     "CS134",
-    "info",
-    what="The distortion parameters of a camera are all zero. It is used as a pinhole camera; "
-    "other readers may go by the name of its model.",
     bad="`SIMPLE_RADIAL` with k = 0",
     remedy="nothing to do here; write it as PINHOLE or SIMPLE_PINHOLE for other readers",
     needs=("cameras",),
 )
 def zero_distortion(scene: RawScene) -> Iterator[Hit]:
+    """The distortion parameters of a camera are all zero. It is used as a pinhole camera; other
+    readers may go by the name of its model."""
     for camera in _polynomial(scene):
         if camera.is_pinhole:
             found = f"{camera.model} without distortion"
             yield Hit(scene.camera_place(camera), "PINHOLE or SIMPLE_PINHOLE", found)
 
 
-@rule(
+@rule.warning(
     "CS135",
-    "warning",
-    what="The focal lengths imply a field of view or an aspect ratio of pixels that no ordinary "
-    "camera has.",
     bad="f = 35 (millimetres) with a width of 4000 pixels",
     remedy="check that the focal lengths are in pixels and belong to images of this size",
     needs=("cameras",),
 )
 def implausible_focal(scene: RawScene) -> Iterator[Hit]:
+    """The focal lengths imply a field of view or an aspect ratio of pixels that no ordinary camera
+    has."""
     for camera in scene.usable_cameras.values():
         fx, fy = camera.K[0, 0], camera.K[1, 1]
         angle = np.degrees(2 * np.arctan(camera.width / (2 * fx)))
@@ -123,15 +105,14 @@ def implausible_focal(scene: RawScene) -> Iterator[Hit]:
             yield Hit(scene.camera_place(camera), "nearly equal focal lengths", found)
 
 
-@rule(
+@rule.warning(
     "CS136",
-    "warning",
-    what="The principal point is outside the image.",
     bad="cx = 2000 with a width of 1600",
     remedy="check that the camera belongs to images of this size (not to a crop or a scaled copy)",
     needs=("cameras",),
 )
 def principal_point_outside(scene: RawScene) -> Iterator[Hit]:
+    """The principal point is outside the image."""
     for camera in scene.usable_cameras.values():
         cx, cy = camera.K[0, 2], camera.K[1, 2]
         if not (0 <= cx <= camera.width and 0 <= cy <= camera.height):
@@ -139,14 +120,13 @@ def principal_point_outside(scene: RawScene) -> Iterator[Hit]:
             yield Hit(scene.camera_place(camera), expected, f"({cx:.5g}, {cy:.5g})")
 
 
-@rule(
+@rule.info(
     "CS137",
-    "info",
-    what="A camera is not used by any image.",
     bad="`cameras.bin` has cameras 1 and 2, but all images have camera 1",
     remedy="nothing to do, unless images are missing from the model",
 )
 def camera_unused(scene: RawScene, cameras: Sequence[Camera], images: RawImages) -> Iterator[Hit]:
+    """A camera is not used by any image."""
     used = set(images.camera_ids.tolist())
     if not used or not used <= {camera.camera_id for camera in cameras}:
         return  # cameras and images do not belong together, which has its own rule
@@ -189,15 +169,14 @@ def _distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
     )
 
 
-@rule(
+@rule.error(
     "CS141",
-    "error",
-    what="Only one of the files `rigs` and `frames`, which belong together, is present.",
     bad="`frames.bin` without `rigs.bin`",
     remedy="copy the missing file, or delete the other one: without both, each image is its own "
     "frame",
 )
 def rigs_partial(scene: RawScene, model: RawModel) -> Iterator[Hit]:
+    """Only one of the files `rigs` and `frames`, which belong together, is present."""
     form = _form(model)
     present = [s for s in ("rigs", "frames") if (model.folder / f"{s}{form}").is_file()]
     if len(present) == 1:
@@ -206,17 +185,16 @@ def rigs_partial(scene: RawScene, model: RawModel) -> Iterator[Hit]:
         yield Hit(place, f"the file that belongs to {present[0]}{form}", "none")
 
 
-@rule(
+@rule.error(
     "CS142",
-    "error",
-    what="Rigs, frames, cameras and images refer to something that does not exist, or an image is "
-    "in no frame or in two frames.",
     bad="`frames.bin` of an earlier run, with images that are not in `images.bin`",
-    remedy="write all five files again together, or delete rigs and frames: then each image is its "
-    "own frame",
+    remedy="write all five files again together, or delete rigs and frames: then each image is "
+    "its own frame",
     needs=("cameras", "images"),
 )
 def rigs_inconsistent(scene: RawScene, model: RawModel) -> Iterator[Hit]:
+    """Rigs, frames, cameras and images refer to something that does not exist, or an image is in no
+    frame or in two frames."""
     place = f"{scene.model_place or '.'}/frames{_form(model)}"
     for expected, wrong in _contradictions(scene).items():
         if wrong:
@@ -262,16 +240,15 @@ def _contradictions(scene: RawScene) -> dict[str, set[str]]:
     }
 
 
-@rule(
+@rule.error(
     "CS143",
-    "error",
-    what="The pose of an image in `images` differs from the pose given by its frame and rig. "
-    "COLMAP reads the frames, older readers read the images, so they see two different scenes.",
     bad="poses transformed in `images.bin` only, with `frames.bin` left as it was",
     remedy="write the model again with COLMAP, or delete rigs and frames if the poses in images "
     "are right",
 )
 def rig_pose_differs(scene: RawScene, model: RawModel, images: RawImages) -> Iterator[Hit]:
+    """The pose of an image in `images` differs from the pose given by its frame and rig. COLMAP
+    reads the frames, older readers read the images, so they see two different scenes."""
     raw = model.rigs
     if raw is None or not len(images) or any(_contradictions(scene).values()):
         return  # no rigs, or those of another model

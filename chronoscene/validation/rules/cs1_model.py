@@ -11,36 +11,34 @@ from chronoscene.colmap.raw_model import MODEL_FILES, RawImages, RawModel
 from chronoscene.formats.chronoscene import MODEL
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
+from chronoscene.validation import rule
 from chronoscene.validation.checks.names import is_portable, is_safe, spelling
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 
 MAX_ID = 2**31 - 2
 """Largest id in COLMAP's databases."""
 
 
-@rule(
+@rule.error(
     "CS101",
-    "error",
-    what="There is no COLMAP model.",
     bad="an empty folder `sparse/0/`",
     remedy="write the model to sparse/0/ (cameras, images, points3D; all .bin or all .txt); to "
     "register photos without poses, use chronoscene register",
 )
 def model_absent(scene: RawScene) -> Iterator[Hit]:
+    """There is no COLMAP model."""
     if scene.model_place is None:
         yield Hit(MODEL, "a COLMAP model", "none")
 
 
-@rule(
+@rule.error(
     "CS102",
-    "error",
-    what="Some of the three model files are missing, or binary and text files are mixed.",
     bad="`cameras.bin` and `images.bin` without `points3D.bin`",
     remedy="copy the missing files, or write the model again, with all files .bin or all .txt",
 )
 def model_partial(scene: RawScene, model: RawModel) -> Iterator[Hit]:
+    """Some of the three model files are missing, or binary and text files are mixed."""
     for stem in MODEL_FILES:
         if stem not in model.files:
             yield Hit(scene.model_file(stem), f"{stem}.bin or {stem}.txt", "neither")
@@ -49,95 +47,88 @@ def model_partial(scene: RawScene, model: RawModel) -> Iterator[Hit]:
         yield Hit(scene.model_place or ".", "only .bin or only .txt files", found)
 
 
-@rule(
+@rule.error(
     "CS103",
-    "error",
-    what="A model file is damaged and cannot be read completely.",
     bad="`images.bin` truncated by a full disk",
     remedy="copy the file again, or write the model again with COLMAP",
 )
 def model_damaged(scene: RawScene, model: RawModel) -> Iterator[Hit]:
+    """A model file is damaged and cannot be read completely."""
     folder = f"{scene.model_place}/" if scene.model_place else ""
     for damage in model.damages:
         yield Hit(f"{folder}{damage.file}", damage.expected, damage.found)
 
 
-@rule(
+@rule.info(
     "CS104",
-    "info",
-    what="The model exists in binary and in text form; the text files are not read.",
     bad="`images.bin` next to `images.txt`",
     remedy="delete the form that is not needed, so that the two cannot diverge",
 )
 def two_forms(scene: RawScene, model: RawModel) -> Iterator[Hit]:
+    """The model exists in binary and in text form; the text files are not read."""
     for stem, file in model.files.items():
         if file.endswith(".bin") and (model.folder / f"{stem}.txt").is_file():
             yield Hit(scene.model_file(stem), "one form of the file", f"also {stem}.txt")
 
 
-@rule(
+@rule.error(
     "CS105",
-    "error",
-    what="The model has no registered images.",
     bad="an `images.txt` with nothing but comments",
     remedy="register the images with COLMAP or chronoscene register",
 )
 def no_images(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """The model has no registered images."""
     if not len(images):
         yield Hit(scene.model_file("images"), "registered images", "none")
 
 
-@rule(
+@rule.error(
     "CS106",
-    "error",
-    what="Two cameras or two images have the same id.",
     bad="two lines in `images.txt` that start with `7`",
     remedy="give each its own id, and update the references to it",
     needs=("model",),
 )
 def duplicate_id(scene: RawScene) -> Iterator[Hit]:
+    """Two cameras or two images have the same id."""
     for stem, ids in _ids(scene):
         for repeated, times in Counter(ids).items():
             if times > 1:
                 yield Hit(scene.model_file(stem), "unique ids", f"id {repeated} {times} times")
 
 
-@rule(
+@rule.error(
     "CS107",
-    "error",
-    what="Two images of the model have the same name.",
     bad="`a.jpg` with image id 1 and with image id 2",
     remedy="keep one of them; if they are two photos, rename one file and register it again",
 )
 def duplicate_name(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """Two images of the model have the same name."""
     for name, times in Counter(images.names).items():
         if times > 1:
             yield Hit(scene.model_file("images"), "unique names", f"{quote(name)} {times} times")
 
 
-@rule(
+@rule.error(
     "CS108",
-    "error",
-    what="An image refers to a camera that is not in the model.",
     bad="image `a.jpg` with camera 3 when `cameras.bin` has only camera 1",
     remedy="write cameras and images again together",
 )
 def unknown_camera(scene: RawScene, cameras: Sequence[Camera], images: RawImages) -> Iterator[Hit]:
+    """An image refers to a camera that is not in the model."""
     known = np.array([c.camera_id for c in cameras], np.int64)
     for i in np.flatnonzero(~np.isin(images.camera_ids, known)):
         place = scene.image_place(images.names[i])
         yield Hit(place, "a camera of the model", f"camera {images.camera_ids[i]}")
 
 
-@rule(
+@rule.error(
     "CS109",
-    "error",
-    what="The id of a camera or image is outside the range that COLMAP supports.",
     bad="image id -1; camera id 4294967295",
     remedy="number from 1, and update the references",
     needs=("model",),
 )
 def id_out_of_range(scene: RawScene) -> Iterator[Hit]:
+    """The id of a camera or image is outside the range that COLMAP supports."""
     for stem, ids in _ids(scene):
         for wrong in sorted({i for i in ids if not 0 <= i <= MAX_ID}):
             yield Hit(scene.model_file(stem), f"ids from 0 to {MAX_ID}", f"id {wrong}")
@@ -148,43 +139,40 @@ def _ids(scene: RawScene) -> Iterator[tuple[str, list[int]]]:
     yield "images", scene.images.ids.tolist() if scene.images else []
 
 
-@rule(
+@rule.error(
     "CS111",
-    "error",
-    what="An image name is empty or leads out of `images/`.",
     bad="`../other/a.jpg`, `/home/me/a.jpg`",
     remedy="in the model, change the name to the path relative to images/",
 )
 def name_leaves_folder(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """An image name is empty or leads out of `images/`."""
     for name in images.names:
         if not is_safe(name):
             yield Hit(scene.model_file("images"), "image names below images/", quote(name))
 
 
-@rule(
+@rule.error(
     "CS112",
-    "error",
-    what="An image name is not UTF-8, or contains control characters.",
     bad="a name in Latin-1; a name with a line break",
     remedy="rename the file, and the image in the model, using letters and digits",
 )
 def name_not_text(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """An image name is not UTF-8, or contains control characters."""
     for name in images.names:
         if any(ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) < 0xE000 for c in name):
             place = scene.model_file("images")
             yield Hit(place, "UTF-8 names without control characters", quote(name))
 
 
-@rule(
+@rule.warning(
     "CS113",
-    "warning",
-    what="Image names differ only by case or by Unicode normalisation: they are the same file on "
-    "Windows and macOS, so that copying or checking out the scene loses an image.",
     bad="`IMG_1.jpg` and `img_1.JPG`; `é` as one character and as two",
     remedy="rename one of the files, in images/ and in the model",
     needs=("images",),
 )
 def name_case_collision(scene: RawScene) -> Iterator[Hit]:
+    """Image names differ only by case or by Unicode normalisation: they are the same file on
+    Windows and macOS, so that copying or checking out the scene loses an image."""
     groups: dict[str, list[str]] = {}
     for name in scene.names:
         groups.setdefault(spelling(name), []).append(name)
@@ -194,16 +182,15 @@ def name_case_collision(scene: RawScene) -> Iterator[Hit]:
             yield Hit(place, "names that differ by more than case", shown(sorted(group)))
 
 
-@rule(
+@rule.info(
     "CS114",
-    "info",
-    what="Other systems cannot store some image names: they have characters that Windows rejects, "
-    "end in a space or a dot, are names of devices, or are longer than 255 bytes.",
     bad="`2016-05-03T12:00:00.jpg`; `aux.png`",
     remedy="nothing to do here; to share the scene, rename the files in images/ and in the model",
     needs=("images",),
 )
 def name_not_portable(scene: RawScene) -> Iterator[Hit]:
+    """Other systems cannot store some image names: they have characters that Windows rejects, end
+    in a space or a dot, are names of devices, or are longer than 255 bytes."""
     names = [name for name in scene.names if not is_portable(name)]
     if names:
         found = f"{counted(len(names), 'name')} that some cannot store: {shown(names)}"

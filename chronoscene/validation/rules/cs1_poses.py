@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import good_poses
 from chronoscene.validation.checks.reprojection import image_errors, pose_limit
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene, derived
 
 Array = NDArray[np.float64]
@@ -48,42 +48,39 @@ MEANINGS = (
 AXES = {"": np.ones(3), "OpenGL axes (y up, z backwards)": np.array([1.0, -1.0, -1.0])}
 
 
-@rule(
+@rule.error(
     "CS121",
-    "error",
-    what="A pose contains NaN or infinity, or its quaternion is zero.",
     bad="`nan` in a translation; quaternion `0 0 0 0`",
     remedy="remove the image from the model, or register it again",
 )
 def pose_not_finite(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """A pose contains NaN or infinity, or its quaternion is zero."""
     for i in np.flatnonzero(~good_poses(images)):
         found = " ".join(f"{x:g}" for x in [*images.quaternions[i], *images.translations[i]])
         yield Hit(scene.image_place(images.names[i]), "a finite pose", found)
 
 
-@rule(
+@rule.warning(
     "CS122",
-    "warning",
-    what="A quaternion does not have unit length; some readers then scale the rotation.",
     bad="quaternion `2 0 0 0`",
     remedy="normalise the quaternion, after checking that its order is w, x, y, z",
 )
 def quaternion_not_unit(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """A quaternion does not have unit length; some readers then scale the rotation."""
     length = np.linalg.norm(images.quaternions, axis=1)
     for i in np.flatnonzero(good_poses(images) & (np.abs(length - 1) > UNIT_TOLERANCE)):
         place = scene.image_place(images.names[i])
         yield Hit(place, "a quaternion of length 1", f"length {length[i]:.4g}")
 
 
-@rule(
+@rule.warning(
     "CS123",
-    "warning",
-    what="The scene is too far from the origin to be resolved in single precision.",
     bad="a model in UTM coordinates, 4,427,000 m north",
     remedy="subtract an offset from the model and record it in sparse/world.json",
     needs=("images",),
 )
 def far_from_origin(scene: RawScene) -> Iterator[Hit]:
+    """The scene is too far from the origin to be resolved in single precision."""
     centres = scene.centres[scene.is_posed]
     if len(centres) < 2:
         return
@@ -95,16 +92,15 @@ def far_from_origin(scene: RawScene) -> Iterator[Hit]:
         yield Hit(scene.model_file("images"), "cameras near the origin of the world", found)
 
 
-@rule(
+@rule.warning(
     "CS124",
-    "warning",
-    what="A camera is absurdly far from the other cameras and the points; methods that derive the "
-    "size of the scene from its cameras get it wrong.",
     bad="a camera 3 km away from a square of 100 m",
     remedy="check the pose: the image was probably registered in the wrong place; remove it from "
     "the model or register it again",
 )
 def far_camera(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """A camera is absurdly far from the other cameras and the points; methods that derive the size
+    of the scene from its cameras get it wrong."""
     posed = np.flatnonzero(scene.is_posed)
     if not len(posed):
         return
@@ -122,16 +118,15 @@ def far_camera(scene: RawScene, images: RawImages) -> Iterator[Hit]:
         yield Hit(place, expected, f"a camera {distance[i]:.3g} away")
 
 
-@rule(
+@rule.error(
     "CS125",
-    "error",
-    what="The poses fit the points only when read in another convention.",
     bad="camera-to-world poses; SciPy's quaternions; camera centres as translations",
-    remedy="write world-to-camera poses as COLMAP does: quaternion w, x, y, z, translation "
-    "t = -R c for a camera centre c, +x right, +y down, +z forward",
+    remedy="write world-to-camera poses as COLMAP does: quaternion w, x, y, z, translation t = -R "
+    "c for a camera centre c, +x right, +y down, +z forward",
     needs=("images", "reprojections"),
 )
 def pose_convention(scene: RawScene) -> Iterator[Hit]:
+    """The poses fit the points only when read in another convention."""
     if found := other_convention(scene):
         place = scene.model_file("images")
         yield Hit(place, "poses as COLMAP writes them", f"poses that fit as {found}")

@@ -11,10 +11,10 @@ import numpy as np
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import quote
 from chronoscene.scene import Camera
+from chronoscene.validation import rule
 from chronoscene.validation.checks.names import Spellings
 from chronoscene.validation.checks.pixels import Pixels
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 
 KINDS = {
@@ -32,15 +32,14 @@ BLANK = 2.0
 """Grey levels between the means of the darkest and the brightest part of an image."""
 
 
-@rule(
+@rule.error(
     "CS201",
-    "error",
-    what="The file of a registered image is missing.",
     bad="`images.bin` has `a.jpg`, but there is only `images/a.JPG`",
     remedy="copy the image there, or remove it from the model",
     needs=("images",),
 )
 def image_missing(scene: RawScene) -> Iterator[Hit]:
+    """The file of a registered image is missing."""
     if not (scene.root / "images").is_dir():
         return  # has its own rule
     present, others = set(scene.present), Spellings(_unregistered(scene))
@@ -64,14 +63,13 @@ def _unregistered(scene: RawScene) -> list[str]:
     return [file for file in scene.files if file not in registered]
 
 
-@rule(
+@rule.info(
     "CS202",
-    "info",
-    what="A file in `images/` is not registered in the model, so it is not used.",
     bad="`images/b.jpg`, which COLMAP could not register",
     remedy="nothing to do, unless the image should have been registered",
 )
 def image_unregistered(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """A file in `images/` is not registered in the model, so it is not used."""
     if not scene.names:
         return  # has its own rule
     files, present = _unregistered(scene), set(scene.present)
@@ -83,15 +81,14 @@ def image_unregistered(scene: RawScene, images: RawImages) -> Iterator[Hit]:
             yield Hit(f"images/{file}", "a registered image", "one that is not in the model")
 
 
-@rule(
+@rule.error(
     "CS203",
-    "error",
-    what="An image file is empty, or is not an image.",
     bad="a file of zero bytes; a text file named `a.jpg`",
     remedy="copy the file again, or convert it to JPEG or PNG",
     needs=("images",),
 )
 def image_unreadable(scene: RawScene) -> Iterator[Hit]:
+    """An image file is empty, or is not an image."""
     for name, header in scene.headers.items():
         if header.problem is not None:
             yield Hit(f"images/{name}", "an image", header.problem)
@@ -99,16 +96,15 @@ def image_unreadable(scene: RawScene) -> Iterator[Hit]:
             yield Hit(f"images/{name}", "8 or 16 bit pixels", "floating point pixels")
 
 
-@rule(
+@rule.error(
     "CS204",
-    "error",
-    what="The aspect ratio of an image differs from that of its camera, so pixels and rays do not "
-    "match.",
     bad="a camera of 4000 x 3000 and a file of 3000 x 4000, rotated by its orientation tag",
     remedy="use the images that the model was made from, not cropped, rotated or padded copies",
     needs=("cameras", "images"),
 )
 def image_shape(scene: RawScene) -> Iterator[Hit]:
+    """The aspect ratio of an image differs from that of its camera, so pixels and rays do not
+    match."""
     for name, size, camera in _sizes(scene):
         if not _same_shape(size, camera):
             rotated = _same_shape(size[::-1], camera)
@@ -118,15 +114,14 @@ def image_shape(scene: RawScene) -> Iterator[Hit]:
             yield Hit(f"images/{name}", _expected(camera), found)
 
 
-@rule(
+@rule.warning(
     "CS205",
-    "warning",
-    what="An image has the aspect ratio of its camera, but another size.",
     bad="a camera of 4000 x 3000 and a file of 1000 x 750",
     remedy="scale the camera to the files, or use files of the camera's size",
     needs=("cameras", "images"),
 )
 def image_size(scene: RawScene) -> Iterator[Hit]:
+    """An image has the aspect ratio of its camera, but another size."""
     for name, size, camera in _sizes(scene):
         if size != (camera.width, camera.height) and _same_shape(size, camera):
             yield Hit(f"images/{name}", _expected(camera), f"{size[0]} x {size[1]}")
@@ -159,32 +154,30 @@ def _expected(camera: Camera) -> str:
     return f"{camera.width} x {camera.height} as in camera {camera.camera_id}"
 
 
-@rule(
+@rule.error(
     "CS206",
-    "error",
-    what="An image file is damaged: its header is valid, but its pixels cannot be decoded (needs "
-    "`--decode`).",
     bad="a JPEG truncated during transfer",
     remedy="copy the file again from its source",
     needs=("images",),
 )
 def image_damaged(scene: RawScene, pixels: dict[str, Pixels]) -> Iterator[Hit]:
+    """An image file is damaged: its header is valid, but its pixels cannot be decoded (needs
+    `--decode`)."""
     for name, decoded in pixels.items():
         if decoded.problem is not None and scene.headers[name].mode != "F":
             yield Hit(f"images/{name}", "an image that can be decoded", decoded.problem)
 
 
-@rule(
+@rule.info(
     "CS207",
-    "info",
-    what="An image has an orientation tag. ChronoScene and COLMAP ignore it, but viewers rotate "
-    "the image.",
     bad="a phone photo in portrait with EXIF orientation 6",
-    remedy="remove the tag, but leave the pixels as they are: the poses refer to them (chronoscene "
-    "validate --fix does so for JPEG files)",
+    remedy="remove the tag, but leave the pixels as they are: the poses refer to them "
+    "(chronoscene validate --fix does so for JPEG files)",
     needs=("images",),
 )
 def orientation_tag(scene: RawScene) -> Iterator[Hit]:
+    """An image has an orientation tag. ChronoScene and COLMAP ignore it, but viewers rotate the
+    image."""
     rotated = images_of_other_shape(scene) if scene.cameras is not None else set()
     for name in scene.readable:
         orientation = scene.headers[name].orientation
@@ -192,15 +185,14 @@ def orientation_tag(scene: RawScene) -> Iterator[Hit]:
             yield Hit(f"images/{name}", "no orientation tag", f"orientation {orientation}")
 
 
-@rule(
+@rule.error(
     "CS208",
-    "error",
-    what="An image file is truncated. With `--decode`, CS206 reports such files.",
     bad="a JPEG of which only the first half was uploaded",
     remedy="copy the file again from its source",
     needs=("images",),
 )
 def image_cut_off(scene: RawScene) -> Iterator[Hit]:
+    """An image file is truncated. With `--decode`, CS206 reports such files."""
     pixels = scene.pixels or {}
     for name in scene.readable:
         header = scene.headers[name]
@@ -208,92 +200,86 @@ def image_cut_off(scene: RawScene) -> Iterator[Hit]:
             yield Hit(f"images/{name}", f"a complete {header.kind} file", "one without its end")
 
 
-@rule(
+@rule.info(
     "CS211",
-    "info",
-    what="An image has more than 8 bits per channel. Only 8 are used; the released code may not be "
-    "able to read it.",
     bad="a PNG with 16 bits per channel",
     remedy="nothing to do here; save it with 8 bits per channel for other readers",
     needs=("images",),
 )
 def image_deep(scene: RawScene) -> Iterator[Hit]:
+    """An image has more than 8 bits per channel. Only 8 are used; the released code may not be able
+    to read it."""
     for name in scene.readable:
         header = scene.headers[name]
         if header.deep and header.mode != "F":
             yield Hit(f"images/{name}", "8 bits per channel", f"more ({header.kind})")
 
 
-@rule(
+@rule.warning(
     "CS212",
-    "warning",
-    what="An image is in CMYK, the colours of printing: it is converted to RGB without its colour "
-    "profile, so its colours differ from those of the other images.",
     bad="a JPEG in CMYK",
     remedy="convert the image to RGB using its colour profile",
     needs=("images",),
 )
 def image_cmyk(scene: RawScene) -> Iterator[Hit]:
+    """An image is in CMYK, the colours of printing: it is converted to RGB without its colour
+    profile, so its colours differ from those of the other images."""
     for name in scene.readable:
         if scene.headers[name].mode == "CMYK":
             yield Hit(f"images/{name}", "pixels in RGB", "pixels in CMYK")
 
 
-@rule(
+@rule.info(
     "CS213",
-    "info",
-    what="An image may have transparent pixels, which are filled with the background colour in "
-    "training and in testing.",
     bad="a PNG with an alpha channel",
     remedy="nothing to do if this is intended; otherwise save the image without transparency",
     needs=("images",),
 )
 def image_transparent(scene: RawScene) -> Iterator[Hit]:
+    """An image may have transparent pixels, which are filled with the background colour in training
+    and in testing."""
     for name in scene.readable:
         header = scene.headers[name]
         if header.transparent:
             yield Hit(f"images/{name}", "opaque pixels", f"pixels of mode {header.mode}")
 
 
-@rule(
+@rule.warning(
     "CS214",
-    "warning",
-    what="An image has several frames, of which only the first is used.",
     bad="an animated WebP",
     remedy="save the frame that is meant as a file of its own",
     needs=("images",),
 )
 def image_animated(scene: RawScene) -> Iterator[Hit]:
+    """An image has several frames, of which only the first is used."""
     for name in scene.readable:
         header = scene.headers[name]
         if header.animated:
             yield Hit(f"images/{name}", "a single frame", f"several frames ({header.kind})")
 
 
-@rule(
+@rule.warning(
     "CS215",
-    "warning",
-    what="The extension of an image does not match its file format; programs that go by the "
-    "extension fail.",
     bad="a PNG named `a.jpg`",
     remedy="rename the file, in images/ and in the model, or convert it",
     needs=("images",),
 )
 def image_misnamed(scene: RawScene) -> Iterator[Hit]:
+    """The extension of an image does not match its file format; programs that go by the extension
+    fail."""
     for name in scene.readable:
         kind, known = scene.headers[name].kind, KINDS.get(PurePosixPath(name).suffix.lower())
         if known is not None and kind not in known:
             yield Hit(f"images/{name}", f"a {known[0]} file", f"a {kind} file")
 
 
-@rule(
+@rule.warning(
     "CS216",
-    "warning",
-    what="An image consists of a single colour (needs `--decode`).",
     bad="a black frame of a video; a photo with the lens cap on",
     remedy="remove the image from the model: there is nothing in it to train or test on",
 )
 def image_blank(pixels: dict[str, Pixels]) -> Iterator[Hit]:
+    """An image consists of a single colour (needs `--decode`)."""
     for name, decoded in pixels.items():
         thumbnail = decoded.thumbnail
         if thumbnail is not None and np.ptp(thumbnail, axis=(0, 1)).max() <= BLANK:

@@ -13,6 +13,7 @@ import numpy as np
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.formats.chronoscene import PERIODS, SPLIT
 from chronoscene.io.wording import counted, shown
+from chronoscene.validation import rule
 from chronoscene.validation.checks.photo_metadata import (
     DAY,
     GpsFit,
@@ -24,7 +25,6 @@ from chronoscene.validation.checks.photo_metadata import (
     stated_dates,
 )
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 
 SLACK = 31
@@ -76,16 +76,15 @@ _BEGIN = re.compile(
 )
 
 
-@rule(
+@rule.warning(
     "CS221",
-    "warning",
-    what="The dates of the photos contradict the order of the periods, or `sparse/periods.json`.",
     bad="the photos of period 0 are from 2023, those of period 1 from 2016",
     remedy="number the periods by date, or correct the dates; if the clocks of the cameras were "
     "wrong, ignore this rule",
     needs=("periods",),
 )
 def exif_period_order(scene: RawScene) -> Iterator[Hit]:
+    """The dates of the photos contradict the order of the periods, or `sparse/periods.json`."""
     medians = median_dates(scene)
     for earlier, later in pairwise(sorted(medians)):
         if medians[earlier] - medians[later] >= DAY:
@@ -103,31 +102,29 @@ def exif_period_order(scene: RawScene) -> Iterator[Hit]:
             yield Hit(PERIODS, expected, stated)
 
 
-@rule(
+@rule.warning(
     "CS222",
-    "warning",
-    what="The date of a photo is that of another period.",
     bad="a photo of 2023 among those of 2016",
     remedy="look at the photo; correct its period in split.txt",
     needs=("periods",),
 )
 def exif_other_period(scene: RawScene) -> Iterator[Hit]:
+    """The date of a photo is that of another period."""
     for name, (taken, own, period) in of_other_period(scene).items():
         found = f"{taken:%Y-%m-%d}, the date of period {period}"
         yield Hit(f"images/{name}", f"a date around {own:%Y-%m-%d}", found)
 
 
-@rule(
+@rule.warning(
     "CS223",
-    "warning",
-    what="The GPS position of a photo is far from its camera in the model, after aligning the "
-    "model with the positions of all photos.",
     bad="a photo of the east facade that was matched to the west facade",
     remedy="check the pose: the photo may have been registered at a similar-looking place; if its "
     "GPS receiver was wrong, ignore this rule",
     needs=("cameras",),
 )
 def exif_position(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """The GPS position of a photo is far from its camera in the model, after aligning the model
+    with the positions of all photos."""
     fit = fit_gps(scene)
     if fit is None:
         return
@@ -163,16 +160,15 @@ def _mostly_far(scene: RawScene, fit: GpsFit, far: np.ndarray) -> dict[int, Hit]
     return hits
 
 
-@rule(
+@rule.warning(
     "CS224",
-    "warning",
-    what="The focal length of a camera contradicts the photos taken with it.",
     bad="f = 4000 px with a width of 4000 px; the photos say 20 mm on 36 mm film (2222 px)",
     remedy="check the camera: in a scene with little relief COLMAP may converge to a wrong focal "
     "length; run the mapper again with the focal length of the photos, not refined",
     needs=("cameras",),
 )
 def exif_focal(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """The focal length of a camera contradicts the photos taken with it."""
     stated: dict[int, list[float]] = {}
     for name, camera_id in zip(images.names, images.camera_ids.tolist(), strict=True):
         focal = scene.headers[name].exif.focal_35mm if name in scene.headers else None
@@ -190,16 +186,15 @@ def exif_focal(scene: RawScene, images: RawImages) -> Iterator[Hit]:
             yield Hit(scene.camera_place(camera), expected, f"{focal:.4g} px")
 
 
-@rule(
+@rule.warning(
     "CS225",
-    "warning",
-    what="The date of a photo is half a year or more from the other dates of its period, and is "
-    "not that of any other period.",
     bad="a photo of 2019 among those of May 2016, in a scene of 2016 and 2023",
-    remedy="look at the photo: there may be no period for its date; if the clock of its camera was "
-    "wrong, ignore this rule",
+    remedy="look at the photo: there may be no period for its date; if the clock of its camera "
+    "was wrong, ignore this rule",
 )
 def exif_date_alone(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
+    """The date of a photo is half a year or more from the other dates of its period, and is not
+    that of any other period."""
     by_period: dict[int, dict[str, datetime]] = {}
     for name, taken in dates_of(scene).items():
         by_period.setdefault(periods[name], {})[name] = taken
@@ -216,15 +211,14 @@ def exif_date_alone(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
                 yield Hit(f"images/{name}", expected, f"{taken:%Y-%m-%d}")
 
 
-@rule(
+@rule.warning(
     "CS226",
-    "warning",
-    what="Photos taken within five minutes of each other are in different periods.",
     bad="every second photo of a flight in period 0, the others in period 1",
     remedy="put the photos of one visit into one period; if dates were copied from one photo to "
     "others, ignore this rule",
 )
 def one_visit_in_two_periods(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
+    """Photos taken within five minutes of each other are in different periods."""
     misfiled = of_other_period(scene)  # has its own rule
     taken = sorted(
         (moment, name)
@@ -241,16 +235,15 @@ def one_visit_in_two_periods(scene: RawScene, periods: dict[str, int]) -> Iterat
         yield Hit(SPLIT, expected, text, count=len(pairs))
 
 
-@rule(
+@rule.warning(
     "CS227",
-    "warning",
-    what="The years in the image names, or the dates in `sparse/periods.json`, contradict the "
-    "order of the periods.",
     bad="images in `2023/` in period 0, those in `2016/` in period 1",
     remedy="number the periods by date",
     needs=("periods",),
 )
 def names_period_order(scene: RawScene) -> Iterator[Hit]:
+    """The years in the image names, or the dates in `sparse/periods.json`, contradict the order of
+    the periods."""
     known = median_dates(scene)  # of these periods, CS221 has compared the stated dates
     stated = {period: date for period, date in stated_dates(scene).items() if period not in known}
     for earlier, later in pairwise(sorted(stated)):
@@ -287,15 +280,14 @@ def _year(name: str) -> int | None:
     return int(found[1]) if found else None
 
 
-@rule(
+@rule.warning(
     "CS228",
-    "warning",
-    what="The folders of the images, or the dates or period numbers that their names begin with, "
-    "match the periods, except for a few images.",
     bad="`2016/a.jpg` in period 1, all other images of `2016/` in period 0",
     remedy="look at the image; correct its period in split.txt",
 )
 def names_other_period(periods: dict[str, int]) -> Iterator[Hit]:
+    """The folders of the images, or the dates or period numbers that their names begin with, match
+    the periods, except for a few images."""
     groups: dict[str, list[str]] = {}
     for name in periods:
         folder, _, file = name.rpartition("/")

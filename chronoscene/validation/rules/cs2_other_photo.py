@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.io.wording import quote, shown
+from chronoscene.validation import rule
 from chronoscene.validation.checks.pixels import Pixels
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 
 Array = NDArray[np.float64]
@@ -53,16 +53,15 @@ TURNS = {
 """Description to the slices that make a turned photo right."""
 
 
-@rule(
+@rule.warning(
     "CS231",
-    "warning",
-    what="A photo does not show the points that it should see: it is a different photo, or it was "
-    "rotated after the model was made (needs `--decode`).",
     bad="`a.jpg` and `b.jpg` with each other's names; a photo rotated by 180 degrees",
     remedy="look at the photo; copy the one that the model was made from",
     needs=("observations",),
 )
 def image_other_photo(scene: RawScene, pixels: dict[str, Pixels]) -> Iterator[Hit]:
+    """A photo does not show the points that it should see: it is a different photo, or it was
+    rotated after the model was made (needs `--decode`)."""
     assert scene.images is not None
     greys = {n: p.grey for n, p in pixels.items() if p.grey is not None}
     names = scene.images.names

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Iterator
 from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene.splits import DEFAULT_RULE, NameEntry, NameIndex, Problem, ProblemKind
+from chronoscene.validation import rule
 from chronoscene.validation.checks.names import Spellings
-from chronoscene.validation.finding import Hit, Severity
-from chronoscene.validation.rule import rule
+from chronoscene.validation.finding import Hit
 from chronoscene.validation.scene_folder import RawScene, TextFile, derived
 
 _SIMILAR = re.compile(r"(splits?|periods?)(\.(txt|csv|tsv))*", re.IGNORECASE)
@@ -27,36 +27,18 @@ def problem_hit(file: str, problem: Problem) -> Hit:
     return Hit(place, problem.expected, problem.found, remedy)
 
 
-def _parser_rule(
-    code: str,
-    name: str,
-    severity: Severity,
-    kind: ProblemKind,
-    *,
-    what: str,
-    bad: str,
-    remedy: str,
-    needs: tuple[str, ...],
-) -> None:
-    """Register a rule that reports the parser's problems of one kind."""
-    file = SPLIT if name.startswith("split") else TEST
-
-    def check(scene: RawScene) -> Iterator[Hit]:
-        problems = scene.split_problems if file == SPLIT else scene.test_problems
-        return (problem_hit(file, problem) for problem in problems if problem.kind == kind)
-
-    check.__name__ = name
-    rule(code, severity, what=what, bad=bad, remedy=remedy, needs=needs)(check)
+def _problems(file: str, problems: Iterable[Problem], kind: ProblemKind) -> Iterator[Hit]:
+    """The parser's problems of one kind."""
+    return (problem_hit(file, problem) for problem in problems if problem.kind == kind)
 
 
-@rule(
+@rule.error(
     "CS301",
-    "error",
-    what="There is no `sparse/split.txt`, so no image has a period.",
     bad="`split.txt` in `sparse/0/`",
     remedy='write one line "<image name> <period id>" for each image',
 )
 def split_absent(scene: RawScene) -> Iterator[Hit]:
+    """There is no `sparse/split.txt`, so no image has a period."""
     if os.path.lexists(scene.root / SPLIT):
         return
     elsewhere = [p for p in SPLIT_ELSEWHERE if (scene.root / p).is_file()]
@@ -98,49 +80,37 @@ def _not_text(scene: RawScene, file: str, text: TextFile | None) -> Iterator[Hit
         yield Hit(file, "a text file", "bytes that are not UTF-8, or no readable file")
 
 
-@rule(
-    "CS302",
-    "error",
-    what="`split.txt` is not a readable text file.",
-    bad="a spreadsheet saved under this name",
-    remedy="save it as UTF-8 text",
-)
+@rule.error("CS302", bad="a spreadsheet saved under this name", remedy="save it as UTF-8 text")
 def split_not_text(scene: RawScene) -> Iterator[Hit]:
+    """`split.txt` is not a readable text file."""
     return _not_text(scene, SPLIT, scene.split_text)
 
 
-_parser_rule(
-    "CS303",
-    "split-line",
-    "error",
-    "fields",
-    what="A line of `split.txt` does not have a name and a period.",
-    bad="`a.jpg`",
-    remedy='write "<image name> <period id>"',
-    needs=("split",),
-)
+@rule.error("CS303", bad="`a.jpg`", remedy='write "<image name> <period id>"', needs=("split",))
+def split_line(scene: RawScene) -> Iterator[Hit]:
+    """A line of `split.txt` does not have a name and a period."""
+    return _problems(SPLIT, scene.split_problems, "fields")
 
-_parser_rule(
+
+@rule.error(
     "CS304",
-    "split-period",
-    "error",
-    "period",
-    what="The last field of a line of `split.txt` is not a period id.",
     bad="`a.jpg 2016-05`",
     remedy="end the line with a period id: 0, 1 and so on",
     needs=("split",),
 )
+def split_period(scene: RawScene) -> Iterator[Hit]:
+    """The last field of a line of `split.txt` is not a period id."""
+    return _problems(SPLIT, scene.split_problems, "period")
 
 
-@rule(
+@rule.error(
     "CS305",
-    "error",
-    what="A registered image is not listed in `split.txt`.",
     bad="`images.bin` has `a.jpg`, but `split.txt` does not",
     remedy="add a line for it, or correct the name in its line",
     needs=("images", "split"),
 )
 def image_without_period(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
+    """A registered image is not listed in `split.txt`."""
     reported = names_on_bad_lines(scene)
     entries = {entry.line: entry for entry in scene.split or ()}
     misspelt = {name: entries[line] for line, name in meant_in_split(scene).items()}
@@ -152,49 +122,44 @@ def image_without_period(scene: RawScene, periods: dict[str, int]) -> Iterator[H
             yield Hit(scene.image_place(name), f"a line in {SPLIT}", found)
 
 
-_parser_rule(
+@rule.error(
     "CS306",
-    "split-ambiguous",
-    "error",
-    "ambiguous",
-    what="A name in `split.txt` matches several images.",
     bad="`0001 0` with `x/0001.png` and `y/0001.png` in the model",
     remedy="write the full names relative to images/",
     needs=("images", "split"),
 )
+def split_ambiguous(scene: RawScene) -> Iterator[Hit]:
+    """A name in `split.txt` matches several images."""
+    return _problems(SPLIT, scene.split_problems, "ambiguous")
 
-_parser_rule(
+
+@rule.error(
     "CS307",
-    "split-contradiction",
-    "error",
-    "contradiction",
-    what="`split.txt` gives an image two periods.",
     bad="`a.jpg 0` and, further down, `a.jpg 1`",
     remedy="keep one of the two lines",
     needs=("images", "split"),
 )
+def split_contradiction(scene: RawScene) -> Iterator[Hit]:
+    """`split.txt` gives an image two periods."""
+    return _problems(SPLIT, scene.split_problems, "contradiction")
 
-_parser_rule(
-    "CS308",
-    "split-duplicate",
-    "info",
-    "duplicate",
-    what="`split.txt` lists an image twice, with the same period.",
-    bad="`a.jpg 0` twice",
-    remedy="delete one of the lines",
-    needs=("images", "split"),
+
+@rule.info(
+    "CS308", bad="`a.jpg 0` twice", remedy="delete one of the lines", needs=("images", "split")
 )
+def split_duplicate(scene: RawScene) -> Iterator[Hit]:
+    """`split.txt` lists an image twice, with the same period."""
+    return _problems(SPLIT, scene.split_problems, "duplicate")
 
 
-@rule(
+@rule.warning(
     "CS309",
-    "warning",
-    what="`split.txt` lists an image that is not in the model; the line has no effect.",
     bad="`IMG_1.jpg 0` when the image is `IMG_0001.jpg`",
     remedy="correct the name, or delete the line if the image could not be registered",
     needs=("images", "split"),
 )
 def split_unknown(scene: RawScene) -> Iterator[Hit]:
+    """`split.txt` lists an image that is not in the model; the line has no effect."""
     images, known = meant_in_split(scene), set(scene.period_ids)
     period = {entry.line: entry.period for entry in scene.split or ()}
     periods = scene.periods or {}
@@ -207,42 +172,35 @@ def split_unknown(scene: RawScene) -> Iterator[Hit]:
     yield from _unknown_hits(SPLIT, worth, images)
 
 
-@rule(
+@rule.info(
     "CS310",
-    "info",
-    what="`split.txt` has Windows line endings; tools that split at spaces read a carriage return "
-    "as part of the period.",
     bad="`a.jpg 0` followed by `\\r\\n`",
     remedy="nothing to do here; save it with Unix line endings for other tools",
 )
 def split_line_ends(split_text: TextFile) -> Iterator[Hit]:
+    """`split.txt` has Windows line endings; tools that split at spaces read a carriage return as
+    part of the period."""
     if lines := split_text.text.count("\r"):
         found = f"carriage returns in {counted(lines, 'line')}"
         yield Hit(SPLIT, "Unix line endings", found, count=lines)
 
 
-@rule(
+@rule.info(
     "CS321",
-    "info",
-    what="There is no `sparse/0/test.txt`; the default split is used.",
     bad="a scene without `test.txt`",
     remedy="list the test images in sparse/0/test.txt, so that everybody uses the same split",
 )
 def test_absent(scene: RawScene) -> Iterator[Hit]:
+    """There is no `sparse/0/test.txt`; the default split is used."""
     if os.path.lexists(scene.root / TEST) or test_elsewhere(scene):
         return
     size = "" if scene.tests is None else f" gives {counted(len(scene.tests), 'test view')}"
     yield Hit(TEST, "a list of test images", f"none; {DEFAULT_RULE}{size}")
 
 
-@rule(
-    "CS322",
-    "warning",
-    what="`test.txt` is not in `sparse/0/`, so it is not read.",
-    bad="`sparse/test.txt`",
-    remedy="move it to sparse/0/test.txt",
-)
+@rule.warning("CS322", bad="`sparse/test.txt`", remedy="move it to sparse/0/test.txt")
 def test_misplaced(scene: RawScene) -> Iterator[Hit]:
+    """`test.txt` is not in `sparse/0/`, so it is not read."""
     if not os.path.lexists(scene.root / TEST):
         for place in test_elsewhere(scene):
             yield Hit(TEST, "the list of test images", f"{place} instead")
@@ -253,27 +211,21 @@ def test_elsewhere(scene: RawScene) -> list[str]:
     return [place for place in TEST_ELSEWHERE if (scene.root / place).is_file()]
 
 
-@rule(
-    "CS323",
-    "error",
-    what="`test.txt` is not a readable text file.",
-    bad="a `test.txt` in an old Windows encoding",
-    remedy="save it as UTF-8 text",
-)
+@rule.error("CS323", bad="a `test.txt` in an old Windows encoding", remedy="save it as UTF-8 text")
 def test_not_text(scene: RawScene) -> Iterator[Hit]:
+    """`test.txt` is not a readable text file."""
     return _not_text(scene, TEST, scene.test_text)
 
 
-@rule(
+@rule.warning(
     "CS324",
-    "warning",
-    what="`test.txt` lists an image that is not in the model; the line has no effect, so the image "
-    "that is meant may be a training image.",
     bad="`IMG_1` in `test.txt` when the image is `IMG_0001.jpg`",
     remedy="correct the name (test.txt has names only, without periods), or delete the line",
     needs=("images",),
 )
 def test_unknown(scene: RawScene, test: list[NameEntry]) -> Iterator[Hit]:
+    """`test.txt` lists an image that is not in the model; the line has no effect, so the image that
+    is meant may be a training image."""
     if not scene.names:
         return  # has its own rule
     lines = {entry.line: entry.name for entry in test}
@@ -283,26 +235,20 @@ def test_unknown(scene: RawScene, test: list[NameEntry]) -> Iterator[Hit]:
     yield from _unknown_hits(TEST, scene.test_problems, images)
 
 
-_parser_rule(
+@rule.error(
     "CS325",
-    "test-ambiguous",
-    "error",
-    "ambiguous",
-    what="A name in `test.txt` matches several images.",
     bad="`0001` with `x/0001.png` and `y/0001.png` in the model",
     remedy="write the full names relative to images/",
     needs=("images", "test"),
 )
+def test_ambiguous(scene: RawScene) -> Iterator[Hit]:
+    """A name in `test.txt` matches several images."""
+    return _problems(TEST, scene.test_problems, "ambiguous")
 
 
-@rule(
-    "CS326",
-    "info",
-    what="`test.txt` lists an image twice.",
-    bad="`a.jpg` twice; `a.jpg` and `a`",
-    remedy="delete one of the lines",
-)
+@rule.info("CS326", bad="`a.jpg` twice; `a.jpg` and `a`", remedy="delete one of the lines")
 def test_duplicate(scene: RawScene, test: list[NameEntry]) -> Iterator[Hit]:
+    """`test.txt` lists an image twice."""
     index = NameIndex(scene.names)
     written: dict[str, list[str]] = {}
     for entry in test:

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted
 from chronoscene.scene.splits import SplitEntry, check_period_ids
+from chronoscene.validation import rule
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.cs3_split import meant_in_split, names_on_bad_lines, problem_hit
 from chronoscene.validation.scene_folder import RawScene
 
@@ -25,14 +25,13 @@ UNEQUAL = 10
 """Ratio between the numbers of training views of two periods."""
 
 
-@rule(
+@rule.error(
     "CS401",
-    "error",
-    what="The period ids are not 0..T-1.",
     bad="ids 2016 and 2023; ids 0 and 2",
     remedy="number the periods from 0 without gaps; put labels and dates into sparse/periods.json",
 )
 def period_ids(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
+    """The period ids are not 0..T-1."""
     if not split and any(p.kind in ("fields", "period") for p in scene.split_problems):
         return  # no line could be read, which has its own rules
     if names_on_bad_lines(scene):
@@ -42,15 +41,14 @@ def period_ids(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
         yield Hit(hit.place, hit.expected, hit.found)
 
 
-@rule(
+@rule.error(
     "CS402",
-    "error",
-    what="A period has no registered image.",
     bad="COLMAP could not register any photo of period 2",
     remedy="register images of this period, or remove it and renumber the others",
     needs=("images",),
 )
 def period_empty(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
+    """A period has no registered image."""
     if not scene.names:
         return  # has its own rule
     images = meant_in_split(scene)
@@ -61,15 +59,14 @@ def period_empty(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
         yield Hit(SPLIT, f"a registered image of period {period}", "none")
 
 
-@rule(
+@rule.error(
     "CS403",
-    "error",
-    what="A period has no training view.",
     bad="all images of period 1 are in `test.txt`",
     remedy="remove some of its images from test.txt",
     needs=("tests",),
 )
 def period_without_train(scene: RawScene) -> Iterator[Hit]:
+    """A period has no training view."""
     default = "register more of its images, or list none of them in a new sparse/0/test.txt"
     for period, (train, _test) in _views(scene).items():
         if train == 0:
@@ -77,23 +74,21 @@ def period_without_train(scene: RawScene) -> Iterator[Hit]:
             yield Hit(TEST, f"a training view in period {period}", "none", remedy)
 
 
-@rule(
+@rule.warning(
     "CS404",
-    "warning",
-    what="A period has no test view, so quality in it cannot be measured.",
     bad="a `test.txt` with images of period 0 only",
     remedy="add some of its images to test.txt",
     needs=("tests",),
 )
 def period_without_test(scene: RawScene) -> Iterator[Hit]:
+    """A period has no test view, so quality in it cannot be measured."""
     for period, (_train, test) in _views(scene).items():
         if test == 0 and scene.tests:
             yield Hit(TEST, f"a test view in period {period}", "none")
 
 
-@rule(
+@rule.warning(
     "CS405",
-    "warning",
     what=f"A period has fewer than {MIN_TRAIN} training views.",
     bad="a period of three photos",
     remedy="register more images of this period",
@@ -108,41 +103,38 @@ def period_few_views(scene: RawScene) -> Iterator[Hit]:
             yield Hit(f"period {period}", f"at least {MIN_TRAIN} training views", found)
 
 
-@rule(
+@rule.info(
     "CS406",
-    "info",
-    what="All images are of one period, so nothing can change.",
     bad="a `split.txt` with period 0 only",
     remedy="nothing to do, unless split.txt should have more periods",
 )
 def single_period(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
+    """All images are of one period, so nothing can change."""
     if len(scene.period_ids) == 1 and len(periods) == len(scene.names):
         yield Hit(SPLIT, "two or more periods", "one")
 
 
-@rule(
+@rule.error(
     "CS407",
-    "error",
-    what="There is no test view at all, so nothing can be measured. Benchmarks refuse the scene.",
     bad="an empty `test.txt`",
     remedy="list images of every period in sparse/0/test.txt, or delete it for the default split",
 )
 def no_test_view(scene: RawScene, tests: set[str]) -> Iterator[Hit]:
+    """There is no test view at all, so nothing can be measured. Benchmarks refuse the scene."""
     if scene.periods and not tests:
         yield Hit(TEST, "test views", "none that is an image of the model")
 
 
-@rule(
+@rule.warning(
     "CS408",
-    "warning",
-    what="The test views are spread unevenly: a period has far fewer or far more of them than its "
-    "share, so a mean over all views does not represent the periods of the scene.",
     bad="20 of 100 images are test views in period 0, 2 of 100 in period 1",
-    remedy="put every n-th image of each period, with the same n, into test.txt (chronoscene split "
-    "writes such a list)",
+    remedy="put every n-th image of each period, with the same n, into test.txt (chronoscene "
+    "split writes such a list)",
     needs=("tests",),
 )
 def test_share(scene: RawScene) -> Iterator[Hit]:
+    """The test views are spread unevenly: a period has far fewer or far more of them than its
+    share, so a mean over all views does not represent the periods of the scene."""
     views = _views(scene)
     if any(train == 0 for train, _ in views.values()):
         return  # has its own rule
@@ -155,15 +147,14 @@ def test_share(scene: RawScene) -> Iterator[Hit]:
             yield Hit(f"period {period}", expected, str(test))
 
 
-@rule(
+@rule.info(
     "CS409",
-    "info",
-    what="A period has less than a tenth of the training views of another period.",
     bad="900 images of 2023, 60 of 2016",
     remedy="nothing to do; look at the scores of each period, not only at the mean over all views",
     needs=("tests",),
 )
 def periods_unequal(scene: RawScene) -> Iterator[Hit]:
+    """A period has less than a tenth of the training views of another period."""
     train = {period: views[0] for period, views in _views(scene).items()}
     most = max(train.values(), default=0)
     for period, number in train.items():

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import WORLD, read_world
 from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import project
 from chronoscene.validation.checks.period_frames import own_frames
 from chronoscene.validation.checks.photo_metadata import fit_gps
 from chronoscene.validation.checks.reprojection import depth_percentiles
 from chronoscene.validation.finding import NOTHING, Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene, derived
 
 Table = NDArray[np.bool_]
@@ -52,14 +52,13 @@ REACH = 3.0
 """How far a camera sees, in units of the 95th percentile of the depths in its period."""
 
 
-@rule(
+@rule.warning(
     "CS506",
-    "warning",
-    what="No point is seen in any image of a period.",
     bad="points of period 0 only; the images of period 1 were added later",
     remedy="triangulate points with the images of this period",
 )
 def period_without_points(scene: RawScene, point_periods: Table) -> Iterator[Hit]:
+    """No point is seen in any image of a period."""
     if not point_periods.any():
         return  # no tracks at all, or no points: CS501, CS514
     for column, period in enumerate(scene.period_ids):
@@ -69,14 +68,9 @@ def period_without_points(scene: RawScene, point_periods: Table) -> Iterator[Hit
             )
 
 
-@rule(
-    "CS507",
-    "info",
-    what="Number of points seen in a single period, and in several.",
-    bad="(for information only)",
-    remedy=NOTHING,
-)
+@rule.info("CS507", bad="(for information only)", remedy=NOTHING)
 def points_of_one_period(scene: RawScene, point_periods: Table) -> Iterator[Hit]:
+    """Number of points seen in a single period, and in several."""
     total = len(point_periods)
     if not total or point_periods.shape[1] < 2:
         return
@@ -86,9 +80,8 @@ def points_of_one_period(scene: RawScene, point_periods: Table) -> Iterator[Hit]
     yield Hit(scene.model_file("points3D"), "points of several periods", found)
 
 
-@rule(
+@rule.warning(
     "CS508",
-    "warning",
     what=f"A period, or a group of periods, shares fewer than {MIN_SHARED} points with the other "
     "periods, so nothing shows that they are in one frame.",
     bad="two models merged by hand; periods 0 and 1 share points, 2 and 3 do, 1 and 2 do not",
@@ -129,16 +122,14 @@ def connected(common: NDArray[np.int64], minimum: int) -> list[NDArray[np.int64]
     return [np.flatnonzero(reach[period]) for period in sorted(set(first))]
 
 
-@rule(
+@rule.warning(
     "CS519",
-    "warning",
-    what="A period is in a frame of its own: mirrored, scaled, rotated or moved against the "
-    "others.",
     bad="period 1 was reconstructed separately and scaled to metres; the other periods were not",
     remedy="transform its poses into the frame of the others, or register all periods together",
     needs=("reprojections", "point_periods"),
 )
 def period_frame(scene: RawScene) -> Iterator[Hit]:
+    """A period is in a frame of its own: mirrored, scaled, rotated or moved against the others."""
     for index, explained in own_frames(scene).items():
         place = f"period {scene.period_ids[index]}"
         yield Hit(place, "the frame of the other periods", explained)
@@ -170,15 +161,14 @@ def _other_depths(scene: RawScene) -> dict[int, float]:
     return ratios
 
 
-@rule(
+@rule.warning(
     "CS520",
-    "warning",
-    what="`sparse/world.json` says metres, but the world is not in metres.",
     bad='`{"unit": "metre"}` with a model straight from COLMAP\'s mapper',
     remedy="scale the model, or correct the unit in sparse/world.json",
     needs=("cameras", "images"),
 )
 def frame_scale(scene: RawScene) -> Iterator[Hit]:
+    """`sparse/world.json` says metres, but the world is not in metres."""
     try:
         if read_world(scene.root).unit != "metre":
             return
@@ -198,17 +188,16 @@ def frame_scale(scene: RawScene) -> Iterator[Hit]:
             yield Hit(place, "a world in metres", f"points {depth:.3g} m from the cameras (median)")
 
 
-@rule(
+@rule.warning(
     "CS521",
-    "warning",
-    what="A period shows a different place than the others: its cameras see hardly any of their "
-    "points, and their cameras hardly any of its points.",
     bad="the photos of 2016 show the north side, those of 2023 the south side",
     remedy="leave the period out, or make it a scene of its own; if the places are the same, its "
     "frame is a different one: register the periods together",
     needs=("reprojections", "point_periods"),
 )
 def period_apart(scene: RawScene) -> Iterator[Hit]:
+    """A period shows a different place than the others: its cameras see hardly any of their points,
+    and their cameras hardly any of its points."""
     if len(scene.period_ids) > MAX_PERIODS:
         return
     share = common_view(scene)

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import counted, shown
+from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import Observations
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene
 
 MAX_SHORT = 0.01
@@ -41,44 +41,34 @@ FAR = 100.0
 """Distance of a point from the centre, in units of the median distance of points and cameras."""
 
 
-@rule(
-    "CS501",
-    "error",
-    what="The model has no points, but methods start from them. Benchmarks refuse the scene.",
-    bad="an empty `points3D.txt`",
-    remedy="triangulate points (colmap point_triangulator)",
+@rule.error(
+    "CS501", bad="an empty `points3D.txt`", remedy="triangulate points (colmap point_triangulator)"
 )
 def no_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    """The model has no points, but methods start from them. Benchmarks refuse the scene."""
     if not len(points):
         yield Hit(scene.model_file("points3D"), "sparse points", "none")
 
 
-@rule(
-    "CS502",
-    "error",
-    what="The coordinates of a point are NaN or infinite.",
-    bad="`nan` in `points3D.txt`",
-    remedy="remove the points from the model",
-)
+@rule.error("CS502", bad="`nan` in `points3D.txt`", remedy="remove the points from the model")
 def point_not_finite(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    """The coordinates of a point are NaN or infinite."""
     bad = np.asarray(~np.isfinite(points.xyz).all(axis=1))
     yield from _some_points(scene, points, bad, "finite coordinates", "NaN or infinity")
 
 
-@rule(
+@rule.warning(
     "CS503",
-    "warning",
-    what="Points are seen in one image or none, so their positions are not measured.",
     bad="points of a laser scan, without tracks",
     remedy="filter the points, or write the tracks with the points",
 )
 def short_track(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    """Points are seen in one image or none, so their positions are not measured."""
     return _short_tracks(scene, points, few=False)
 
 
-@rule(
+@rule.info(
     "CS525",
-    "info",
     what=f"Up to {100 * MAX_SHORT:g} % of the points are seen in one image or none, so their "
     "positions are not measured.",
     bad="a point that lost an observation when its image was cropped",
@@ -99,14 +89,13 @@ def _short_tracks(scene: RawScene, points: RawPoints, *, few: bool) -> Iterator[
         yield from _some_points(scene, points, lengths == number, "two or more", found)
 
 
-@rule(
+@rule.error(
     "CS504",
-    "error",
-    what="A track refers to an image, or a keypoint of an image, that does not exist.",
     bad="`images.bin` and `points3D.bin` of two different runs",
     remedy="write images and points again together, from one model",
 )
 def broken_track(scene: RawScene, points: RawPoints, observations: Observations) -> Iterator[Hit]:
+    """A track refers to an image, or a keypoint of an image, that does not exist."""
     place, missing = scene.model_file("points3D"), observations.image < 0
     if lost := int(np.count_nonzero(missing)):
         ids = _listed(np.unique(points.track_image[missing]).tolist())
@@ -117,16 +106,15 @@ def broken_track(scene: RawScene, points: RawPoints, observations: Observations)
         yield Hit(place, "tracks of existing keypoints", found, count=lost)
 
 
-@rule(
+@rule.error(
     "CS505",
-    "error",
-    what="Images and points disagree on which keypoint belongs to which point.",
     bad="a keypoint refers to point 5, but the track of point 5 does not list it",
     remedy="write images and points again together, from one model",
 )
 def track_disagrees(
     scene: RawScene, images: RawImages, points: RawPoints, observations: Observations
 ) -> Iterator[Hit]:
+    """Images and points disagree on which keypoint belongs to which point."""
     rows = np.flatnonzero(observations.valid)
     keypoints = observations.keypoint[rows]
     agree = images.keypoint_point[keypoints] == points.ids[observations.point[rows]]
@@ -140,16 +128,15 @@ def track_disagrees(
         yield Hit(scene.model_file("images"), "tracks that agree", found, count=lost)
 
 
-@rule(
+@rule.info(
     "CS509",
-    "info",
-    what="An image sees no point of the model, so no point confirms its pose.",
     bad="test images that were added with known poses",
     remedy="nothing to do if the poses come from another source",
 )
 def image_without_points(
     scene: RawScene, images: RawImages, observations: Observations
 ) -> Iterator[Hit]:
+    """An image sees no point of the model, so no point confirms its pose."""
     counts = np.bincount(observations.image[observations.valid], minlength=len(images))
     names = [images.names[i] for i in np.flatnonzero(counts == 0)]
     if names:
@@ -157,16 +144,15 @@ def image_without_points(
         yield Hit(scene.model_file("images"), "points in every image", found, count=len(names))
 
 
-@rule(
+@rule.warning(
     "CS510",
-    "warning",
-    what="The position of an observation in its image is NaN or infinite.",
     bad="a keypoint at `nan nan` in a track",
     remedy="remove these observations; they come from pixels that cannot be undistorted",
 )
 def observation_not_finite(
     scene: RawScene, images: RawImages, observations: Observations
 ) -> Iterator[Hit]:
+    """The position of an observation in its image is NaN or infinite."""
     if np.isfinite(images.keypoint_xy).all():
         return
     xy = images.keypoint_xy[observations.keypoint[observations.valid]]
@@ -175,26 +161,24 @@ def observation_not_finite(
         yield Hit(scene.model_file("images"), "finite pixel positions", found, count=bad)
 
 
-@rule(
+@rule.error(
     "CS514",
-    "error",
-    what="No point of the model is seen in a training image, but methods start from such points. "
-    "Benchmarks refuse the scene.",
     bad="points without tracks; points seen only in test images",
     remedy="triangulate points (colmap point_triangulator), or change the split",
 )
 def no_training_points(
     scene: RawScene, images: RawImages, observations: Observations, tests: set[str]
 ) -> Iterator[Hit]:
+    """No point of the model is seen in a training image, but methods start from such points.
+    Benchmarks refuse the scene."""
     train = np.array([name not in tests for name in images.names], bool)
     total = len(scene.points or ())
     if total and not train[observations.image[observations.valid]].any():
         yield Hit(scene.model_file("points3D"), "points seen in training images", f"0 of {total}")
 
 
-@rule(
+@rule.warning(
     "CS517",
-    "warning",
     what=f"More than {MAX_DUPLICATES:.0%} of the points coincide with another point, to within a "
     "millionth of the scene.",
     bad="the points of two runs in one file",
@@ -237,15 +221,14 @@ def _repeated(values: NDArray[np.uint64]) -> int:
     return int(np.count_nonzero(ordered[1:] == ordered[:-1]))
 
 
-@rule(
+@rule.warning(
     "CS518",
-    "warning",
-    what="Points are absurdly far from everything else; they blow up every bounding box.",
     bad="a point 40 km away from a square of 100 m",
     remedy="filter the points: they come from wrong matches, or from the sky",
     needs=("images",),
 )
 def far_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    """Points are absurdly far from everything else; they blow up every bounding box."""
     xyz, cameras = points.xyz, scene.centres[scene.is_posed]
     usable = np.isfinite(xyz).all(axis=1)
     if not usable.any():
@@ -263,15 +246,14 @@ def far_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
         yield Hit(scene.model_file("points3D"), expected, found, count=number)
 
 
-@rule(
+@rule.warning(
     "CS522",
-    "warning",
-    what="Nearly all points have the same colour, which is useless to methods that start from the "
-    "colours of the points.",
     bad="a model triangulated without colours: all points are black",
     remedy="extract the colours (colmap color_extractor) and write the model again",
 )
 def points_without_colours(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    """Nearly all points have the same colour, which is useless to methods that start from the
+    colours of the points."""
     if len(points) < MIN_COLOURED:
         return
     packed = points.rgb.astype(np.int64) @ [65536, 256, 1]

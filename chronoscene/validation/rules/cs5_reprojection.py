@@ -9,6 +9,7 @@ import numpy as np
 
 from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import shown
+from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import Reprojection
 from chronoscene.validation.checks.period_frames import (
     MIN_ERROR,
@@ -25,7 +26,6 @@ from chronoscene.validation.checks.reprojection import (
     pose_limit,
 )
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.cs1_poses import other_convention
 from chronoscene.validation.scene_folder import RawScene, derived
 
@@ -42,9 +42,8 @@ MIN_STORED = 0.9
 """Share of the points that must have an error stored with them."""
 
 
-@rule(
+@rule.warning(
     "CS511",
-    "warning",
     what=f"More than {MAX_OUTSIDE:.0%} of a camera's observations are outside its image.",
     bad="a camera scaled to half the size, with keypoints still at full size",
     remedy="give the camera the size at which the keypoints were found",
@@ -66,15 +65,14 @@ def observations_outside(
             yield Hit(scene.camera_place(camera), expected, found, count=number)
 
 
-@rule(
+@rule.error(
     "CS512",
-    "error",
-    what="Most points are behind the cameras that see them: the poses use another convention.",
     bad="poses with OpenGL axes",
     remedy="store world-to-camera poses with +x right, +y down, +z forward (negate the y and z "
     "axes of OpenGL cameras; invert camera-to-world poses)",
 )
 def points_behind_cameras(scene: RawScene, reprojections: list[Reprojection]) -> Iterator[Hit]:
+    """Most points are behind the cameras that see them: the poses use another convention."""
     total = sum(len(seen.depth) for seen in reprojections)
     behind = sum(int(np.count_nonzero(~(seen.depth > 0))) for seen in reprojections)
     if behind > MAX_BEHIND * total:
@@ -82,15 +80,14 @@ def points_behind_cameras(scene: RawScene, reprojections: list[Reprojection]) ->
         yield Hit(scene.model_file("images"), "points in front of the cameras", found)
 
 
-@rule(
+@rule.warning(
     "CS513",
-    "warning",
-    what="The points that an image sees are reprojected far from where it sees them.",
     bad="a camera-to-world pose; a focal length of another image size",
     remedy="check pose, camera and image size of this image, or register it again",
     needs=("reprojections",),
 )
 def pose_disagrees(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """The points that an image sees are reprojected far from where it sees them."""
     errors, judged = image_errors(scene), judged_images(scene)
     limits = {image: pose_limit(scene, image) for image in judged}
     wrong = [image for image in judged if not errors[image] <= limits[image]]
@@ -115,15 +112,14 @@ def pose_disagrees(scene: RawScene, images: RawImages) -> Iterator[Hit]:
             yield Hit(place, expected, f"{errors[image]:.3g} px")
 
 
-@rule(
+@rule.warning(
     "CS515",
-    "warning",
-    what="The reprojection error of a period is far above that of another period.",
     bad="medians of 0.5 px in period 0 and 3.1 px in period 1",
     remedy="register the period again: refine its poses and its camera, or match more images",
     needs=("periods", "reprojections"),
 )
 def period_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """The reprojection error of a period is far above that of another period."""
     errors = image_errors(scene)
     for period, limit in _worse_periods(scene).items():
         index = scene.period_ids.index(period)
@@ -154,15 +150,14 @@ def _other_focal(scene: RawScene, index: int, limit: float) -> str:
     return "" if factor is None else f"; it fits with focal lengths multiplied by {factor:.4g}"
 
 
-@rule(
+@rule.warning(
     "CS516",
-    "warning",
-    what="The reprojection error of an image is far above that of its period.",
     bad="3.1 px in one image, 0.5 px in the others",
     remedy="check pose and camera of this image, or register it again",
     needs=("periods", "reprojections"),
 )
 def image_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
+    """The reprojection error of an image is far above that of its period."""
     for image in judged_images(scene):
         index, error = int(scene.image_periods[image]), float(image_errors(scene)[image])
         period = scene.period_ids[index] if index >= 0 else -1
@@ -172,17 +167,16 @@ def image_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
             yield Hit(place, f"a median error below {limit:.3g} px", f"{error:.3g} px")
 
 
-@rule(
+@rule.warning(
     "CS524",
-    "warning",
-    what="The reprojection errors are far larger than the errors stored with the points: cameras, "
-    "poses or points were changed after the model was made.",
     bad="a focal length replaced by that of the data sheet; stored 0.5 px, measured 3.2 px",
     remedy="use cameras, images and points of one model, or refine them together (colmap "
     "bundle_adjuster)",
     needs=("reprojections",),
 )
 def error_outdated(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    """The reprojection errors are far larger than the errors stored with the points: cameras, poses
+    or points were changed after the model was made."""
     stored = points.error[(points.error > 0) & np.isfinite(points.error)]
     if len(stored) < MIN_STORED * len(points) or not len(stored):
         return  # not every program stores them

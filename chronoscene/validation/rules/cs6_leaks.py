@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import shown
 from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.validation import rule
 from chronoscene.validation.checks.pixels import THUMBNAIL, Pixels
 from chronoscene.validation.checks.reprojection import typical_depth
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.scene_folder import RawScene, derived
 
 SAME_PLACE = 1e-3
@@ -53,14 +53,13 @@ _BLOCK = 8
 _ROWS = 256
 
 
-@rule(
+@rule.error(
     "CS601",
-    "error",
-    what="A test image is also a training image (same bytes or, with `--decode`, same pixels).",
     bad="`a.jpg` and its copy `a_copy.jpg`, one of them in `test.txt`",
     remedy="remove one of the images from the model",
 )
 def leak_train_test(scene: RawScene, tests: set[str]) -> Iterator[Hit]:
+    """A test image is also a training image (same bytes or, with `--decode`, same pixels)."""
     for kind, group in _equal(scene):
         train = [n for n in group if n not in tests]
         test = [n for n in group if n in tests]
@@ -70,14 +69,13 @@ def leak_train_test(scene: RawScene, tests: set[str]) -> Iterator[Hit]:
             yield Hit(f"images/{test[0]}", expected, found, also=tuple(train))
 
 
-@rule(
+@rule.error(
     "CS602",
-    "error",
-    what="One photo is in two periods (same bytes or, with `--decode`, same pixels).",
     bad="a folder of 2016 copied into the folder of 2023",
     remedy="keep the image in the period in which it was taken",
 )
 def leak_periods(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
+    """One photo is in two periods (same bytes or, with `--decode`, same pixels)."""
     for kind, group in _equal(scene):
         listed = sorted({periods[n] for n in group})
         if len(listed) > 1:
@@ -85,31 +83,27 @@ def leak_periods(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
             yield Hit(f"images/{group[0]}", "an image of one period", found, also=tuple(group[1:]))
 
 
-@rule(
-    "CS603",
-    "warning",
-    what="One photo is there twice, in one period and twice in train or twice in test.",
-    bad="`a.jpg` and `a_copy.jpg`",
-    remedy="remove one of the images from the model",
+@rule.warning(
+    "CS603", bad="`a.jpg` and `a_copy.jpg`", remedy="remove one of the images from the model"
 )
 def image_twice(scene: RawScene, periods: dict[str, int], tests: set[str]) -> Iterator[Hit]:
+    """One photo is there twice, in one period and twice in train or twice in test."""
     for kind, group in _equal(scene):
         if len({(periods[n], n in tests) for n in group}) == 1:
             found = f"the same {kind} in {shown(group[1:])}"
             yield Hit(f"images/{group[0]}", "a unique image", found, also=tuple(group[1:]))
 
 
-@rule(
+@rule.warning(
     "CS604",
-    "warning",
-    what="A test image looks the same as a training image or as an image of another period (needs "
-    "`--decode`).",
     bad="a training image, and the same photo saved again as JPEG for testing",
     remedy="look at both; remove one if it is a copy that was saved again",
 )
 def near_leak(
     scene: RawScene, periods: dict[str, int], tests: set[str], pixels: dict[str, Pixels]
 ) -> Iterator[Hit]:
+    """A test image looks the same as a training image or as an image of another period (needs
+    `--decode`)."""
     role = {n: (period, n in tests) for n, period in periods.items()}
     pixels = {n: p for n, p in pixels.items() if n in role}
     near = {
@@ -139,15 +133,14 @@ def _apart(scene: RawScene, a: str, b: str) -> str:
     return f", though their cameras are {shift / extent:.2g} times the depth of the scene apart"
 
 
-@rule(
+@rule.warning(
     "CS605",
-    "warning",
-    what="A test image has the pose of a training image of its period, so it measures memorisation "
-    "rather than new views.",
     bad="a burst of three photos, the second of which is in `test.txt`",
     remedy="remove one of the two, or make the test image a training image",
 )
 def pose_leak(scene: RawScene, images: RawImages, tests: set[str]) -> Iterator[Hit]:
+    """A test image has the pose of a training image of its period, so it measures memorisation
+    rather than new views."""
     posed = np.flatnonzero(scene.is_posed)
     pairs = twins(
         scene.centres[posed],

@@ -16,8 +16,8 @@ from chronoscene.colmap.raw_model import RawPoints
 from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene.splits import TEST_EVERY
+from chronoscene.validation import rule
 from chronoscene.validation.finding import Hit
-from chronoscene.validation.rule import rule
 from chronoscene.validation.rules.cs3_split import test_elsewhere
 from chronoscene.validation.scene_folder import RawScene, TextFile
 
@@ -41,14 +41,13 @@ OFF_CENTRE = 0.5
 """Pixels; half a pixel is a difference of convention, not of the lens."""
 
 
-@rule(
+@rule.warning(
     "CS701",
-    "warning",
-    what="The official loader would fail on a line of `split.txt`, or read a different period.",
     bad="`a.jpg  0` (two spaces); a tab; an empty line; a name with a space",
     remedy='write "<name> <period>" with one space, no other spaces, no tabs and no empty lines',
 )
 def official_split_line(scene: RawScene, split_text: TextFile) -> Iterator[Hit]:
+    """The official loader would fail on a line of `split.txt`, or read a different period."""
     if split_text.data[:3] == b"\xef\xbb\xbf":
         found = "a byte order mark, which it takes for part of the first name"
         yield Hit(f"{SPLIT}:1", "plain text", found)
@@ -79,16 +78,15 @@ def official_failure(line: str) -> str | None:
     return None
 
 
-@rule(
+@rule.warning(
     "CS702",
-    "warning",
-    what="Two images are the same to the official loader, which identifies them by their file name "
-    "up to the first dot; the later line of `split.txt` overwrites the earlier one.",
     bad="`x/0001.png` and `y/0001.png`; `a.1.png` and `a.2.png`; `0001.jpg` and `0001.png`",
     remedy="give all images different file names up to the first dot",
     needs=("images",),
 )
 def official_name_collision(scene: RawScene) -> Iterator[Hit]:
+    """Two images are the same to the official loader, which identifies them by their file name up
+    to the first dot; the later line of `split.txt` overwrites the earlier one."""
     groups: dict[str, list[str]] = {}
     for name in scene.names:
         groups.setdefault(_cut(name), []).append(name)
@@ -102,48 +100,45 @@ def official_name_collision(scene: RawScene) -> Iterator[Hit]:
             yield Hit(place, "file names that differ before the first dot", found)
 
 
-@rule(
+@rule.info(
     "CS703",
-    "info",
-    what="Images are in folders below `images/`; the official loader looks for all of them "
-    "directly in `images/`, and fails on names with folders in `split.txt`.",
     bad="`images/2016/a.jpg`",
     remedy="nothing to do here; flatten the folders to use the scene with the official code, too",
     needs=("images",),
 )
 def official_folders(scene: RawScene) -> Iterator[Hit]:
+    """Images are in folders below `images/`; the official loader looks for all of them directly in
+    `images/`, and fails on names with folders in `split.txt`."""
     inside = [name for name in scene.names if "/" in name]
     if inside:
         found = f"{counted(len(inside), 'image')} in folders: {shown(inside)}"
         yield Hit("images", "no folders", found, count=len(inside))
 
 
-@rule(
+@rule.warning(
     "CS704",
-    "warning",
-    what="The official loader would fail on a greyscale image.",
     bad="an 8 bit greyscale PNG",
     remedy="save the image with three channels",
     needs=("images",),
 )
 def official_grey(scene: RawScene) -> Iterator[Hit]:
+    """The official loader would fail on a greyscale image."""
     for name in scene.readable:
         mode = scene.headers[name].mode
         if mode in GREY_MODES:
             yield Hit(f"images/{name}", "an image with colours", f"pixels of mode {mode}")
 
 
-@rule(
+@rule.info(
     "CS705",
-    "info",
-    what="The principal point is not in the centre of the image; ChronoScene uses it, the official "
-    "code ignores it.",
     bad="cx = 140.8 with a width of 320",
     remedy="nothing to do here; expect worse results from the official code, or crop the images "
     "with chronoscene undistort --center",
     needs=("cameras",),
 )
 def official_principal_point(scene: RawScene) -> Iterator[Hit]:
+    """The principal point is not in the centre of the image; ChronoScene uses it, the official code
+    ignores it."""
     for camera in scene.usable_cameras.values():
         dx, dy = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
         if max(abs(dx), abs(dy)) > OFF_CENTRE:
@@ -151,17 +146,16 @@ def official_principal_point(scene: RawScene) -> Iterator[Hit]:
             yield Hit(scene.camera_place(camera), "a principal point in the centre", found)
 
 
-@rule(
+@rule.info(
     "CS706",
-    "info",
-    what="Without `test.txt` the official loader takes every 8th of all images, whatever their "
-    "period: a different split from that of ChronoScene.",
     bad="a scene without `test.txt`",
     remedy="write sparse/0/test.txt, so that everybody uses the same split",
 )
 def official_default_split(
     scene: RawScene, periods: dict[str, int], tests: set[str]
 ) -> Iterator[Hit]:
+    """Without `test.txt` the official loader takes every 8th of all images, whatever their period:
+    a different split from that of ChronoScene."""
     if scene.test is not None or test_elsewhere(scene):
         return  # there is a list, perhaps in the wrong place, which has its own rule
     theirs = set(sorted(periods, key=_cut)[::TEST_EVERY])
@@ -173,16 +167,15 @@ def official_default_split(
     yield Hit(TEST, "the same split in the official code", found)
 
 
-@rule(
+@rule.info(
     "CS707",
-    "info",
-    what="The units of the scene are too small for the released code, whose voxels have an edge of "
-    "0.001 world units; the code of 3D Gaussian splatting drops everything nearer to the camera "
-    "than 0.2.",
     bad="a city in units of 100 m",
     remedy="nothing to do here; for the released code, scale the scene up, or set the voxel size",
 )
 def official_units(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
+    """The units of the scene are too small for the released code, whose voxels have an edge of
+    0.001 world units; the code of 3D Gaussian splatting drops everything nearer to the camera than
+    0.2."""
     xyz = points.xyz[np.isfinite(points.xyz).all(axis=1)]
     if _is_small(xyz):
         cells = len(np.unique(np.round(xyz / VOXEL), axis=0))
