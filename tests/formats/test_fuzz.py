@@ -1,23 +1,18 @@
 """Damaged scenes of every format by the thousand: our errors or a result, and nothing else.
 
 Each case damages one or two files of a good scene, then reads, converts and sometimes undistorts
-it. ``CHRONOSCENE_FUZZ_SECONDS`` is the time for all of it (default 10), ``CHRONOSCENE_FUZZ_SEED``
-the first seed; a failure names the seed of its case, and an abort of the process ends pytest.
+it.
 """
 
 import copy
 import json
-import os
 import random
-import resource
 import shutil
-import struct
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzzing import FLOATS, WORDS, damage_bytes, damaged_files, many_cases
 from PIL import Image
 
 from chronoscene.colmap.model import PosedImage
@@ -39,58 +34,12 @@ from chronoscene.undistort import undistort
 
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow's, on damaged files
 
-SECONDS = float(os.environ.get("CHRONOSCENE_FUZZ_SECONDS", "10"))
-SEED = int(os.environ.get("CHRONOSCENE_FUZZ_SEED", "0"))
-
-SLOWEST = 10.0
-"""Seconds of computing for one case; a good one takes a hundredth."""
-
-MEMORY = 1_000_000
-"""Kilobytes by which the process may grow."""
-
-NUMBERS = (0, 1, 2**31 - 1, 2**31, 2**32 - 1, 10**12, 2**62, 2**63 - 1, 2**63, 2**64 - 1)
-FLOATS = (float("nan"), float("inf"), -1e308, 1e308, 5e-324, 0.0, -0.0, 1e17)
-WORDS = (b"nan", b"inf", b"-1", b"1e999", b"9" * 5000, b"../../outside/secret.png", b"\0")
 VALUES = (
     None, True, -1, 0, 2**70, 1.5, float("nan"), float("inf"), "", "../../outside/secret.png",
     "/etc/passwd", "C:\\x.png", "a\0b", "\ud800", "x" * 5000, "a/" * 2000, [], [[]], {}, "images",
     [[0] * 4] * 4, [[1e200] * 4] * 4, ["../outside/secret.png"], "points.ply", "transforms.json",
 )  # fmt: skip
 """What may stand anywhere in a JSON file."""
-
-opened: list[str] = []
-"""Files that nobody is to open, and that were opened: outside of the scene, and pickles."""
-
-
-def watch(event, arguments):
-    if event == "open" and isinstance(arguments[0], str | bytes):
-        name = os.path.normpath(os.fsdecode(arguments[0]))
-        if name.endswith("0/outside/secret.png") or "cam_dict" in name:
-            opened.append(name)
-
-
-sys.addaudithook(watch)
-
-
-def damage_bytes(rng, data):
-    """A few random changes of some bytes."""
-    data = bytearray(data)
-    for _ in range(rng.choice([1, 1, 1, 2, 5, 20])):
-        if not data:
-            return rng.randbytes(rng.randrange(40))
-        at = rng.randrange(len(data))
-        end, new = rng.choice(
-            [
-                (at + 1, bytes([data[at] ^ 1 << rng.randrange(8)])),
-                (rng.choice([at + 8, len(data)]), b""),
-                (at, rng.randbytes(rng.randrange(1, 64))),
-                (at, data[rng.randrange(len(data)) :][:200]),
-                (at + 8, struct.pack("<Q", rng.choice(NUMBERS))),
-                (at + 8, struct.pack("<d", rng.choice(FLOATS))),
-            ]
-        )
-        data[at:end] = new
-    return bytes(data)
 
 
 def damage_words(rng, data):
@@ -136,51 +85,27 @@ def damage(rng, path, data):
     return damage_bytes(rng, data)
 
 
-def many_cases(seconds, run):
-    """Run cases, each with its own random numbers, until the time is over; name one that fails."""
-    end, seed = time.monotonic() + seconds, SEED
-    while time.monotonic() < end or seed < SEED + 10:
-        began, before = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        try:
-            run(random.Random(seed))
-            assert time.process_time() - began < SLOWEST
-            assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MEMORY
-            assert not opened
-        except BaseException as error:
-            error.add_note(f"CHRONOSCENE_FUZZ_SEED={seed}")
-            raise
-        seed += 1
-    print(f"{seed - SEED} cases")  # shown by pytest -rP
-
-
 @pytest.fixture
 def run_damaged(tmp_path):
     """Factory of a loop over damaged files of a folder, each of which a function is to survive."""
     (tmp_path / "outside").mkdir()
     Image.new("RGB", (8, 8)).save(tmp_path / "outside/secret.png")
 
-    def loop(files, seconds, survive):
+    def loop(files, count, survive):
         refused = 0
-        opened.clear()
 
         def run(rng):
             nonlocal refused
-            chosen = rng.sample(files, min(len(files), rng.choice([1, 1, 1, 2])))
-            good = {path: path.read_bytes() for path in chosen}
             try:
-                for path, data in good.items():
-                    path.write_bytes(damage(rng, path, data))
-                survive(rng)
+                with damaged_files(rng, files, damage):
+                    survive(rng)
             except ChronoSceneError as error:
                 assert "Traceback" not in str(error) and "\n" not in str(error)
                 assert all((error.place, error.expected, error.found, error.todo))
                 assert len(error.found) < 2000 and len(error.expected) < 2000
                 refused += 1
-            finally:
-                for path, data in good.items():
-                    path.write_bytes(data)
 
-        many_cases(seconds, run)
+        many_cases(count, run)
         assert refused
 
     return loop
@@ -300,8 +225,7 @@ def test_damaged_scenes(variants, run_damaged, tmp_path, variant):
     folder = make()
     out = tmp_path / "out"
     use(random.Random(0), folder, name, out)  # it is good
-    seconds = SECONDS / (len(VARIANTS) + 8)
-    run_damaged(damageable(folder), seconds, lambda rng: use(rng, folder, name, out))
+    run_damaged(damageable(folder), 30, lambda rng: use(rng, folder, name, out))
     assert not (tmp_path / "exploded").exists()
 
 
@@ -328,7 +252,7 @@ def test_damaged_images_are_undistorted_or_refused(colmap_folder, run_damaged, t
         undistort(scene, tmp_path / "out", center=rng.random() < 0.5, threads=1)
         make_split(read_scene(tmp_path / "out"), SplitSettings("date"))
 
-    run_damaged(files, SECONDS / (len(VARIANTS) + 8), survive)
+    run_damaged(files, 50, survive)
 
 
 def test_any_camera_is_undistorted_or_refused(run_damaged):
@@ -351,7 +275,7 @@ def test_any_camera_is_undistorted_or_refused(run_damaged):
         xy = np.random.default_rng(0).uniform(-10, 700, (20, 2))
         assert move_pixels(change, xy).shape == (20, 2)
 
-    run_damaged([], SECONDS / (len(VARIANTS) + 8), survive)
+    run_damaged([], 50, survive)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary"])
@@ -367,7 +291,7 @@ def test_damaged_point_clouds(run_damaged, tmp_path, form):
         header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
         path.write_bytes(header.encode() + bytes(50 * 24))
     assert len(read_points(path)) == 50
-    run_damaged([path], SECONDS / (len(VARIANTS) + 8), lambda rng: read_points(path))
+    run_damaged([path], 100, lambda rng: read_points(path))
 
 
 def test_points_that_a_header_only_claims(tmp_path):
