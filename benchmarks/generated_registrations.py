@@ -4,7 +4,7 @@ A city of boxes is seen by rings of cameras at every date. Observations are proj
 each period is a model of its own in a frame of its own, and is brought to the first period by what
 matches between them, as the route ``separate`` does. What can go wrong there can be asked for: few
 matches, matches in one spot, matches of repeated structure that agree with each other and are all
-wrong, gross outliers, a period bent by drift, alignment by GPS alone, or a plain error.
+wrong, gross outliers, a period deformed by drift, alignment by GPS alone, or a plain error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from chronoscene.geodesy import Georeference
 from chronoscene.registration.quality.misalignment import measure, transfers
 from chronoscene.registration.quality.rays import Rays, place, rays_at
-from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered
+from chronoscene.registration.reconstruct.estimation import cross_matches
+from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.scene import Camera
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.similarity import Sim3, fit_robustly
@@ -60,8 +61,8 @@ class CaseSettings:
     """Share of the matched tracks that is held out."""
     noise: float = 0.4
     """Standard deviation of an observation, pixels."""
-    bend: float = 0.0
-    """Height by which the edge of the scene is bent in the periods after the first."""
+    doming: float = 0.0
+    """Height by which the edge of the scene rises in the periods after the first."""
     rotation: float = 0.0
     """Error that is added to the last period."""
     shift: float = 0.0
@@ -106,7 +107,7 @@ def generate_case(settings: CaseSettings) -> Generated:
     sightings, of_two = _observe(rng, settings, stable, tied, truth, periods)
     out = of_two & (rng.random(len(of_two)) < settings.held_out)
     gps = _gps(rng, settings, camera_centre(truth), periods)
-    poses = _bent(_jittered(rng, truth), truth, periods, stable, settings.bend)
+    poses = _domed(_jittered(rng, truth), truth, periods, stable, settings.doming)
     model = _empty(settings, poses, periods, gps)
     poses = _align(rng, settings, model, _part(sightings, ~out))
     model = replace(model, cam_from_world=poses)
@@ -261,15 +262,15 @@ def _jittered(rng: np.random.Generator, poses: Array) -> Array:
     return out
 
 
-def _bent(poses: Array, truth: Array, periods: Ints, points: Array, height: float) -> Array:
-    """Poses of later periods in a world bent like a bowl: dz = height (r / (SIDE / 2))^2.
+def _domed(poses: Array, truth: Array, periods: Ints, points: Array, height: float) -> Array:
+    """Poses of later periods in a domed world: dz = height (r / (SIDE / 2))^2.
 
-    Cameras rise with the bowl and turn to where the bent points are: what adjustment makes of a
-    lens that is a little wrong.
+    Cameras rise with it and turn to the displaced points: what bundle adjustment makes of slightly
+    wrong lens distortion.
     """
     from scipy.spatial.transform import Rotation
 
-    def bend(x: Array) -> Array:
+    def raised(x: Array) -> Array:
         lift = height * (x[:, :2] ** 2).sum(axis=1) / (SIDE / 2) ** 2
         return np.asarray(x + lift[:, None] * [0.0, 0.0, 1.0])
 
@@ -277,8 +278,8 @@ def _bent(poses: Array, truth: Array, periods: Ints, points: Array, height: floa
     for i in np.flatnonzero(periods > 0) if height else ():
         local = points[::10] @ truth[i, :3, :3].T + truth[i, :3, 3]
         seen = local[:, 2] > 1
-        centre = bend(camera_centre(poses[i])[None])[0]
-        there = bend(points[::10])[seen] - centre
+        centre = raised(camera_centre(poses[i])[None])[0]
+        there = raised(points[::10])[seen] - centre
         here = local[seen] / np.linalg.norm(local[seen], axis=1, keepdims=True)
         there /= np.linalg.norm(there, axis=1, keepdims=True)
         out[i, :3, :3] = Rotation.align_vectors(here, there)[0].as_matrix()
@@ -424,22 +425,4 @@ def _with_tracks(model: Registered, seen: _Sightings, held: _Sightings) -> Regis
     if not len(held.track):
         return model
     tracks = HeldOutTracks(_starts(held.track), held.image, held.xy)
-    return replace(model, held_out_tracks=tracks, held_out=cross_matches(model, tracks))
-
-
-def cross_matches(model: Registered, tracks: HeldOutTracks) -> tuple[CrossMatches, ...]:
-    """All pairs of images of different periods that share held-out tracks."""
-    track = np.repeat(np.arange(len(tracks.start) - 1), np.diff(tracks.start))
-    by_pair: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for t in range(len(tracks.start) - 1):
-        rows = np.flatnonzero(track == t)
-        for i in rows:
-            for j in rows:
-                a, b = int(tracks.image[i]), int(tracks.image[j])
-                if model.periods[a] < model.periods[b]:
-                    by_pair.setdefault((a, b), []).append((int(i), int(j)))
-    out = []
-    for (a, b), pairs in sorted(by_pair.items()):
-        i, j = np.array(pairs).T
-        out.append(CrossMatches(a, b, tracks.xy[i], tracks.xy[j], track[i]))
-    return tuple(out)
+    return replace(model, held_out_tracks=tracks, held_out=cross_matches(tracks, model.periods))

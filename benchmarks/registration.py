@@ -78,8 +78,8 @@ FAMILIES: dict[str, Callable[[np.random.Generator], dict[str, object]]] = {
         "by_gps": True, "ties": int(_log_uniform(rng, 5, 300)), "gps_noise": 3.0
     },
     "chain": lambda rng: {"periods": 4, "chain": True, "ties": int(rng.integers(50, 500))},
-    "bent": lambda rng: {
-        "ties": int(rng.integers(200, 1000)), "bend": _log_uniform(rng, 0.05, 5)
+    "doming": lambda rng: {
+        "ties": int(rng.integers(200, 1000)), "doming": _log_uniform(rng, 0.05, 5)
     },
     "drift in scale": lambda rng: {
         "ties": int(rng.integers(200, 1000)), "scale": _log_uniform(rng, 5e-4, 0.05)

@@ -103,7 +103,7 @@ CASES: dict[str, dict[str, Any]] = {
     "by GPS, few matches": {"by_gps": True, "ties": 20},
     "nothing in common": {"by_gps": True, "ties": 0},
     "few matches in one spot": {"ties": 25, "cluster": 8.0},
-    "drift": {"bend": 2.5},
+    "drift": {"doming": 2.5},
     "four periods, the last wrong": {"periods": 4, "rotation": 0.4},
 }
 
