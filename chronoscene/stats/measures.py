@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from chronoscene.scene import Scene, tracks
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.stats.counts import CountRule, SceneCount, count_scene
-from chronoscene.stats.view_overlap import common_view
+from chronoscene.stats.view_overlap import in_view
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -93,7 +93,7 @@ def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatis
         periods=by_period,
         whole=whole,
         overlap=period_overlap(seen > 0),
-        in_view=common_view(scene, seen > 0, found.depth),
+        in_view=in_view(scene, seen > 0, found.depth),
         unit=scene.world.unit,
     )
 

@@ -9,7 +9,7 @@ from skeletons.dataset import write_skeleton
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.stats.measures import reproject
-from chronoscene.stats.view_overlap import DEPTH_PERCENTILE, REACH_FACTOR, common_view
+from chronoscene.stats.view_overlap import DEPTH_PERCENTILE, REACH_FACTOR, in_view
 
 PINHOLE = Camera(1, "PINHOLE", 100, 100, (50.0, 50.0, 50.0, 50.0))
 """Sees 45 degrees to every side."""
@@ -41,7 +41,7 @@ def scene_of(camera: Camera, poses: list[np.ndarray], points: list, owners: list
 
 def views(scene: Scene) -> list[list[float | None]]:
     seen = scene.count_views() > 0
-    return [list(row) for row in common_view(scene, seen, reproject(scene).depth)]
+    return [list(row) for row in in_view(scene, seen, reproject(scene).depth)]
 
 
 def moved(x: float) -> np.ndarray:
@@ -96,5 +96,5 @@ def test_equals_plain_loops(tmp_path) -> None:
                     inside = 0 <= x <= frame.camera.width and 0 <= y <= frame.camera.height
                     hit |= inside and 0 < local[2] <= reach
                 hits.append(hit)
-            share = common_view(scene, seen, found.depth)[a][b]
+            share = in_view(scene, seen, found.depth)[a][b]
             assert share == pytest.approx(np.mean(hits))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import Similarity, fit_robustly
+from chronoscene.scene.tracks import MIN_PARALLAX, meet
 from chronoscene.validation.checks.reprojection import image_errors, period_errors, pose_limit
 from chronoscene.validation.scene_folder import RawScene, derived
 
@@ -25,10 +26,6 @@ MAX_RAYS = 20_000
 
 MIN_POINTS = 10
 """Points that the cameras of a period must triangulate alone."""
-
-MIN_PARALLAX = 1e-4
-"""Smallest eigenvalue of the mean of ``I - d d^T`` over the rays of a point: sine squared of about
-half a degree."""
 
 STRAY = 100.0
 """Distance of a camera from the others, in units of their median distance, beyond which its rays
@@ -181,24 +178,20 @@ class Rays:
         return factor, float(np.median(np.linalg.norm(projected * factor - observed, axis=1)))
 
     def place_points(self) -> tuple[NDArray[np.int64], Array]:
-        """Triangulate the points with enough parallax from these rays alone: indices and positions.
-
-        A position is nearest to all rays: ``sum(I - d d^T) x = sum((I - d d^T) c)``.
-        """
+        """Triangulate the points with enough parallax from these rays alone: indices, positions."""
         local = np.column_stack([self.plane, np.ones(len(self.plane))])
         direction = np.einsum("nji,nj->ni", self.rotation, local)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         away = np.linalg.norm(self.centre - np.median(self.centre, axis=0), axis=1)
         sound = np.isfinite(direction).all(axis=1) & (away <= STRAY * np.median(away))
-        direction, centre = direction[sound], self.centre[sound]
-        across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-        index, slot, count = np.unique(self.point[sound], return_inverse=True, return_counts=True)
-        left, right = np.zeros((len(index), 3, 3)), np.zeros((len(index), 3))
-        np.add.at(left, slot, across)
-        np.add.at(right, slot, np.einsum("nij,nj->ni", across, centre))
-        good = np.linalg.eigvalsh(left / count[:, None, None])[:, 0] > MIN_PARALLAX
-        placed = np.linalg.solve(left[good], right[good][:, :, None])[:, :, 0]
-        return index[good], np.asarray(placed, np.float64)
+        rows = np.flatnonzero(sound)
+        if not len(rows):
+            return rows, np.zeros((0, 3))
+        rows = rows[np.argsort(self.point[rows], kind="stable")]
+        index, first = np.unique(self.point[rows], return_index=True)
+        xyz, parallax = meet(direction[rows], self.centre[rows], first)
+        good = parallax > MIN_PARALLAX
+        return index[good], xyz[good]
 
 
 def explain(scene: RawScene, period: int, limit: float) -> str | None:
@@ -257,7 +250,8 @@ def _negated(world: Array, camera: Array) -> str:
 def _moved(similarity: Similarity, own: Array, target: Array) -> str:
     rotation = similarity.matrix / similarity.scale
     turn = rotation if not similarity.mirrored else -rotation
-    angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    cosine = np.clip((np.trace(turn) - 1) / 2, -1, 1)
+    angle = round(float(np.degrees(np.arccos(cosine))), 4)  # arccos is that exact near 0
     shift = np.linalg.norm(np.median(target, axis=0) - np.median(own, axis=0))
     mirrored = "mirrored, " if similarity.mirrored else ""
     return (

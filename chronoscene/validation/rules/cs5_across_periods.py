@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import WORLD, read_world
-from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.scene.common_view import common_view
+from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
 from chronoscene.validation import rule
-from chronoscene.validation.checks.observations import project
 from chronoscene.validation.checks.period_frames import own_frames
 from chronoscene.validation.checks.photo_metadata import fit_gps
 from chronoscene.validation.checks.reprojection import depth_percentiles
@@ -200,7 +200,7 @@ def period_apart(scene: RawScene) -> Iterator[Hit]:
     and their cameras hardly any of its points."""
     if len(scene.period_ids) > MAX_PERIODS:
         return
-    share = common_view(scene)
+    share = _views(scene)
     share[~(np.diag(share) >= OWN)] = np.nan  # cameras that miss their own points tell nothing
     for index in own_frames(scene).keys() | _other_depths(scene).keys():
         share[index], share[:, index] = np.nan, np.nan  # a wrong frame tells nothing of places
@@ -211,7 +211,7 @@ def period_apart(scene: RawScene) -> Iterator[Hit]:
             yield Hit(f"period {period}", "views of the place that the others show", found)
 
 
-def common_view(scene: RawScene) -> NDArray[np.float64]:
+def _views(scene: RawScene) -> NDArray[np.float64]:
     """Share of the points of a period (columns) in the view of a camera of another (rows). [T, T]
 
     Points and images are sampled. NaN for periods without points or without cameras.
@@ -219,8 +219,8 @@ def common_view(scene: RawScene) -> NDArray[np.float64]:
     images, points, seen = scene.images, scene.points, scene.point_periods
     assert images is not None and points is not None and seen is not None
     count = len(scene.period_ids)
-    share = np.full((count, count), np.nan)
-    reach = depth_percentiles(scene, 95)
+    depths = depth_percentiles(scene, 95)
+    reach = np.array([REACH * depths.get(i, np.nan) for i in range(count)])
     finite = np.isfinite(points.xyz).all(axis=1)
     owners = [_sample(finite & seen[:, i], MAX_POINTS // count) for i in range(count)]
     xyz = points.xyz[np.concatenate([np.zeros(0, np.int64), *owners])]
@@ -228,18 +228,17 @@ def common_view(scene: RawScene) -> NDArray[np.float64]:
     known = np.isin(images.camera_ids, list(scene.usable_cameras))
     known &= scene.is_posed
     rotations = rotation_from_quaternion(images.quaternions)
-    for row in sorted(reach.keys() - {-1}):
-        viewed = np.zeros(len(xyz), bool)
-        for image in _sample(known & (scene.image_periods == row), MAX_IMAGES // count).tolist():
-            camera = scene.usable_cameras[int(images.camera_ids[image])]
-            rotation, translation = rotations[image], images.translations[image]
-            depth, x, y = project(rotation, translation, camera, *xyz.T)
-            inside = (x >= 0) & (x <= camera.width) & (y >= 0) & (y <= camera.height)
-            viewed |= inside & (depth > 0) & (depth < REACH * reach[row])
-        for column in range(count):
-            if len(owners[column]):
-                share[row, column] = viewed[owner == column].mean()
-    return share
+    views = [
+        [
+            (
+                scene.usable_cameras[int(images.camera_ids[i])],
+                pose_from_rotation_translation(rotations[i], images.translations[i]),
+            )
+            for i in _sample(known & (scene.image_periods == period), MAX_IMAGES // count).tolist()
+        ]
+        for period in range(count)
+    ]
+    return common_view(xyz, owner, views, reach).T
 
 
 def _sample(mask: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
