@@ -1,4 +1,4 @@
-"""COLMAP models for use: read and checked, and written.
+"""COLMAP models: read as they are, read and checked for use, and written.
 
 pycolmap is the authority on cameras and poses (text and binary, models with and without rigs and
 frames). Points and observations come from `chronoscene.colmap.binary` and are checked here;
@@ -37,7 +37,7 @@ from chronoscene.scene.cameras import from_pycolmap
 from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
 
 UNIT = 1e-9
-"""Deviation of the length of a quaternion from 1 that is rounding."""
+"""Quaternions whose length differs from 1 by less are unit quaternions up to rounding."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,10 @@ class Model:
 
 
 def read_raw_model(folder: Path) -> RawModel:
-    """Read what can be read; never raises for what is in the files."""
+    """Read each file by itself, so that a damaged one does not hide problems in the others.
+
+    Never raises for what is in the files.
+    """
     files = model_files(folder)
     readers: dict[str, Callable[[Path], Any]] = {
         "cameras.bin": binary.read_cameras,
@@ -117,33 +120,34 @@ def read_model(folder: Path) -> Model:
         with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
             reconstruction = read_reconstruction(folder)
             reconstruction.write_binary(temporary)
+            images = _posed_images(folder, reconstruction)
             raw = binary.read_images(Path(temporary) / "images.bin")
             points = binary.read_points(Path(temporary) / "points3D.bin")
-        row, xy = _observed(folder, raw, points)
-        images = _posed_images(folder, reconstruction)
     else:
-        binary.read_cameras(folder / "cameras.bin")  # pycolmap does not notice that a file
-        binary.read_rigs(folder)  # ends early
+        binary.read_cameras(folder / "cameras.bin")  # pycolmap ignores that a file ends early
+        binary.read_rigs(folder)
         raw = binary.read_images(folder / "images.bin")
         points = binary.read_points(folder / "points3D.bin")
-        row, xy = _observed(folder, raw, points)
         images = read_poses(folder, raw)
-    return Model(images, _checked_points(folder, images, raw, points, row, xy))
+    return Model(images, _checked_points(folder, images, raw, points))
 
 
 def read_poses(folder: Path, images: RawImages) -> tuple[PosedImage, ...]:
     """Registered images of a binary model as COLMAP understands them, sorted by name.
 
-    pycolmap judges all that takes part in a pose: cameras, rigs, frames, names. It is given the
-    model without points and keypoints, in a fraction of the time.
+    pycolmap checks everything that a pose depends on: cameras, rigs, frames, names. It gets the
+    model without points and keypoints, which takes a fraction of the time.
 
     Args:
         folder: Of the model.
         images: What its ``images.bin`` says.
 
     Raises:
-        SceneError: If pycolmap refuses the model, or a name is no text or comes twice.
+        SceneError: If pycolmap refuses the model, or an id or a name occurs twice.
     """
+    ids = np.sort(images.ids)
+    if len(twice := ids[1:][ids[1:] == ids[:-1]]):
+        raise _model_error(folder, "one image of each id", f"image id {twice[0]} twice")
     with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
         write_without_observations(folder, images, Path(temporary))
         return _posed_images(folder, read_reconstruction(Path(temporary), place=folder))
@@ -160,7 +164,7 @@ def read_reconstruction(folder: Path, *, place: Path | None = None) -> pycolmap.
         SceneError: If pycolmap refuses it.
     """
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = 3  # what is wrong comes as an exception, not on stderr
+    pycolmap.logging.minloglevel = 3  # errors come as exceptions, not on stderr
     try:
         return pycolmap.Reconstruction(str(folder))
     except Exception as error:  # ValueError, RuntimeError, IndexError, MemoryError were all seen
@@ -226,17 +230,16 @@ def copy_poses(source: Path, folder: Path) -> int:
     return int(known.sum())
 
 
-def _observed(
-    folder: Path, images: RawImages, points: RawPoints
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Row of the image [M] and pixel position [M, 2] of every observation.
+def _checked_points(
+    folder: Path, images: Sequence[PosedImage], raw: RawImages, points: RawPoints
+) -> Points:
+    """Points whose tracks refer to the posed images.
 
-    Refuses two images of one id, and tracks over images or keypoints that do not exist.
+    Raises:
+        SceneError: If a track refers to an image or a keypoint that does not exist.
     """
-    order = np.argsort(images.ids, kind="stable")
-    known = images.ids[order]
-    if len(twice := known[1:][known[1:] == known[:-1]]):
-        raise _model_error(folder, "one image of each id", f"image id {twice[0]} twice")
+    order = np.argsort(raw.ids)
+    known = raw.ids[order]
     image, keypoint = points.track_image, points.track_keypoint
     slot = np.searchsorted(known, image)
     # One past the end stands for ids above all known ones, and for all where there are none.
@@ -246,32 +249,22 @@ def _observed(
             folder, "tracks over images of the model", f"image {image[lost].min()}, which it lacks"
         )
     row = order[slot]
-    lengths = np.diff(images.keypoint_start)[row]
-    wrong = (keypoint < 0) | (keypoint >= lengths)
-    if wrong.any():
-        i = int(np.flatnonzero(wrong)[0])
+    lengths = np.diff(raw.keypoint_start)[row]
+    wrong = np.flatnonzero((keypoint < 0) | (keypoint >= lengths))
+    if len(wrong):
+        i = wrong[0]
         raise _model_error(
             folder,
             "tracks over keypoints of the images",
             f"keypoint {keypoint[i]} of image {image[i]}, which has {lengths[i]}",
         )
-    return row, images.keypoint_xy[images.keypoint_start[row] + keypoint]
-
-
-def _checked_points(
-    folder: Path,
-    images: Sequence[PosedImage],
-    raw: RawImages,
-    points: RawPoints,
-    row: NDArray[np.int64],
-    xy: NDArray[np.float64],
-) -> Points:
-    """Points whose tracks refer to registered images; refuses tracks over others."""
-    index = {image.image_id: i for i, image in enumerate(images)}
+    index = {posed.image_id: i for i, posed in enumerate(images)}
     frame = np.array([index.get(i, -1) for i in raw.ids.tolist()], np.int32)[row]
     if (frame < 0).any():
-        lost = raw.ids[row[frame < 0][0]]
-        raise _model_error(folder, "tracks over registered images", f"image {lost} without a pose")
+        lost_id = image[frame < 0][0]
+        raise _model_error(
+            folder, "tracks over registered images", f"image {lost_id} without a pose"
+        )
     return Points(
         ids=points.ids,
         xyz=points.xyz,
@@ -279,7 +272,7 @@ def _checked_points(
         error=points.error,
         track_start=points.track_start,
         track_frame=frame,
-        track_xy=xy,
+        track_xy=raw.keypoint_xy[raw.keypoint_start[row] + keypoint],
     )
 
 
@@ -303,8 +296,8 @@ def _posed_images(folder: Path, model: pycolmap.Reconstruction) -> tuple[PosedIm
 def _pose(rigid: pycolmap.Rigid3d) -> NDArray[np.float64]:
     """The same pose as a matrix, NaN for quaternions without a direction. [4, 4]
 
-    Text with few digits has quaternions that are not quite unit, of which pycolmap makes matrices
-    that are no rotations.
+    Text with few digits has quaternions that are not quite unit; the matrices that pycolmap makes
+    of them are not rotations.
     """
     x, y, z, w = rigid.rotation.quat
     with np.errstate(all="ignore"):
