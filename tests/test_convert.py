@@ -152,7 +152,7 @@ def test_unknown_target_and_grouping(make_scene_folder, tmp_path):
     folder = make_scene_folder()
     with pytest.raises(ConfigError, match="nerfstudio, wat, found 'neusc'"):
         convert(folder, tmp_path / "out", target="neusc")
-    with pytest.raises(ConfigError, match="no such option for chronoscene, which says its periods"):
+    with pytest.raises(ConfigError, match="which defines its own periods"):
         convert(folder, tmp_path / "out", period_by="year")
 
 
@@ -160,7 +160,7 @@ def test_losses(make_scene_folder):
     scene = read_scene(make_scene_folder())
     assert losses(scene, "chronoscene") == []
     (names,) = losses(scene, "colmap-folders")
-    assert names.endswith("these image names, which get the mark of their period")
+    assert names.endswith("the image names, to which the period is added")
     assert losses(scene, "nerfstudio") == [
         "nerfstudio has no place for the observations of points, their ids and errors"
     ]
@@ -173,7 +173,7 @@ def test_losses(make_scene_folder):
         "the labels of the periods as they are (but: 0_a, 1_2023)",
         "the dates of the periods",
         "unit and reference system of the world",
-        "these image names, which get the mark of their period",
+        "the image names, to which the period is added",
     ]
 
 
@@ -222,7 +222,7 @@ def test_two_names_of_one_file_are_refused(make_scene_folder, tmp_path, source):
     first, second = scene.frames
     twice = dataclasses.replace(scene, frames=(first, dataclasses.replace(second, name="a//0.png")))
     for name in ("chronoscene", "nerfstudio"):
-        with pytest.raises(SceneError, match="expected a file of its own for each image"):
+        with pytest.raises(SceneError, match="expected a separate file for each image"):
             load_format(name).write(twice, tmp_path / "out", image_source=source)
     assert not (tmp_path / "out").exists()
 

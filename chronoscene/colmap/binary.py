@@ -3,7 +3,7 @@
 Two reasons for a reader beside pycolmap: pycolmap gives points and observations one Python object
 at a time (seconds for a scene of half a million points), and it does not notice that a file ends
 early. Every length is checked against the size of the file before it is used. Nothing else is
-checked, and nothing dropped: ids may come twice, names may be no text.
+checked, and nothing dropped: ids may be duplicated, names may not be valid text.
 
 Records are little endian; a count comes first (u64). Camera: i32 id, i32 model, u64 width, u64
 height, f64 parameters. Image: i32 id, f64 quaternion wxyz, f64 translation, i32 camera, name ended
@@ -75,7 +75,7 @@ def read_points(path: Path) -> RawPoints:
     """Points of ``points3D.bin``, sorted by id.
 
     Raises:
-        SceneError: If the file cannot be read, ends inside a record, or has a point twice.
+        SceneError: If the file cannot be read, ends inside a record, or has duplicate ids.
     """
     return _read(path, _walk_points)
 
@@ -93,31 +93,31 @@ def read_rigs(folder: Path) -> RawRigs | None:
 
 
 class _RecordError(Exception):
-    """What is wrong inside a file, in words."""
+    """What is wrong with a record."""
 
 
 class _Reader:
-    """Takes one thing after the other out of a file, and says which record the file ends inside."""
+    """Reads a file from start to end; errors name the record in which it ends."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
         self.at = 0
-        """Bytes taken so far."""
+        """Bytes read so far."""
         self.index: int | None = None
-        """Of the record that is being read; None while their number is read."""
+        """Of the current record; None before the first."""
         self.kind = ""
         self.parts = ""
-        """Parts that the record announces, in words. Forgotten at the next record."""
+        """Number of parts that the current record announces, for messages."""
 
-    def records(self, kind: str, smallest: int) -> Iterator[int]:
-        """Index of each record; the walk takes its parts before it asks for the next.
+    def records(self, kind: str, min_size: int) -> Iterator[int]:
+        """Index of each record; the caller reads the record before it asks for the next.
 
         Raises:
-            _RecordError: If so many records of at least ``smallest`` bytes cannot fit into the
-                file, or something follows the last.
+            _RecordError: If the file is too short for so many records of at least ``min_size``
+                bytes, or something follows the last.
         """
         (count,) = self.unpack(_COUNT)
-        if count * smallest > len(self.data) - self.at:
+        if count * min_size > len(self.data) - self.at:
             raise _RecordError(f"{count} records announced in {len(self.data)} bytes")
         self.kind = kind
         for self.index in range(count):
@@ -131,7 +131,7 @@ class _Reader:
         return layout.unpack_from(self.data, self.skip(layout.size))
 
     def skip(self, size: int) -> int:
-        """Go on by ``size`` bytes, which must be there; returns where they begin."""
+        """Skip ``size`` bytes, which must exist; returns where they begin."""
         begin = self.at
         if size > len(self.data) - begin:
             raise self.ends()
@@ -139,7 +139,7 @@ class _Reader:
         return begin
 
     def text(self) -> bytes:
-        """The next bytes up to a zero byte, which is taken too."""
+        """The bytes up to the next zero byte, which is skipped."""
         begin, end = self.at, self.data.find(b"\0", self.at)
         if end < 0:
             raise self.ends()
@@ -147,7 +147,7 @@ class _Reader:
         return self.data[begin:end]
 
     def ends(self) -> _RecordError:
-        """The complaint that the file ends too early."""
+        """The error that the file ends too early."""
         if self.index is None:
             return _RecordError("a file that ends inside the number of its records")
         announced = f", which announces {self.parts}" if self.parts else ""
@@ -242,7 +242,7 @@ def _sensor(reader: _Reader) -> Sensor:
 
 
 def _walk_points(reader: _Reader) -> RawPoints:
-    """One step per record, since each says only how long itself is; all else in whole columns."""
+    """One step per record, as each states only its own length; all else in whole columns."""
     offsets = _quick_offsets(reader.data)
     if offsets is None:
         offsets = _checked_offsets(reader)
@@ -252,7 +252,7 @@ def _walk_points(reader: _Reader) -> RawPoints:
 
 
 def _quick_offsets(data: bytes) -> list[int] | None:
-    """Where the records begin and the last ends, if the file is as it should be."""
+    """Offsets of the records and of the end of the last; None if the file is damaged."""
     if len(data) < _COUNT.size:
         return None
     (count,) = _COUNT.unpack_from(data)

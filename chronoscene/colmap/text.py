@@ -33,12 +33,12 @@ from chronoscene.io.wording import quote
 from chronoscene.scene.cameras import CAMERA_MODELS, Camera
 
 BLOCK = 20_000
-"""Lines whose fields are in memory as text at one time."""
+"""Lines that are split into fields at a time, to bound the memory."""
 
 MAX_DAMAGES = 100
 """Damaged lines of one file that are listed."""
 
-_IMAGE_LINE = '"<id> <qw> <qx> <qy> <qz> <tx> <ty> <tz> <camera id> <name>" with blanks between'
+_IMAGE_LINE = '"<id> <qw> <qx> <qy> <qz> <tx> <ty> <tz> <camera id> <name>" separated by blanks'
 _KEYPOINT_LINE = '"<x> <y> <point id>" for each keypoint'
 _POINT_LINE = '"<id> <x> <y> <z> <r> <g> <b> <error>" and pairs "<image id> <keypoint>"'
 
@@ -46,14 +46,14 @@ Line = tuple[int, str]
 """Number from 1, and the text without surrounding blanks."""
 
 Fields = deque[str]
-"""Of a line; they are taken from the left."""
+"""Fields of a line, consumed from the left."""
 
 
 def read_cameras(path: Path) -> tuple[Camera, ...]:
     """Cameras in the order of the file.
 
     Raises:
-        DamagedError: With every line that is not a camera.
+        DamagedError: With every damaged line.
     """
     cameras, damages = [], []
     for number, line in _records(_lines(path)):
@@ -87,7 +87,7 @@ def read_images(path: Path) -> RawImages:
     """Images in the order of the file.
 
     Raises:
-        DamagedError: With every line that is not right.
+        DamagedError: With every damaged line.
     """
     heads, names, keypoint_lines, damages = [], [], [], []
     lines = _lines(path)
@@ -100,7 +100,7 @@ def read_images(path: Path) -> RawImages:
             names.append(fields[9])
         except (ValueError, IndexError, OverflowError):
             damages.append(Damage(f"{path.name}:{number}", _IMAGE_LINE, quote(line)))
-    values, lengths = _numbers(path, keypoint_lines, _KEYPOINT_LINE, _triples, damages)
+    values, lengths = _numbers(path, keypoint_lines, _KEYPOINT_LINE, lambda n: n % 3 == 0, damages)
     _raise_any(damages)
     infinite = np.flatnonzero(~np.isfinite(values))
     for row in np.unique(np.searchsorted(np.cumsum(lengths), infinite, "right")):
@@ -127,11 +127,11 @@ def read_points(path: Path) -> RawPoints:
     """Points sorted by id.
 
     Raises:
-        DamagedError: With every line that is not a point, or with the ids that come twice.
+        DamagedError: With every damaged line, or with duplicate ids.
     """
     damages: list[Damage] = []
     lines = list(_records(_lines(path)))
-    values, lengths = _numbers(path, lines, _POINT_LINE, _point, damages)
+    values, lengths = _numbers(path, lines, _POINT_LINE, lambda n: n >= 8 and n % 2 == 0, damages)
     _raise_any(damages)
     start = np.concatenate([[0], np.cumsum(lengths)])
     heads = values[start[:-1, None] + np.arange(8)]
@@ -203,14 +203,6 @@ def _sensor(fields: Fields) -> Sensor:
     return (CAMERA if kind == "CAMERA" else 1), int(fields.popleft())
 
 
-def _triples(count: int) -> bool:
-    return count % 3 == 0
-
-
-def _point(count: int) -> bool:
-    return count >= 8 and count % 2 == 0
-
-
 def _lines(path: Path) -> Iterator[Line]:
     text = path.read_bytes().decode("utf-8", "surrogateescape")
     yield from ((i, line.strip()) for i, line in enumerate(text.split("\n"), start=1))
@@ -252,7 +244,7 @@ def _numbers(
 
 
 def _integers(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Cast; what is not finite becomes some number that no id has, without a warning."""
+    """Cast without a warning; what is not finite becomes a number that is no valid id."""
     with np.errstate(invalid="ignore"):
         return values.astype(np.int64)
 

@@ -23,13 +23,13 @@ _COUNT = struct.Struct("<Q")
 _CAMERA, _IMAGE = struct.Struct("<IIQQ"), struct.Struct("<I7dI")
 _PAIR = np.dtype("<i4")
 _ID = 0xFFFFFFFF
-"""Ids have 32 bits; which of them are negative is a matter of the reader."""
+"""Ids have 32 bits; readers differ in whether they are signed."""
 
 
 def write_raw_model(
     folder: Path, cameras: Sequence[Camera], images: RawImages, points: RawPoints
 ) -> None:
-    """Write the three files into an existing folder. Nothing is checked: what is broken stays so.
+    """Write the three files into an existing folder. Nothing is checked or repaired.
 
     Raises:
         struct.error, OverflowError: If a number does not fit into its field.
@@ -42,7 +42,7 @@ def write_raw_model(
 def write_without_observations(source: Path, images: RawImages, folder: Path) -> None:
     """Write a binary model with the cameras, rigs, frames and poses of another, and no points.
 
-    COLMAP judges all that takes part in a pose, in a fraction of the time.
+    pycolmap reads it in a fraction of the time.
 
     Args:
         source: Folder of the other model, of which cameras, rigs and frames are copied.

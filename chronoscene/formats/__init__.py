@@ -2,10 +2,10 @@
 
 A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and where it makes sense
 
-- ``write(scene, out, image_source=..., progress=...)``, and with it ``losses(scene)``, what of the
-  scene has no place in the format;
-- ``PERIOD_BY``, the values that ``read(path, period_by=...)`` knows, where periods can be chosen;
-- ``remarks(path)``, what a folder has that does not become part of the scene.
+- ``write(scene, out, image_source=..., progress=...)`` and ``losses(scene)``, which lists what of
+  the scene the format cannot hold;
+- ``PERIOD_BY``, the values of ``read(path, period_by=...)``, where periods can be chosen;
+- ``remarks(path)``, which lists what of a folder does not become part of the scene.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def load_format(name: str) -> Any:
     """Module of a format.
 
     Raises:
-        ConfigError: If there is no such format; names those that there are.
+        ConfigError: If the format is unknown; lists the known ones.
     """
     check_choice("dataset format", name, FORMATS)
     return import_module(FORMATS[name])
@@ -50,7 +50,7 @@ def detect_format(path: Path) -> str:
     """Name of the one format whose marks a folder has.
 
     Raises:
-        SceneError: If no format matches; says what was looked for.
+        SceneError: If no format matches; lists what was looked for.
     """
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
@@ -64,7 +64,7 @@ def detect_format(path: Path) -> str:
             path,
             expected="a folder of one format",
             found=f"marks of {' and '.join(matching)}",
-            todo="name the one that is meant with --format (stats: --dataset-format)",
+            todo="choose one with --format (stats: --dataset-format)",
         )
     looked_for = "; ".join(f"{name}: {module.MARKS}" for name, module in modules.items())
     content = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
@@ -84,7 +84,7 @@ def _advice(path: Path) -> str:
         return "move this COLMAP model to sparse/0 in a folder with images/"
     if find_model(path) and (path / "images").is_dir():
         return (
-            "say which image is of which period: write sparse/split.txt, or convert it with "
+            "assign images to periods: write sparse/split.txt, or convert the folder with "
             "--format colmap-folders --period-by table:FILE"
         )
     advice = "give the folder of one scene; DATASET.md describes its files"
@@ -97,7 +97,7 @@ def find_scenes(path: Path, *, format: str | None = None) -> list[Path]:
     """The scene folder itself, or the scenes directly inside a folder, sorted by name.
 
     Raises:
-        SceneError: If there is no scene at all; says what was looked for.
+        SceneError: If there is no scene; lists what was looked for.
     """
     modules = [load_format(name) for name in ([format] if format else format_names())]
 
@@ -125,7 +125,7 @@ def read_scene(
 
     Raises:
         SceneError: If the folder is of no known format, or damaged.
-        ConfigError: If there is no such format, or no such grouping in it.
+        ConfigError: If the format or the grouping is unknown.
     """
     path = Path(path)
     name = format if format is not None else detect_format(path)
@@ -136,7 +136,7 @@ def read_scene(
     if not hasattr(module, "PERIOD_BY"):
         raise ConfigError(
             "--period-by",
-            expected=f"no such option for {name}, which says its periods itself",
+            expected=f"no such option for {name}, which defines its own periods",
             found=repr(period_by),
             todo="leave it out",
         )

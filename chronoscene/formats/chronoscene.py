@@ -45,13 +45,13 @@ PERIODS = "sparse/periods.json"
 WORLD = "sparse/world.json"
 
 MAX_COORDINATE = 1e100
-"""Beyond any world; squares and sums of such numbers are still finite."""
+"""Larger than any world; squares and sums of such numbers are still finite."""
 
 NOT_RIGID = 1e-6
 """Deviation from a rotation beyond which a pose is refused; COLMAP's are exact to rounding."""
 
 MAX_PERIODS = 100_000
-"""Far beyond any real scene: more come from a mistaken id, and would fill the memory."""
+"""Far more than any real scene has: a mistaken id must not fill the memory."""
 
 
 def matches(path: Path) -> bool:
@@ -67,7 +67,7 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
         model: Its COLMAP model, where that was read before.
 
     Raises:
-        SceneError: If a file is missing, damaged or contradicts another.
+        SceneError: If files are missing, damaged, or contradict each other.
     """
     path = Path(path)
     entries, problems = parse_split_text(read_text(path / SPLIT))
@@ -93,7 +93,7 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
 
 
 def remarks(path: Path) -> list[str]:
-    """What a folder has that is not part of the format."""
+    """What of a folder is not part of the format."""
     others = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
     others = [name for name in others if name not in ("images/", "sparse/")]
     return [f"not part of the format, and not converted: {', '.join(others)}"] if others else []
@@ -107,21 +107,21 @@ def raise_first(path: Path, problems: Iterable[Problem]) -> None:
 
 
 def check_image(place: Path, image: PosedImage) -> None:
-    """Refuse an image that no method could use: its name, its pose, its camera."""
+    """Refuse an image whose name, pose or camera no method could use."""
     check_name(place, image.name)
     camera, pose = image.camera, image.cam_from_world
     if not (np.abs(pose) < MAX_COORDINATE).all():
         raise SceneError(
             place,
             expected=f"a finite pose of {image.name!r}",
-            found="NaN, infinity, or more than any place can have",
+            found="NaN, infinity, or absurdly large numbers",
             todo="remove the image from the model, or register it again",
         )
     if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > NOT_RIGID:
         raise SceneError(
             place,
             expected=f"a rotation in the pose of {image.name!r}",
-            found="another matrix, from a quaternion that is too large or too small",
+            found="a different matrix, from a quaternion that is too large or too small",
             todo="remove the image from the model, or register it again",
         )
     if not camera.is_usable:
@@ -232,7 +232,7 @@ def check_writable_name(place: Path, frame: Frame) -> None:
     if [(entry.name, entry.period) for entry in entries] != [(frame.name, frame.period)]:
         raise SceneError(
             place,
-            expected="image names without line breaks, and without blanks at their ends",
+            expected="image names without line breaks and without leading or trailing blanks",
             found=repr(frame.name),
             todo="rename the image",
         )

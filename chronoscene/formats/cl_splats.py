@@ -171,7 +171,7 @@ def write(
     Images are directly in ``images/``, and their names begin with ``day_<period>_``.
 
     Raises:
-        SceneError: If ``out`` is in use, an image is missing or of another camera than a pinhole,
+        SceneError: If ``out`` is in use, an image is missing or its camera is not a pinhole,
             or names without their folders are equal.
     """
     return write_renamed(

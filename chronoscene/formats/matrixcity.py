@@ -65,9 +65,9 @@ SAME_POSE = 0.01
 PARTS_OF_A_CITY = ("train", "test", "train_dense", "pose", "aerial", "street")
 """Folders that say what images are for, or how they were flown: neither blocks nor periods."""
 
-DEEPEST = 4
-MOST_FOLDERS = 5000
-"""Folders that are looked at, so that a wrong path does not take forever."""
+MAX_DEPTH = 4
+MAX_FOLDERS = 5000
+"""Folders that are searched, so that a wrong path does not take forever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +135,8 @@ def _check_same(path: Path, first: Shot, second: Shot) -> None:
     if np.abs(first.cam_from_world - second.cam_from_world).max() > SAME_POSE:
         raise SceneError(
             path / first.name,
-            expected="the same pose in all files of poses",
-            found="two that differ",
+            expected="the same pose in all pose files",
+            found="two different poses",
             todo="remove the files that are wrong",
         )
 
@@ -148,7 +148,7 @@ def remarks(path: Path) -> list[str]:
     if left := [file for files, _ in _walk(path) for file in files if file not in read]:
         named = ", ".join(str(PurePosixPath(file.folder) / file.name) for file in left[:3])
         found.append(
-            f"{len(left)} files of poses are not read, as raw ones win over prepared ones and "
+            f"{len(left)} pose files are not read, as raw ones win over prepared ones and "
             f"train over train_dense: {named}{', ...' if len(left) > 3 else ''}"
         )
     return found
@@ -160,7 +160,7 @@ def _walk(path: Path) -> Iterator[tuple[list[PoseFile], str | None]]:
     An orphan is a block with numbered images and no file of poses.
     """
     waiting, visited = [""], 0
-    while waiting and visited < MOST_FOLDERS:
+    while waiting and visited < MAX_FOLDERS:
         folder, visited = waiting.pop(), visited + 1
         here = path / folder
         if head_has(here / RAW, RAW_KEY):
@@ -170,7 +170,7 @@ def _walk(path: Path) -> Iterator[tuple[list[PoseFile], str | None]]:
         prepared = [PoseFile(folder, name) for name in PREPARED if (here / name).is_file()]
         numbered = any(re.fullmatch(r"[0-9]{4,}\.png", name) for name in images)
         yield prepared, folder if numbered else None
-        if len(PurePosixPath(folder).parts) < DEEPEST:
+        if len(PurePosixPath(folder).parts) < MAX_DEPTH:
             below = sorted(folders, key=natural_key, reverse=True)
             waiting += [str(PurePosixPath(folder) / name) for name in below]
 
@@ -191,7 +191,7 @@ def _pose_files(path: Path) -> list[PoseFile]:
             path / orphans[0] if found else path,
             expected=f"{RAW} with {RAW_KEY} beside the images" if found else MARKS,
             found="none",
-            todo="copy it there again, or remove the block" if found else "give another folder",
+            todo="copy it again, or remove the block" if found else "choose another folder",
         )
     chosen = raw or found
     if any("train" in file.parts for file in chosen):
@@ -244,7 +244,7 @@ def _group(path: Path, labels: dict[str, list[str]], by: str | None) -> Grouped:
         raise SceneError(
             path,
             expected="every block in a folder of its period",
-            found="one without",
+            found="a block without one",
             todo="leave --period-by out, or give the folder above",
         )
     first = {name: parts[0] for name, parts in labels.items()}

@@ -85,14 +85,14 @@ COLMAP = "colmap/sparse/0"
 """The model that a file without ``applied_transform`` was made from, in old versions."""
 
 HISTORICAL = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))
-"""What these versions did to the world of that model, and did not write down."""
+"""The undocumented change of axes that these versions applied to the world of that model."""
 
 RAW_MATRIXCITY = '"rot_mat"'
 """A key of the raw files of MatrixCity, which have the same name."""
 
 
 def matches(path: Path) -> bool:
-    """Whether a folder has a ``transforms.json`` that is no raw file of MatrixCity."""
+    """Whether a folder has a ``transforms.json`` that is not a raw file of MatrixCity."""
     place = path / FILE
     if (path / "sparse/split.txt").exists() or not place.is_file():
         return False
@@ -356,7 +356,7 @@ def losses(scene: Scene) -> list[str]:
     if count := int((~_finite(scene.points)).sum()):
         lost.append(f"{count} points that are not finite")
     if len({frame.camera.model == FISHEYE for frame in scene.frames}) > 1:
-        lost.append(f"{FISHEYE} beside other cameras, as its loader takes one kind for all frames")
+        lost.append(f"{FISHEYE} beside other cameras, as its loader uses one kind for all frames")
     return lost
 
 

@@ -67,7 +67,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
         raise SceneError(
             path / "dense/images",
             expected="images with a date in their names",
-            found="none that train.txt and trash.txt leave",
+            found="none after train.txt and trash.txt",
             todo="see DATASET.md, Other formats",
         )
     dated = [name for name in used if name in dates]
@@ -99,7 +99,7 @@ def remarks(path: Path) -> list[str]:
             found.append(f"{file} beside {LISTS[0]}/ is not read, as there is one in it")
         entries = parse_test_text(read_text(places[0])) if places else []
         if unknown := sum(not index.find(entry.name) for entry in entries):
-            found.append(f"{file} has {unknown} names that fit no registered image")
+            found.append(f"{file} has {unknown} names that match no registered image")
     if (path / "semantic_maps").is_dir():
         found.append("semantic_maps/ (sky, people) is not read")
     return found
@@ -114,7 +114,7 @@ def _used_names(path: Path, model: Model) -> list[str]:
 
 
 def _listed(path: Path, file: str, names: list[str]) -> list[str] | None:
-    """Registered images that a list names, in its order; None where there is no such list."""
+    """Registered images that a list names, in its order; None without such a list."""
     place = next(
         (path / folder / file for folder in LISTS if (path / folder / file).exists()), None
     )
@@ -127,7 +127,7 @@ def _listed(path: Path, file: str, names: list[str]) -> list[str] | None:
         if len(found) > 1:
             raise SceneError(
                 f"{place}:{entry.line}",
-                expected="a name that fits one image",
+                expected="a name that matches one image",
                 found=repr(entry.name),
                 todo="write the full name",
             )

@@ -9,8 +9,8 @@ uses the first camera for all images and ignores distortion; results that are to
 its own need images undistorted to one camera.
 
 Nothing in these files says that they are WAT, so the names of its ten scenes are the mark. A scene
-of another name in the same layout is `colmap-folders`, whose reading is the same where the folders
-are in natural order.
+of another name in the same layout is `colmap-folders`, which reads the same where the folders are
+in natural order.
 
 Source: Cai and Mueller, CLNeRF, ICCV 2023; layout as in ``IntelLabs/CLNeRF`` at ``d5573a7``.
 """
@@ -103,7 +103,7 @@ def write(
 
     Each period becomes a task: a folder directly in ``images/``, named after the label where the
     alphabetical order of the labels is that of the periods, else after id and label. The loader
-    takes the size and intrinsics of camera 1 for all images, so there must be no other.
+    uses the size and intrinsics of camera 1 for all images, so there must be only one camera.
 
     Raises:
         SceneError: If ``out`` is in use, an image is missing, or cameras differ.
@@ -131,7 +131,7 @@ def _one_camera(scene: Scene, out: Path) -> Camera:
             expected=f"one camera for all images, and of {', '.join(READ_MODELS)}, as the loader "
             "of CLNeRF takes camera 1 for all",
             found=f"{len(cameras) + 1} cameras" if cameras else camera.model,
-            todo="write another format, or bring the images to one camera",
+            todo="choose another format, or undistort the images to one camera",
         )
     return camera
 

@@ -1,7 +1,7 @@
 """What cameras and drones write into their photos: when, where, with which lens; orientation tags.
 
-Nothing of it is trusted: whatever is absent, damaged or absurd is None. Only the header of a file
-is read.
+Nothing is trusted: whatever is absent, damaged or absurd is None. Only the header of a file is
+read.
 
 Sources: Exif 2.32 (CIPA DC-008) for the tags, JFIF and TIFF 6.0 for where they are in a file; the
 names of DJI's XMP attributes are as the makers' photos have them.
@@ -47,7 +47,7 @@ class DroneData:
     """What DJI drones add in XMP."""
 
     relative_altitude: float | None = None
-    """Metres above the place of take-off, by the barometer."""
+    """Metres above the take-off point, by barometer."""
     absolute_altitude: float | None = None
     """Metres."""
     gimbal_yaw: float | None = None
@@ -63,7 +63,7 @@ class DroneData:
 
 @dataclass(frozen=True, slots=True)
 class ExifData:
-    """What a photo says about itself; None for what it does not say."""
+    """Metadata of a photo; None for what is missing."""
 
     date: datetime | None = None
     """When it was taken, by the clock of the camera, without a time zone."""
@@ -83,7 +83,7 @@ class ExifData:
     orientation: int = 1
     """1..8; 1 is upright."""
     width: int | None = None
-    """Pixels, by the tag: the file itself may have been scaled since."""
+    """Pixels, according to the tag; the file may have been resized since."""
     height: int | None = None
     drone: DroneData | None = None
 
@@ -94,10 +94,7 @@ class ExifData:
 
 
 def read_exif(path: Path) -> ExifData:
-    """What the header of a photo says; nothing for a file that is no image.
-
-    Never raises for what is in the file.
-    """
+    """Metadata in the header of a photo; empty for a file that is not an image. Never raises."""
     try:
         with warnings.catch_warnings(), Image.open(path) as image:
             warnings.simplefilter("ignore")
@@ -107,7 +104,7 @@ def read_exif(path: Path) -> ExifData:
 
 
 def exif_of(image: Image.Image) -> ExifData:
-    """What the header of an open image says. Never raises for what is in the file."""
+    """Metadata in the header of an open image. Never raises."""
     try:
         tags = Image.Image.getexif(image)  # the one of PNG files would decode the pixels
         if not tags and "xmp" not in image.info:
@@ -135,7 +132,7 @@ def _parse(
     latitude = _degrees(gps.get(2), gps.get(1), "S", 90.0)
     longitude = _degrees(gps.get(4), gps.get(3), "W", 180.0)
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
-        latitude = longitude = None  # without a fix some write zeros
+        latitude = longitude = None  # without a fix, some cameras write zeros
     altitude, below = _number(gps.get(6)), _integer(gps.get(5)) in (1, 3)
     orientation = _integer(main.get(_ORIENTATION)) or 1
     return ExifData(
@@ -156,7 +153,7 @@ def _parse(
 
 
 def _drone(xmp: Any) -> DroneData | None:
-    """DJI's attributes, by their names: XMP from a file is not given to an XML parser."""
+    """DJI's attributes, found by name: untrusted XMP is not given to an XML parser."""
     if not isinstance(xmp, bytes) or b"drone-dji:" not in xmp[:MAX_XMP_BYTES]:
         return None
     text = xmp[:MAX_XMP_BYTES].decode("utf-8", "replace")
@@ -180,10 +177,10 @@ def _drone(xmp: Any) -> DroneData | None:
 
 
 def _date(value: Any) -> datetime | None:
-    """Date and time as Exif writes them, and as programs do that do not read Exif closely.
+    """Date and time in the form of Exif, or in variants that other programs write.
 
-    Without a time of day, or with an impossible one, midnight. A fraction of a second and a time
-    zone that follow are left out: clocks of cameras are not that good.
+    Midnight where the time of day is missing or impossible. Fractions of a second and time zones
+    are ignored: clocks of cameras are not that accurate.
     """
     found = _DATE.match(_text(value) or "")
     if not found:
@@ -259,9 +256,9 @@ def _text(value: Any) -> str | None:
 
 
 def set_upright(data: bytes) -> bytes | None:
-    """The same JPEG with orientation 1; None if it has no such tag. No pixel is compressed again.
+    """The same JPEG with orientation 1 and no pixel touched; None if there is nothing to change.
 
-    Pillow would write all metadata anew, and lose what it does not know.
+    Pillow would rewrite all metadata and lose what it does not know.
     """
     upright = bytearray(data)
     for at, order in _orientation_values(data):
@@ -270,7 +267,7 @@ def set_upright(data: bytes) -> bytes | None:
 
 
 def _orientation_values(data: bytes) -> Iterator[tuple[int, str]]:
-    """Where the orientation tags of the main directories are, as 16 bits, and their byte order."""
+    """Offset of the 16 bits of each orientation tag in a main directory, and their byte order."""
     for start, tiff in _exif_segments(data):
         order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
         if order is None:
@@ -288,7 +285,7 @@ def _orientation_values(data: bytes) -> Iterator[tuple[int, str]]:
 
 
 def _exif_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Where the TIFF headers in the Exif segments of a JPEG begin, and all that is theirs."""
+    """Offset and content of the TIFF data in each Exif segment of a JPEG."""
     at = 2 if data[:2] == b"\xff\xd8" else len(data)
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != _START_OF_SCAN:
         end = at + 2 + struct.unpack_from(">H", data, at + 2)[0]

@@ -2,8 +2,8 @@
 
 The rule, for every method alike: an image wider than ``max_width`` is scaled to that width, its
 height truncated to whole pixels, with Pillow's bicubic filter, which smooths before it shrinks.
-What counts is the size that the camera of the model has; a file of another size is resized from
-the file to the target in one step. Intrinsics are scaled by the exact ratio of the sizes per axis.
+The size of the model's camera decides; a file of a different size is resized to the target in one
+step. Intrinsics are scaled by the exact ratio of the sizes per axis.
 
 Orientation tags are not applied: COLMAP works on the pixels as stored, and so do the poses.
 """
@@ -201,7 +201,7 @@ def _image_error(path: Path, error: BaseException) -> ImageError:
 class ImageStore:
     """The images of a scene at the evaluation size, decoded when they are first needed.
 
-    Safe to use from several threads. What was used longest ago leaves the cache first.
+    Thread-safe. The least recently used image leaves the cache first.
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class ImageStore:
         return resize_camera(camera, *evaluation_size(camera.width, camera.height, self._max_width))
 
     def load(self, frame: Frame) -> NDArray[np.uint8]:
-        """Image of a frame at the evaluation size. Shared with others: not to be written to.
+        """Image of a frame at the evaluation size. Shared: do not write to it.
 
         Returns:
             RGB. [H, W, 3]
@@ -271,7 +271,7 @@ class ImageStore:
             self.load(frame)
 
     def _keep(self, name: str, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Put an image into the cache; another thread may have been quicker."""
+        """Put an image into the cache; another thread may have been faster."""
         with self._lock:
             if name in self._cache:
                 return self._cache[name]
@@ -296,7 +296,7 @@ def place_images(
 
     Raises:
         SceneError: If an image is missing.
-        ConfigError: If there is no such image source.
+        ConfigError: If the image source is unknown.
     """
     check_choice("image_source", image_source, IMAGE_SOURCES)
     for done, frame in enumerate(scene.frames, start=1):
@@ -311,15 +311,15 @@ def place_image(source: Path, target: Path, image_source: ImageSource) -> None:
     """Copy or link one image.
 
     Raises:
-        SceneError: If it is missing, or its place is taken.
+        SceneError: If it is missing, or its target exists.
     """
     if not source.is_file():
         raise SceneError(source, expected="an image", found="nothing", todo="copy it there")
-    if os.path.lexists(target):  # a/b and a//b; or a and A on a disk that takes them for one
+    if os.path.lexists(target):  # a/b and a//b; or a and A on a disk that ignores case
         raise SceneError(
             target,
-            expected="a file of its own for each image",
-            found="one that another image has",
+            expected="a separate file for each image",
+            found="a file that was written for another image",
             todo="rename the image",
         )
     target.parent.mkdir(parents=True, exist_ok=True)

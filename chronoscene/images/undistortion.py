@@ -24,11 +24,11 @@ from chronoscene.scene.tracks import by_image
 ROWS = 128
 """Rows of a map that are computed at once, to bound the memory."""
 
-LARGEST_SIDE = 65535
-"""Pixels; what a JPEG file can hold. A camera that needs more is a mistake."""
+MAX_JPEG_SIDE = 65535
+"""Pixels; a camera that needs more than a JPEG file can hold is a mistake."""
 
-LARGEST_DISAGREEMENT = 0.01
-"""Pixels between an observation and the projection of its ray."""
+MAX_ROUND_TRIP_ERROR = 0.01
+"""Pixels between an observation and the projection of its ray; beyond, the ray is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ def pinhole_camera(camera: Camera, *, center: bool = False) -> Camera:
     """The PINHOLE camera for the images of a camera.
 
     Raises:
-        SceneError: If there is none: not perspective, or no principal point inside to centre.
+        SceneError: If the camera is not perspective, or its principal point is not in the image.
     """
     if camera.is_pinhole:
         K = camera.K
@@ -87,13 +87,13 @@ def pinhole_camera(camera: Camera, *, center: bool = False) -> Camera:
         raise _camera_error(camera, "a camera that can be undistorted")
     if center:
         camera = _centred(camera)
-    if max(camera.width, camera.height) > LARGEST_SIDE:
-        raise _camera_error(camera, f"at most {LARGEST_SIDE} pixels a side")
+    if max(camera.width, camera.height) > MAX_JPEG_SIDE:
+        raise _camera_error(camera, f"at most {MAX_JPEG_SIDE} pixels a side")
     return camera
 
 
 def _centred(camera: Camera) -> Camera:
-    """The largest image inside of the camera's that has the principal point in its centre."""
+    """The largest image inside the camera's with the principal point in its centre."""
     fx, fy, cx, cy = camera.params
     width = 2 * math.floor(min(cx, camera.width - cx))
     height = 2 * math.floor(min(cy, camera.height - cy))
@@ -113,8 +113,8 @@ def move_observations(scene: Scene, changes: list[CameraChange]) -> tuple[Scene,
     """The scene with its new cameras and observations.
 
     Returns:
-        The scene, the number of observations that are outside of the new images and were dropped,
-        and the number of points that lost all of theirs and were dropped too.
+        The scene, the number of observations dropped because they are outside the new images, and
+        the number of points dropped because they lost all their observations.
     """
     points = scene.points
     xy, inside = np.empty_like(points.track_xy), np.zeros(len(points.track_xy), bool)
@@ -135,7 +135,7 @@ def move_observations(scene: Scene, changes: list[CameraChange]) -> tuple[Scene,
 
 
 def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where pixels of the old image are in the new one; NaN where nowhere. [N, 2] -> [N, 2]"""
+    """Positions in the new image of pixels of the old one; NaN where none. [N, 2] -> [N, 2]"""
     if change.is_copy or not len(xy):
         return xy
     fx, fy, cx, cy = change.target.params
@@ -145,14 +145,14 @@ def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.flo
 def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points at depth 1 that a camera sees at pixels. [N, 2] -> [N, 2]
 
-    COLMAP finds them step by step, and returns something even where there is no such ray: beyond
-    the field of view of the model. So they are projected again, and NaN where that disagrees.
+    COLMAP iterates, and returns a result even beyond the field of view of the model, where there is
+    no such ray. So rays are projected again, and become NaN where the projection disagrees.
     """
     rays = unproject_pixels(camera, xy)
     if camera.is_pinhole:
         return rays
     again = project_points(camera, np.column_stack([rays, np.ones(len(rays))]))
-    wrong = ~(np.abs(again - xy).max(axis=1) < LARGEST_DISAGREEMENT)
+    wrong = ~(np.abs(again - xy).max(axis=1) < MAX_ROUND_TRIP_ERROR)
     rays[wrong] = np.nan
     return rays
 

@@ -97,14 +97,14 @@ def test_what_is_written_says_the_time_step_in_the_name(make_scene_folder, tmp_p
         new = sources[scene.image_path(frame).resolve()]
         assert new.name == f"day_{frame.period}_{frame.name.replace('/', '_')}"
         assert new.period == frame.period
-    assert "this split, as its loader takes every 8th image of all" in " ".join(
+    assert "the split, because its loader takes every 8th image of all" in " ".join(
         cl_splats.losses(scene.with_frames([replace(f, split="train") for f in scene.frames]))
     )
 
 
 def test_names_that_would_become_one_are_refused(make_scene_folder, tmp_path):
     scene = read_scene(make_scene_folder({"a/0.png": 0, "a_0.png": 0, "b/0.png": 1}))
-    with pytest.raises(SceneError, match="image names that differ when / becomes _"):
+    with pytest.raises(SceneError, match="image names that remain distinct when / becomes _"):
         cl_splats.write(scene, tmp_path / "out")
 
 

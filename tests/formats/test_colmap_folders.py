@@ -86,10 +86,10 @@ def test_unknown_grouping_names_those_that_there_are(colmap_folder):
 def test_no_model_and_no_images(colmap_folder):
     folder = colmap_folder(DATED)
     (folder / "images").rename(folder / "photos")
-    with pytest.raises(SceneError, match="no such folder of images"):
+    with pytest.raises(SceneError, match="no folder of images"):
         read_scene(folder, format="colmap-folders")
     (folder / "sparse/0/points3D.bin").unlink()
-    with pytest.raises(SceneError, match="found no such model"):
+    with pytest.raises(SceneError, match="found no model"):
         read_scene(folder, format="colmap-folders")
 
 
@@ -165,7 +165,7 @@ def test_folders_that_differ_in_zeros_have_one_order(colmap_folder):
 def test_images_without_periods_are_refused_with_the_way_out(colmap_folder):
     folder = colmap_folder(["a.png", "b.png"])
     with pytest.raises(
-        SceneError, match=r"sparse/split\.txt, or convert it with --format colmap-f"
+        SceneError, match=r"sparse/split\.txt, or convert the folder with --format colmap-f"
     ):
         read_scene(folder)
 

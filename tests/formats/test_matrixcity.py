@@ -182,7 +182,7 @@ def test_files_that_repeat_images_must_agree(raw_city, shift):
         text = json.dumps({"camera_angle_x": 1.0, "frames": listed})
         (folder / "pose" / block / "transforms_train.json").write_text(text)
     if shift:
-        with pytest.raises(SceneError, match="the same pose in all files"):
+        with pytest.raises(SceneError, match="the same pose in all pose files"):
             read_scene(folder)
     else:
         assert len(read_scene(folder).frames) == 3
@@ -191,4 +191,4 @@ def test_files_that_repeat_images_must_agree(raw_city, shift):
 def test_files_that_are_not_read_are_remarked_upon(raw_city):
     folder = raw_city(["train/block_A", "train_dense/block_A", "test/block_B"])
     (remark,) = matrixcity.remarks(folder)[1:]
-    assert remark.startswith("1 files of poses") and "train_dense/block_A/transforms" in remark
+    assert remark.startswith("1 pose files") and "train_dense/block_A/transforms" in remark

@@ -72,7 +72,7 @@ def test_what_lists_say_beyond_the_scene_is_remarked_upon(pointz):
     for place in ("", "annots"):
         (folder / place / "trash.txt").write_text(f"{NAMES[1]}\n")
     remarks = neusc.remarks(folder)
-    assert "train.txt has 1 names that fit no registered image" in remarks
+    assert "train.txt has 1 names that match no registered image" in remarks
     assert "trash.txt beside annots/ is not read, as there is one in it" in remarks
 
 
@@ -112,5 +112,5 @@ def test_names_without_a_date_are_refused(pointz, name):
 
 
 def test_lists_that_leave_nothing(pointz):
-    with pytest.raises(SceneError, match=r"none that train\.txt and trash\.txt leave"):
+    with pytest.raises(SceneError, match=r"none after train\.txt and trash\.txt"):
         read_scene(pointz(NAMES, train=["17", "18"]))

@@ -120,7 +120,7 @@ def test_what_clnerf_does_otherwise_is_said(make_scene_folder):
     bent = Camera(1, "OPENCV", 64, 48, (50, 52, 30, 25.5, 0.1, 0, 0, 0))
     scene = scene.with_frames([dataclasses.replace(f, camera=bent) for f in scene.frames])
     lost = " ".join(wat.losses(scene))
-    assert "this split, as its loader takes images 0, 8, 16" in lost
+    assert "the split, because its loader takes images 0, 8, 16" in lost
     assert "distortion, which its loader ignores" in lost
     periods = (Period(0, "a"), Period(1, "b"))
     named = dataclasses.replace(scene, periods=periods)
@@ -129,5 +129,5 @@ def test_what_clnerf_does_otherwise_is_said(make_scene_folder):
 
 def test_names_that_would_become_one_are_refused(make_scene_folder, tmp_path):
     scene = read_scene(make_scene_folder({"a/x/0.png": 0, "a/x_0.png": 0, "b/0.png": 1}))
-    with pytest.raises(SceneError, match="image names that differ when / becomes _"):
+    with pytest.raises(SceneError, match="image names that remain distinct when / becomes _"):
         wat.write(scene, tmp_path / "out", image_source="none")

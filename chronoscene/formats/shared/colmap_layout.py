@@ -73,14 +73,14 @@ def read_images(path: Path, images: Path) -> Model:
     """Read and check the model of a scene.
 
     Raises:
-        SceneError: If there is none, it has no image, or a name, pose or camera is of no use.
+        SceneError: If it is missing or empty, or has an unusable name, pose or camera.
     """
     folder = find_model(path)
     if folder is None or not images.is_dir():
         raise SceneError(
             path,
             expected=f"{images.relative_to(path)}/ and a COLMAP model in {' or '.join(MODELS)}",
-            found="no such model" if folder is None else "no such folder of images",
+            found="no model" if folder is None else "no folder of images",
             todo="copy the missing folder there",
         )
     model = read_model(folder)
@@ -152,9 +152,9 @@ def write_renamed(
     if len(set(names.values())) < len(names):
         raise SceneError(
             out,
-            expected="image names that differ when / becomes _",
-            found="equal ones",
-            todo="rename images",
+            expected="image names that remain distinct when / becomes _",
+            found="duplicates",
+            todo="rename the images",
         )
     new = _renamed(scene, names)
     for frame in new.frames:
@@ -175,7 +175,7 @@ def write_renamed(
 def _renamed(scene: Scene, names: Mapping[str, str]) -> Scene:
     """The same scene with other image names: frames sorted again, tracks following them.
 
-    The files keep their names, so `Scene.image_path` of the result is of no use.
+    The files keep their names, so `Scene.image_path` of the result is invalid.
     """
     new = [replace(frame, name=names[frame.name]) for frame in scene.frames]
     order = sorted(range(len(new)), key=lambda i: new[i].name)
@@ -203,12 +203,12 @@ def period_folders(
 
 
 def new_names(scene: Scene, folders: list[str], *, deep: bool) -> dict[str, str]:
-    """Name of each image in the folder of its period; names that are all there stay.
+    """Name of each image in the folder of its period; unchanged if all are there already.
 
     Args:
         scene: Any scene.
         folders: Of its periods.
-        deep: Whether there may be folders in the folder of a period.
+        deep: Whether the folder of a period may have subfolders.
     """
     old = {f.name: folders[f.period] for f in scene.frames}
     fits = all(
@@ -228,7 +228,7 @@ def as_pinhole(camera: Camera) -> Camera:
 
 
 def lost_labels(scene: Scene, labels: list[str]) -> list[str]:
-    """What is lost where a period has no more than a label, and that only of a certain form."""
+    """Losses of a format that has only a label for each period."""
     lost = []
     if labels != [period.label for period in scene.periods]:
         lost.append(f"the labels of the periods as they are (but: {', '.join(labels[:8])})")
@@ -240,20 +240,20 @@ def lost_labels(scene: Scene, labels: list[str]) -> list[str]:
 
 
 def lost_names(names: Mapping[str, str]) -> list[str]:
-    """What to say where names change, with which anything else may refer to the images."""
+    """Losses of a format that changes image names, by which other files may refer to them."""
     if all(new == old for old, new in names.items()):
         return []
-    return ["these image names, which get the mark of their period"]
+    return ["the image names, to which the period is added"]
 
 
 def lost_split(scene: Scene, tests: set[str], rule: str) -> list[str]:
-    """What to say where a loader takes its own test images, whatever the split of the scene.
+    """Losses of a format whose loader chooses the test images itself.
 
     Args:
         scene: Any scene.
-        tests: Names, in the scene, of the images that it takes.
-        rule: Which those are, in words.
+        tests: Names, in the scene, of the images that it chooses.
+        rule: Its rule, in words.
     """
     if {f.name for f in scene.select(split="test")} == tests:
         return []
-    return [f"this split, as its loader takes {rule}"]
+    return [f"the split, because its loader takes {rule}"]

@@ -94,7 +94,7 @@ def read_table(path: Path, images: Sequence[str] = ("file",)) -> list[tuple[str,
         images: Names that the column of the images may have; the other one is ``period``.
 
     Raises:
-        SceneError: If it is no CSV file, has no row, or lacks a column.
+        SceneError: If it is not a CSV file, is empty, or lacks a column.
     """
     text = enumerate(read_text(path).splitlines(), start=1)
     lines = [(number, line) for number, line in text if line.strip()]
@@ -116,14 +116,14 @@ def group_by_table(names: Sequence[str], path: Path) -> Grouped:
     """Periods from a CSV file; labels are sorted naturally, so numbers and dates are in order.
 
     Raises:
-        SceneError: If the file is damaged, an image is missing or ambiguous in it.
+        SceneError: If the file is damaged, or an image is missing or ambiguous in it.
     """
     index = NameIndex(names)
     labels: dict[str, str] = {}
     for place, name, label in read_table(path):
         found = index.find(name)
         if len(found) > 1:
-            raise _table_error(place, "a name that fits one image", repr(name))
+            raise _table_error(place, "a name that matches one image", repr(name))
         if found and label and labels.setdefault(found[0], label) != label:
             raise _table_error(place, f"one period of {name!r}", "two")
     if lost := [name for name in names if name not in labels]:
@@ -136,7 +136,7 @@ def _table_error(place: object, expected: str, found: str) -> SceneError:
 
 
 def rule_error(by: str, rules: Iterable[str]) -> ConfigError:
-    """A value of the option that a format does not know."""
+    """An unknown value of the option."""
     return ConfigError(
         OPTION, expected=f"one of {', '.join(rules)}", found=repr(by), todo="choose one of them"
     )

@@ -20,12 +20,12 @@ def read_json(place: Path, kind: type) -> Any:
     """Read a JSON file that holds a list or an object.
 
     Raises:
-        SceneError: If the file is missing, holds something else, or a text that is no Unicode.
+        SceneError: If the file is missing or damaged, or holds something else.
     """
     text = read_text(place)
     try:
         data = json.loads(text, object_pairs_hook=_distinct)
-        if re.search(r"\\u[dD][89a-fA-F]", text):  # half of a pair of codes, perhaps alone
+        if re.search(r"\\u[dD][89a-fA-F]", text):  # half of a surrogate pair, perhaps alone
             json.dumps(data, ensure_ascii=False).encode()
     except RecursionError as error:
         raise json_error(place, "JSON", "lists or objects nested too deeply") from error
@@ -38,7 +38,7 @@ def read_json(place: Path, kind: type) -> Any:
 
 
 def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object; of two equal keys, one would be lost without a word."""
+    """An object; of two equal keys, one would be lost silently."""
     found = dict(pairs)
     if len(found) < len(pairs):
         ((twice, _),) = Counter(key for key, _ in pairs).most_common(1)
@@ -54,7 +54,7 @@ def json_error(
 
 
 def is_number(value: object) -> bool:
-    """Whether a JSON value is a finite number, and no integer beyond what a float can hold."""
+    """Whether a JSON value is a finite number that a float can hold."""
     return type(value) in (int, float) and -1e300 < value < 1e300  # type: ignore[operator]
 
 
@@ -72,10 +72,10 @@ def parse_periods(place: Path, items: list[Any], count: int) -> tuple[Period, ..
     """Periods from the content of ``periods.json``.
 
     Raises:
-        SceneError: If they are damaged or not those with the ids 0 to ``count - 1``.
+        SceneError: If they are damaged, or their ids are not 0 to ``count - 1``.
     """
     if [item.get("id") if isinstance(item, dict) else None for item in items] != [*range(count)]:
-        raise json_error(place, f"objects with ids 0..{count - 1} in order", "others")
+        raise json_error(place, f"objects with ids 0..{count - 1} in order", "other ids")
     return tuple(_parse_period(place, item) for item in items)
 
 
@@ -83,7 +83,7 @@ def _parse_period(place: Path, item: dict[str, Any]) -> Period:
     _check_keys(place, item, {"id", "label", "date"})
     label, when = item.get("label", str(item["id"])), item.get("date")
     if not isinstance(label, str) or not label.strip():
-        raise json_error(place, "a label that is a text", repr(label))
+        raise json_error(place, "a label that is text", repr(label))
     if when is not None and not (isinstance(when, str) and is_iso_date(when)):
         raise json_error(place, "a date YYYY, YYYY-MM or YYYY-MM-DD, or null", repr(when))
     return Period(item["id"], label, when)

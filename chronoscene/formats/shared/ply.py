@@ -59,10 +59,10 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, np.dtype]:
     """Whether the file is text, number of vertices, their record; stops at the first vertex."""
     start = file.read(MAX_HEADER_BYTES)
     if not re.match(rb"ply\s*\n", start):
-        raise _error(path, 'a PLY file, whose first line is "ply"', "another")
+        raise _error(path, 'a PLY file, whose first line is "ply"', "a different first line")
     found = re.search(rb"\nend_header[ \t\r]*\n", start)
     if found is None:
-        raise _error(path, "a header of PLY", "none that ends")
+        raise _error(path, "a header of PLY", "no end_header")
     file.seek(found.end())
     lines = [line.strip() for line in start[: found.end()].decode("ascii", "replace").split("\n")]
     counts: dict[str, int] = {}
@@ -106,7 +106,7 @@ def _read_vertices(path: Path, file: BinaryIO) -> NDArray[np.void]:
     for i, name in enumerate(names):
         kind = dtype[name]
         if kind.kind in "iu" and not _fits(values[:, i], np.iinfo(kind)):
-            raise _error(path, f"whole numbers of type {kind} as {name}", "others")
+            raise _error(path, f"whole numbers of type {kind} as {name}", "other values")
         with np.errstate(over="ignore"):  # infinite then, and refused where it matters
             vertices[name] = values[:, i]
     return vertices
@@ -126,7 +126,7 @@ def _read_table(path: Path, file: BinaryIO, rows: int, columns: int) -> NDArray[
                 encoding="ascii",
             )
     except ValueError as error:  # UnicodeDecodeError is one
-        raise _error(path, f"{columns} numbers for each vertex", "another line") from error
+        raise _error(path, f"{columns} numbers for each vertex", "a different line") from error
     if values.shape != (rows, columns):
         raise _error(path, f"{rows} vertices", f"{len(values)} lines with numbers")
     return values

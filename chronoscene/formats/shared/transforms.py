@@ -1,8 +1,8 @@
 """Poses and cameras from ``transforms.json`` and its relatives; shared by several formats.
 
 Files of this family hold camera-to-world matrices with OpenGL axes (+x right, +y up, looking along
--z) and intrinsics for all frames or for each. What they say is not trusted: numbers are checked,
-and image paths must stay inside the scene folder.
+-z) and intrinsics for all frames or for each. They are not trusted: numbers are checked, and image
+paths must stay inside the scene folder.
 """
 
 from __future__ import annotations
@@ -77,15 +77,15 @@ def head_has(path: Path, text: str, *, length: int = 65536) -> bool:
 
 
 def file_name(place: object, folder: str, file_path: object) -> str:
-    """Path below the scene folder of a file that another one names.
+    """Path below the scene folder of a file that another file names.
 
     Args:
         place: For the message.
-        folder: Folder of the other file, below the scene folder; "" if it is directly there.
-        file_path: What it says, relative to its folder.
+        folder: Folder of the other file, below the scene folder; "" for the scene folder.
+        file_path: As the other file has it, relative to its folder.
 
     Raises:
-        SceneError: If the path is absolute, leads out of the scene folder, or is no text.
+        SceneError: If the path is absolute, leads out of the scene folder, or is not text.
     """
     if not isinstance(file_path, str) or not file_path.strip() or "\0" in file_path:
         raise json_error(place, "a file_path", repr(file_path))
@@ -99,7 +99,7 @@ def file_name(place: object, folder: str, file_path: object) -> str:
 
 
 def image_name(place: object, root: Path, folder: str, file_path: object) -> str:
-    """Path of an image below the scene folder; an extension that is left out is found out.
+    """Path of an image below the scene folder; a missing extension is found.
 
     Args:
         place: For the message.
@@ -129,7 +129,7 @@ def matrix(place: object, value: object, rows: tuple[int, ...] = (4,)) -> NDArra
         found = " x ".join(map(str, array.shape)) if array.ndim == 2 else "something else"
         raise json_error(place, expected, found)
     if not (np.abs(array) < MAX_COORDINATE).all():
-        raise json_error(place, expected, "NaN, infinity, or more than any place can have")
+        raise json_error(place, expected, "NaN, infinity, or absurdly large numbers")
     full = np.eye(4)
     full[: len(array)] = array
     if full[3].tolist() != [0, 0, 0, 1]:
@@ -138,10 +138,10 @@ def matrix(place: object, value: object, rows: tuple[int, ...] = (4,)) -> NDArra
 
 
 def nearest_rotation(place: object, block: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation nearest to a matrix that is one up to rounding. [3, 3]
+    """The rotation nearest to a matrix that is a rotation up to rounding. [3, 3]
 
     Raises:
-        SceneError: If it is none: scaled, mirrored or skewed.
+        SceneError: If it is scaled, mirrored or skewed.
     """
     u, sizes, vt = np.linalg.svd(block)
     rotation: NDArray[np.float64] = u @ vt
@@ -310,6 +310,6 @@ def _distortion(place: object, data: Mapping[str, Any]) -> dict[str, float]:
     listed = data.get("distortion_params")
     if listed is not None:
         if not isinstance(listed, list) or len(listed) > len(_LIST_ORDER):
-            raise json_error(place, f"distortion_params {', '.join(_LIST_ORDER)}", "others")
+            raise json_error(place, f"distortion_params {', '.join(_LIST_ORDER)}", "something else")
         data = dict(zip(_LIST_ORDER, listed, strict=False))
     return {key: number(place, data, key) or 0.0 for key in _LIST_ORDER}
