@@ -1,1 +1,4 @@
-"""From images to features, matches between them, and tracks held out for testing."""
+"""Features, verified matches and held-out tracks of the photos, in COLMAP databases.
+
+`matching` runs the steps; the others are what the worker process does in them.
+"""

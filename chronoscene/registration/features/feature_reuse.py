@@ -9,7 +9,6 @@ these functions can be killed and called again.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,7 @@ from typing import Any
 
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import write_text_atomic
+from chronoscene.registration.photos.photo import sha256_of
 
 METHOD = 1
 """Version of extraction and matching; raise it when they change in a way no setting shows."""
@@ -33,18 +33,13 @@ def record_of(arguments: Mapping[str, Any]) -> Record:
     folder, groups = Path(arguments["photos"]), arguments["groups"]
     names = sorted(name for group in groups for name in group["names"])
     with ThreadPoolExecutor(arguments["threads"]) as pool:
-        digests = list(pool.map(_digest, (folder / name for name in names)))
+        digests = list(pool.map(sha256_of, (folder / name for name in names)))
     settings = {key: arguments[key] for key in ("max_image_size", "max_features")}
     return {
         "settings": settings | {"method": METHOD, "pycolmap": pycolmap.__version__},
         "groups": groups,
         "photos": dict(zip(names, digests, strict=True)),
     }
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def renew(database: Path, wanted: Record) -> None:

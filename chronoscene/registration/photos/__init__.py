@@ -1,1 +1,1 @@
-"""From folders of photographs to images with names, periods, cameras and GPS positions."""
+"""From folders of photos to `Inputs`: images with names, periods and GPS positions."""

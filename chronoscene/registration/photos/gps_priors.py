@@ -32,7 +32,7 @@ class Positions:
     """NaN where a photo has none. [N, 3]"""
     sigma: NDArray[np.float64]
     """Standard deviation, metres, NaN where there is none. [N, 3]"""
-    believed: NDArray[np.bool_]
+    plausible: NDArray[np.bool_]
     """Neither missing nor a gross error. [N]"""
     remarks: tuple[str, ...]
     """For the log."""
@@ -69,17 +69,17 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
     )
     enu = nothing.copy()
     enu[has] = frame.to_enu(latitude[has], longitude[has], height[has])
-    believed, more = _plausible(captures, enu, has)
+    plausible, more = _plausible(captures, enu, has)
     remarks += more
     sigma = np.stack([_sigma(c, kind) for c in captures])
-    spread = np.ptp(enu[believed], axis=0) if believed.any() else np.zeros(3)
-    if believed.sum() < 3 or spread.max() < CONSTANT_METRES:
+    spread = np.ptp(enu[plausible], axis=0) if plausible.any() else np.zeros(3)
+    if plausible.sum() < 3 or spread.max() < CONSTANT_METRES:
         remarks.append(
             f"all GPS positions lie within {CONSTANT_METRES} m: one fix for all photos, not usable"
         )
         return Positions(None, nothing, nothing, none, tuple(remarks))
     remarks.insert(0, f"{int(has.sum())} of {count} photos have a GPS position; frame {frame.crs}")
-    return Positions(frame, enu, sigma, believed, tuple(remarks))
+    return Positions(frame, enu, sigma, plausible, tuple(remarks))
 
 
 def _heights(

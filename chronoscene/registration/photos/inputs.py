@@ -7,8 +7,6 @@ does not read in colour are written as PNG. All others are links to the original
 
 from __future__ import annotations
 
-import hashlib
-import os
 import re
 import shutil
 from collections.abc import Sequence
@@ -16,17 +14,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.geodesy import Georeference, from_crs
 from chronoscene.images.exif import set_upright
-from chronoscene.images.store import image_size, load_rgb
+from chronoscene.images.store import image_size, load_rgb, place_image
 from chronoscene.io.staging import replacing
 from chronoscene.registration.context import Context
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.gps_priors import Positions, locate
-from chronoscene.registration.photos.photo import Capture
+from chronoscene.registration.photos.photo import Capture, sha256_of
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
 
@@ -71,22 +70,17 @@ class Inputs:
 
     def totals(self) -> list[int]:
         """Photos of each period."""
-        counts = [0] * len(self.labels)
-        for period in self.periods.values():
-            counts[period] += 1
-        return counts
+        periods = np.array(list(self.periods.values()), np.int64)
+        return [int(n) for n in np.bincount(periods, minlength=len(self.labels))]
 
     def priors(self) -> dict[str, Any]:
         """Plausible positions: ``enu`` and ``sigma`` by name."""
         found = self.positions
-        rows = [
-            (capture.name, enu.tolist(), sigma.tolist())
-            for capture, enu, sigma, good in zip(
-                self.images, found.enu, found.sigma, found.believed, strict=True
-            )
-            if good
-        ]
-        return {"enu": {n: e for n, e, _ in rows}, "sigma": {n: s for n, _, s in rows}}
+        good = [(i, c.name) for i, c in enumerate(self.images) if found.plausible[i]]
+        return {
+            "enu": {name: found.enu[i].tolist() for i, name in good},
+            "sigma": {name: found.sigma[i].tolist() for i, name in good},
+        }
 
     def centres(self) -> dict[str, list[float]]:
         """Where images were taken, as far as known, in one frame."""
@@ -190,7 +184,7 @@ def _place(
     for frame in scene.frames if scene else ():
         assert scene is not None
         _check_pinhole(scene, frame)
-        link(scene.image_path(frame), context.photos / frame.name)
+        place_image(scene.image_path(frame), context.photos / frame.name, "symlink")
     return names, [*remarks, *told]
 
 
@@ -219,11 +213,7 @@ def _check_pinhole(scene: Scene, frame: Frame) -> None:
 
 def content_digests(captures: Sequence[Capture]) -> dict[str, str]:
     """SHA-256 of each file by name."""
-    digests = {}
-    for capture in captures:
-        with capture.path.open("rb") as file:
-            digests[capture.name] = hashlib.file_digest(file, "sha256").hexdigest()
-    return digests
+    return {capture.name: sha256_of(capture.path) for capture in captures}
 
 
 def drop_copies(captures: Sequence[Capture], digests: dict[str, str]) -> Prepared:
@@ -268,7 +258,7 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
             _copy_upright(capture.path, target)
             turned += 1
         else:
-            link(capture.path, target)
+            place_image(capture.path, target, "symlink")
         names.append(target.relative_to(folder).as_posix())
     remarks = []
     if turned:
@@ -313,15 +303,6 @@ def _convert(source: Path, target: Path) -> Path:
     with replacing(target) as partial:
         Image.fromarray(load_rgb(source)).save(partial, format="PNG")
     return target
-
-
-def link(source: Path, target: Path) -> None:
-    """Make a symbolic link, replacing what is there."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    partial.unlink(missing_ok=True)
-    partial.symlink_to(source.resolve())
-    partial.replace(target)
 
 
 def _copy_upright(source: Path, target: Path) -> None:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -160,10 +161,7 @@ def scene_extent(model: Registered) -> float:
 def _period(model: Registered, evidence: Evidence, period: int) -> PeriodFigures:
     mine = model.periods == period
     missing = [n for n, p in model.unregistered_periods.items() if p == period]
-    reasons: dict[str, int] = {}
-    for name in missing:
-        reason = model.unregistered.get(name, "unknown")
-        reasons[reason] = reasons.get(reason, 0) + 1
+    reasons = Counter(model.unregistered.get(name, "unknown") for name in missing)
     rays = evidence.observed[period]
     error = np.linalg.norm(project(rays, model.points[rays.track])[0], axis=1)
     error = error[np.isfinite(error)]

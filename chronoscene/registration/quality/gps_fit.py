@@ -44,7 +44,7 @@ def fit_gps(centres: Array, gps: Array) -> GpsFit | str:
 
     Args:
         centres: In the frame of the model, which is east, north, up in metres. [N, 3]
-        gps: NaN where there is none, whether it was believed or not. [N, 3]
+        gps: NaN where there is none, whether it is plausible or not. [N, 3]
     """
     has = np.isfinite(gps).all(axis=1)
     if has.sum() < MIN_POSITIONS:

@@ -59,20 +59,20 @@ class GpsAlignment:
 
 
 def align_to_gps(
-    poses: NDArray[np.float64], enu: NDArray[np.float64], believed: NDArray[np.bool_]
+    poses: NDArray[np.float64], enu: NDArray[np.float64], usable: NDArray[np.bool_]
 ) -> GpsAlignment | None:
     """Robust similarity from camera centres to GPS positions.
 
     Args:
         poses: ``cam_from_world`` of the model. [N, 4, 4]
         enu: Metres; NaN where unknown. [N, 3]
-        believed: Positions to use. [N]
+        usable: Positions to use. [N]
 
     Returns:
         None with fewer than three positions.
     """
     centres = camera_centre(poses)
-    use = np.flatnonzero(believed & np.isfinite(enu).all(axis=1))
+    use = np.flatnonzero(usable & np.isfinite(enu).all(axis=1))
     if len(use) < 3:
         return None
     similarity = _first_guess(poses[use], enu[use])

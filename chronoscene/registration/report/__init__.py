@@ -1,1 +1,1 @@
-"""The page that shows a certificate to people."""
+"""``registration.html``: a certificate and its registration in, one page out."""

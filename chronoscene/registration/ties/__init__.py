@@ -1,1 +1,1 @@
-"""Tie points that a person clicked: read, compared with a model, used to align it."""
+"""Tie points and ground control: read, compared with a registration, used to align it."""

@@ -1,4 +1,4 @@
-"""GPS to metres, and which positions are believed."""
+"""GPS to metres, and which positions are plausible."""
 
 from pathlib import Path
 
@@ -46,7 +46,7 @@ GRID = np.array([[20.0 * i, 15.0 * j] for i in range(5) for j in range(4)])
 def test_a_grid_keeps_its_shape() -> None:
     found = locate(captures(GRID))
     assert found.georeference is not None
-    assert found.believed.all()
+    assert found.plausible.all()
     shape = found.enu[:, :2] - found.enu[0, :2]
     np.testing.assert_allclose(shape, GRID - GRID[0], rtol=0.005, atol=0.01)
 
@@ -56,11 +56,11 @@ def test_the_date_line_tears_nothing() -> None:
     assert np.ptp(found.enu[:, 0]) == pytest.approx(80.0, rel=0.01)
 
 
-def test_wildly_wrong_positions_are_named_and_not_believed() -> None:
+def test_wildly_wrong_positions_are_named_and_not_used() -> None:
     offsets = GRID.copy()
     offsets[3] = [250_000.0, 0.0]
     found = locate(captures(offsets))
-    assert found.believed.tolist() == [i != 3 for i in range(20)]
+    assert found.plausible.tolist() == [i != 3 for i in range(20)]
     assert any(r.startswith("3.jpg: GPS is 2") for r in found.remarks)
 
 
@@ -69,8 +69,8 @@ def test_missing_positions_stay_missing() -> None:
     offsets[5] = np.nan
     found = locate(captures(offsets))
     assert np.isnan(found.enu[5]).all()
-    assert not found.believed[5]
-    assert found.believed.sum() == 19
+    assert not found.plausible[5]
+    assert found.plausible.sum() == 19
 
 
 def test_one_fix_for_all_photos_is_no_frame() -> None:
