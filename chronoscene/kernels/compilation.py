@@ -22,6 +22,7 @@ and nan are kept, since comparisons with them decide what is culled."""
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 _FOLDER = Path(__file__).parent
+_UNREADABLE = (AttributeError, EOFError, ImportError, pickle.PickleError, TypeError, ValueError)
 
 
 def inner(
@@ -98,14 +99,7 @@ def _forgiving(load: Callable[[], dict[Any, Any]]) -> Callable[[], dict[Any, Any
     def load_or_nothing() -> dict[Any, Any]:
         try:
             return load()
-        except (
-            AttributeError,
-            EOFError,
-            ImportError,
-            pickle.UnpicklingError,
-            TypeError,
-            ValueError,
-        ):
+        except _UNREADABLE:
             return {}
 
     return load_or_nothing

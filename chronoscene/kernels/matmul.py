@@ -91,39 +91,32 @@ def _make_tile(vectors: int, relu: bool) -> Any:
     return intrinsic(tile)
 
 
-_TILE_1 = _make_tile(1, relu=False)
-_TILE_2 = _make_tile(2, relu=False)
-_TILE_1_RELU = _make_tile(1, relu=True)
-_TILE_2_RELU = _make_tile(2, relu=True)
+def _make_product(relu: bool) -> Any:
+    one, two = _make_tile(1, relu), _make_tile(2, relu)
+
+    @inner
+    def product(left, right, first, out, rows, columns, depth):  # type: ignore[no-untyped-def]
+        for column in range(0, columns - LANES, 2 * LANES):
+            for row in range(0, rows, ROW_TILE):
+                two(left, right, first, out, row, column, depth)
+        if columns % (2 * LANES):
+            for row in range(0, rows, ROW_TILE):
+                one(left, right, first, out, row, columns - LANES, depth)
+
+    return product
 
 
-@inner
-def product(left, right, first, out, rows, columns, depth):  # type: ignore[no-untyped-def]
-    """out = first + left @ right.
+product = _make_product(relu=False)
+"""out = first + left @ right.
 
-    Args:
-        left: [rows, depth], with a step.
-        right: [depth, columns]
-        first: [rows, columns]; may be ``out``, or one row if its row distance is 0.
-        out: [rows, columns]
-        rows: Multiple of ROW_TILE.
-        columns: Multiple of LANES.
-        depth: Any.
-    """
-    for column in range(0, columns - LANES, 2 * LANES):
-        for row in range(0, rows, ROW_TILE):
-            _TILE_2(left, right, first, out, row, column, depth)
-    if columns % (2 * LANES):
-        for row in range(0, rows, ROW_TILE):
-            _TILE_1(left, right, first, out, row, columns - LANES, depth)
-
-
-@inner
-def relu_product(left, right, first, out, rows, columns, depth):  # type: ignore[no-untyped-def]
-    """out = max(0, first + left @ right); see `product`."""
-    for column in range(0, columns - LANES, 2 * LANES):
-        for row in range(0, rows, ROW_TILE):
-            _TILE_2_RELU(left, right, first, out, row, column, depth)
-    if columns % (2 * LANES):
-        for row in range(0, rows, ROW_TILE):
-            _TILE_1_RELU(left, right, first, out, row, columns - LANES, depth)
+Args:
+    left: [rows, depth], with a step.
+    right: [depth, columns]
+    first: [rows, columns]; may be ``out``, or one row if its row distance is 0.
+    out: [rows, columns]
+    rows: Multiple of ROW_TILE.
+    columns: Multiple of LANES.
+    depth: Any.
+"""
+relu_product = _make_product(relu=True)
+"""out = max(0, first + left @ right); nan stays nan."""

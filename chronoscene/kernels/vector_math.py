@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from numba import types
@@ -68,25 +69,24 @@ def quad_sum(typingctx: Any, value: Any) -> Any:
     return value(value), codegen
 
 
-@intrinsic
-def quad_heads(typingctx: Any, value: Any) -> Any:
-    """The first of each four lanes, moved to the front."""
+def _make_permutation(source: Callable[[int, int], int]) -> Callable:
+    """Function that moves lanes: ``source`` says where a lane, of so many, comes from."""
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        order = [4 * i % value.lanes for i in range(value.lanes)]
-        return emit_shuffle(builder, args[0], args[0], order)
+    @intrinsic
+    def permute(typingctx: Any, value: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            order = [source(i, value.lanes) for i in range(value.lanes)]
+            return emit_shuffle(builder, args[0], args[0], order)
 
-    return value(value), codegen
+        return value(value), codegen
+
+    return permute
 
 
-@intrinsic
-def quad_spread(typingctx: Any, value: Any) -> Any:
-    """The first lanes, each four times: the reverse of `quad_heads`."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return emit_shuffle(builder, args[0], args[0], [i // 4 for i in range(value.lanes)])
-
-    return value(value), codegen
+quad_heads = _make_permutation(lambda i, lanes: 4 * i % lanes)
+"""The first of each four lanes, moved to the front."""
+quad_spread = _make_permutation(lambda i, lanes: i // 4)
+"""The first lanes, each four times: the reverse of `quad_heads`."""
 
 
 @inner

@@ -136,58 +136,43 @@ def _promote(context: Any, builder: Any, kinds: Any, args: Any) -> tuple[Vector,
 
 # Operators.
 
-Emit = Callable[[Any, str, Any, Any], Any]
-"""Writes an operation on two vectors of one kind: (builder, kind, a, b)."""
+_COMPARISONS = {"lt": "<", "le": "<=", "gt": ">", "ge": ">="}
+_ARITHMETIC = {"add": "add", "sub": "sub", "mul": "mul", "truediv": "div"}
+_BITWISE = {"and_": "and_", "or_": "or_", "lshift": "shl", "rshift": "ashr"}
 
 
-def _define_operator(op: Callable, emit: Emit, mask: bool) -> None:
-    """Let ``op`` take two vectors, or a vector and a number."""
+def _emit_operator(builder: Any, kind: str, name: str, a: Any, b: Any) -> Any:
+    """Comparisons are false where either is nan."""
+    if name in _COMPARISONS:
+        compare = builder.fcmp_ordered if kind == "f32" else builder.icmp_signed
+        return compare(_COMPARISONS[name], a, b)
+    if name in _ARITHMETIC and kind == "f32":
+        return getattr(builder, "f" + _ARITHMETIC[name])(a, b, flags=FAST_MATH)
+    return getattr(builder, (_ARITHMETIC | _BITWISE)[name])(a, b)
 
-    @type_callable(op)
+
+def _define_operator(name: str) -> None:
+    """Let an operator take two vectors, or a vector and a number."""
+    function = getattr(operator, name)
+
+    @type_callable(function)
     def _type(context: Any) -> Callable:
         def typer(a: Any, b: Any) -> Any:
             like = _like(a, b)
-            return like.with_kind("i1") if like and mask else like
+            return like.with_kind("i1") if like and name in _COMPARISONS else like
 
         return typer
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         like, (a, b) = _promote(context, builder, sig.args, args)
-        return emit(builder, like.kind, a, b)
+        return _emit_operator(builder, like.kind, name, a, b)
 
     for pair in ((Vector, Vector), (Vector, types.Number), (types.Number, Vector)):
-        lower_builtin(op, *pair)(lower)
+        lower_builtin(function, *pair)(lower)
 
 
-def _arithmetic(name: str) -> Emit:
-    def emit(builder: Any, kind: str, a: Any, b: Any) -> Any:
-        if kind == "f32":
-            return getattr(builder, "f" + name)(a, b, flags=FAST_MATH)
-        return getattr(builder, name)(a, b)
-
-    return emit
-
-
-def _bitwise(name: str) -> Emit:
-    return lambda builder, kind, a, b: getattr(builder, name)(a, b)
-
-
-def _comparison(symbol: str) -> Emit:
-    """False where either is nan."""
-
-    def emit(builder: Any, kind: str, a: Any, b: Any) -> Any:
-        compare = builder.fcmp_ordered if kind == "f32" else builder.icmp_signed
-        return compare(symbol, a, b)
-
-    return emit
-
-
-for _op, _name in (("add", "add"), ("sub", "sub"), ("mul", "mul"), ("truediv", "div")):
-    _define_operator(getattr(operator, _op), _arithmetic(_name), mask=False)
-for _op, _name in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">=")):
-    _define_operator(getattr(operator, _op), _comparison(_name), mask=True)
-for _op, _name in (("and_", "and_"), ("or_", "or_"), ("lshift", "shl"), ("rshift", "ashr")):
-    _define_operator(getattr(operator, _op), _bitwise(_name), mask=False)
+for _name in (*_COMPARISONS, *_ARITHMETIC, *_BITWISE):
+    _define_operator(_name)
 
 
 # Functions for kernels.
@@ -286,22 +271,22 @@ def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
     return _like(a, b)(mask, a, b), codegen
 
 
-def _make_extremum(symbol: str) -> Callable:
+def _make_extremum(comparison: str) -> Callable:
     @intrinsic
     def extremum(typingctx: Any, a: Any, b: Any) -> Any:
         """The smaller (larger) of two per lane; the second if one is nan."""
 
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
             like, (x, y) = _promote(context, builder, sig.args, args)
-            return builder.select(_comparison(symbol)(builder, like.kind, x, y), x, y)
+            return builder.select(_emit_operator(builder, like.kind, comparison, x, y), x, y)
 
         return _like(a, b)(a, b), codegen
 
     return extremum
 
 
-minimum = _make_extremum("<")
-maximum = _make_extremum(">")
+minimum = _make_extremum("lt")
+maximum = _make_extremum("gt")
 
 
 @intrinsic

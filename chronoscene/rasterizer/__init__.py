@@ -113,22 +113,9 @@ def rasterize(
     check_choice("backend", backend, ["auto", *BACKENDS], error=BackendError)
     if backend == "auto":
         backend = "cuda" if means.is_cuda else "cpu"
-    inputs = Inputs(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmats,
-        Ks,
-        width,
-        height,
-        near_plane,
-        far_plane,
-        eps2d,
-        backgrounds,
-        render_depth,
-    )
+    gaussians = (means, quats, scales, opacities, colors)
+    options = (near_plane, far_plane, eps2d, backgrounds, render_depth)
+    inputs = Inputs(*gaussians, viewmats, Ks, width, height, *options)
     check_inputs(inputs, check_finite)
     result: Rasterization = import_module(BACKENDS[backend]).rasterize(inputs)
     return result

@@ -193,7 +193,8 @@ def test_blocks_are_those_that_the_ellipse_touches(tools: SimpleNamespace) -> No
     size: Any = SimpleNamespace(width=100, height=70, near_plane=0.01, far_plane=1e10, eps2d=0.3)
     view = layout.make_view(scene.viewmats[0], scene.Ks[0], size)
     visible = (np.empty(800, np.float32), np.empty(800, np.float32), np.empty(400, np.float32))
-    binned = passes.bin_gaussians(passes.Workspace(), gaussians, view, visible)
+    binned = passes.Rendering(view)
+    binned.bin_gaussians(gaussians, visible)
     listed = np.zeros((400, 3 * 32, 4 * 32), bool)
     for tile in range(view.tiles):
         y, x = 32 * (tile // view.tiles_x), 32 * (tile % view.tiles_x)

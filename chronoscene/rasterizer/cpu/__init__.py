@@ -18,8 +18,8 @@ from torch.nn.functional import pad
 from chronoscene.errors import BackendError
 from chronoscene.rasterizer import RasterInfo, Rasterization
 from chronoscene.rasterizer.constants import VALUE_MAX
-from chronoscene.rasterizer.cpu import passes
 from chronoscene.rasterizer.cpu.layout import LANES, Array, View, make_view
+from chronoscene.rasterizer.cpu.passes import Gaussians, Rendering
 from chronoscene.rasterizer.cpu.project import set_colors
 from chronoscene.rasterizer.inputs import Inputs, recentred
 
@@ -44,7 +44,11 @@ def rasterize(inputs: Inputs) -> Rasterization:
     gaussians = _prepare(means, quats, scales, opacities, colors)
     count, padded, cameras = means.shape[0], gaussians[0].shape[0], viewmats.shape[0]
     wants_grad = torch.is_grad_enabled() and any(x.requires_grad for x in gaussians)
-    info = _Visible.empty(cameras, padded)
+    info = RasterInfo(
+        torch.empty(cameras, padded, 2),
+        torch.empty(cameras, padded, 2, dtype=torch.int32),
+        torch.empty(cameras, padded),
+    )
     leaf = info.means2d[:, :count].detach().requires_grad_(wants_grad)
     images, alphas, depths = [], [], []
     poses, intrinsics = (x.detach().double().numpy() for x in (viewmats, inputs.Ks))
@@ -55,7 +59,7 @@ def rasterize(inputs: Inputs) -> Rasterization:
             *gaussians,
             _slot(leaf, c, padded) if wants_grad else None,
             background,
-            Request(view, info.of(c), render_depth),
+            Request(view, _flat(info, c), render_depth),
         )
         images.append(image)
         alphas.append(alpha)
@@ -107,30 +111,14 @@ def _prepare(
     return tuple(x.float().contiguous() for x in (means, quats, scales, opacities, colors))
 
 
-@dataclass(frozen=True, slots=True)
-class _Visible:
-    """What the projection tells the caller. radii holds int32."""
-
-    means2d: Tensor
-    radii: Tensor
-    depths: Tensor
-
-    @classmethod
-    def empty(cls, cameras: int, count: int) -> _Visible:
-        return cls(
-            torch.empty(cameras, count, 2),
-            torch.empty(cameras, count, 2, dtype=torch.int32),
-            torch.empty(cameras, count),
-        )
-
-    def of(self, c: int) -> tuple[Array, Array, Array]:
-        """Flat arrays of one camera for the kernel, which writes integers as float bits."""
-        means2d, radii, depths = (
-            self.means2d[c],
-            self.radii[c].view(torch.float32),
-            self.depths[c],
-        )
-        return means2d.numpy().reshape(-1), radii.numpy().reshape(-1), depths.numpy()
+def _flat(info: RasterInfo, c: int) -> tuple[Array, Array, Array]:
+    """Flat arrays of one camera for the kernel, which writes integers as float bits."""
+    radii = info.radii[c].view(torch.float32)
+    return (
+        info.means2d[c].numpy().reshape(-1),
+        radii.numpy().reshape(-1),
+        info.depths[c].numpy(),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,17 +128,6 @@ class Request:
     view: View
     visible: tuple[Array, Array, Array]
     render_depth: bool
-
-
-class _Lease:
-    """A workspace in use; goes back when it is dropped."""
-
-    def __init__(self) -> None:
-        self.workspace = passes.acquire_workspace()
-        self.binned: passes.Binned | None = None
-
-    def __del__(self) -> None:
-        passes.release_workspace(self.workspace)
 
 
 class Render(torch.autograd.Function):
@@ -168,15 +145,14 @@ class Render(torch.autograd.Function):
         background: Tensor | None,
         request: Request,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        lease = _Lease()
         inputs = (means, quats, scales, opacities, colors)
         job = _Job(inputs, background, request)
-        image, alphas, weighted = job.forward(lease)
+        rendering, image, alphas, weighted = job.forward()
         ctx.set_materialize_grads(False)
         ctx.request = request
         ctx.slot = (-1, 2) if means2d is None else means2d.shape
         ctx.save_for_backward(*inputs, background, alphas)
-        ctx.lease = lease if any(ctx.needs_input_grad) else None
+        ctx.rendering = rendering if any(ctx.needs_input_grad) else None
         return image, alphas, weighted
 
     @staticmethod
@@ -184,19 +160,16 @@ class Render(torch.autograd.Function):
     def backward(ctx: Any, *output_grads: Tensor | None) -> tuple[Tensor | None, ...]:
         *inputs, background, alphas = ctx.saved_tensors
         job = _Job(tuple(inputs), background, ctx.request)
-        lease, ctx.lease = ctx.lease, None
-        if lease is None:  # a second backward pass through the same graph
-            lease = _Lease()
-            job.forward(lease)
+        rendering, ctx.rendering = ctx.rendering, None
+        if rendering is None:  # a second backward pass through the same graph
+            rendering, *_ = job.forward()
         image_grad, alpha_grad, weighted_grad = output_grads
         if image_grad is None:
             image_grad = torch.zeros(*alphas.shape[:2], inputs[-1].shape[1])
-        grads = job.backward(lease, image_grad, alpha_grad, weighted_grad)
+        grads = job.backward(rendering, image_grad, alpha_grad, weighted_grad)
         background_grad = None
         if background is not None and ctx.needs_input_grad[6]:
-            assert lease.binned is not None
-            light = passes.transmittance(lease.binned, job.view)
-            background_grad = _background_gradient(image_grad, light)
+            background_grad = _background_gradient(image_grad, rendering.transmittance())
         *gaussian_grads, means2d_grad = grads
         return (*gaussian_grads, means2d_grad.reshape(ctx.slot), background_grad, None)
 
@@ -223,42 +196,31 @@ class _Job:
         if background is not None:
             self.background[: self.channels] = background.detach().numpy()
 
-    def forward(self, lease: _Lease) -> tuple[Tensor, Tensor, Tensor | None]:
+    def forward(self) -> tuple[Rendering, Tensor, Tensor, Tensor | None]:
         height, width = self.view.height, self.view.width
-        lease.binned = passes.bin_gaussians(
-            lease.workspace, self._scene(), self.view, self.request.visible
-        )
+        rendering = Rendering(self.view)
+        rendering.bin_gaussians(self._gaussians(), self.request.visible)
         images = torch.empty(self.groups, height, width, 3)
         alphas = torch.empty(height, width, 1)
         for group in range(self.groups):
-            self._load_colors(lease, group)
-            passes.render(
-                lease.workspace,
-                lease.binned,
-                self.view,
-                self.background[3 * group : 3 * group + 3],
-                images[group].numpy().reshape(-1),
-                alphas.numpy().reshape(-1),
-            )
+            self._load_colors(rendering, group)
+            image = images[group].numpy().reshape(-1)
+            rendering.composite(self._background(group), image, alphas.numpy().reshape(-1))
         if self.direct:
-            return images[0], alphas, None
+            return rendering, images[0], alphas, None
         values = torch.cat(list(images), dim=-1)
         weighted = values[..., self.channels : self.total].clone()
-        return (
-            values[..., : self.channels].contiguous(),
-            alphas,
-            weighted if self.request.render_depth else None,
-        )
+        image_values = values[..., : self.channels].contiguous()
+        return rendering, image_values, alphas, weighted if self.request.render_depth else None
 
     def backward(
         self,
-        lease: _Lease,
+        rendering: Rendering,
         image_grad: Tensor,
         alpha_grad: Tensor | None,
         weighted_grad: Tensor | None,
     ) -> tuple[Tensor, ...]:
         """Gradients of means, quats, scales, opacities, colors and means2d."""
-        assert lease.binned is not None
         outputs = tuple(
             torch.empty(self.count, k) if k > 1 else torch.empty(self.count)
             for k in (3, 4, 3, 1, 3, 2)
@@ -266,71 +228,61 @@ class _Job:
         grads = tuple(x.numpy().reshape(-1) for x in outputs)
         depth_grads = np.empty(0, np.float32)
         if self.direct:
-            summed: Any = self._sum_pixels(lease, 0, image_grad, alpha_grad)
+            summed: Any = self._sum_pixels(rendering, 0, image_grad, alpha_grad)
         else:
             if weighted_grad is not None:
                 image_grad = torch.cat([image_grad, weighted_grad], dim=-1)
             image_grad = pad(image_grad, (0, 3 * self.groups - image_grad.shape[-1]))
-            summed, values = self._sum_groups(lease, image_grad, alpha_grad)
+            summed, values = self._sum_groups(rendering, image_grad, alpha_grad)
             if self.request.render_depth:
                 depth_grads = values[:, self.channels].copy()
-        passes.gaussian_gradients(
-            lease.binned, self._scene(), self.view, summed, depth_grads, grads
-        )
+        rendering.gaussian_gradients(self._gaussians(), summed, depth_grads, grads)
         means, quats, scales, opacities, colors, means2d = outputs
         if not self.direct:
             colors = torch.from_numpy(values[:, : self.channels].copy())
         return means, quats, scales, opacities, colors, means2d
 
     def _sum_groups(
-        self, lease: _Lease, image_grad: Tensor, alpha_grad: Tensor | None
+        self, rendering: Rendering, image_grad: Tensor, alpha_grad: Tensor | None
     ) -> tuple[Array, Array]:
         """16 sums of each Gaussian over all groups, and the gradients of all channels."""
-        assert lease.binned is not None
         sums = np.zeros((self.count, 16), np.float32)
         values = np.zeros((self.count, 3 * self.groups), np.float32)
         for group in range(self.groups):
-            self._load_colors(lease, group)
+            self._load_colors(rendering, group)
             part = image_grad[..., 3 * group : 3 * group + 3]
-            summed = self._sum_pixels(lease, group, part, alpha_grad)
-            passes.sum_rows(lease.binned, *summed, sums.reshape(-1))
+            rendering.sum_rows(
+                *self._sum_pixels(rendering, group, part, alpha_grad), sums.reshape(-1)
+            )
             values[:, 3 * group : 3 * group + 3] = sums[:, 6:9]
             sums[:, 6:9] = 0
             alpha_grad = None  # counted once
         return sums.reshape(-1), values
 
     def _sum_pixels(
-        self, lease: _Lease, group: int, image_grad: Tensor, alpha_grad: Tensor | None
+        self, rendering: Rendering, group: int, image_grad: Tensor, alpha_grad: Tensor | None
     ) -> tuple[Array, Array]:
-        assert lease.binned is not None
-        nothing = np.empty(0, np.float32)
-        return passes.render_backward(
-            lease.workspace,
-            lease.binned,
-            self.view,
-            self.background[3 * group : 3 * group + 3],
-            image_grad.contiguous().numpy().reshape(-1),
-            nothing if alpha_grad is None else alpha_grad.contiguous().numpy().reshape(-1),
-        )
+        alpha = torch.empty(0) if alpha_grad is None else alpha_grad
+        grads = (x.contiguous().numpy().reshape(-1) for x in (image_grad, alpha))
+        return rendering.composite_backward(self._background(group), *grads)
 
-    def _scene(self) -> passes.Gaussians:
+    def _background(self, group: int) -> Array:
+        return self.background[3 * group : 3 * group + 3]
+
+    def _gaussians(self) -> Gaussians:
         """Flat arrays; colours that do not go straight into the records are left out."""
         seen = self.colors if self.direct else torch.zeros(self.count, 3)
         tensors = (self.means, self.quats, self.scales, self.opacities, seen)
         means, quats, scales, opacities, colors = (x.detach().numpy().reshape(-1) for x in tensors)
         return means, quats, scales, opacities, colors
 
-    def _load_colors(self, lease: _Lease, group: int) -> None:
+    def _load_colors(self, rendering: Rendering, group: int) -> None:
+        """Put the channels of a group into the records, unless they are there."""
         if self.direct:
             return
-        assert lease.binned is not None
         values = self.colors.detach()
         if self.request.render_depth:
             depths = torch.from_numpy(self.request.visible[2])
             values = torch.cat([values, depths[:, None]], dim=1)
-        set_colors(
-            values.contiguous().numpy().reshape(-1),
-            self.total,
-            3 * group,
-            lease.binned.records,
-        )
+        flat = values.contiguous().numpy().reshape(-1)
+        set_colors(flat, self.total, 3 * group, rendering.records)

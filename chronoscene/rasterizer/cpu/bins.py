@@ -50,11 +50,8 @@ def _columns(mx: Any, my: Any, tile_y: int, record: Any, at: int, width: int) ->
     """
     top = _block_rows() + np.float32(32 * tile_y - my)
     bottom = top + 3.0
-    shear, half, rightmost = (
-        record[at + layout.SHEAR],
-        record[at + layout.HALF_WIDTH],
-        record[at + layout.RIGHTMOST],
-    )
+    shear, half = record[at + layout.SHEAR], record[at + layout.HALF_WIDTH]
+    rightmost = record[at + layout.RIGHTMOST]
     inverse_y, reach = record[at + layout.INVERSE_Y], record[at + layout.LEVEL] - _LEVEL_MIN
     yr = minimum(maximum(top, rightmost), bottom)
     yl = minimum(maximum(top, -rightmost), bottom)
@@ -180,17 +177,9 @@ def _list_phase(control, phase, starts, ends, order, count, view, scene, counts,
     parts = ends.size
     part = draw(control, phase)
     while part < parts:
-        ends[part] = _list_part(
-            count * part // parts,
-            count * (part + 1) // parts,
-            starts[part],
-            starts[part + 1],
-            order,
-            view,
-            scene,
-            counts[part],
-            listed,
-        )
+        first, last = count * part // parts, count * (part + 1) // parts
+        at, limit = starts[part], starts[part + 1]
+        ends[part] = _list_part(first, last, at, limit, order, view, scene, counts[part], listed)
         finish(control, phase)
         part = draw(control, phase)
     wait_for(control, phase, parts)

@@ -7,7 +7,7 @@ cost more than rendering. Nothing may rely on what an earlier call left in it.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -58,28 +58,18 @@ def _aligned(size: int, dtype: type) -> Array:
     return raw[start : start + count].view(dtype)
 
 
-def acquire_workspace() -> Workspace:
-    """A workspace that nobody uses."""
-    with _lock:
-        return _free.pop() if _free else Workspace()
-
-
-def release_workspace(workspace: Workspace) -> None:
-    """Give a workspace back for the next caller."""
-    with _lock:
-        if len(_free) < _MAX_FREE_WORKSPACES:
-            _free.append(workspace)
-
-
 def clear_workspaces() -> None:
     """Give the memory of unused workspaces back to the system."""
     with _lock:
         _free.clear()
 
 
-@dataclass(slots=True)
-class Binned:
-    """What the forward pass leaves for the backward pass, in a workspace."""
+class Rendering:
+    """One image on its way through the kernels, forward and backward.
+
+    What the forward pass leaves for the backward pass is in a workspace, which goes back to the
+    free ones when this is dropped.
+    """
 
     keys: Array
     records: Array
@@ -94,180 +84,149 @@ class Binned:
     planes: tuple[Array, Array]
     """Transmittance, and the end of the entries that count, of each pixel, by tile."""
 
+    def __init__(self, view: View) -> None:
+        self.view = view
+        with _lock:
+            self.workspace = _free.pop() if _free else Workspace()
 
-def _parts(count: int) -> int:
-    """Into how many parts a list is cut: several for each worker, so that one who comes late or
-    has the hard ones holds up nobody, but not so many that their counts outweigh the list."""
-    return max(1, min(4 * num_workers(), 64, count // 2048))
+    def __del__(self) -> None:
+        with _lock:
+            if len(_free) < _MAX_FREE_WORKSPACES:
+                _free.append(self.workspace)
 
-
-def bin_gaussians(
-    workspace: Workspace, gaussians: Gaussians, view: View, visible: tuple[Array, Array, Array]
-) -> Binned:
-    """Project, sort and list by tile; ``visible`` receives means2d, radii (as bits), depths."""
-    n, w = gaussians[3].size, workspace.array
-    chunks, parts = max(1, n // layout.CHUNK), _parts(n)
-    records, keys = w("records", n * layout.RECORD, np.float32), w("keys", n, np.int32)
-    numbering = (w("row_starts", n, np.int32), w("row_bases", chunks + 1, np.int64))
-    sorting = (
-        w("digits", parts << DIGIT_BITS, np.int64).reshape(parts, -1),
-        w("pairs", n, np.int64),
-        w("spare", n, np.int64),
-        np.zeros(4, np.int64),
-    )
-    ends, tile_starts = np.empty(parts, np.int64), w("tile_starts", view.tiles + 1, np.int64)
-    tile_order = w("tile_order", view.tiles, np.int32)
-    while True:
-        starts = np.arange(parts + 1) * int(workspace.pairs_per_gaussian * (n // parts + 1))
-        listed, entries = _lists(workspace, int(starts[-1]))
-        counts = w("tile_counts", parts * view.tiles, np.int64).reshape(parts, -1)
-        launch(
-            bins.bin_gaussians,
-            max(chunks, parts),
-            gaussians,
-            view.camera,
-            (view.width, view.height, view.tiles_x),
-            (records, records.view(np.int32)),
-            keys,
-            numbering,
-            visible,
-            sorting,
-            (starts, ends),
-            (counts, tile_starts, tile_order, listed, entries),
-            phases=bins.BIN_PHASES,
+    def bin_gaussians(self, gaussians: Gaussians, visible: tuple[Array, Array, Array]) -> None:
+        """Project, sort and list by tile; ``visible`` receives means2d, radii (as bits), depths."""
+        n, view, w = gaussians[3].size, self.view, self.workspace.array
+        # Several parts for each worker, so that one who comes late or has the hard ones holds up
+        # nobody, but not so many that their counts outweigh the list.
+        parts = max(1, min(4 * num_workers(), 64, n // 2048))
+        chunks = max(1, n // layout.CHUNK)
+        self.records, self.keys = (
+            w("records", n * layout.RECORD, np.float32),
+            w("keys", n, np.int32),
         )
-        if sorting[3][3] == 0:
-            break
-        # A part has at most all rows; this is asked for once, then remembered.
-        needed = numbering[1][-1] / (n // parts + 1)
-        workspace.pairs_per_gaussian = min(needed, 4 * workspace.pairs_per_gaussian)
-        sorting[3][3] = 0
-    pixels = view.tiles * layout.TILE_PIXELS
-    planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
-    tiles = (tile_starts, w("tile_stops", view.tiles, np.int64), tile_order)
-    return Binned(keys, records, numbering, tiles, entries, planes)
+        self.numbering = (w("row_starts", n, np.int32), w("row_bases", chunks + 1, np.int64))
+        sorting = (
+            w("digits", parts << DIGIT_BITS, np.int64).reshape(parts, -1),
+            w("pairs", n, np.int64),
+            w("spare", n, np.int64),
+            np.zeros(4, np.int64),
+        )
+        ends, tile_starts = np.empty(parts, np.int64), w("tile_starts", view.tiles + 1, np.int64)
+        tile_order = w("tile_order", view.tiles, np.int32)
+        while True:
+            room = int(self.workspace.pairs_per_gaussian * (n // parts + 1))
+            listed = self._make_lists(room * parts)
+            counts = w("tile_counts", parts * view.tiles, np.int64).reshape(parts, -1)
+            launch(
+                bins.bin_gaussians,
+                max(chunks, parts),
+                gaussians,
+                view.camera,
+                (view.width, view.height, view.tiles_x),
+                (self.records, self.records.view(np.int32)),
+                self.keys,
+                self.numbering,
+                visible,
+                sorting,
+                (np.arange(parts + 1) * room, ends),
+                (counts, tile_starts, tile_order, listed, self.entries),
+                phases=bins.BIN_PHASES,
+            )
+            if sorting[3][3] == 0:
+                break
+            # A part has at most all rows; this is asked for once, then remembered.
+            needed = self.numbering[1][-1] / (n // parts + 1)
+            self.workspace.pairs_per_gaussian = min(needed, 4 * self.workspace.pairs_per_gaussian)
+            sorting[3][3] = 0
+        self.tiles = (tile_starts, w("tile_stops", view.tiles, np.int64), tile_order)
+        pixels = view.tiles * layout.TILE_PIXELS
+        self.planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
 
+    def _make_lists(self, room: int) -> tuple[Array, Array, Array, Array]:
+        """Memory for (Gaussian, tile) pairs by part, which is returned, and by tile."""
+        w = self.workspace.array
+        self.entries = (
+            w("entry_gaussian", room + _MARGIN, np.int32),
+            w("entry_blocks", room, np.uint64),
+            w("entry_row", room + _MARGIN, np.int32),
+        )
+        return (
+            w("list_tile", room, np.int32),
+            w("list_gaussian", room, np.int32),
+            w("list_blocks", room, np.uint64),
+            w("list_row", room, np.int32),
+        )
 
-def _lists(
-    workspace: Workspace, room: int
-) -> tuple[tuple[Array, Array, Array, Array], tuple[Array, Array, Array]]:
-    """Memory for (Gaussian, tile) pairs by part, and by tile."""
-    w = workspace.array
-    listed = (
-        w("list_tile", room, np.int32),
-        w("list_gaussian", room, np.int32),
-        w("list_blocks", room, np.uint64),
-        w("list_row", room, np.int32),
-    )
-    entries = (
-        w("entry_gaussian", room + _MARGIN, np.int32),
-        w("entry_blocks", room, np.uint64),
-        w("entry_row", room + _MARGIN, np.int32),
-    )
-    return listed, entries
+    def _launch_tiles(self, kernel: Any, scratch: tuple[str, int], *args: Any) -> None:
+        """Run a kernel over the tiles, with scratch numbers for each worker."""
+        workers, (name, numbers) = num_workers(), scratch
+        states = self.workspace.array(name, workers * numbers, np.float32).reshape(workers, -1)
+        size = (self.view.width, self.view.height)
+        frame = (size, self.tiles, self.entries, self.records, self.planes)
+        launch(kernel, self.view.tiles, *frame, states, *args)
 
+    def composite(self, background: Array, image: Array, alphas: Array) -> None:
+        """Composite the three channels in the records."""
+        self._launch_tiles(composite, ("forward", FORWARD_NUMBERS), background, image, alphas)
 
-def render(
-    workspace: Workspace,
-    binned: Binned,
-    view: View,
-    background: Array,
-    image: Array,
-    alphas: Array,
-) -> None:
-    """Composite the three channels in the records."""
-    workers = num_workers()
-    states = workspace.array("forward", workers * FORWARD_NUMBERS, np.float32)
-    launch(
-        composite,
-        view.tiles,
-        (view.width, view.height),
-        binned.tiles,
-        binned.entries,
-        binned.records,
-        binned.planes,
-        states.reshape(workers, -1),
-        background,
-        image,
-        alphas,
-    )
+    def composite_backward(
+        self, background: Array, image_grad: Array, alpha_grad: Array
+    ) -> tuple[Array, Array]:
+        """Sums over pixels by entry: (touched, rows)."""
+        count = int(self.numbering[1][-1])
+        # One more than there are: `project_backward` may read the row after the last.
+        rows = self.workspace.array("rows", (count + 1) * layout.RECORD, np.float32)
+        touched = self.workspace.array("touched", count + 1, np.uint8)
+        touched[:] = 0
+        scratch = ("backward", BACKWARD_NUMBERS)
+        grads, out = (image_grad, alpha_grad), (touched, rows)
+        self._launch_tiles(composite_backward, scratch, background, grads, out)
+        return touched, rows
 
+    def transmittance(self) -> Array:
+        """What light is left at each pixel, with more digits than 1 - opacity has. [H, W]"""
+        tiles_x, tiles_y = self.view.tiles_x, self.view.tiles // self.view.tiles_x
+        # By tile, block, row and column.
+        plane = self.planes[0].reshape(tiles_y, tiles_x, layout.BLOCKS, layout.BLOCKS, 4, 4)
+        rows = plane.transpose(0, 2, 4, 1, 3, 5)
+        rows = rows.reshape(tiles_y * layout.TILE, tiles_x * layout.TILE)
+        return rows[: self.view.height, : self.view.width]
 
-def render_backward(
-    workspace: Workspace,
-    binned: Binned,
-    view: View,
-    background: Array,
-    image_grad: Array,
-    alpha_grad: Array,
-) -> tuple[Array, Array]:
-    """Sums over pixels by entry: (touched, rows)."""
-    workers, count = num_workers(), int(binned.numbering[1][-1])
-    states = workspace.array("backward", workers * BACKWARD_NUMBERS, np.float32)
-    rows = workspace.array("rows", (count + 1) * layout.RECORD, np.float32)  # see project.py
-    touched = workspace.array("touched", count + 1, np.uint8)
-    touched[:] = 0
-    launch(
-        composite_backward,
-        view.tiles,
-        (view.width, view.height),
-        binned.tiles,
-        binned.entries,
-        binned.records,
-        binned.planes,
-        states.reshape(workers, -1),
-        background,
-        (image_grad, alpha_grad),
-        (touched, rows),
-    )
-    return touched, rows
+    def sum_rows(self, touched: Array, rows: Array, sums: Array) -> None:
+        """Add the rows to 16 numbers of each Gaussian."""
+        launch(add_rows, self.numbering[1].size - 1, self.numbering, touched, rows, sums)
 
+    def gaussian_gradients(
+        self,
+        gaussians: Gaussians,
+        summed: tuple[Array, Array] | Array,
+        depth_gradients: Array,
+        grads: tuple[Array, ...],
+    ) -> None:
+        """Gradients of the inputs, written to ``grads``, from what was summed over pixels.
 
-def transmittance(binned: Binned, view: View) -> Array:
-    """What light is left at each pixel, with more digits than 1 - opacity has. [H, W]"""
-    tiles_y = view.tiles // view.tiles_x
-    # By tile, block, row and column.
-    plane = binned.planes[0].reshape(tiles_y, view.tiles_x, layout.BLOCKS, layout.BLOCKS, 4, 4)
-    rows = plane.transpose(0, 2, 4, 1, 3, 5)
-    rows = rows.reshape(tiles_y * layout.TILE, view.tiles_x * layout.TILE)
-    return rows[: view.height, : view.width]
-
-
-def sum_rows(binned: Binned, touched: Array, rows: Array, sums: Array) -> None:
-    """Add the rows to 16 numbers of each Gaussian."""
-    chunks = binned.numbering[1].size - 1
-    launch(add_rows, chunks, binned.numbering, touched, rows, sums)
-
-
-def gaussian_gradients(
-    binned: Binned,
-    gaussians: Gaussians,
-    view: View,
-    summed: tuple[Array, Array] | Array,
-    depth_gradients: Array,
-    grads: tuple[Array, ...],
-) -> None:
-    """Gradients of the inputs, written to ``grads``, from what was summed over pixels.
-
-    Args:
-        summed: (touched, rows) of one rendering, or 16 numbers of each Gaussian.
-        depth_gradients: d loss / d z-depth of each Gaussian, or nothing.
-    """
-    if isinstance(summed, tuple):
-        touched, rows = summed
-        sums = np.zeros(num_workers() * layout.RECORD * LANES, np.float32)
-    else:
-        touched, rows, sums = np.empty(0, np.uint8), np.empty(0, np.float32), summed
-    launch(
-        project_backward,
-        binned.numbering[1].size - 1,
-        gaussians,
-        depth_gradients,
-        view.camera,
-        binned.keys,
-        binned.numbering,
-        touched,
-        rows,
-        sums,
-        grads,
-    )
+        Args:
+            gaussians: As in the forward pass.
+            summed: (touched, rows) of one rendering, or 16 numbers of each Gaussian.
+            depth_gradients: d loss / d z-depth of each Gaussian, or nothing.
+            grads: Of means, quats, scales, opacities, colors and means2d.
+        """
+        if isinstance(summed, tuple):
+            touched, rows = summed
+            sums = np.zeros(num_workers() * layout.RECORD * LANES, np.float32)
+        else:
+            touched, rows, sums = np.empty(0, np.uint8), np.empty(0, np.float32), summed
+        launch(
+            project_backward,
+            self.numbering[1].size - 1,
+            gaussians,
+            depth_gradients,
+            self.view.camera,
+            self.keys,
+            self.numbering,
+            touched,
+            rows,
+            sums,
+            grads,
+        )

@@ -104,37 +104,21 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     u_sheared = zero - u * shear
     # The standard deviation of x given y: the root of the determinant over that of y.
     half = (given * inverse_given) * (second * inverse) * inverse_y
-    store_records(
-        records,
-        layout.RECORD * at,
-        (
-            mx,
-            my,
-            select(sideways, u_sheared, u),
-            select(sideways, u, u_sheared),
-            select(sideways, zero - v, v),
-            level,
-            cr,
-            cg,
-            cb,
-            xy * inverse_y * inverse_y,
-            half * (1.0 / layout.WHITEN),
-            xy / xx * ex,
-            as_float(tx0 + (ntx << 16)),
-            as_float(ty0 + (nty << 16)),
-            zero,
-            layout.WHITEN * inverse_y,
-        ),
+    conic = (
+        select(sideways, u_sheared, u),
+        select(sideways, u, u_sheared),
+        select(sideways, zero - v, v),
     )
+    spans = (xy * inverse_y * inverse_y, half * (1.0 / layout.WHITEN), xy / xx * ex)
+    tiles = (as_float(tx0 + (ntx << 16)), as_float(ty0 + (nty << 16)))
+    record = (mx, my, *conic, level, cr, cg, cb, *spans, *tiles, zero, layout.WHITEN * inverse_y)
+    store_records(records, layout.RECORD * at, record)
     store(keys, at, select(drawn, as_int(pz), -1))
     store_columns(means2d, 2 * at, (select(visible, mx, 0.0), select(visible, my, 0.0)))
     rx = to_int(minimum(zero - floor(zero - ex), _RADIUS_MAX))
     ry = to_int(minimum(zero - floor(zero - ey), _RADIUS_MAX))
-    store_columns(
-        radii,
-        2 * at,
-        (as_float(select(visible, rx, 0)), as_float(select(visible, ry, 0))),
-    )
+    rx, ry = select(visible, rx, 0), select(visible, ry, 0)
+    store_columns(radii, 2 * at, (as_float(rx), as_float(ry)))
     store(depths, at, select(visible, pz, 0.0))
 
 
