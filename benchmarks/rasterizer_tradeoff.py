@@ -63,22 +63,22 @@ CUBIC = """    ff = f * f
 PER_THREAD_SUMS: tuple[Patch, ...] = (
     (
         CPU + "composite_backward.py",
-        "BACKWARD_NUMBERS = _STEPS + 32\n",
-        "BACKWARD_NUMBERS = _STEPS + 48\n",
+        "BACKWARD_NUMBERS = _STEPS + STEPS\n",
+        "BACKWARD_NUMBERS = _STEPS + STEPS + 16\n",
     ),
     (
         CPU + "composite_backward.py",
         """        place = places[entry]
         touched[place] = 1
-        store_sums(rows, lay.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
-        rows[lay.RECORD * place + lay.SUM_SIGN] = records[record + lay.V]
+        store_sums(rows, layout.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
+        rows[layout.RECORD * place + layout.SUM_SIGN] = records[record + layout.V]
 """,
         """        store_sums(state, BACKWARD_NUMBERS - 16, (s, su, sv, suu, suv, svv, sr, sg, sb))
-        home = base + lay.RECORD * gaussians[entry]
+        home = base + layout.RECORD * gaussians[entry]
         for lane in range(0, 16, LANES):
             old = load(rows, home + lane)
             store(rows, home + lane, old + load(state, BACKWARD_NUMBERS - 16 + lane))
-        rows[home + lay.SUM_SIGN] = records[record + lay.V]
+        rows[home + layout.SUM_SIGN] = records[record + layout.V]
 """,
     ),
     (
@@ -88,25 +88,24 @@ PER_THREAD_SUMS: tuple[Patch, ...] = (
     ),
     (
         CPU + "composite_backward.py",
-        "            touched,\n            rows,\n            state,\n        )",
-        "            touched,\n            rows,\n            state,\n"
-        "            worker * (rows.size // states.shape[0]),\n        )",
+        "touched, rows, state)\n        job =",
+        "touched, rows, state, worker * (rows.size // states.shape[0]))\n        job =",
     ),
     (
         CPU + "composite_backward.py",
-        "prefetch_write(rows, lay.RECORD * places[ahead])",
-        "prefetch_write(rows, base + lay.RECORD * gaussians[ahead])",
+        "prefetch_write(rows, layout.RECORD * places[ahead])",
+        "prefetch_write(rows, base + layout.RECORD * gaussians[ahead])",
     ),
     (
-        CPU + "pipeline.py",
-        'rows = workspace.array("rows", (count + 1) * lay.RECORD, np.float32)  # see project.py\n',
-        'rows = workspace.array("rows", workers * binned.keys.size * lay.RECORD, np.float32)\n'
-        "    rows[:] = 0\n",
+        CPU + "passes.py",
+        'rows = self.workspace.array("rows", (count + 1) * layout.RECORD, np.float32)\n',
+        "size = num_workers() * self.keys.size * layout.RECORD\n"
+        '        rows = self.workspace.array("rows", size, np.float32)\n        rows[:] = 0\n',
     ),
     (
-        CPU + "pipeline.py",
-        "    return touched, rows\n",
-        "    return rows.reshape(workers, -1).sum(axis=0)\n",
+        CPU + "passes.py",
+        "        return touched, rows\n",
+        "        return rows.reshape(num_workers(), -1).sum(axis=0)\n",
     ),
 )
 
@@ -124,13 +123,13 @@ VARIANTS = (
         (
             (
                 CPU + "project.py",
-                "    reach = (level - _LEVEL_MIN) * (2.0 / lay.LOG2_E)\n",
-                "    reach = minimum((level - _LEVEL_MIN) * (2.0 / lay.LOG2_E), 9.0)\n",
+                "    reach = (level - layout.LEVEL_MIN) * (2.0 / layout.LOG2_E)\n",
+                "    reach = minimum((level - layout.LEVEL_MIN) * (2.0 / layout.LOG2_E), 9.0)\n",
             ),
             (
                 CPU + "bins.py",
-                "record[at + lay.LEVEL] - _LEVEL_MIN\n",
-                "min(record[at + lay.LEVEL] - _LEVEL_MIN, np.float32(4.5 * lay.LOG2_E))\n",
+                "record[at + layout.LEVEL] - _LEVEL_MIN\n",
+                "min(record[at + layout.LEVEL] - _LEVEL_MIN, np.float32(4.5 * layout.LOG2_E))\n",
             ),
         ),
     ),
@@ -143,7 +142,7 @@ VARIANTS = (
     ),
     Variant(
         "cubic exponential",
-        ((CPU + "vecmath.py",
+        (("kernels/vector_math.py",
           """    ff = f * f
     low = f * 0.6931469440460205 + 1.0000001192092896
     middle = f * 0.05550713092088699 + 0.24022120237350464

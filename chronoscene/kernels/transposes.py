@@ -161,7 +161,7 @@ def _emit_sums(builder: Any, vectors: list[Any]) -> Any:
         for halves in inner
     ]
     while groups > 1:
-        # Two vectors of `width` live groups each are folded into one.
+        # Two vectors with `groups` groups of sums each are folded into one.
         both = list(range(0, lanes // 4, 2)), list(range(1, lanes // 4, 2))
         rounds.append(
             tuple(

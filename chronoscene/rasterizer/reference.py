@@ -221,8 +221,8 @@ def _composite_tile(
     alphas = splats.opacities[index] * torch.exp(-0.5 * distances)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp(max=ALPHA_MAX), 0)
     with torch.no_grad():
-        alive = torch.cumprod(1 - alphas, dim=1) > TRANSMITTANCE_MIN
-    alphas = torch.where(alive, alphas, 0)
+        active = torch.cumprod(1 - alphas, dim=1) > TRANSMITTANCE_MIN
+    alphas = torch.where(active, alphas, 0)
     after = torch.cumprod(1 - alphas, dim=1)
     ones = after.new_ones(len(after), 1)
     transmittance = torch.cat([ones, after], dim=1)

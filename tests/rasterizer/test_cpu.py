@@ -26,7 +26,7 @@ from chronoscene.rasterizer import rasterize
 from chronoscene.rasterizer.cpu import layout, passes
 from chronoscene.rasterizer.cpu.sort import DIGIT_BITS, SORT_PHASES, sort_phases
 
-MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
 
 
 def assert_equal_bits(a: list[torch.Tensor], b: list[torch.Tensor]) -> None:
@@ -41,7 +41,7 @@ def threads() -> Any:
     numba.set_num_threads(before)
 
 
-@pytest.mark.skipif(MOST_THREADS < 2, reason="needs two threads")
+@pytest.mark.skipif(MAX_THREADS < 2, reason="needs two threads")
 @pytest.mark.parametrize(("count", "size"), [(3000, 150), (40, 20)])
 def test_bits_do_not_depend_on_the_number_of_threads(
     count: int, size: int, tools: SimpleNamespace, threads: Any
@@ -50,7 +50,7 @@ def test_bits_do_not_depend_on_the_number_of_threads(
         count, size, size + 7, backgrounds=np.array([[0.1, 0.2, 0.3]], np.float32)
     )
     results = []
-    for number in (1, 2, 1, MOST_THREADS):
+    for number in (1, 2, 1, MAX_THREADS):
         threads(number)
         results.append(everything(scene))
     for other in results[1:]:

@@ -43,7 +43,7 @@ BY_NAME = {extreme.name: extreme for extreme in EXTREMES}
 AGREEING = [e for e in EXTREMES if e.outcome == AGREES]
 CULLING = [e for e in EXTREMES if e.outcome == CULLED]
 REFUSED = [e for e in EXTREMES if e.outcome not in (AGREES, CULLED)]
-MOST_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
 
 
 def named(extremes: list[Extreme]) -> Any:
@@ -127,7 +127,7 @@ def threads() -> Any:
     numba.set_num_threads(before)
 
 
-@pytest.mark.skipif(MOST_THREADS < 2, reason="needs two threads")
+@pytest.mark.skipif(MAX_THREADS < 2, reason="needs two threads")
 @named([*AGREEING, *CULLING])
 def test_bits_do_not_depend_on_the_number_of_threads(extreme: Extreme, threads: Any) -> None:
     scene, results = extreme.build(), []

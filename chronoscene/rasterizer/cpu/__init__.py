@@ -114,11 +114,7 @@ def _prepare(
 def _flat(info: RasterInfo, c: int) -> tuple[Array, Array, Array]:
     """Flat arrays of one camera for the kernel, which writes integers as float bits."""
     radii = info.radii[c].view(torch.float32)
-    return (
-        info.means2d[c].numpy().reshape(-1),
-        radii.numpy().reshape(-1),
-        info.depths[c].numpy(),
-    )
+    return (info.means2d[c].numpy().reshape(-1), radii.numpy().reshape(-1), info.depths[c].numpy())
 
 
 @dataclass(frozen=True, slots=True)

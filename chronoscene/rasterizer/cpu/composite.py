@@ -102,10 +102,10 @@ def power_at(gaussian: Any, block: Any, part: int, state: Any, steps: int) -> An
 
 @inner(fast_math=True)
 def _start_tile(left, top, width, height, state, planes, plane, end):
-    """Light everywhere, pixels outside the image dead. Returns the blocks inside."""
+    """Light everywhere but in pixels outside the image. Returns the blocks inside."""
     transmittance, last = planes
     transmittance[plane : plane + layout.TILE_PIXELS] = np.float32(1.0)
-    live = np.uint64(0)
+    active = np.uint64(0)
     for block in range(64):
         x, y = left + 4 * (block % 8), top + 4 * (block // 8)
         at = _STATE * block
@@ -113,43 +113,43 @@ def _start_tile(left, top, width, height, state, planes, plane, end):
         last[plane + 16 * block : plane + 16 * block + 16] = end
         if x + 4 <= width and y + 4 <= height:
             state[at : at + 16] = np.float32(1.0)
-            live |= np.uint64(1) << np.uint64(block)
+            active |= np.uint64(1) << np.uint64(block)
             continue
         state[at : at + 16] = np.float32(0.0)
         if x < width and y < height:
-            live |= np.uint64(1) << np.uint64(block)
+            active |= np.uint64(1) << np.uint64(block)
             for row in range(min(4, height - y)):
                 for column in range(min(4, width - x)):
                     state[at + 4 * row + column] = np.float32(1.0)
-    return live
+    return active
 
 
 @inner(fast_math=True)
 def _any_light(state, at):
-    """Whether any pixel of a block is alive."""
-    alive = False
+    """Whether any pixel of a block is active."""
+    found = False
     for part in range(PARTS):
-        alive |= any_lane(load(state, at + LANES * part) > 0.0)
-    return alive
+        found |= any_lane(load(state, at + LANES * part) > 0.0)
+    return found
 
 
 @inner(fast_math=True)
-def _forward_tile(start, end, left, top, live, plane, entries, records, planes, state):
+def _forward_tile(start, end, left, top, active, plane, entries, records, planes, state):
     """Composite the entries of a tile: C += alpha T c, T *= 1 - alpha. Returns where it stopped.
 
-    A dead pixel has light 0 here, so that nothing adds to it; what light it had is kept in the
+    A finished pixel has light 0 here, so that nothing adds to it; what light it had is kept in the
     planes, with the entry before which it ended. That happens once per pixel: the branch is rare,
     and keeps the test out of the chain of dependent instructions. The blocks of each entry are cut
-    down to those that were alive, for the backward pass.
+    down to those that were active, for the backward pass.
     """
     transmittance, last = planes
     gaussians, blocks, _ = entries
     for entry in range(start, end):
-        bits = blocks[entry] & live
+        bits = blocks[entry] & active
         blocks[entry] = bits
         prefetch(records, layout.RECORD * gaussians[entry + AHEAD])
         if bits == 0:
-            if live == 0:
+            if active == 0:
                 return entry
             continue
         record = layout.RECORD * gaussians[entry]
@@ -168,16 +168,16 @@ def _forward_tile(start, end, left, top, live, plane, entries, records, planes, 
                 # Not light - weight: its rounding is that of the light before, which may be 1000
                 # times what is left.
                 after = select(counts, multiply_add(0.0 - alpha, light, light), light)
-                dying = (light > 0.0) & (after <= constants.TRANSMITTANCE_MIN)
-                if any_lane(dying):
-                    weight = select(dying, 0.0, weight)
-                    after = select(dying, 0.0, after)
+                ending = (light > 0.0) & (after <= constants.TRANSMITTANCE_MIN)
+                if any_lane(ending):
+                    weight = select(ending, 0.0, weight)
+                    after = select(ending, 0.0, after)
                     here = plane + 16 * block + LANES * part
-                    store_where(transmittance, here, dying, light)
-                    store_where(last, here, dying, splat_int(entry))
+                    store_where(transmittance, here, ending, light)
+                    store_where(last, here, ending, splat_int(entry))
                     store(state, at, after)
                     if not _any_light(state, _STATE * block):
-                        live &= ~(np.uint64(1) << np.uint64(block))
+                        active &= ~(np.uint64(1) << np.uint64(block))
                 store(state, at, after)
                 store(state, at + 16, load(state, at + 16) + weight * red)
                 store(state, at + 32, load(state, at + 32) + weight * green)
@@ -228,7 +228,7 @@ def composite(
         tiles: (first entry of each tile and the end of the last, where compositing stopped, which
             is written, order in which to take the tiles). int64, int64, int32
         entries: (Gaussian, blocks, row) of each entry, the first readable a little past the end;
-            blocks are cut down to those that were alive. int32, uint64, int32
+            blocks are cut down to those that were active. int32, uint64, int32
         records: See `layout`.
         planes: (transmittance, end of the entries that count), by tile, written.
         states: Scratch, `FORWARD_NUMBERS` per worker.
@@ -243,9 +243,11 @@ def composite(
         tile = order[job]
         left, top = tile_corner(tile, width)
         plane, start, end = layout.TILE_PIXELS * tile, starts[tile], starts[tile + 1]
-        live = _start_tile(left, top, width, height, state, planes, plane, end)
+        active = _start_tile(left, top, width, height, state, planes, plane, end)
         x, y = np.float32(left), np.float32(top)
-        stops[tile] = _forward_tile(start, end, x, y, live, plane, entries, records, planes, state)
+        stops[tile] = _forward_tile(
+            start, end, x, y, active, plane, entries, records, planes, state
+        )
         light = (background[0], background[1], background[2])
         _write_tile(left, top, width, height, plane, state, planes[0], light, image, alphas)
         job = draw(control, 0)

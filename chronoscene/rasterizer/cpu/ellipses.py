@@ -11,15 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 from chronoscene.kernels.compilation import inlined
-from chronoscene.kernels.vectors import (
-    absolute,
-    as_float,
-    as_int,
-    maximum,
-    minimum,
-    select,
-    sqrt,
-)
+from chronoscene.kernels.vectors import absolute, as_float, as_int, maximum, minimum, select, sqrt
 from chronoscene.rasterizer.cpu import layout
 
 
@@ -105,11 +97,7 @@ def either(mask: Any, a: Any, b: Any) -> Any:
 
 @inlined
 def cross(a: Any, b: Any) -> Any:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 @inlined

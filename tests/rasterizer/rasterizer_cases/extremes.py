@@ -269,7 +269,7 @@ _THIN = "Right: neither pass has a difference in which the thin axis would vanis
 _UNIT = "Right: the length of a quaternion has no influence; it is scaled before it is squared."
 _FAINT = "Culled: an opacity of 1/255 or less is nowhere seen."
 _PLACE = "Error: it names the argument and the first index."
-_SIZED = "Right: pixels outside the image are dead from the start."
+_SIZED = "Right: pixels outside the image are finished from the start."
 
 EXTREMES = (
     *_survey("UTM", UTM),
