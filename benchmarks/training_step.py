@@ -32,7 +32,6 @@ import torch
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronogs.presets import PRESETS
-from chronoscene.anchors import volume_loss
 from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.anchors.model import AnchorModel
@@ -51,8 +50,8 @@ PARTS: tuple[tuple[str, Any, str], ...] = (
     ("decode", Decode, "forward"),
     ("rasterize", Render, "forward"),
     ("loss", losses._PhotometricLoss, "forward"),
-    ("volume term", volume_loss._MeanVolume, "forward"),
-    ("volume term, backward", volume_loss._MeanVolume, "backward"),
+    ("volume term", losses._MeanVolume, "forward"),
+    ("volume term, backward", losses._MeanVolume, "backward"),
     ("loss, backward", losses._PhotometricLoss, "backward"),
     ("rasterize, backward", Render, "backward"),
     ("decode, backward", Decode, "backward"),

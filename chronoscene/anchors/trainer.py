@@ -18,10 +18,9 @@ from torch import Tensor
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import AnchorArrays, DensityStatistics, grow, prune_mask
 from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
-from chronoscene.anchors.volume_loss import mean_volume
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
-from chronoscene.training.losses import photometric_loss
+from chronoscene.training.losses import mean_volume, photometric_loss
 from chronoscene.training.optimizer import Adam
 from chronoscene.training.rendering import camera_centre_tensor, draw
 from chronoscene.training.row_adam import make_table

@@ -1,4 +1,4 @@
-"""Photometric loss between a rendered image and a photo."""
+"""Losses: photometric, between a rendered image and a photo; and the mean volume of Gaussians."""
 
 from __future__ import annotations
 
@@ -6,11 +6,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from numba import prange
 from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
+from chronoscene.kernels.compilation import kernel
 from chronoscene.training.ssim_kernel import CHANNELS, RADIUS, SIGMA, l1_ssim
+
+_CHUNK = 4096
+"""Gaussians that are summed one after the other; fixed, so the sum does not depend on the
+threads."""
 
 
 def photometric_loss(image: Tensor, target: Tensor, *, ssim_weight: float = 0.2) -> Tensor:
@@ -117,3 +123,62 @@ def _check_images(image: Tensor, target: Tensor) -> None:
             found=f"{image.dtype} and {target.dtype}",
             todo="convert one of them",
         )
+
+
+def mean_volume(scales: Tensor, opacities: Tensor) -> Tensor:
+    """Mean over the Gaussians with an opacity above 0 of the product of their scales: keeps them
+    small.
+
+    Args:
+        scales: [N, 3]
+        opacities: Only their sign counts; they get no gradient. [N]
+
+    Returns:
+        Scalar; 0 where no Gaussian is switched on.
+
+    Source: the official code of Scaffold-GS and ChronoGS (the ChronoGS paper leaves the term out).
+    """
+    if scales.is_cuda:
+        volumes = scales.prod(dim=1)[opacities > 0]
+        return volumes.mean() if len(volumes) else scales.sum() * 0.0
+    result: Tensor = _MeanVolume.apply(scales, opacities)
+    return result
+
+
+class _MeanVolume(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, scales: Tensor, opacities: Tensor) -> Tensor:
+        chunks = -(-len(scales) // _CHUNK)
+        sums, counts = np.zeros(chunks), np.zeros(chunks, np.int64)
+        values, active = scales.detach().numpy(), opacities.detach().numpy()
+        _sum_volumes(values, active, sums, counts)
+        ctx.save_for_backward(scales, opacities)
+        ctx.count = max(int(counts.sum()), 1)
+        return scales.new_tensor(sums.sum() / ctx.count)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:
+        scales, opacities = ctx.saved_tensors
+        result = torch.empty_like(scales)
+        factor = scales.numpy().dtype.type(grads[0].item() / ctx.count)
+        _volume_gradients(scales.detach().numpy(), opacities.numpy(), factor, result.numpy())
+        return result, None
+
+
+@kernel(parallel=True)
+def _sum_volumes(scales, opacities, sums, counts):  # type: ignore[no-untyped-def]
+    for c in prange(len(sums)):
+        total, count = 0.0, 0
+        for i in range(c * _CHUNK, min((c + 1) * _CHUNK, len(scales))):
+            if opacities[i] > 0.0:
+                total += scales[i, 0] * scales[i, 1] * scales[i, 2]
+                count += 1
+        sums[c], counts[c] = total, count
+
+
+@kernel(parallel=True)
+def _volume_gradients(scales, opacities, factor, result):  # type: ignore[no-untyped-def]
+    for i in prange(len(scales)):
+        f = factor if opacities[i] > 0.0 else factor * 0.0
+        a, b, c = scales[i, 0], scales[i, 1], scales[i, 2]
+        result[i, 0], result[i, 1], result[i, 2] = f * b * c, f * a * c, f * a * b

@@ -11,9 +11,9 @@ import torch
 from chronogs.method import ChronoGS
 from chronoscene.anchors.config import HEADS
 from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
-from chronoscene.anchors.volume_loss import mean_volume
 from chronoscene.errors import ConfigError
 from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.training.losses import mean_volume
 from chronoscene.training.rendering import Splats, draw
 
 Make = Callable[..., ChronoGS]
@@ -108,18 +108,6 @@ def test_gaussians_that_are_off_leave_the_background(method: Make, noise_set: Ca
     for name in ("features", "offsets", "log_scales"):
         grad = getattr(made.model, name).grad
         assert grad is None or not grad.any()
-
-
-def test_mean_volume_is_the_mean_over_what_is_on() -> None:
-    scales = torch.rand(10_000, 3, dtype=torch.float32, requires_grad=True)
-    opacities = torch.randn(10_000)
-    on = opacities > 0
-    expected = scales.double().prod(dim=1)[on].mean()
-    value = mean_volume(scales, opacities)
-    assert float(value.detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
-    (reference,) = torch.autograd.grad(expected, scales)
-    (grad,) = torch.autograd.grad(2.0 * value, scales)
-    torch.testing.assert_close(grad, 2.0 * reference, rtol=1e-5, atol=1e-12)
 
 
 def test_geometry_and_appearance_of_different_periods(method: Make, noise_set: Callable) -> None:

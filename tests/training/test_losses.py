@@ -12,6 +12,7 @@ from skimage.metrics import structural_similarity
 
 from chronoscene.errors import ShapeError
 from chronoscene.training.losses import (
+    mean_volume,
     photometric_loss,
     photometric_loss_reference,
     ssim_map,
@@ -190,3 +191,15 @@ def test_strided_and_double_images() -> None:
 def test_wrong_images(image: torch.Tensor, target: torch.Tensor, message: str) -> None:
     with pytest.raises(ShapeError, match=message):
         photometric_loss(image, target)
+
+
+def test_mean_volume_is_the_mean_over_what_is_on() -> None:
+    scales = torch.rand(10_000, 3, dtype=torch.float32, requires_grad=True)
+    opacities = torch.randn(10_000)
+    on = opacities > 0
+    expected = scales.double().prod(dim=1)[on].mean()
+    value = mean_volume(scales, opacities)
+    assert float(value.detach()) == pytest.approx(float(expected.detach()), rel=1e-6)
+    (reference,) = torch.autograd.grad(expected, scales)
+    (grad,) = torch.autograd.grad(2.0 * value, scales)
+    torch.testing.assert_close(grad, 2.0 * reference, rtol=1e-5, atol=1e-12)
