@@ -27,9 +27,9 @@ class _Moments:
 class Adam:
     """Adam over named tensors, with a learning rate per tensor and step.
 
-    The same update as `torch.optim.Adam`, fused into one pass over memory and equal bit by bit for
-    any number of threads. Rows of a parameter can be added and removed; a parameter keeps its step
-    count when that happens, as in 3DGS.
+    The same update as `torch.optim.Adam`, fused into one pass over memory, with equal bits for any
+    number of threads. Rows of a parameter can be added and removed; its step count then stays, as
+    in 3DGS.
 
     Args:
         params: Contiguous leaf tensors that require a gradient.
@@ -63,7 +63,7 @@ class Adam:
 
         Args:
             lrs: Learning rate of each parameter.
-            skip: Names of parameters to leave alone, moments and step count too.
+            skip: Names of parameters to leave alone, with their moments and step counts.
         """
         for name, value in self.params.items():
             if value.grad is None or name in skip:
@@ -118,7 +118,7 @@ class Adam:
         return state
 
     def load_state(self, state: Mapping[str, Tensor]) -> None:
-        """Take over what `state` gave, for parameters of the same names and shapes."""
+        """Restore what `state` gave, for parameters of the same names and shapes."""
         for name, value in self.params.items():
             for part in ("mean", "square"):
                 check_shape(f"{name}.{part}", state[f"{name}.{part}"], tuple(value.shape))

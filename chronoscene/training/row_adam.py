@@ -1,15 +1,15 @@
 """Adam for tables of which every step reads only some rows and columns.
 
 A view sees a part of the anchors and needs the features of one period. Adam moves the others too:
-their first moment decays over some dozen steps, and they follow it. Here they do so when they are
-read next, all steps at once, so that a step costs what it reads, however large the model is.
+their first moment decays over some dozen steps, and they follow it. Here they catch up when they
+are next read, all steps at once, so a step costs what it reads, however large the model is.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -21,22 +21,24 @@ from chronoscene.training.adam_kernel import BETA1, BETA2
 from chronoscene.training.optimizer import Adam
 
 _HORIZON = 256
-"""Steps after which a waiting number no longer moves: the rest of its way is 2e-12 of it."""
+"""Steps after which a number that is not read no longer moves: what is left of its way is 2e-12 of
+it."""
 _RATIO = BETA1 / BETA2**0.5
 _NAME = "table"
 
 
-class Table(Protocol):
-    """A trained tensor with a row per anchor. [R, ...]"""
+class Table(ABC):
+    """A trained tensor with one row per anchor. [R, ...]"""
 
-    @property
-    def value(self) -> Tensor:
-        """The table; up to date after `flush`."""
+    value: Tensor
+    """The table; up to date after `flush`."""
 
+    @abstractmethod
     def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
         """Copies of some rows and blocks, up to date, as a leaf that collects a gradient.
 
-        `step` uses that gradient; the copies of an earlier call are forgotten.
+        `step` uses that gradient; the copies of an earlier call are forgotten. The table is left as
+        it is.
 
         Args:
             rows: Each at most once. [M]
@@ -46,19 +48,24 @@ class Table(Protocol):
             [M, ...], with the table's own shape of a row if there is one block.
         """
 
+    @abstractmethod
     def step(self, rate: float) -> None:
-        """One step with a learning rate: what was not fetched has the gradient zero."""
+        """One step with a learning rate; what was not fetched has the gradient zero."""
 
+    @abstractmethod
     def flush(self) -> Tensor:
         """Bring all rows up to date; returns the table."""
 
+    @abstractmethod
     def snapshot(self) -> Tensor:
         """What `flush` would return, perhaps a copy. Changes nothing: later steps round as if it
-        had not been."""
+        had not been called."""
 
+    @abstractmethod
     def extend(self, new_rows: Tensor) -> Tensor:
         """Append rows with zero moments; returns the table. [n, ...]"""
 
+    @abstractmethod
     def keep(self, mask: Tensor) -> Tensor:
         """Keep the rows where the mask holds; returns the table. bool [R]"""
 
@@ -70,8 +77,8 @@ def make_table(value: Tensor, blocks: Sequence[int] | None, eps: float, *, lazy:
     return DenseTable(value, blocks, eps)
 
 
-class DenseTable:
-    """The usual `Adam`, which moves every row in every step, as a `Table`.
+class DenseTable(Table):
+    """The usual `Adam`, which moves every row in every step.
 
     Args:
         value: The table. [R, ...]
@@ -87,11 +94,10 @@ class DenseTable:
         self._fetched: tuple[tuple[Tensor, ...], Tensor] | None = None
 
     @property
-    def value(self) -> Tensor:
+    def value(self) -> Tensor:  # type: ignore[override]
         return self._adam.params[_NAME].detach()
 
     def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
-        """See `Table.fetch`."""
         cells: tuple[Tensor, ...] = (torch.from_numpy(rows).to(self.value.device),)
         if self._blocks is not None:
             columns = torch.arange(sum(self._blocks)).split(list(self._blocks))
@@ -102,7 +108,6 @@ class DenseTable:
         return leaf
 
     def step(self, rate: float) -> None:
-        """See `Table.step`."""
         grad = torch.zeros_like(self.value)
         if self._fetched is not None and (found := self._fetched[1].grad) is not None:
             grad[self._fetched[0]] = found
@@ -112,34 +117,32 @@ class DenseTable:
         self._adam.zero_grad()
 
     def flush(self) -> Tensor:
-        """See `Table.flush`."""
         return self.value
 
     def snapshot(self) -> Tensor:
-        """See `Table.snapshot`."""
         return self.value
 
     def extend(self, new_rows: Tensor) -> Tensor:
-        """See `Table.extend`."""
         self._fetched = None
         return self._adam.extend(_NAME, new_rows).detach()
 
     def keep(self, mask: Tensor) -> Tensor:
-        """See `Table.keep`."""
         self._fetched = None
         return self._adam.keep(_NAME, mask).detach()
 
 
-class RowAdam:
-    """Adam, as `chronoscene.training.optimizer.Adam` has it, without touching what is not read.
+class RowAdam(Table):
+    """The update of `Adam`, without touching what is not read.
 
     With s steps done, a number that gets no gradient in the steps s + 1 .. t moves by
 
         (mean / sqrt(square)) sum_i rate_i root_i^-1 (BETA1 / sqrt(BETA2))^(i - s),
 
     where rate_i and root_i hold learning rate and bias corrections; the sum is the same for all
-    numbers. That is Adam but for rounding, and for eps, which counts for numbers with gradients
-    near it alone. float32 on a CPU.
+    numbers. That is Adam except for rounding, and for eps, which matters only to numbers whose
+    gradients are near it. float32 on a CPU.
+
+    Source: Kingma and Ba 2015 (Adam), algorithm 1; the sum is our derivation.
 
     Args:
         value: The table. [R, ...]
@@ -162,15 +165,14 @@ class RowAdam:
         """rate / root of each step."""
         self._ways = self._new_ways()
         self._settled = np.empty(_HORIZON, np.float32)
-        """The whole way of what was last read at each step, known up to `_HORIZON` steps ago; then
-        room for more."""
+        """The whole way of what was last read at each step, known up to `_HORIZON` steps ago; the
+        rest is spare room."""
         self._fetched: tuple[_Rows, Tensor] | None = None
 
     def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
-        """See `Table.fetch`. Changes nothing in the table."""
         chosen = _Rows(np.ascontiguousarray(rows, np.int64), self._places(blocks))
         out = torch.empty(len(rows), chosen.columns)
-        # As a part of the root, whose bias correction is in the way.
+        # In units of the root of the second moment without bias correction.
         eps = np.float32(self._eps * (1 - BETA2 ** max(self.steps, 1)) ** 0.5)
         kernel.fetch(*self._addresses(chosen), eps, out.data_ptr())
         if len(self._widths) == 1:
@@ -180,7 +182,6 @@ class RowAdam:
         return leaf
 
     def step(self, rate: float) -> None:
-        """See `Table.step`; what was not fetched waits."""
         root = (1 - BETA2 ** (self.steps + 1)) ** -0.5
         corrected = rate / (1 - BETA1 ** (self.steps + 1))
         if self._fetched is not None and (found := self._fetched[1].grad) is not None:
@@ -197,7 +198,6 @@ class RowAdam:
             self._settle(self._ways[_HORIZON, 0])
 
     def flush(self) -> Tensor:
-        """See `Table.flush`."""
         self.value.copy_(self.snapshot())
         gaps = self.steps - self._stamps
         for moments, beta in ((self._mean, BETA1), (self._square, BETA2)):
@@ -207,7 +207,6 @@ class RowAdam:
         return self.value
 
     def snapshot(self) -> Tensor:
-        """See `Table.snapshot`."""
         if not (self._stamps < self.steps).any():
             return self.value
         fetched = self._fetched
@@ -217,7 +216,6 @@ class RowAdam:
         return copies.view(self.value.shape)
 
     def extend(self, new_rows: Tensor) -> Tensor:
-        """See `Table.extend`."""
         self.flush()
         zeros = torch.zeros_like(new_rows, dtype=self.value.dtype)
         self._mean, self._square = (torch.cat((x, zeros)) for x in (self._mean, self._square))
@@ -226,7 +224,6 @@ class RowAdam:
         return self.value
 
     def keep(self, mask: Tensor) -> Tensor:
-        """See `Table.keep`."""
         self.flush()
         tables = (self.value, self._mean, self._square)
         self.value, self._mean, self._square = (table[mask] for table in tables)
@@ -280,7 +277,7 @@ class RowAdam:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rows:
-    """What a step reads of a table; see `_row_adam_kernel.Part`."""
+    """What a step reads of a table; see `row_adam_kernel.Part`."""
 
     rows: NDArray[np.int64]
     places: NDArray[np.int64]
