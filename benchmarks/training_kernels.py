@@ -4,7 +4,7 @@
 
 Prints milliseconds as the caller sees them, medians and minima, and the processor time of the
 calling thread. The step is that of ChronoGS at the sizes of the paper, with all anchors visible:
-10 offsets, features of 16 + 3 x 16 and 32, hidden layers of 32. "living" are offsets with a
+10 offsets, features of 16 + 3 x 16 and 32, hidden layers of 32. "active" are offsets with a
 positive opacity, the only ones that a rasterizer sends gradients to. The last lines compare Adam
 on all rows of ten times as many anchors with Adam on those in view; "forward" is the fetch.
 """
@@ -27,7 +27,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.anchors.decode.heads import HeadWeights, decode, decode_active, decode_reference
+from chronoscene.anchors.decode.heads import (
+    DecodeInputs,
+    HeadWeights,
+    decode,
+    decode_active,
+    decode_reference,
+)
 from chronoscene.kernels.runtime import available_threads, set_threads
 from chronoscene.training.losses import photometric_loss, photometric_loss_reference
 from chronoscene.training.optimizer import Adam
@@ -71,7 +77,11 @@ class Step:
 
     def run(self, function: Callable[..., object]) -> object:
         """Decode everything."""
-        return function(
+        return function(self.inputs())
+
+    def inputs(self) -> DecodeInputs:
+        """What is decoded."""
+        return DecodeInputs(
             self.positions, *self.leaves, self.weights, *self.heads, self.centre, self.visible,
             base_dim=BASE, period_dim=PERIOD,
         )  # fmt: skip
@@ -83,10 +93,7 @@ class Step:
     def switch_off(self, share: float) -> None:
         """Shift the opacities so that about this share of the offsets is off."""
         with torch.no_grad():
-            out = decode(
-                self.positions, *self.leaves, self.weights, *self.heads, self.centre,
-                self.visible, base_dim=BASE, period_dim=PERIOD,
-            )  # fmt: skip
+            out = decode(self.inputs())
             self.heads[0].b2.sub_(torch.atanh(out.opacities.quantile(share)))
 
 
@@ -133,21 +140,21 @@ class TwoParts:
 
 
 def time_decode(step: Step, repeats: int, reference: bool) -> None:
-    """Decode with gradients for the living offsets, and with them for all."""
+    """Decode with gradients for the active offsets, and with them for all."""
     whole = step.run(decode)
     assert isinstance(whole, tuple)
-    living = whole[3].detach() > 0
+    active = whole[3].detach() > 0
     g = torch.Generator().manual_seed(1)
     every = [torch.randn(value.shape, generator=g) for value in whole]
-    some = [grad * living.reshape(-1, *[1] * (grad.ndim - 1)) for grad in every]
-    few = [grad[living] for grad in every]
-    share = f"{100 * float(living.float().mean()):.0f} %"
+    some = [grad * active.reshape(-1, *[1] * (grad.ndim - 1)) for grad in every]
+    few = [grad[active] for grad in every]
+    share = f"{100 * float(active.float().mean()):.0f} %"
 
-    def living_only() -> Sequence[Tensor]:
+    def active_only() -> Sequence[Tensor]:
         return step.run(decode_active)[0]  # type: ignore[index]
 
     rows: list[tuple[str, Callable[[], Sequence[Tensor]], Sequence[Tensor]]] = [
-        (f"decode_active, {share} living", living_only, few),
+        (f"decode_active, {share} active", active_only, few),
         (f"decode, gradients for {share}", partial(step.run, decode), some),  # type: ignore[list-item]
         ("decode, gradients for all", partial(step.run, decode), every),  # type: ignore[list-item]
     ]
@@ -216,11 +223,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--anchors", type=int, default=31_000)
-    parser.add_argument("--living", type=float, default=0.21, help="share of offsets switched on")
+    parser.add_argument("--active", type=float, default=0.21, help="share of offsets switched on")
     parser.add_argument("--no-reference", dest="reference", action="store_false")
     args = parser.parse_args()
     step = Step(args.anchors)
-    step.switch_off(1 - args.living)
+    step.switch_off(1 - args.active)
     print(f"{platform.processor() or platform.machine()}, {args.anchors} anchors x {OFFSETS}")
     print(f"{'ms: median, minimum, thread':<44} {'forward':^23} | {'backward':^23} |")
     for threads in sorted({1, available_threads()}):

@@ -18,8 +18,8 @@ class ChronoGSConfig(AnchorConfig):
     global_dim: int = 32
     """Length of the feature of a period (d_g); 0: without global changes."""
     fusion: str = "concat"
-    """``concat``: base, period and global feature side by side (code); ``sum``: added (paper's
-    formula; needs equal lengths)."""
+    """``concat``: base, period and global feature side by side (code); ``sum``: added (formula of
+    the paper; needs equal lengths)."""
     global_init: str = "gaussian"
     """``gaussian``: standard normal (code); ``zero`` (paper: all features start at zero);
     ``uniform``: within -1..1."""
@@ -30,8 +30,9 @@ class ChronoGSConfig(AnchorConfig):
     ``period_dim`` 0 is Scaffold-GS with an appearance vector per period."""
 
     period_sharing: float = 0.0
-    """Weight of a group lasso on what an anchor's features have of their own per period: anchors
-    that do not need any end with equal blocks, and one block is stored. Not in the paper."""
+    """Weight of a group lasso on the deviation of an anchor's period features from their mean:
+    anchors that need no deviation end with equal blocks, and one block is stored. Not in the
+    paper."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

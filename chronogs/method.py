@@ -29,17 +29,6 @@ class ChronoGS(AnchorMethod):
     model_class = ChronoGSModel
     config: ChronoGSConfig
 
-    def layout(self, num_periods: int) -> AnchorLayout:
-        config = self.config
-        return AnchorLayout.of(
-            config,
-            num_periods,
-            period_dim=config.period_dim,
-            global_dim=config.global_dim,
-            fusion=config.fusion,
-            global_heads=tuple(config.global_heads),
-        )
-
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
         return super().rates(camera_extent) | {"global_features": self.config.global_lr}
 

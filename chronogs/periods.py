@@ -5,7 +5,7 @@ not the mean of two images.
 
 Quirks of the official code that are not repeated here: it truncates towards zero, so a period in
 (-1, 0) extrapolates; between T - 1 and T it keeps only part of the last weight; and T is the number
-of distinct ids of the split file, so ids with gaps break it. Outside 0..T-1 this one refuses.
+of distinct ids of the split file, so ids with gaps break it. Periods outside 0..T-1 are refused.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from chronoscene.errors import ConfigError
 
 
 def period_weights(period: float, num_periods: int) -> NDArray[np.float32]:
-    """One-hot for an integer; linear between the two neighbours otherwise. [T]
+    """e(t): one-hot for an integer t; linear between the two neighbours otherwise. [T]
 
     Args:
         period: 0..T-1.
@@ -33,7 +33,7 @@ def period_weights(period: float, num_periods: int) -> NDArray[np.float32]:
             "period",
             expected=f"a number within 0..{num_periods - 1}",
             found=str(period),
-            todo="name a period that the model was trained on, or a value between two of them",
+            todo="choose a period that the model was trained on, or a value between two of them",
         )
     lower = min(math.floor(period), num_periods - 1)
     share = period - lower

@@ -1,8 +1,9 @@
-"""Anchors that need nothing of their own per period: found in training, stored once.
+"""Anchors whose feature need not vary with the period: found in training, stored once.
 
 ChronoGS keeps T blocks for every anchor, though most of a place does not change. The proximal step
 of a group lasso draws the blocks of an anchor to their mean and makes them equal where the data
-asks for little difference; such an anchor is stored with one block. Not in the paper.
+calls for little difference; such an anchor is stored with one block. Not in the paper; the proximal
+step is that of Yuan and Lin 2006 (group lasso), with the deviations of an anchor as one group.
 """
 
 from __future__ import annotations

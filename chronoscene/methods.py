@@ -4,6 +4,9 @@ A method is a plug-in. Its `MethodSpec` is pure data, found through the entry-po
 ``chronoscene.methods``; listing methods imports nothing heavy. Its class fulfils `Method`. The
 harness owns the loop, the clock, the seeds and the files; a method sees a `TrainingSet` in the
 normalised training frame and never a dataset folder.
+
+A method that splats Gaussians need not implement all of `Method`: `GaussianMethod` in
+`chronoscene.gaussians` and `AnchorMethod` in `chronoscene.anchors` do it, and say what to override.
 """
 
 from __future__ import annotations
@@ -40,7 +43,7 @@ class MethodSpec:
     licence: str
     """Licence of this implementation, and of the official code where it differs."""
     period_input: PeriodInput
-    """``none``: hidden from it; ``label``: integer; ``continuous``: fractional too."""
+    """``none``: hidden from it; ``label``: an integer; ``continuous``: may be fractional."""
     outputs: tuple[str, ...]
     """Subset of ``rgb, alpha, depth``."""
     devices: tuple[str, ...]
@@ -79,7 +82,8 @@ class TrainingSet:
     """Everything that a method may learn from, in the normalised training frame.
 
     The training frame is the world, recentred and scaled in float64 before anything is cast to
-    float32: learning rates and voxel sizes are tied to its scale. `training_from_world` leads back.
+    float32: learning rates and voxel sizes depend on its scale. The inverse of
+    `training_from_world` leads back.
     """
 
     views: tuple[TrainingView, ...]
@@ -131,7 +135,7 @@ class MethodSize:
 
 
 class Method(Protocol):
-    """The interface of a method. ``method(config)`` makes an empty one; then `setup` or `load`."""
+    """The interface of a method. ``method(config)`` makes one, `setup` or `load` fills it."""
 
     def __init__(self, config: Any) -> None: ...
 
@@ -146,7 +150,7 @@ class Method(Protocol):
             index: Number of steps done before, from 0.
             progress: Share of the training that is over, 0..1. Every schedule (learning rates,
                 densification) follows it, so that a run that ends by the clock goes through the
-                same phases as one that ends by a number of iterations.
+                same phases as one that ends after a number of iterations.
         """
         ...
 
@@ -159,7 +163,7 @@ class Method(Protocol):
         ...
 
     def load(self, folder: Path, *, device: str) -> None:
-        """Read what `save` wrote; afterwards `render` gives the same pixels."""
+        """Read what `save` wrote; `render` then gives the same pixels."""
         ...
 
     def size(self) -> MethodSize: ...
@@ -188,7 +192,7 @@ def load_spec(name: str) -> MethodSpec:
     """Find a method by its name, or by ``module:SPEC`` while it is being developed.
 
     Raises:
-        ConfigError: If there is no such method; names those that there are.
+        ConfigError: If there is no such method; the message lists the known ones.
     """
     if ":" in name:
         spec = import_object(name)

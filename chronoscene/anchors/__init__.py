@@ -1,1 +1,5 @@
-"""Scenes as anchors whose features are decoded into Gaussians; Scaffold-GS and ChronoGS use it."""
+"""Scenes as anchors whose features are decoded into Gaussians, as in Scaffold-GS and ChronoGS.
+
+In: a `TrainingSet` and an `AnchorConfig`. Out: a trained `AnchorModel`, and `AnchorMethod`, the
+base class of the plug-ins. `decode` holds the MLPs; what varies with the period, a method says.
+"""

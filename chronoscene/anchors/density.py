@@ -7,7 +7,7 @@ the same anchors for any number of threads.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -18,8 +18,6 @@ from chronoscene.anchors.voxels import cell_indices, pack_cells
 from chronoscene.kernels.compilation import kernel
 
 Float = NDArray[np.float32]
-
-
 _COUNTERS = ("opacity_sum", "visits", "motion", "grad_sum", "hits")
 
 
@@ -105,9 +103,8 @@ def _accumulate(  # type: ignore[no-untyped-def]
             visits[a] += np.float32(1.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AnchorArrays:
-    """The tensors of a model that have a row per anchor."""
+class AnchorRows(NamedTuple):
+    """What has one row per anchor, as arrays."""
 
     anchors: Float
     """Positions in training units. [A, 3]"""
@@ -119,103 +116,79 @@ class AnchorArrays:
     """[A, F]"""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NewAnchors:
-    """Anchors that growth adds, in the order in which they are appended."""
-
-    positions: Float
-    """[B, 3]"""
-    features: Float
-    """Per channel the largest value over the anchors of the candidates in the cell. [B, F]"""
-    log_scales: Float
-    """Log of the cell edge, in all six columns. [B, 6]"""
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-
 def min_visits(config: AnchorConfig) -> float:
     """Views of an anchor since the last round above which it is judged; half for a Gaussian."""
     return config.density_interval * config.success_threshold
 
 
 def grow(
-    arrays: AnchorArrays,
+    model: AnchorRows,
     statistics: DensityStatistics,
     config: AnchorConfig,
     voxel_size: float,
     generator: np.random.Generator,
-) -> NewAnchors:
+) -> AnchorRows:
     """Find new anchors where the gradients of Gaussians are large.
 
     A Gaussian is a candidate of level l when it was hit often enough, its mean gradient reaches
     ``grad_threshold * 2**l`` and chance keeps it. Its cell gets an anchor unless it has one.
 
     Args:
-        arrays: The model.
+        model: All anchors.
         statistics: Counters of the Gaussians that were judged are zeroed.
         config: Thresholds and cell sizes in voxels.
         voxel_size: Smallest cell, in training units.
         generator: Source of the random masks.
+
+    Returns:
+        new: In the order in which they are appended. Features are, per channel, the largest over
+            the anchors of the candidates in the cell; log-scales that of the edge of the cell.
     """
     eligible = statistics.hits > 0.5 * min_visits(config)
     gradients = statistics.grad_sum / np.maximum(statistics.hits, np.float32(1.0))
-    occupied = arrays.anchors
-    found: list[NewAnchors] = []
+    occupied, found = model.anchors, [_take(model, slice(0))]
     for level in range(config.growth_levels):
         chosen = eligible & (gradients >= config.grad_threshold * 2**level)
         if config.random_growth:
             chosen &= generator.random(chosen.shape, dtype=np.float32) > 0.5 ** (level + 1)
-        if level > 0 and config.chained_levels and not found:
+        if level > 0 and config.chained_levels and len(occupied) == len(model.anchors):
             continue
         voxels = max(config.coarsest_cell // config.cell_refinement**level, 1)
-        new = _new_in_level(arrays, chosen, occupied, voxel_size * voxels)
-        if config.max_anchors:
-            new = _limited(new, config.max_anchors - len(occupied), generator)
-        if len(new):
-            found.append(new)
-            occupied = np.concatenate([occupied, new.positions])
+        new = _new_in_level(model, chosen, occupied, voxel_size * voxels)
+        count, room = len(new.anchors), config.max_anchors - len(occupied)
+        if config.max_anchors and count > room:
+            new = _take(new, np.sort(generator.permutation(count)[: max(room, 0)]))
+        found.append(new)
+        occupied = np.concatenate([occupied, new.anchors])
     statistics.hits[eligible] = 0.0
     statistics.grad_sum[eligible] = 0.0
-    return _concatenate(found, arrays.features.shape[1])
+    return AnchorRows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 def _new_in_level(
-    arrays: AnchorArrays, chosen: NDArray[np.bool_], occupied: Float, size: float
-) -> NewAnchors:
+    model: AnchorRows, chosen: NDArray[np.bool_], occupied: Float, size: float
+) -> AnchorRows:
     """One anchor per cell that holds a chosen Gaussian and no anchor yet."""
     parent, slot = np.nonzero(chosen)
-    reach = np.exp(arrays.log_scales[parent, :3])
-    centres = arrays.anchors[parent] + arrays.offsets[parent, slot] * reach
+    reach = np.exp(model.log_scales[parent, :3])
+    centres = model.anchors[parent] + model.offsets[parent, slot] * reach
     cells = np.concatenate([cell_indices(centres, size), cell_indices(occupied, size)])
     keys = pack_cells(cells)
     free = np.flatnonzero(~np.isin(keys[: len(parent)], keys[len(parent) :]))
     if len(free) == 0:
-        return _concatenate([], arrays.features.shape[1])
+        return _take(model, slice(0))
     order = free[np.argsort(keys[free], kind="stable")]
     starts = np.flatnonzero(np.diff(keys[order], prepend=keys[order[0]] - 1))
-    features = np.maximum.reduceat(arrays.features[parent[order]], starts, axis=0)
-    positions = (cells[order[starts]] * size).astype(np.float32)
-    return NewAnchors(positions, features, np.full((len(starts), 6), np.log(size), np.float32))
-
-
-def _limited(new: NewAnchors, room: int, generator: np.random.Generator) -> NewAnchors:
-    """At most ``room`` of the new anchors; of more, a random selection."""
-    if len(new) <= room:
-        return new
-    rows = np.sort(generator.permutation(len(new))[: max(room, 0)])
-    return NewAnchors(new.positions[rows], new.features[rows], new.log_scales[rows])
-
-
-def _concatenate(parts: list[NewAnchors], channels: int) -> NewAnchors:
-    if not parts:
-        empty = np.zeros((0, 3), np.float32)
-        return NewAnchors(empty, np.zeros((0, channels), np.float32), np.zeros((0, 6), np.float32))
-    return NewAnchors(
-        np.concatenate([p.positions for p in parts]),
-        np.concatenate([p.features for p in parts]),
-        np.concatenate([p.log_scales for p in parts]),
+    return AnchorRows(
+        anchors=(cells[order[starts]] * size).astype(np.float32),
+        offsets=np.zeros((len(starts), *model.offsets.shape[1:]), np.float32),
+        log_scales=np.full((len(starts), 6), np.log(size), np.float32),
+        features=np.maximum.reduceat(model.features[parent[order]], starts, axis=0),
     )
+
+
+def _take(anchors: AnchorRows, rows: slice | NDArray[np.int64]) -> AnchorRows:
+    return AnchorRows(*(array[rows] for array in anchors))
 
 
 def prune_mask(statistics: DensityStatistics, config: AnchorConfig) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import HEADS, AnchorConfig
-from chronoscene.anchors.decode.heads import HeadWeights, decode, decode_active
+from chronoscene.anchors.decode.heads import DecodeInputs, HeadWeights, decode, decode_active
 from chronoscene.anchors.visibility import visible_anchors
 from chronoscene.anchors.voxels import initial_log_scales
 from chronoscene.errors import CheckpointError
@@ -62,22 +62,16 @@ class AnchorLayout:
         return self.base_dim + self.num_periods * self.period_dim
 
     @classmethod
-    def of(cls, config: AnchorConfig, num_periods: int, **parts: Any) -> AnchorLayout:
-        """Layout of a config; ``parts`` gives what only some methods have."""
-        width = config.base_dim + int(parts.get("period_dim", 0))
-        return cls(
+    def of(cls, config: AnchorConfig, num_periods: int) -> AnchorLayout:
+        """Layout of a config: takes over the options that have the name of a field."""
+        names = [f.name for f in dataclasses.fields(cls) if hasattr(config, f.name)]
+        layout = cls(
             num_periods=num_periods,
             offsets=config.offsets_per_anchor,
-            base_dim=config.base_dim,
-            hidden_dim=config.hidden_dim or max(width, 1),
-            direction=config.direction,
-            direction_heads=tuple(config.direction_heads),
-            offset_unit=config.offset_unit,
-            scale_unit=config.scale_unit,
-            visibility=config.visibility,
-            near_plane=config.near_plane,
-            **parts,
+            **{name: getattr(config, name) for name in names},
         )
+        width = max(layout.base_dim + layout.period_dim, 1)
+        return dataclasses.replace(layout, hidden_dim=config.hidden_dim or width)
 
     @classmethod
     def from_meta(cls, meta: Mapping[str, Any]) -> AnchorLayout:
@@ -213,8 +207,7 @@ class AnchorModel:
             centre: Camera centre that gives the viewing direction. [3]
             visible: Ascending indices, int64. [M]
         """
-        inputs, base_dim = self._decode_arguments(period_weights, centre, visible)
-        return decode(*inputs, base_dim=base_dim, period_dim=self.layout.period_dim)
+        return decode(self._decode_inputs(period_weights, centre, visible))
 
     def decode_active(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
@@ -225,21 +218,32 @@ class AnchorModel:
             splats: The L Gaussians with an opacity above 0.
             positions: Their places in the output of `decode`, ascending. int64 [L]
         """
-        inputs, base_dim = self._decode_arguments(period_weights, centre, visible)
-        return decode_active(*inputs, base_dim=base_dim, period_dim=self.layout.period_dim)
+        return decode_active(self._decode_inputs(period_weights, centre, visible))
 
-    def _decode_arguments(
+    def _decode_inputs(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
-    ) -> tuple[tuple[Any, ...], int]:
-        """What both functions above hand to the kernels, and the length of the base feature."""
+    ) -> DecodeInputs:
         layout, features, base_dim = self.layout, self.features, self.layout.base_dim
         if layout.direction == "full":  # a second base feature that nothing trains
             offset = self.anchors - centre
             features = torch.cat([features[:, :base_dim], offset, features[:, base_dim:]], dim=1)
             base_dim += 3
-        tensors = (self.anchors, self.offsets, features, self._scales_in_use())
-        heads = [self._kernel_head(name) for name in HEADS]
-        return (*tensors, self.global_features, period_weights, *heads, centre, visible), base_dim
+        opacity, covariance, color = (self._kernel_head(name) for name in HEADS)
+        return DecodeInputs(
+            anchors=self.anchors,
+            offsets=self.offsets,
+            features=features,
+            log_scales=self._scales_in_use(),
+            global_features=self.global_features,
+            period_weights=period_weights,
+            opacity_head=opacity,
+            covariance_head=covariance,
+            color_head=color,
+            camera_centre=centre,
+            visible=visible,
+            base_dim=base_dim,
+            period_dim=layout.period_dim,
+        )
 
     def _scales_in_use(self) -> Tensor:
         """Log-scales with zeros where a rule says that the unit of the frame counts. [A, 6]"""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
-from chronoscene.anchors.density import AnchorArrays, DensityStatistics, grow, prune_mask
+from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
 from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
@@ -218,20 +218,16 @@ class AnchorTrainer:
 
     def _grow(self, statistics: DensityStatistics) -> None:
         model = self.model
-        names = ("anchors", "offsets", "log_scales", "features")
-        arrays = AnchorArrays(*(getattr(model, n).detach().cpu().numpy() for n in names))
-        new = grow(arrays, statistics, self.config, self.voxel_size, self.growth_generator)
-        rows = {
-            "offsets": np.zeros((len(new), *model.offsets.shape[1:]), np.float32),
-            "features": new.features,
-            "log_scales": new.log_scales,
-        }
-        for name, array in rows.items():
-            table = self.tables[name].extend(torch.from_numpy(array).to(model.device))
-            setattr(model, name, table)
-        positions = torch.from_numpy(new.positions).to(model.device)
+        names = AnchorRows._fields
+        rows = AnchorRows(*(getattr(model, n).detach().cpu().numpy() for n in names))
+        new = grow(rows, statistics, self.config, self.voxel_size, self.growth_generator)
+        for name, table in self.tables.items():
+            setattr(
+                model, name, table.extend(torch.from_numpy(getattr(new, name)).to(model.device))
+            )
+        positions = torch.from_numpy(new.anchors).to(model.device)
         model.anchors = torch.cat([model.anchors, positions])
-        statistics.extend(len(new))
+        statistics.extend(len(new.anchors))
 
     def _prune(self, statistics: DensityStatistics) -> None:
         """Drop anchors and bound the scales. A model is never left without any anchor."""

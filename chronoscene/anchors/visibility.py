@@ -69,7 +69,7 @@ def _mark(  # type: ignore[no-untyped-def]
         x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
         y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
         u, v = fx * x / z + cx, fy * y / z + cy
-        # Footprint: Sigma' = J W Sigma W^T J^T (EWA), of which the diagonal is needed.
+        # Diagonal of Sigma' = J W Sigma W^T J^T (3DGS, equation 5), plus the blur.
         slope_x = min(max(x / z, low_x), high_x)
         slope_y = min(max(y / z, low_y), high_y)
         variance_u, variance_v = EPS2D, EPS2D

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.errors import ConfigError
 from chronoscene.training.sparse_points import rms_spacing
 
 MIN_DISTANCE = 1e-7
@@ -68,10 +67,6 @@ def resolve_voxel_size(
             training frame; ``world``: units of the scene, as in the official code.
         training_from_world: Scale of the similarity from world to training frame.
     """
-    if value < 0:
-        raise ConfigError(
-            "voxel_size", expected="0 or more", found=str(value), todo="correct the value"
-        )
     if value == 0:
         return float(np.median(np.square(neighbour_distances(points))))
     if unit == "spacing":

@@ -119,7 +119,7 @@ def densify(
 def _split(
     parents: dict[str, Tensor], config: GaussianConfig, generator: np.random.Generator
 ) -> dict[str, Tensor]:
-    """Two smaller Gaussians for each, centred on samples of it: x ~ N(mean, R S S^T R^T)."""
+    """Two smaller Gaussians for each, centred on samples of N(mean, R S S^T R^T), equation 6."""
     parts = {name: rows.repeat(PARTS, *(1,) * (rows.dim() - 1)) for name, rows in parents.items()}
     quats = parts["quats"].cpu().double().numpy()
     quats[np.linalg.norm(quats, axis=-1) == 0] = (1, 0, 0, 0)

@@ -26,7 +26,7 @@ def photometric_loss(image: Tensor, target: Tensor, *, ssim_weight: float = 0.2)
 
     SSIM has an 11x11 Gaussian window of sigma 1.5, zero padding, constants 0.01² and 0.03², and is
     the mean over pixels and channels. On a CPU, value and gradient come from one compiled pass in
-    float32, equal bit by bit for any number of threads; elsewhere from
+    float32, with equal bits for any number of threads; elsewhere from
     `photometric_loss_reference`.
 
     Args:
@@ -38,9 +38,9 @@ def photometric_loss(image: Tensor, target: Tensor, *, ssim_weight: float = 0.2)
         A scalar.
 
     Raises:
-        ShapeError: If the images differ in size, or their types are others than the above.
+        ShapeError: If the images differ in size, or have other types.
 
-    Source: Kerbl et al. 2023 (3D Gaussian Splatting), section 5; Wang et al. 2004 for SSIM.
+    Source: Kerbl et al. 2023 (3D Gaussian Splatting), equation 7; Wang et al. 2004 for SSIM.
     """
     _check_images(image, target)
     if image.device.type != "cpu" or image.dtype != torch.float32:

@@ -9,9 +9,8 @@ import pytest
 
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import (
-    AnchorArrays,
+    AnchorRows,
     DensityStatistics,
-    NewAnchors,
     grow,
     prune_mask,
 )
@@ -20,20 +19,20 @@ CONFIG = AnchorConfig(random_growth=False)
 
 
 def grown(
-    arrays: AnchorArrays,
+    arrays: AnchorRows,
     statistics: DensityStatistics,
     config: AnchorConfig = CONFIG,
     *,
     voxel_size: float = 0.001,
     seed: int = 0,
-) -> NewAnchors:
+) -> AnchorRows:
     return grow(arrays, statistics, config, voxel_size, np.random.default_rng(seed))
 
 
-def arrays_of(positions: list[list[float]], features: list[list[float]]) -> AnchorArrays:
+def arrays_of(positions: list[list[float]], features: list[list[float]]) -> AnchorRows:
     """One anchor in the origin cell with one Gaussian per position: offset scale 1."""
     count = len(positions)
-    return AnchorArrays(
+    return AnchorRows(
         anchors=np.zeros((count, 3), np.float32),
         offsets=np.array(positions, np.float32)[:, None],
         log_scales=np.zeros((count, 6), np.float32),
@@ -65,15 +64,15 @@ def test_larger_gradients_reach_finer_levels(gradient: float, levels: int) -> No
 
 def test_a_gaussian_needs_more_than_forty_hits() -> None:
     arrays = arrays_of([[0.5, 0.0, 0.0]], [[1.0]])
-    assert len(grown(arrays, statistics_of([9e-4], 40))) == 0
-    assert len(grown(arrays, statistics_of([9e-4], 41))) > 0
+    assert len(grown(arrays, statistics_of([9e-4], 40)).anchors) == 0
+    assert len(grown(arrays, statistics_of([9e-4], 41)).anchors) > 0
 
 
 def test_nothing_at_the_coarsest_level_means_nothing_at_all() -> None:
     # The coarse cell holds the anchor in the origin, the cells of 0.004 do not.
     arrays = arrays_of([[0.0062, 0.0, 0.0]], [[1.0]])
     statistics = statistics_of([9e-4], 41)
-    assert len(grown(arrays, statistics)) == 0
+    assert len(grown(arrays, statistics).anchors) == 0
     unchained = dataclasses.replace(CONFIG, chained_levels=False)
     statistics = statistics_of([9e-4], 41)
     new = grown(arrays, statistics, unchained)
@@ -86,18 +85,17 @@ def test_a_new_anchor_sits_in_its_cell_with_the_largest_features_of_its_parents(
     statistics = statistics_of([3e-4, 3e-4], 41)
     new = grown(arrays, statistics, one_level)
     cell = np.round(0.5 / 0.016) * 0.016
-    np.testing.assert_allclose(new.positions, [[cell, 0, 0]], rtol=1e-6)
+    np.testing.assert_allclose(new.anchors, [[cell, 0, 0]], rtol=1e-6)
     np.testing.assert_array_equal(new.features, [[1.0, 3.0]])
     np.testing.assert_allclose(new.log_scales, np.full((1, 6), np.log(0.016)), rtol=1e-6)
 
 
 def test_offsets_count_in_units_of_the_anchor() -> None:
-    arrays = dataclasses.replace(
-        arrays_of([[1.0, 0, 0]], [[1.0]]), log_scales=np.full((1, 6), np.log(0.32), np.float32)
-    )
+    log_scales = np.full((1, 6), np.log(0.32), np.float32)
+    arrays = arrays_of([[1.0, 0, 0]], [[1.0]])._replace(log_scales=log_scales)
     rules = dataclasses.replace(CONFIG, growth_levels=1)
     new = grown(arrays, statistics_of([3e-4], 41), rules)
-    np.testing.assert_allclose(new.positions, [[0.32, 0, 0]], rtol=1e-6)
+    np.testing.assert_allclose(new.anchors, [[0.32, 0, 0]], rtol=1e-6)
 
 
 def test_only_judged_gaussians_lose_their_counters() -> None:
@@ -128,8 +126,8 @@ def test_growth_stops_at_the_limit_and_repeats_with_the_seed() -> None:
     arrays = arrays_of([[0.5 + 0.1 * i, 0, 0] for i in range(50)], [[0.0]] * 50)
     limited = dataclasses.replace(CONFIG, max_anchors=57)
     runs = [grown(arrays, statistics_of([9e-4] * 50, 41), limited, seed=3) for _ in range(2)]
-    assert len(runs[0]) == 7
-    np.testing.assert_array_equal(runs[0].positions, runs[1].positions)
+    assert len(runs[0].anchors) == 7
+    np.testing.assert_array_equal(runs[0].anchors, runs[1].anchors)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from chronoscene.anchors.voxels import (
     resolve_voxel_size,
     voxelize,
 )
-from chronoscene.errors import ConfigError
 from chronoscene.methods import View
 from chronoscene.rasterizer import NEAR_PLANE, rasterize
 
@@ -79,11 +78,6 @@ def test_voxel_units(grid: np.ndarray) -> None:
     assert size == pytest.approx({"spacing": 1.0, "training": 0.5, "world": 0.05})
     # Every inner point of the grid has three neighbours at distance 2: the mean square is 4.
     assert resolve_voxel_size(grid, 0.0, "world", training_from_world=0.1) == pytest.approx(4.0)
-
-
-def test_a_negative_voxel_is_refused(grid: np.ndarray) -> None:
-    with pytest.raises(ConfigError, match=r"voxel_size: expected 0 or more, found -1"):
-        resolve_voxel_size(grid, -1, "world", training_from_world=1.0)
 
 
 @pytest.fixture

@@ -49,6 +49,8 @@ def test_reading_the_specs_imports_nothing_heavy() -> None:
         ({"direction_heads": ("colour",)}, "direction_heads: .*did you mean 'color'"),
         ({"period_dim": -1}, "period_dim, global_dim: expected 0 or more, found -1, 32"),
         ({"iterations": 0}, "iterations: expected at least 1, found 0"),
+        ({"voxel_size": -1.0}, "voxel_size: expected at least 0.0, found -1.0"),
+        ({"near_plane": -1.0}, "near_plane: expected at least 0.0, found -1.0"),
         ({"density_interval": 0}, "density_interval: expected at least 1"),
     ],
 )

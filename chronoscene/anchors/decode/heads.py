@@ -1,13 +1,13 @@
-"""Decode anchors into Gaussians: the small MLPs of ChronoGS and Scaffold-GS.
+"""Decode anchors into Gaussians: the small MLPs of Scaffold-GS and ChronoGS.
 
-`decode_reference` is the definition, in plain torch; `decode` is the compiled form of it.
+`decode_reference` is the definition, in plain torch; `decode` is its compiled form.
 
-Source: ChronoGS (arXiv 2511.18794), section 3, and Scaffold-GS, whose anchors it extends.
+Source: Scaffold-GS (Lu et al., CVPR 2024), section 3.2, and ChronoGS (arXiv 2511.18794), section 3,
+which adds the features that vary with the period.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +20,8 @@ from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
 from chronoscene.training.rendering import Splats
 
-ALL = np.float32(-np.inf)
-"""Opacity above which Gaussians live, if all shall."""
+_ALL = np.float32(-np.inf)
+"""Opacity above which Gaussians are active, if all are to be."""
 
 
 class HeadWeights(NamedTuple):
@@ -40,23 +40,43 @@ class HeadWeights(NamedTuple):
     """[O]"""
 
 
-def decode_reference(
-    anchors: Tensor,
-    offsets: Tensor,
-    features: Tensor,
-    log_scales: Tensor,
-    global_features: Tensor,
-    period_weights: Tensor,
-    opacity_head: HeadWeights,
-    covariance_head: HeadWeights,
-    color_head: HeadWeights,
-    camera_centre: Tensor,
-    visible: Tensor,
-    *,
-    base_dim: int,
-    period_dim: int,
-) -> Splats:
-    """Decode the visible anchors in plain torch; the definition that `decode` is compared with.
+class DecodeInputs(NamedTuple):
+    """What is decoded. Sizes: A anchors of which M are visible, k offsets, T periods."""
+
+    anchors: Tensor
+    """Positions in world units; get no gradient. [A, 3]"""
+    offsets: Tensor
+    """In units of the anchor's scale. [A, k, 3]"""
+    features: Tensor
+    """Base feature, then one block per period. [A, Fb + T * Fv]"""
+    log_scales: Tensor
+    """Logarithms in world units; 0:3 for offsets, 3:6 for Gaussians. [A, 6]"""
+    global_features: Tensor
+    """One row per period. [T, G]"""
+    period_weights: Tensor
+    """One-hot, or a mixture of periods. [T]"""
+    opacity_head: HeadWeights
+    """k outputs."""
+    covariance_head: HeadWeights
+    """7 k outputs: 3 scales and 4 quaternion numbers per offset."""
+    color_head: HeadWeights
+    """3 k outputs: rgb per offset."""
+    camera_centre: Tensor
+    """In world units; gets no gradient. [3]"""
+    visible: Tensor
+    """Ascending indices of the anchors to decode. int64 [M]"""
+    base_dim: int
+    """Fb"""
+    period_dim: int
+    """Fv"""
+
+    @property
+    def heads(self) -> tuple[HeadWeights, HeadWeights, HeadWeights]:
+        return self.opacity_head, self.covariance_head, self.color_head
+
+
+def decode_reference(x: DecodeInputs) -> Splats:
+    """Decode the visible anchors in plain torch: the definition of `decode`.
 
     With e the period weights, f = (base, sum_s e_s period_s), d the unit vector from the camera to
     the anchor and g = sum_s e_s global_s, every head sees the input (f, d, g) and
@@ -64,163 +84,100 @@ def decode_reference(
         opacity = tanh(o), color = sigmoid(c), scale = exp(log_scales[3:6]) sigmoid(s),
         quat = q / |q|, mean = anchor + offset exp(log_scales[0:3]).
 
-    Convention:
-        The covariance head gives 3 scales and 4 quaternion numbers per offset, the colour head rgb
-        per offset. The direction of an anchor in the camera centre is zero.
+    The direction of an anchor in the camera centre is zero.
 
-    Args:
-        anchors: Positions in world units; get no gradient. [A, 3]
-        offsets: In units of the anchor's scale. [A, k, 3]
-        features: Base feature, then one block per period. [A, Fb + T * Fv]
-        log_scales: Logarithms in world units; 0:3 for offsets, 3:6 for Gaussians. [A, 6]
-        global_features: One row per period. [T, G]
-        period_weights: One-hot, or a mixture of periods. [T]
-        opacity_head: k outputs.
-        covariance_head: 7 k outputs.
-        color_head: 3 k outputs.
-        camera_centre: In world units; gets no gradient. [3]
-        visible: Sorted indices of the anchors to decode. int64 [M]
-        base_dim: Fb.
-        period_dim: Fv.
+    Returns:
+        splats: k to each visible anchor, anchor by anchor; opacities -1..1, colours 0..1. [M * k]
     """
-    num_offsets, num_periods = opacity_head.w2.shape[0], period_weights.shape[0]
-    check_shape("features", features, (anchors.shape[0], base_dim + num_periods * period_dim))
-    rows = features[visible]
-    periods = rows[:, base_dim:].reshape(len(visible), num_periods, period_dim)
-    centres = anchors[visible].detach()
-    directions = centres - camera_centre.detach()
+    num_offsets, num_periods = x.opacity_head.w2.shape[0], x.period_weights.shape[0]
+    check_shape(
+        "features", x.features, (x.anchors.shape[0], x.base_dim + num_periods * x.period_dim)
+    )
+    rows = x.features[x.visible]
+    periods = rows[:, x.base_dim :].reshape(len(x.visible), num_periods, x.period_dim)
+    centres = x.anchors[x.visible].detach()
+    directions = centres - x.camera_centre.detach()
     lengths = directions.norm(dim=-1, keepdim=True)
     directions = torch.where(lengths > MIN_DISTANCE, directions / lengths, 0)
     inputs = torch.cat(
         (
-            rows[:, :base_dim],
-            torch.einsum("t,mtv->mv", period_weights, periods),
+            rows[:, : x.base_dim],
+            torch.einsum("t,mtv->mv", x.period_weights, periods),
             directions,
-            (period_weights @ global_features).expand(len(visible), -1),
+            (x.period_weights @ x.global_features).expand(len(x.visible), -1),
         ),
         dim=-1,
     )
-    factors = torch.exp(log_scales[visible])[:, None, :]
-    covariances = _mlp(inputs, covariance_head).reshape(-1, num_offsets, 7)
+    factors = torch.exp(x.log_scales[x.visible])[:, None, :]
+    covariances = _mlp(inputs, x.covariance_head).reshape(-1, num_offsets, 7)
     return Splats(
-        means=(centres[:, None] + offsets[visible] * factors[..., :3]).reshape(-1, 3),
+        means=(centres[:, None] + x.offsets[x.visible] * factors[..., :3]).reshape(-1, 3),
         quats=_unit_quats(covariances[..., 3:].reshape(-1, 4)),
         scales=(factors[..., 3:] * torch.sigmoid(covariances[..., :3])).reshape(-1, 3),
-        opacities=torch.tanh(_mlp(inputs, opacity_head)).reshape(-1),
-        colors=torch.sigmoid(_mlp(inputs, color_head)).reshape(-1, 3),
+        opacities=torch.tanh(_mlp(inputs, x.opacity_head)).reshape(-1),
+        colors=torch.sigmoid(_mlp(inputs, x.color_head)).reshape(-1, 3),
     )
 
 
-def decode(
-    anchors: Tensor,
-    offsets: Tensor,
-    features: Tensor,
-    log_scales: Tensor,
-    global_features: Tensor,
-    period_weights: Tensor,
-    opacity_head: HeadWeights,
-    covariance_head: HeadWeights,
-    color_head: HeadWeights,
-    camera_centre: Tensor,
-    visible: Tensor,
-    *,
-    base_dim: int,
-    period_dim: int,
-) -> Splats:
+def decode(x: DecodeInputs) -> Splats:
     """Decode the visible anchors: `decode_reference`, compiled for float32 on a CPU.
 
     Only rows of visible anchors are read. Gradients of per-anchor tensors are dense, zero in other
-    rows and in the blocks of periods of weight 0. Values and gradients are equal bit by bit for any
+    rows and in the blocks of periods of weight 0. Values and gradients have equal bits for any
     number of threads. Other types and devices go through `decode_reference`.
 
     Raises:
         ShapeError: If the sizes do not fit together.
     """
-    tensors = (offsets, features, log_scales, global_features)
-    heads = (opacity_head, covariance_head, color_head)
-    fixed = (anchors, period_weights, camera_centre, visible)
-    return _decode(fixed, tensors, heads, (base_dim, period_dim), ALL)[0]
+    return _decode(x, _ALL)[0]
 
 
-def decode_active(
-    anchors: Tensor,
-    offsets: Tensor,
-    features: Tensor,
-    log_scales: Tensor,
-    global_features: Tensor,
-    period_weights: Tensor,
-    opacity_head: HeadWeights,
-    covariance_head: HeadWeights,
-    color_head: HeadWeights,
-    camera_centre: Tensor,
-    visible: Tensor,
-    *,
-    base_dim: int,
-    period_dim: int,
-) -> tuple[Splats, Tensor]:
+def decode_active(x: DecodeInputs) -> tuple[Splats, Tensor]:
     """Decode only what can be seen: `decode` without the Gaussians of opacity 0 or less.
 
-    A rasterizer culls those anyway. With few offsets switched on this is much faster.
+    A rasterizer culls those anyway. Where most offsets are switched off this is much faster.
 
     Returns:
-        decoded: The L living Gaussians.
+        splats: The L active Gaussians.
         index: Their positions in the output of `decode`, ascending. int64 [L]
     """
-    tensors = (offsets, features, log_scales, global_features)
-    heads = (opacity_head, covariance_head, color_head)
-    fixed = (anchors, period_weights, camera_centre, visible)
-    return _decode(fixed, tensors, heads, (base_dim, period_dim), np.float32(0))
+    return _decode(x, np.float32(0))
 
 
-def _decode(
-    fixed: tuple[Tensor, Tensor, Tensor, Tensor],
-    tensors: tuple[Tensor, Tensor, Tensor, Tensor],
-    heads: tuple[HeadWeights, HeadWeights, HeadWeights],
-    dims: tuple[int, int],
-    above: np.float32,
-) -> tuple[Splats, Tensor]:
-    anchors, period_weights, camera_centre, visible = fixed
-    _check(anchors, tensors, period_weights, heads, camera_centre, visible, *dims)
-    weights = [weight for head in heads for weight in head]
+def _decode(x: DecodeInputs, above: np.float32) -> tuple[Splats, Tensor]:
+    _check(x)
+    fixed = (x.anchors, x.period_weights, x.camera_centre, x.visible)
+    tensors = (x.offsets, x.features, x.log_scales, x.global_features)
+    weights = [weight for head in x.heads for weight in head]
     floats = (*fixed[:3], *tensors, *weights)
     if all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in floats):
+        dims = (x.base_dim, x.period_dim)
         *outputs, index = Decode.apply(dims, above, fixed, *tensors, *weights)
         return Splats(*outputs), index
-    decoded = decode_reference(
-        anchors, *tensors, period_weights, *heads, camera_centre, visible,
-        base_dim=dims[0], period_dim=dims[1],
-    )  # fmt: skip
-    index = (~(decoded.opacities <= float(above))).nonzero()[:, 0]
-    return Splats(*(value[index] for value in decoded)), index
+    splats = decode_reference(x)
+    index = (~(splats.opacities <= float(above))).nonzero()[:, 0]
+    return Splats(*(value[index] for value in splats)), index
 
 
-def _check(
-    anchors: Tensor,
-    tensors: Sequence[Tensor],
-    period_weights: Tensor,
-    heads: Sequence[HeadWeights],
-    camera_centre: Tensor,
-    visible: Tensor,
-    base_dim: int,
-    period_dim: int,
-) -> None:
+def _check(x: DecodeInputs) -> None:
     """Check all sizes: the kernels do not."""
-    offsets, features, log_scales, global_features = tensors
-    rows, periods = anchors.shape[0], period_weights.shape[0]
-    hidden, count = heads[0].w1.shape[0], heads[0].b2.shape[0]
-    check_shape("anchors", anchors, (rows, 3))
-    check_shape("offsets", offsets, (rows, count, 3))
-    check_shape("features", features, (rows, base_dim + periods * period_dim))
-    check_shape("log_scales", log_scales, (rows, 6))
-    check_shape("global_features", global_features, (periods, None))
-    check_shape("camera_centre", camera_centre, (3,))
-    check_shape("visible", visible, (None,))
-    inputs = base_dim + period_dim + 3 + global_features.shape[1]
-    for name, head, width in zip(("opacity", "covariance", "color"), heads, (1, 7, 3), strict=True):
+    rows, periods = x.anchors.shape[0], x.period_weights.shape[0]
+    hidden, count = x.opacity_head.w1.shape[0], x.opacity_head.b2.shape[0]
+    check_shape("anchors", x.anchors, (rows, 3))
+    check_shape("offsets", x.offsets, (rows, count, 3))
+    check_shape("features", x.features, (rows, x.base_dim + periods * x.period_dim))
+    check_shape("log_scales", x.log_scales, (rows, 6))
+    check_shape("global_features", x.global_features, (periods, None))
+    check_shape("camera_centre", x.camera_centre, (3,))
+    check_shape("visible", x.visible, (None,))
+    inputs = x.base_dim + x.period_dim + 3 + x.global_features.shape[1]
+    names = ("opacity", "covariance", "color")
+    for name, head, width in zip(names, x.heads, (1, 7, 3), strict=True):
         check_shape(f"{name} head w1", head.w1, (hidden, inputs))
         check_shape(f"{name} head b1", head.b1, (hidden,))
         check_shape(f"{name} head w2", head.w2, (width * count, hidden))
         check_shape(f"{name} head b2", head.b2, (width * count,))
+    visible = x.visible
     rising = bool((visible[1:] > visible[:-1]).all())
     if not rising or (len(visible) and (visible[0] < 0 or visible[-1] >= rows)):
         raise ShapeError(

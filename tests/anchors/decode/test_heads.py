@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from chronoscene.anchors.decode.heads import (
+    DecodeInputs,
     HeadWeights,
     decode,
     decode_active,
@@ -54,7 +55,7 @@ class Problem:
         """Outputs."""
         names = ("opacity_head", "covariance_head", "color_head")
         named = dict(zip(names, heads, strict=True))
-        return function(**self.fixed, **leaves, **named, **self.dims)
+        return function(DecodeInputs(**self.fixed, **leaves, **named, **self.dims))
 
     def double(self) -> Problem:
         """The same numbers in float64."""
@@ -288,17 +289,17 @@ def test_outputs_that_do_not_matter() -> None:
 
 
 def active_gradients(problem: Problem, function: Any) -> tuple[Splats, Tensor, dict[str, Tensor]]:
-    """Run with gradients for living Gaussians only; outputs of those, their index, gradients."""
+    """Run with gradients for active Gaussians only; outputs of those, their index, gradients."""
     with torch.no_grad():
         opacities = problem.call(decode, problem.leaves, problem.heads).opacities
-    living = opacities > 0
-    index = living.nonzero()[:, 0]
+    active = opacities > 0
+    index = active.nonzero()[:, 0]
     if function is decode_active:
         whole, problem.grads = problem.grads, tuple(grad[index] for grad in problem.grads)
         found: list[Tensor] = []
 
-        def run(**arguments: Any) -> Splats:
-            out, positions = decode_active(**arguments)
+        def run(inputs: DecodeInputs) -> Splats:
+            out, positions = decode_active(inputs)
             found.append(positions)
             return out
 
@@ -306,7 +307,7 @@ def active_gradients(problem: Problem, function: Any) -> tuple[Splats, Tensor, d
         problem.grads = whole
         return out, found[0], grads
     problem.grads = tuple(
-        grad * living.reshape(-1, *[1] * (grad.ndim - 1)) for grad in problem.grads
+        grad * active.reshape(-1, *[1] * (grad.ndim - 1)) for grad in problem.grads
     )
     out, grads = problem.run(function)
     return Splats(*(value[index] for value in out)), index, grads
@@ -320,7 +321,7 @@ def active_gradients(problem: Problem, function: Any) -> tuple[Splats, Tensor, d
     shift=st.sampled_from([-9.0, -1.0, -0.3, 0.0, 9.0]),
     seed=st.integers(0, 1000),
 )
-def test_living_equals_the_living_part(
+def test_active_equals_the_active_part(
     visible: int, offsets: int, hidden: int, shift: float, seed: int
 ) -> None:
     problem = make_problem(visible=visible, offsets=offsets, hidden=hidden, seed=seed)
@@ -333,7 +334,7 @@ def test_living_equals_the_living_part(
     assert all(torch.equal(our_grads[name], grad) for name, grad in grads.items())
 
 
-def test_living_over_several_chunks_and_threads() -> None:
+def test_active_over_several_chunks_and_threads() -> None:
     problem = make_problem(anchors=3 * CHUNK, visible=2 * CHUNK + 77, offsets=5)
     with torch.no_grad():
         problem.heads[0].b2.sub_(0.5)
@@ -348,7 +349,7 @@ def test_living_over_several_chunks_and_threads() -> None:
     assert all(torch.equal(grad, many_grads[name]) for name, grad in one_grads.items())
 
 
-def test_living_in_double_is_the_living_part_of_the_definition() -> None:
+def test_active_in_double_is_the_active_part_of_the_definition() -> None:
     problem = make_problem().double()
     out, index = problem.call(decode_active, problem.leaves, problem.heads)
     truth = problem.call(decode_reference, problem.leaves, problem.heads)
@@ -356,7 +357,7 @@ def test_living_in_double_is_the_living_part_of_the_definition() -> None:
     assert torch.equal(out.colors, truth.colors[index])
 
 
-def test_not_a_number_lives() -> None:
+def test_not_a_number_is_active() -> None:
     """It reaches the rasterizer, which reports it, instead of vanishing."""
     problem = make_problem()
     first = int(problem.fixed["visible"][0])
