@@ -19,7 +19,7 @@ from chronoscene.anchors.method import AnchorMethod
 from chronoscene.anchors.model import AnchorLayout
 from chronoscene.anchors.trainer import AfterUpdate
 from chronoscene.methods import Prediction, View
-from chronoscene.training.rendering import draw, prediction_of
+from chronoscene.training.splatting import draw, prediction_of
 
 
 class ChronoGS(AnchorMethod):

@@ -19,9 +19,8 @@ from chronoscene.errors import CheckpointError
 from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
-from chronoscene.training.method import SplattingMethod
-from chronoscene.training.rendering import draw
 from chronoscene.training.sparse_points import finite_rows
+from chronoscene.training.splatting import SplattingMethod, draw
 
 
 class AnchorMethod(SplattingMethod):

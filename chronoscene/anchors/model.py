@@ -26,7 +26,7 @@ from chronoscene.anchors.voxels import initial_log_scales
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import View
 from chronoscene.rasterizer import NEAR_PLANE
-from chronoscene.training.rendering import Splats, camera_centre_tensor
+from chronoscene.training.splatting import Splats, camera_centre_tensor
 
 PER_ANCHOR = ("offsets", "features", "log_scales")
 """Trained tensors with one row per anchor."""

@@ -22,7 +22,6 @@ from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.losses import mean_volume, photometric_loss
 from chronoscene.training.optimizer import Adam
-from chronoscene.training.rendering import camera_centre_tensor, draw
 from chronoscene.training.row_adam import make_table
 from chronoscene.training.schedule import (
     ViewSampler,
@@ -31,6 +30,7 @@ from chronoscene.training.schedule import (
     log_linear,
 )
 from chronoscene.training.sparse_points import finite_rows
+from chronoscene.training.splatting import camera_centre_tensor, draw
 
 Rates = Mapping[str, tuple[float, float]]
 AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]

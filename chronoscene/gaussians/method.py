@@ -15,8 +15,7 @@ from chronoscene.gaussians.trainer import Due, GaussianTrainer
 from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.checkpoint import META_FILE
-from chronoscene.training.method import SplattingMethod
-from chronoscene.training.rendering import draw
+from chronoscene.training.splatting import SplattingMethod, draw
 
 
 class GaussianMethod(SplattingMethod):

@@ -19,8 +19,8 @@ from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.losses import photometric_loss
 from chronoscene.training.optimizer import Adam
-from chronoscene.training.rendering import draw
 from chronoscene.training.schedule import ViewSampler, log_linear
+from chronoscene.training.splatting import draw
 
 _SPLIT_STREAM = 1
 """Keeps the samples of splits apart from other draws of the same seed."""

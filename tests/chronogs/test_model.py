@@ -14,7 +14,7 @@ from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
 from chronoscene.errors import ConfigError
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.training.losses import mean_volume
-from chronoscene.training.rendering import Splats, draw
+from chronoscene.training.splatting import Splats, draw
 
 Make = Callable[..., ChronoGS]
 CENTRE = torch.tensor([0.3, -0.2, 2.0])

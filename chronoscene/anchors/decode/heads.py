@@ -18,7 +18,7 @@ from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.decode.layout import MIN_DISTANCE, MIN_QUAT_NORM
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
-from chronoscene.training.rendering import Splats
+from chronoscene.training.splatting import Splats
 
 _ALL = np.float32(-np.inf)
 """Opacity above which Gaussians are active, if all are to be."""

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from chronoscene.methods import View
-from chronoscene.training.rendering import camera_centre_tensor, camera_tensors
+from chronoscene.training.splatting import camera_centre_tensor, camera_tensors
 
 
 def make_view():
