@@ -35,9 +35,9 @@ from chronoscene.anchors.decode.heads import (
     decode_reference,
 )
 from chronoscene.kernels.runtime import available_threads, set_threads
+from chronoscene.training.adam import Adam, DenseTable, Table
 from chronoscene.training.losses import photometric_loss, photometric_loss_reference
-from chronoscene.training.optimizer import Adam
-from chronoscene.training.row_adam import DenseTable, RowAdam, Table
+from chronoscene.training.row_adam import RowAdam
 
 OFFSETS, BASE, PERIOD, PERIODS, SHARED, HIDDEN = 10, 16, 16, 3, 32, 32
 HEIGHT, WIDTH = 240, 320

@@ -43,7 +43,8 @@ from chronoscene.images.store import ImageStore
 from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
 from chronoscene.rasterizer.cpu import Render
 from chronoscene.training import losses
-from chronoscene.training.row_adam import DenseTable, RowAdam
+from chronoscene.training.adam import DenseTable
+from chronoscene.training.row_adam import RowAdam
 
 PARTS: tuple[tuple[str, Any, str], ...] = (
     ("frustum culling", AnchorModel, "visible"),

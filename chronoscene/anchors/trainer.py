@@ -20,8 +20,8 @@ from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, pru
 from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
+from chronoscene.training.adam import Adam
 from chronoscene.training.losses import mean_volume, photometric_loss
-from chronoscene.training.optimizer import Adam
 from chronoscene.training.row_adam import make_table
 from chronoscene.training.schedule import (
     ViewSampler,

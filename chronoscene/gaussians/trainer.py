@@ -17,8 +17,8 @@ from chronoscene.gaussians.density import GradientStatistics, densify, reset_opa
 from chronoscene.gaussians.model import GaussianModel
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
+from chronoscene.training.adam import Adam
 from chronoscene.training.losses import photometric_loss
-from chronoscene.training.optimizer import Adam
 from chronoscene.training.schedule import ViewSampler, log_linear
 from chronoscene.training.splatting import draw
 

@@ -7,67 +7,43 @@ are next read, all steps at once, so a step costs what it reads, however large t
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numba import prange
+from numpy import float32
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.training import row_adam_kernel as kernel
-from chronoscene.training.adam_kernel import BETA1, BETA2
-from chronoscene.training.optimizer import Adam
+from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.kernels.memory import load_first, read, read_index, store_first, write_index
+from chronoscene.kernels.vectors import LANES, select, splat, sqrt
+from chronoscene.training.adam import (
+    BETA1,
+    BETA2,
+    GAIN1,
+    GAIN2,
+    KEEP2,
+    TINY_MEAN,
+    TINY_SQUARE,
+    DenseTable,
+    Table,
+)
 
 _HORIZON = 256
 """Steps after which a number that is not read no longer moves: what is left of its way is 2e-12 of
 it."""
 _RATIO = BETA1 / BETA2**0.5
-_NAME = "table"
-
-
-class Table(ABC):
-    """A trained tensor with one row per anchor. [R, ...]"""
-
-    value: Tensor
-    """The table; up to date after `flush`."""
-
-    @abstractmethod
-    def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
-        """Copies of some rows and blocks, up to date, as a leaf that collects a gradient.
-
-        `step` uses that gradient; the copies of an earlier call are forgotten. The table is left as
-        it is.
-
-        Args:
-            rows: Each at most once. [M]
-            blocks: Their columns come one after the other.
-
-        Returns:
-            [M, ...], with the table's own shape of a row if there is one block.
-        """
-
-    @abstractmethod
-    def step(self, rate: float) -> None:
-        """One step with a learning rate; what was not fetched has the gradient zero."""
-
-    @abstractmethod
-    def flush(self) -> Tensor:
-        """Bring all rows up to date; returns the table."""
-
-    @abstractmethod
-    def snapshot(self) -> Tensor:
-        """What `flush` would return, perhaps a copy. Changes nothing: later steps round as if it
-        had not been called."""
-
-    @abstractmethod
-    def extend(self, new_rows: Tensor) -> Tensor:
-        """Append rows with zero moments; returns the table. [n, ...]"""
-
-    @abstractmethod
-    def keep(self, mask: Tensor) -> Tensor:
-        """Keep the rows where the mask holds; returns the table. bool [R]"""
+LOG_BETA2 = math.log(BETA2)
+WAY_PARTS = 3
+"""Numbers for each gap: way over mean / root of square, and what is left of the two moments."""
+CHUNK = 256
+"""Rows that a task takes at a time."""
+ZERO = float32(0)
 
 
 def make_table(value: Tensor, blocks: Sequence[int] | None, eps: float, *, lazy: bool) -> Table:
@@ -75,60 +51,6 @@ def make_table(value: Tensor, blocks: Sequence[int] | None, eps: float, *, lazy:
     if lazy and value.device.type == "cpu" and value.dtype == torch.float32:
         return RowAdam(value, blocks, eps)
     return DenseTable(value, blocks, eps)
-
-
-class DenseTable(Table):
-    """The usual `Adam`, which moves every row in every step.
-
-    Args:
-        value: The table. [R, ...]
-        blocks: Columns of each block; None for one block.
-        eps: Added to the root of the second moment.
-    """
-
-    def __init__(
-        self, value: Tensor, blocks: Sequence[int] | None = None, eps: float = 1e-15
-    ) -> None:
-        self._adam = Adam({_NAME: value.detach().requires_grad_()}, eps)
-        self._blocks = blocks
-        self._fetched: tuple[tuple[Tensor, ...], Tensor] | None = None
-
-    @property
-    def value(self) -> Tensor:  # type: ignore[override]
-        return self._adam.params[_NAME].detach()
-
-    def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
-        cells: tuple[Tensor, ...] = (torch.from_numpy(rows).to(self.value.device),)
-        if self._blocks is not None:
-            columns = torch.arange(sum(self._blocks)).split(list(self._blocks))
-            chosen = torch.cat([columns[block] for block in blocks]).to(self.value.device)
-            cells = (cells[0][:, None], chosen)
-        leaf = self.value[cells].requires_grad_()
-        self._fetched = cells, leaf
-        return leaf
-
-    def step(self, rate: float) -> None:
-        grad = torch.zeros_like(self.value)
-        if self._fetched is not None and (found := self._fetched[1].grad) is not None:
-            grad[self._fetched[0]] = found
-        self._fetched = None
-        self._adam.params[_NAME].grad = grad
-        self._adam.step({_NAME: rate})
-        self._adam.zero_grad()
-
-    def flush(self) -> Tensor:
-        return self.value
-
-    def snapshot(self) -> Tensor:
-        return self.value
-
-    def extend(self, new_rows: Tensor) -> Tensor:
-        self._fetched = None
-        return self._adam.extend(_NAME, new_rows).detach()
-
-    def keep(self, mask: Tensor) -> Tensor:
-        self._fetched = None
-        return self._adam.keep(_NAME, mask).detach()
 
 
 class RowAdam(Table):
@@ -174,7 +96,7 @@ class RowAdam(Table):
         out = torch.empty(len(rows), chosen.columns)
         # In units of the root of the second moment without bias correction.
         eps = np.float32(self._eps * (1 - BETA2 ** max(self.steps, 1)) ** 0.5)
-        kernel.fetch(*self._addresses(chosen), eps, out.data_ptr())
+        _fetch(*self._addresses(chosen), eps, out.data_ptr())
         if len(self._widths) == 1:
             out = out.view(len(rows), *self.value.shape[1:])
         leaf = out.requires_grad_()
@@ -189,7 +111,7 @@ class RowAdam(Table):
             grads = found.contiguous()
             scalars = (np.float32(corrected), np.float32(root), np.float32(self._eps))
             addresses = (copies.data_ptr(), grads.data_ptr())
-            kernel.update(*self._addresses(chosen), *addresses, scalars)
+            _update(*self._addresses(chosen), *addresses, scalars)
         self._fetched = None
         self.steps += 1
         self._speeds.append(corrected / root)
@@ -247,16 +169,14 @@ class RowAdam(Table):
         widths = self._widths[chosen]
         return np.stack([chosen, self._starts[chosen], widths, np.cumsum(widths) - widths], axis=1)
 
-    def _addresses(self, chosen: _Rows) -> tuple[kernel.Table, kernel.Part, int, int, int, int]:
+    def _addresses(self, chosen: _Rows) -> tuple[_Table, _Part, int, int, int, int]:
         """The first arguments of both kernels."""
         tables = (self.value.data_ptr(), self._mean.data_ptr(), self._square.data_ptr())
         rows, places = chosen.rows, chosen.places
         ways, settled = self._ways, self._settled
         return (
-            kernel.Table(*tables, self._columns, self._stamps.ctypes.data, len(self._widths)),
-            kernel.Part(
-                rows.ctypes.data, len(rows), places.ctypes.data, len(places), chosen.columns
-            ),
+            _Table(*tables, self._columns, self._stamps.ctypes.data, len(self._widths)),
+            _Part(rows.ctypes.data, len(rows), places.ctypes.data, len(places), chosen.columns),
             self.steps,
             ways.ctypes.data,
             len(ways) - 1,
@@ -277,7 +197,7 @@ class RowAdam(Table):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rows:
-    """What a step reads of a table; see `row_adam_kernel.Part`."""
+    """What a step reads of a table; see `row_adam__Part`."""
 
     rows: NDArray[np.int64]
     places: NDArray[np.int64]
@@ -285,3 +205,129 @@ class _Rows:
     @property
     def columns(self) -> int:
         return int(self.places[:, 2].sum())
+
+
+class _Table(NamedTuple):
+    """Addresses and lengths of a table and its moments."""
+
+    values: int
+    """[R, columns]"""
+    means: int
+    squares: int
+    columns: int
+    stamps: int
+    """Step up to which a row and block is done. int64 [R, blocks]"""
+    blocks: int
+
+
+class _Part(NamedTuple):
+    """Addresses and lengths of what a step reads of a table."""
+
+    rows: int
+    """Each once. int64 [M]"""
+    num_rows: int
+    places: int
+    """(block, first column, columns, first column in the copy) of each block. int64 [b, 4]"""
+    num_places: int
+    columns: int
+    """Of the copy."""
+
+
+@inner
+def _clean(mean, square):  # type: ignore[no-untyped-def]
+    """Moments without denormal numbers; see `TINY_MEAN`."""
+    tiny, zero = splat(TINY_MEAN), splat(ZERO)
+    mean = select(mean < tiny, select(zero - tiny < mean, zero, mean), mean)
+    return mean, select(square < splat(TINY_SQUARE), zero, square)
+
+
+@inner
+def _wait_of(table, stamp_at, now, ways, longest, settled):  # type: ignore[no-untyped-def]
+    """Way, and what is left of the moments, of a row and block that was not read for a while."""
+    stamp = read_index(table.stamps, stamp_at)
+    gap = now - stamp
+    if gap <= longest:
+        at = WAY_PARTS * gap
+        return read(ways, at), read(ways, at + 1), read(ways, at + 2)
+    return read(settled, stamp), ZERO, float32(math.exp(gap * LOG_BETA2))
+
+
+@inner
+def _place(table, part, m, b):  # type: ignore[no-untyped-def]
+    """Of block b of copy m: places of its stamp and numbers, its width, its place in the copy."""
+    row = read_index(part.rows, m)
+    stamp_at = row * table.blocks + read_index(part.places, 4 * b)
+    at = row * table.columns + read_index(part.places, 4 * b + 1)
+    to = m * part.columns + read_index(part.places, 4 * b + 3)
+    return stamp_at, at, read_index(part.places, 4 * b + 2), to
+
+
+@inner
+def _copy(table, at, width, way, eps, out, to):  # type: ignore[no-untyped-def]
+    """The numbers of one row and block after their wait."""
+    for c in range(0, width, LANES):
+        left = width - c
+        value = load_first(table.values, at + c, left)
+        if way != ZERO:
+            mean = load_first(table.means, at + c, left)
+            root = sqrt(load_first(table.squares, at + c, left))
+            value = value - way * mean / (root + eps)
+        store_first(out, to + c, value, left)
+
+
+@kernel(parallel=True)
+def _fetch(table, part, now, ways, longest, settled, eps, out):  # type: ignore[no-untyped-def]
+    """Copy rows as they are at the present step.
+
+    Args:
+        table: `_Table`.
+        part: `_Part`.
+        now: Present step.
+        ways: Address of numbers for each wait of 0..longest steps. float32 [G + 1, WAY_PARTS]
+        longest: G; what waited longer has gone all its way.
+        settled: Address of the way of those, by their stamp. float32
+        eps: As a part of the root.
+        out: Address of the copies. [M, columns]
+    """
+    for task in prange((part.num_rows + CHUNK - 1) // CHUNK):
+        for m in range(task * CHUNK, min((task + 1) * CHUNK, part.num_rows)):
+            for b in range(part.num_places):
+                stamp_at, at, width, to = _place(table, part, m, b)
+                way, _, _ = _wait_of(table, stamp_at, now, ways, longest, settled)
+                _copy(table, at, width, way, eps, out, to)
+
+
+@inner
+def _step(table, at, width, keep, copies, grads, to, scalars):  # type: ignore[no-untyped-def]
+    keep1, keep2 = keep
+    rate, root, eps = scalars
+    for c in range(0, width, LANES):
+        left = width - c
+        grad = load_first(grads, to + c, left)
+        mean = keep1 * load_first(table.means, at + c, left)
+        mean = mean + GAIN1 * (grad - mean)
+        square = (KEEP2 * keep2) * load_first(table.squares, at + c, left)
+        mean, square = _clean(mean, square + GAIN2 * grad * grad)
+        moved = rate * mean / (sqrt(square) * root + eps)
+        store_first(table.values, at + c, load_first(copies, to + c, left) - moved, left)
+        store_first(table.means, at + c, mean, left)
+        store_first(table.squares, at + c, square, left)
+
+
+@kernel(parallel=True)
+def _update(table, part, now, ways, longest, settled, copies, grads, scalars):  # type: ignore[no-untyped-def]
+    """One step of Adam for rows that were fetched; see `TINY_MEAN`.
+
+    Args:
+        table, part, now, ways, longest, settled: As in `_fetch`.
+        copies: Address of what it wrote.
+        grads: Address of the gradients of the copies.
+        scalars: rate, root and eps, as in `adam_block`.
+    """
+    for task in prange((part.num_rows + CHUNK - 1) // CHUNK):
+        for m in range(task * CHUNK, min((task + 1) * CHUNK, part.num_rows)):
+            for b in range(part.num_places):
+                stamp_at, at, width, to = _place(table, part, m, b)
+                _, keep1, keep2 = _wait_of(table, stamp_at, now, ways, longest, settled)
+                _step(table, at, width, (keep1, keep2), copies, grads, to, scalars)
+                write_index(table.stamps, stamp_at, now + 1)

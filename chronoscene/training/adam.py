@@ -1,18 +1,40 @@
-"""Adam for parameters whose rows come and go."""
+"""Adam for parameters whose rows come and go, and for tables of which a step reads some rows."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numba import prange
+from numpy import float32
 from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
-from chronoscene.training.adam_kernel import BETA1, BETA2, BLOCK, adam_block, adam_blocks
+from chronoscene.kernels.compilation import kernel
+
+BETA1 = 0.9
+BETA2 = 0.999
+# Rounded once: 1 - float32(0.999) would be off by 5e-5.
+GAIN1 = float32(1 - BETA1)
+KEEP2 = float32(BETA2)
+GAIN2 = float32(1 - BETA2)
+
+BLOCK = 16384
+"""Elements per task. Fixed, so that vector bodies and remainders fall on the same elements, and
+results are equal bit by bit, for any number of threads."""
+
+# Moments below these are zero for every practical purpose: the update that they cause is under
+# 1e-18 of a learning rate. Left to decay they end up as denormals, which are slow on many CPUs.
+TINY_MEAN = float32(1e-34)
+TINY_SQUARE = float32(1e-37)
+
+_NAME = "table"
 
 
 @dataclass(slots=True, eq=False)
@@ -157,3 +179,133 @@ def _step_torch(
     moments.mean.lerp_(grad, 1 - BETA1)
     moments.square.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
     value.addcdiv_(moments.mean, (moments.square.sqrt() * root).add_(eps), value=-rate)
+
+
+@kernel(fastmath={"contract", "nsz", "arcp"})
+def adam_block(values, grads, means, squares, rate, root, eps):  # type: ignore[no-untyped-def]
+    """Update a flat array in place (Kingma and Ba 2015, algorithm 1).
+
+    mean += (1 - BETA1) (grad - mean);  square = BETA2 square + (1 - BETA2) grad²;
+    value -= rate * mean / (sqrt(square) * root + eps).
+
+    Args:
+        rate: Learning rate over the bias correction of the first moment.
+        root: 1 over the root of the bias correction of the second moment.
+    """
+    zero = float32(0)
+    for i in range(values.shape[0]):
+        grad = grads[i]
+        mean = means[i] + GAIN1 * (grad - means[i])
+        square = KEEP2 * squares[i] + GAIN2 * grad * grad
+        mean = zero if abs(mean) < TINY_MEAN else mean
+        square = zero if square < TINY_SQUARE else square
+        values[i] -= rate * mean / (math.sqrt(square) * root + eps)
+        means[i] = mean
+        squares[i] = square
+
+
+@kernel(parallel=True)
+def adam_blocks(values, grads, means, squares, rate, root, eps):  # type: ignore[no-untyped-def]
+    """Update a large flat array in place, blocks spread over the threads."""
+    size = values.shape[0]
+    for block in prange((size + BLOCK - 1) // BLOCK):
+        # Slices: an index that is counted from 0 is known not to wrap, so the loop vectorises.
+        part = slice(block * BLOCK, min((block + 1) * BLOCK, size))
+        adam_block(values[part], grads[part], means[part], squares[part], rate, root, eps)
+
+
+class Table(ABC):
+    """A trained tensor with one row per anchor. [R, ...]"""
+
+    value: Tensor
+    """The table; up to date after `flush`."""
+
+    @abstractmethod
+    def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
+        """Copies of some rows and blocks, up to date, as a leaf that collects a gradient.
+
+        `step` uses that gradient; the copies of an earlier call are forgotten. The table is left as
+        it is.
+
+        Args:
+            rows: Each at most once. [M]
+            blocks: Their columns come one after the other.
+
+        Returns:
+            [M, ...], with the table's own shape of a row if there is one block.
+        """
+
+    @abstractmethod
+    def step(self, rate: float) -> None:
+        """One step with a learning rate; what was not fetched has the gradient zero."""
+
+    @abstractmethod
+    def flush(self) -> Tensor:
+        """Bring all rows up to date; returns the table."""
+
+    @abstractmethod
+    def snapshot(self) -> Tensor:
+        """What `flush` would return, perhaps a copy. Changes nothing: later steps round as if it
+        had not been called."""
+
+    @abstractmethod
+    def extend(self, new_rows: Tensor) -> Tensor:
+        """Append rows with zero moments; returns the table. [n, ...]"""
+
+    @abstractmethod
+    def keep(self, mask: Tensor) -> Tensor:
+        """Keep the rows where the mask holds; returns the table. bool [R]"""
+
+
+class DenseTable(Table):
+    """The usual `Adam`, which moves every row in every step.
+
+    Args:
+        value: The table. [R, ...]
+        blocks: Columns of each block; None for one block.
+        eps: Added to the root of the second moment.
+    """
+
+    def __init__(
+        self, value: Tensor, blocks: Sequence[int] | None = None, eps: float = 1e-15
+    ) -> None:
+        self._adam = Adam({_NAME: value.detach().requires_grad_()}, eps)
+        self._blocks = blocks
+        self._fetched: tuple[tuple[Tensor, ...], Tensor] | None = None
+
+    @property
+    def value(self) -> Tensor:  # type: ignore[override]
+        return self._adam.params[_NAME].detach()
+
+    def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
+        cells: tuple[Tensor, ...] = (torch.from_numpy(rows).to(self.value.device),)
+        if self._blocks is not None:
+            columns = torch.arange(sum(self._blocks)).split(list(self._blocks))
+            chosen = torch.cat([columns[block] for block in blocks]).to(self.value.device)
+            cells = (cells[0][:, None], chosen)
+        leaf = self.value[cells].requires_grad_()
+        self._fetched = cells, leaf
+        return leaf
+
+    def step(self, rate: float) -> None:
+        grad = torch.zeros_like(self.value)
+        if self._fetched is not None and (found := self._fetched[1].grad) is not None:
+            grad[self._fetched[0]] = found
+        self._fetched = None
+        self._adam.params[_NAME].grad = grad
+        self._adam.step({_NAME: rate})
+        self._adam.zero_grad()
+
+    def flush(self) -> Tensor:
+        return self.value
+
+    def snapshot(self) -> Tensor:
+        return self.value
+
+    def extend(self, new_rows: Tensor) -> Tensor:
+        self._fetched = None
+        return self._adam.extend(_NAME, new_rows).detach()
+
+    def keep(self, mask: Tensor) -> Tensor:
+        self._fetched = None
+        return self._adam.keep(_NAME, mask).detach()

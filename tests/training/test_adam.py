@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chronoscene.errors import ShapeError
-from chronoscene.training.adam_kernel import BLOCK
-from chronoscene.training.optimizer import Adam
+from chronoscene.training.adam import BLOCK, Adam
 
 # Worst of 1200 runs of 20 steps with rates up to 0.1: 1.7e-6, from rounding in another order.
 TOLERANCE = 5e-6
