@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
-from chronoscene.anchors.decode.heads import HeadWeights
+from chronoscene.anchors.decode import HeadWeights
 from chronoscene.anchors.model import HEADS
 from chronoscene.bench.provenance import code_version, processor_name
 from chronoscene.bench.strategies import make_parts

@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.anchors.decode.heads import (
+from chronoscene.anchors.decode import (
     DecodeInputs,
     HeadWeights,
     decode,

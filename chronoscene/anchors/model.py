@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import HEADS, AnchorConfig
-from chronoscene.anchors.decode.heads import DecodeInputs, HeadWeights, decode, decode_active
+from chronoscene.anchors.decode import DecodeInputs, HeadWeights, decode, decode_active
 from chronoscene.anchors.visibility import visible_anchors
 from chronoscene.anchors.voxels import initial_log_scales
 from chronoscene.errors import CheckpointError

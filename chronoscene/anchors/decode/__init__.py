@@ -1,1 +1,201 @@
-"""From the features of anchors to Gaussians: small MLPs, in torch and compiled."""
+"""Decode anchors into Gaussians: the small MLPs of Scaffold-GS and ChronoGS.
+
+`decode_reference` is the definition, in plain torch; `decode` is its compiled form: `function`
+joins it to torch, `forward` and `backward` are the kernels, on memory that `layout` describes.
+
+Source: Scaffold-GS (Lu et al., CVPR 2024), section 3.2, and ChronoGS (arXiv 2511.18794), section 3,
+which adds the features that vary with the period.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chronoscene.anchors.decode.function import Decode
+from chronoscene.anchors.decode.layout import MIN_DISTANCE, MIN_QUAT_NORM
+from chronoscene.checks import check_shape
+from chronoscene.errors import ShapeError
+from chronoscene.training.splatting import Splats
+
+_ALL = np.float32(-np.inf)
+"""Opacity above which Gaussians are active, if all are to be."""
+
+
+class HeadWeights(NamedTuple):
+    """One MLP with a ReLU hidden layer. I inputs, H hidden units, O outputs.
+
+    Input order: base feature, period feature, unit direction, global feature.
+    """
+
+    w1: Tensor
+    """[H, I]"""
+    b1: Tensor
+    """[H]"""
+    w2: Tensor
+    """[O, H]"""
+    b2: Tensor
+    """[O]"""
+
+
+class DecodeInputs(NamedTuple):
+    """What is decoded. Sizes: A anchors of which M are visible, k offsets, T periods."""
+
+    anchors: Tensor
+    """Positions in world units; get no gradient. [A, 3]"""
+    offsets: Tensor
+    """In units of the anchor's scale. [A, k, 3]"""
+    features: Tensor
+    """Base feature, then one block per period. [A, Fb + T * Fv]"""
+    log_scales: Tensor
+    """Logarithms in world units; 0:3 for offsets, 3:6 for Gaussians. [A, 6]"""
+    global_features: Tensor
+    """One row per period. [T, G]"""
+    period_weights: Tensor
+    """One-hot, or a mixture of periods. [T]"""
+    opacity_head: HeadWeights
+    """k outputs."""
+    covariance_head: HeadWeights
+    """7 k outputs: 3 scales and 4 quaternion numbers per offset."""
+    color_head: HeadWeights
+    """3 k outputs: rgb per offset."""
+    camera_centre: Tensor
+    """In world units; gets no gradient. [3]"""
+    visible: Tensor
+    """Ascending indices of the anchors to decode. int64 [M]"""
+    base_dim: int
+    """Fb"""
+    period_dim: int
+    """Fv"""
+
+    @property
+    def heads(self) -> tuple[HeadWeights, HeadWeights, HeadWeights]:
+        return self.opacity_head, self.covariance_head, self.color_head
+
+
+def decode_reference(x: DecodeInputs) -> Splats:
+    """Decode the visible anchors in plain torch: the definition of `decode`.
+
+    With e the period weights, f = (base, sum_s e_s period_s), d the unit vector from the camera to
+    the anchor and g = sum_s e_s global_s, every head sees the input (f, d, g) and
+
+        opacity = tanh(o), color = sigmoid(c), scale = exp(log_scales[3:6]) sigmoid(s),
+        quat = q / |q|, mean = anchor + offset exp(log_scales[0:3]).
+
+    The direction of an anchor in the camera centre is zero.
+
+    Returns:
+        splats: k to each visible anchor, anchor by anchor; opacities -1..1, colours 0..1. [M * k]
+    """
+    num_offsets, num_periods = x.opacity_head.w2.shape[0], x.period_weights.shape[0]
+    check_shape(
+        "features", x.features, (x.anchors.shape[0], x.base_dim + num_periods * x.period_dim)
+    )
+    rows = x.features[x.visible]
+    periods = rows[:, x.base_dim :].reshape(len(x.visible), num_periods, x.period_dim)
+    centres = x.anchors[x.visible].detach()
+    directions = centres - x.camera_centre.detach()
+    lengths = directions.norm(dim=-1, keepdim=True)
+    directions = torch.where(lengths > MIN_DISTANCE, directions / lengths, 0)
+    inputs = torch.cat(
+        (
+            rows[:, : x.base_dim],
+            torch.einsum("t,mtv->mv", x.period_weights, periods),
+            directions,
+            (x.period_weights @ x.global_features).expand(len(x.visible), -1),
+        ),
+        dim=-1,
+    )
+    factors = torch.exp(x.log_scales[x.visible])[:, None, :]
+    covariances = _mlp(inputs, x.covariance_head).reshape(-1, num_offsets, 7)
+    return Splats(
+        means=(centres[:, None] + x.offsets[x.visible] * factors[..., :3]).reshape(-1, 3),
+        quats=_unit_quats(covariances[..., 3:].reshape(-1, 4)),
+        scales=(factors[..., 3:] * torch.sigmoid(covariances[..., :3])).reshape(-1, 3),
+        opacities=torch.tanh(_mlp(inputs, x.opacity_head)).reshape(-1),
+        colors=torch.sigmoid(_mlp(inputs, x.color_head)).reshape(-1, 3),
+    )
+
+
+def decode(x: DecodeInputs) -> Splats:
+    """Decode the visible anchors: `decode_reference`, compiled for float32 on a CPU.
+
+    Only rows of visible anchors are read. Gradients of per-anchor tensors are dense, zero in other
+    rows and in the blocks of periods of weight 0. Values and gradients have equal bits for any
+    number of threads. Other types and devices go through `decode_reference`.
+
+    Raises:
+        ShapeError: If the sizes do not fit together.
+    """
+    return _decode(x, _ALL)[0]
+
+
+def decode_active(x: DecodeInputs) -> tuple[Splats, Tensor]:
+    """Decode only what can be seen: `decode` without the Gaussians of opacity 0 or less.
+
+    A rasterizer culls those anyway. Where most offsets are switched off this is much faster.
+
+    Returns:
+        splats: The L active Gaussians.
+        index: Their positions in the output of `decode`, ascending. int64 [L]
+    """
+    return _decode(x, np.float32(0))
+
+
+def _decode(x: DecodeInputs, above: np.float32) -> tuple[Splats, Tensor]:
+    _check(x)
+    fixed = (x.anchors, x.period_weights, x.camera_centre, x.visible)
+    tensors = (x.offsets, x.features, x.log_scales, x.global_features)
+    weights = [weight for head in x.heads for weight in head]
+    floats = (*fixed[:3], *tensors, *weights)
+    if all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in floats):
+        dims = (x.base_dim, x.period_dim)
+        *outputs, index = Decode.apply(dims, above, fixed, *tensors, *weights)
+        return Splats(*outputs), index
+    splats = decode_reference(x)
+    index = (~(splats.opacities <= float(above))).nonzero()[:, 0]
+    return Splats(*(value[index] for value in splats)), index
+
+
+def _check(x: DecodeInputs) -> None:
+    """Check all sizes: the kernels do not."""
+    rows, periods = x.anchors.shape[0], x.period_weights.shape[0]
+    hidden, count = x.opacity_head.w1.shape[0], x.opacity_head.b2.shape[0]
+    check_shape("anchors", x.anchors, (rows, 3))
+    check_shape("offsets", x.offsets, (rows, count, 3))
+    check_shape("features", x.features, (rows, x.base_dim + periods * x.period_dim))
+    check_shape("log_scales", x.log_scales, (rows, 6))
+    check_shape("global_features", x.global_features, (periods, None))
+    check_shape("camera_centre", x.camera_centre, (3,))
+    check_shape("visible", x.visible, (None,))
+    inputs = x.base_dim + x.period_dim + 3 + x.global_features.shape[1]
+    names = ("opacity", "covariance", "color")
+    for name, head, width in zip(names, x.heads, (1, 7, 3), strict=True):
+        check_shape(f"{name} head w1", head.w1, (hidden, inputs))
+        check_shape(f"{name} head b1", head.b1, (hidden,))
+        check_shape(f"{name} head w2", head.w2, (width * count, hidden))
+        check_shape(f"{name} head b2", head.b2, (width * count,))
+    visible = x.visible
+    rising = bool((visible[1:] > visible[:-1]).all())
+    if not rising or (len(visible) and (visible[0] < 0 or visible[-1] >= rows)):
+        raise ShapeError(
+            "visible",
+            expected=f"ascending indices of {rows} anchors",
+            found="others",
+            todo="pass indices of rows that exist, sorted, each once",
+        )
+
+
+def _mlp(inputs: Tensor, head: HeadWeights) -> Tensor:
+    return torch.relu(inputs @ head.w1.T + head.b1) @ head.w2.T + head.b2
+
+
+def _unit_quats(quats: Tensor) -> Tensor:
+    squares = quats.square().sum(-1, keepdim=True)
+    valid = squares > MIN_QUAT_NORM**2
+    identity = torch.zeros_like(quats)
+    identity[:, 0] = 1
+    return torch.where(valid, quats * torch.where(valid, squares, 1).rsqrt(), identity)

@@ -1,7 +1,7 @@
 """Gradients of the anchor decode, compiled.
 
 Anchors with a gradient are gathered into blocks. The first layers are matrix products over a block;
-for the second layers see `_decode_second`.
+for the second layers see `second_layers`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,10 @@ def _has_gradient(grads, g):  # type: ignore[no-untyped-def]
 
 @inner
 def _raw_gradients(outputs, grads, g, count, work, done):  # type: ignore[no-untyped-def]
-    """Gradients of the raw outputs of the Gaussians of an anchor, behind those ``done`` before."""
+    """Gradients of the raw outputs of the Gaussians of an anchor, behind those ``done`` before:
+
+    tanh' = 1 - tanh^2, sigmoid' = sigmoid (1 - sigmoid), d q/|q| = (I - q q^T / |q|^2) / |q|.
+    """
     for c in range(0, count, LANES):
         opacity = load_first(outputs.opacities, g + c, count - c)
         grad = load_first(grads.opacities, g + c, count - c)

@@ -1,7 +1,7 @@
 """Decode anchors, compiled: blocks of anchors through the joined heads.
 
-Two passes. The first finds the opacities, and so which Gaussians live and where in the output they
-go; the second decodes the shapes and colours of anchors that have a living Gaussian.
+Two passes. The first finds the opacities, and so which Gaussians are active and where in the output
+they go; the second decodes the shapes and colours of anchors that have an active Gaussian.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ AHEAD = 16
 """Anchors between the request for a row and its use."""
 ZERO = float32(0)
 ONE = float32(1)
-LEAST_DISTANCE = float32(MIN_DISTANCE)
-LEAST_SQUARE = float32(MIN_QUAT_NORM**2)
+_MIN_DISTANCE = float32(MIN_DISTANCE)
+_MIN_SQUARE = float32(MIN_QUAT_NORM**2)
 
 
 @inner
@@ -98,7 +98,7 @@ def gather_inputs(layout, source, m, x, slot):  # type: ignore[no-untyped-def]
     dy = read(source.anchors, 3 * anchor + 1) - read(source.centre, 1)
     dz = read(source.anchors, 3 * anchor + 2) - read(source.centre, 2)
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    over = ONE / length if length > LEAST_DISTANCE else ZERO
+    over = ONE / length if length > _MIN_DISTANCE else ZERO
     write(x, at + layout.features, dx * over)
     write(x, at + layout.features + 1, dy * over)
     write(x, at + layout.features + 2, dz * over)
@@ -127,15 +127,15 @@ def _output_layer(layout, weights, work, head, first, columns):  # type: ignore[
 
 @inner
 def _count_row(raw, at, count, m, above, out):  # type: ignore[no-untyped-def]
-    """Opacities of an anchor, and how many of its Gaussians live."""
+    """Opacities tanh(o) of an anchor, and how many of its Gaussians are active."""
     first = m * count
     for c in range(0, count, LANES):
         store_first(out.alphas, first + c, tanh(load(raw, at + c)), count - c)
-    living = 0
+    active = 0
     for j in range(first, first + count):
-        # What is not a number lives, so that it does not go unnoticed.
-        living += not (read(out.alphas, j) <= above)
-    write_index(out.starts, m + 1, living)
+        # What is not a number is active, so that it does not go unnoticed.
+        active += not (read(out.alphas, j) <= above)
+    write_index(out.starts, m + 1, active)
 
 
 @kernel(parallel=True)
@@ -146,7 +146,7 @@ def decode_opacities(layout, weights, source, above, out, work, work_size, tasks
         layout: `Layout`.
         weights: `Weights`.
         source: `Anchors`.
-        above: Gaussians live unless their opacity is this or less. float32
+        above: Gaussians are active unless their opacity is this or less. float32
         out: `Outputs`, alphas and starts written.
         work: `Work` of the first task, finite numbers.
         work_size: Numbers in it.
@@ -177,8 +177,8 @@ def factors(source, anchor, row):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _gather_living(layout, source, m, slot, above, work, done, out):  # type: ignore[no-untyped-def]
-    """Put raw outputs of the living Gaussians of an anchor behind those ``done`` before."""
+def _gather_active(layout, source, m, slot, above, work, done, out):  # type: ignore[no-untyped-def]
+    """Put raw outputs of the active Gaussians of an anchor behind those ``done`` before."""
     anchor, raw = read_index(source.visible, m), slot * layout.outputs_pad
     factors(source, anchor, work.row)
     g = read_index(out.starts, m)
@@ -194,6 +194,7 @@ def _gather_living(layout, source, m, slot, above, work, done, out):  # type: ig
         copy_quad(work.scales, 3 * done, work.raw, raw + layout.scales_at + 3 * j)
         copy_quad(work.quats, 4 * done, work.raw, raw + layout.quats_at + 4 * j)
         copy_quad(work.colors, 3 * done, work.raw, raw + layout.colors_at + 3 * j)
+        # mean = anchor + offset exp(log_scales[0:3])
         for c in range(3):
             offset = read(source.offsets, 3 * (anchor * layout.offsets + j) + c)
             mean = read(source.anchors, 3 * anchor + c) + offset * read(work.row, c)
@@ -205,19 +206,22 @@ def _gather_living(layout, source, m, slot, above, work, done, out):  # type: ig
 
 @inner
 def _activate(work, count, first, out):  # type: ignore[no-untyped-def]
-    """Turn raw outputs of ``count`` Gaussians into those from ``first`` on."""
+    """Turn raw outputs of ``count`` Gaussians into those from ``first`` on:
+
+    color = sigmoid(c), scale = sigmoid(s) exp(log_scales[3:6]), quat = q / |q|.
+    """
     for c in range(0, 3 * count, LANES):
         left, at = 3 * count - c, 3 * first + c
         store_first(out.colors, at, sigmoid(load(work.colors, c)), left)
         scale = sigmoid(load(work.scales, c)) * load(work.factors, c)
         store_first(out.scales, at, scale, left)
-    least = splat(LEAST_SQUARE)
+    tiny = splat(_MIN_SQUARE)
     for c in range(0, 4 * count, LANES):
         value = load(work.quats, c)
         square = quad_sum(value * value)
-        inverse = select(square < least, splat(ZERO), ONE / sqrt(square))
+        inverse = select(square < tiny, splat(ZERO), ONE / sqrt(square))
         # Without a direction they become the identity.
-        unit = select(square < least, _identity(), value * inverse)
+        unit = select(square < tiny, _identity(), value * inverse)
         store_first(out.quats, 4 * first + c, unit, 4 * count - c)
         quads = min(count - c // 4, LANES // 4)
         store_first(out.inverse_norms, first + c // 4, quad_heads(inverse), quads)
@@ -232,13 +236,13 @@ def _decode_block(layout, weights, source, count, above, work, out):  # type: ig
     done = 0
     for i in range(count):
         m = read_index(work.rows, i)
-        done = _gather_living(layout, source, m, i, above, work, done, out)
+        done = _gather_active(layout, source, m, i, above, work, done, out)
     _activate(work, done, read_index(out.starts, read_index(work.rows, 0)), out)
 
 
 @kernel(parallel=True)
 def decode_forward(layout, weights, source, above, out, work, work_size, tasks):  # type: ignore[no-untyped-def]
-    """Second pass: everything of the living Gaussians; arguments as `decode_opacities`."""
+    """Second pass: everything of the active Gaussians; arguments as `decode_opacities`."""
     for task in prange(tasks):
         own = task_work(work, task, work_size)
         for begin in range(task * CHUNK, source.num_visible, tasks * CHUNK):

@@ -164,7 +164,7 @@ class Head(NamedTuple):
 
 
 class Anchors(NamedTuple):
-    """Addresses of what is decoded; see `chronoscene.anchors.decode.heads.decode_reference`."""
+    """Addresses of what is decoded; see `chronoscene.anchors.decode.DecodeInputs`."""
 
     anchors: int
     offsets: int
@@ -182,7 +182,7 @@ class Anchors(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """Addresses of what comes out, L living Gaussians."""
+    """Addresses of what comes out, L active Gaussians."""
 
     alphas: int
     """Opacities of all offsets. [M k]"""

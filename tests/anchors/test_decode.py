@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from chronoscene.anchors.decode.heads import (
+from chronoscene.anchors.decode import (
     DecodeInputs,
     HeadWeights,
     decode,
