@@ -155,30 +155,18 @@ def _finding(rule: Rule, hit: Hit) -> Finding:
 
 
 def _failure(rule: Rule, error: Exception) -> Finding:
-    hit = Hit(
-        f"rule {rule.code}",
-        "a rule that runs on every scene",
-        f"{type(error).__name__}: {error}",
-        "report this bug; the scene is not at fault",
-    )
-    failed = replace(rule, code=RULE_FAILED, name="rule-failed", severity="error")
-    return _finding(failed, hit)
+    place, expected = f"rule {rule.code}", "a rule that runs on every scene"
+    remedy = "report this bug; the scene is not at fault"
+    found = printable(f"{type(error).__name__}: {error}")
+    return Finding(RULE_FAILED, "rule-failed", "error", place, expected, found, remedy, 1)
 
 
 def lost_report(path: Path) -> SceneReport:
     """The report on a scene whose process died."""
-    finding = Finding(
-        code=RULE_FAILED,
-        name="rule-failed",
-        severity="error",
-        place=".",
-        expected="a scene that can be checked",
-        found="one whose checking process died",
-        remedy="if memory ran out, check this scene by itself; otherwise report the bug",
-        count=1,
-    )
-    name = printable(path.resolve().name)
-    return SceneReport(name, path, UNKNOWN, findings=(finding,), skipped=())
+    expected, found = "a scene that can be checked", "one whose checking process died"
+    remedy = "if memory ran out, check this scene by itself; otherwise report the bug"
+    finding = Finding(RULE_FAILED, "rule-failed", "error", ".", expected, found, remedy, 1)
+    return SceneReport(printable(path.resolve().name), path, UNKNOWN, (finding,), ())
 
 
 def _summary(scene: RawScene) -> Summary:

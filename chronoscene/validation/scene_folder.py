@@ -213,7 +213,7 @@ class RawScene:
 
     @cached_property
     def split_text(self) -> TextFile | None:
-        return self._text(SPLIT)
+        return read_text_file(self.root / SPLIT)
 
     @cached_property
     def _parsed_split(self) -> tuple[list[SplitEntry], list[Problem]]:
@@ -248,7 +248,7 @@ class RawScene:
 
     @cached_property
     def test_text(self) -> TextFile | None:
-        return self._text(TEST)
+        return read_text_file(self.root / TEST)
 
     @cached_property
     def test(self) -> list[NameEntry] | None:
@@ -343,9 +343,6 @@ class RawScene:
         if not self.decode:
             return None
         return read_pixels(self.root / "images", self.readable, self._track)
-
-    def _text(self, place: str) -> TextFile | None:
-        return read_text_file(self.root / place)
 
 
 def derived(compute: Callable[[RawScene], T]) -> Callable[[RawScene], T]:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import groupby, islice
 from pathlib import Path
+from typing import Any
 
 from PIL import Image
 
@@ -47,27 +47,6 @@ MAX_ROWS = 100
 TITLES: dict[Severity, str] = {"error": "Errors", "warning": "Warnings", "info": "Remarks"}
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    place: str
-    expected: str
-    found: str
-    pictures: tuple[str, ...]
-    """As data URIs."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Block:
-    """All findings of one rule in one scene."""
-
-    code: str
-    name: str
-    what: str
-    rows: tuple[_Row, ...]
-    total: int
-    remedies: tuple[str, ...]
-
-
 def write_html(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
     """All findings of some scenes as an HTML page."""
     return render_page(
@@ -82,8 +61,8 @@ def write_html(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
     )
 
 
-def _sections(report: SceneReport) -> list[tuple[Severity, list[_Block]]]:
-    """Blocks by severity, without severities that have no findings."""
+def _sections(report: SceneReport) -> list[tuple[Severity, list[dict[str, Any]]]]:
+    """Findings by rule and severity, without severities that have no findings."""
     pictures = Pictures(report.path)
     sections = []
     for severity in SEVERITIES:
@@ -94,19 +73,16 @@ def _sections(report: SceneReport) -> list[tuple[Severity, list[_Block]]]:
     return sections
 
 
-def _block(findings: list[Finding], pictures: Pictures) -> _Block:
+def _block(findings: list[Finding], pictures: Pictures) -> dict[str, Any]:
+    """All findings of one rule in one scene."""
     first = findings[0]
-    return _Block(
-        code=first.code,
-        name=first.name,
-        what=RULES[first.code].what if first.code in RULES else first.expected,
-        rows=tuple(
-            _Row(f.place, f.expected, f.found, pictures.of(f.place, f.also))
-            for f in findings[:MAX_ROWS]
-        ),
-        total=len(findings),
-        remedies=tuple(dict.fromkeys(f.remedy for f in findings if f.remedy != NOTHING))[:5],
-    )
+    return {
+        "first": first,
+        "what": RULES[first.code].what if first.code in RULES else first.expected,
+        "rows": [(f, pictures.of(f.place, f.also)) for f in findings[:MAX_ROWS]],
+        "total": len(findings),
+        "remedies": list(dict.fromkeys(f.remedy for f in findings if f.remedy != NOTHING))[:5],
+    }
 
 
 def _skipped(report: SceneReport) -> list[tuple[str, str]]:
