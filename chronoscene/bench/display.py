@@ -1,4 +1,4 @@
-"""What a training shows: a live bar on a terminal, a line per probe elsewhere."""
+"""Progress of a training: a live bar on a terminal, one line per probe elsewhere."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class ProgressDisplay:
     def update(
         self, iteration: int, seconds: float, report: StepReport, psnr: float | None
     ) -> None:
-        """Take in one step; the observer of `training.train`."""
+        """Show one step; the observer of `training_loop.train`."""
         past = report.loss if self._loss is None else self._loss
         self._loss = SMOOTHING * past + (1 - SMOOTHING) * report.loss
         now, progress = time.monotonic(), self._stop.progress(iteration, seconds)
@@ -80,7 +80,7 @@ class ProgressDisplay:
         self._psnr = psnr
 
     def status(self, iteration: int, seconds: float, psnr: float | None) -> str:
-        """One line on the state of the training."""
+        """The state of the training in one line."""
         left = self._stop.seconds_left(iteration, seconds)
         pieces = [f"iteration {iteration}", f"loss {self._loss:.4f}"]
         if psnr is not None:

@@ -1,4 +1,4 @@
-"""A job is one run as data: what the bench hands to a worker process, as JSON."""
+"""A job is one run as data, which the bench passes to a worker process as JSON."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def parse_duration(text: str) -> float:
             "--budget",
             expected="a positive time such as 90s, 5m or 1h30m",
             found=repr(text),
-            todo="write numbers with the units h, m and s",
+            todo="write numbers with the units h, m or s",
         )
     return seconds
 
 
 @dataclass(frozen=True, slots=True)
 class StopRule:
-    """A training ends after a number of iterations, by the training clock, or by what is first."""
+    """When a training ends: after some iterations, after a time, or whichever comes first."""
 
     iterations: int | None
     seconds: float | None
@@ -55,12 +55,12 @@ class StopRule:
         return min(1.0, max(shares))
 
     def seconds_left(self, iterations: int, seconds: float) -> float | None:
-        """Estimate of the training time still needed; None before there is anything to go by."""
+        """Estimate of the training time that is left; None if there is nothing to go by yet."""
         progress = self.progress(iterations, seconds)
         return seconds * (1.0 - progress) / progress if progress > 0 else None
 
     def split(self, parts: int) -> tuple[StopRule, ...]:
-        """Equal shares for several models; what does not divide goes to the first ones."""
+        """Equal shares for several models; the first ones get what is left over."""
         seconds = None if self.seconds is None else self.seconds / parts
         if self.iterations is None:
             return (replace(self, seconds=seconds),) * parts
@@ -69,7 +69,7 @@ class StopRule:
 
 
 SHARING = ("total", "each")
-"""Under the strategy separate: all models share the iterations and the time, or get them each."""
+"""Under the strategy separate: the models share iterations and time, or each get all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +168,7 @@ class Job:
 
 
 def check_job(job: Job, spec: MethodSpec) -> None:
-    """Find wrong settings before anything is trained.
+    """Check the settings before anything is trained.
 
     Raises:
         ConfigError: If a preset, key, value or device does not exist.

@@ -90,7 +90,7 @@ def split_overrides(settings: BenchSettings, specs: list[MethodSpec]) -> dict[st
                 f"--set {key}",
                 expected=f"a key, or one after {', '.join(f'{n}.' for n in names)}",
                 found=repr(method),
-                todo="name a method that is run",
+                todo="use the name of a method that is run",
             )
         for name in [method] if dot else names:
             chosen[name][rest] = value
@@ -104,9 +104,9 @@ def _check_names(scenes: list[Scene]) -> None:
         if other is not scene:
             raise ConfigError(
                 scene.root,
-                expected="a scene with a name of its own",
+                expected="a scene with a unique name",
                 found=f"{scene.name!r}, the name of {other.root} too",
-                todo="rename a folder, or run them with different --out",
+                todo="rename a folder, or run the scenes with different --out",
             )
 
 
@@ -188,7 +188,7 @@ def is_finished(job: Job, spec: MethodSpec, overwrite: bool = False) -> bool:
 
 
 def first_difference(old: Any, new: Any, key: str = "settings") -> tuple[str, str]:
-    """Where two documents differ first, as ``key value`` of both."""
+    """The first difference of two documents, as ``key value`` of both."""
     if isinstance(old, dict) and isinstance(new, dict):
         for name in [*new, *(k for k in old if k not in new)]:
             if old.get(name) != new.get(name):

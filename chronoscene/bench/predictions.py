@@ -30,7 +30,7 @@ _UNSAFE = re.compile(r'[%<>:"|?*\\\x00-\x1f\x7f]')
 
 
 class ImageEntry(BaseModel):
-    """One image of a folder."""
+    """One image in the folder."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -62,7 +62,7 @@ class Manifest(BaseModel):
 
 
 def safe_name(name: str) -> str:
-    """A name as a path that every file system takes: odd characters become ``%XX``."""
+    """A name as a path that every file system accepts: special characters become ``%XX``."""
     return _UNSAFE.sub(lambda match: f"%{ord(match.group()):02X}", name)
 
 
@@ -81,7 +81,7 @@ def _inside(path: str) -> PurePosixPath:
         raise CheckpointError(
             repr(path),
             expected="a path below its folder",
-            found="one that leads elsewhere",
+            found="a path that leads outside",
             todo="do not use these files",
         )
     return pure
@@ -188,14 +188,16 @@ def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
 
     path = folder / _inside(entry.file)
     if not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
-        raise CheckpointError(path, expected="an image", found="no such file", todo="run again")
+        raise CheckpointError(
+            path, expected="an image", found="no such file", todo="run bench again"
+        )
     data = path.read_bytes()
     if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise CheckpointError(
             path,
             expected=f"the file with SHA-256 {entry.sha256[:12]}... that {MANIFEST} lists",
-            found="another one",
-            todo="the image was changed after it was rendered: delete the run and bench again",
+            found="another file",
+            todo="the image was changed after rendering: delete the run and run bench again",
         )
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None or image.shape[:2] != (entry.height, entry.width):
@@ -205,7 +207,7 @@ def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
 
 def _untrusted(path: Path, found: str) -> CheckpointError:
     return CheckpointError(
-        path, expected="what bench wrote", found=found, todo="delete the folder and bench again"
+        path, expected="what bench wrote", found=found, todo="delete the folder and run bench again"
     )
 
 
@@ -217,7 +219,7 @@ def ground_truth_folder(runs: Path, scene: str) -> Path:
 def freeze_ground_truth(
     runs: Path, scene: Scene, scene_hash: str, store: ImageStore, max_width: int
 ) -> Manifest:
-    """Write the test photos once; later calls only check that they are of the same scene and size.
+    """Write the test photos once; later calls only check that scene and size are the same.
 
     Raises:
         ConfigError: If the folder of runs holds another scene of this name, or another size.
@@ -249,7 +251,7 @@ def _write_ground_truth(
                 rendered_period=frame.period,
             )
         writer.close(kind="ground truth", scene=scene.name, scene_hash=scene_hash, details=details)
-        if not folder.exists():  # a bench beside this one may have been quicker
+        if not folder.exists():  # another bench may have written it meanwhile
             os.replace(partial, folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)

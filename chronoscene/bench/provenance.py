@@ -1,4 +1,4 @@
-"""What a number depends on: hashes of scene and config, the code, the machine."""
+"""What results depend on: fingerprints of scene and configuration, code and machine."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _file_hash(scene: Scene, name: str) -> str:
             path,
             expected="an image",
             found=error.strerror or "a file that cannot be read",
-            todo="copy the image there, or take it out of the model",
+            todo="copy the image there, or remove it from the model",
         ) from error
 
 

@@ -168,7 +168,7 @@ def read_rows(folder: Path) -> list[Row]:
             path,
             expected="the rows of a run",
             found=f"{type(error).__name__}: {error}",
-            todo="delete the run and bench again",
+            todo="delete the run and run bench again",
         ) from error
 
 
@@ -191,7 +191,7 @@ def damaged(path: Path, error: ValidationError) -> CheckpointError:
         path,
         expected="what bench wrote",
         found=f"{first['msg']} ({where})",
-        todo="delete the run and bench again",
+        todo="delete the run and run bench again",
     )
 
 

@@ -101,7 +101,7 @@ def match_views(
 
 def _mismatch(folder: Path, expected: str, found: str) -> CheckpointError:
     return CheckpointError(
-        folder, expected=expected, found=found, todo="delete the run and bench again"
+        folder, expected=expected, found=found, todo="delete the run and run bench again"
     )
 
 
@@ -202,8 +202,7 @@ def _rescore_one(runs: Path, folder: Path, scorers: Scorers) -> Rescored:
 def keep_earlier(folder: Path, record: RunRecord, scores: Scores) -> tuple[list[str], Scores]:
     """Keep earlier values of metrics that this machine cannot compute.
 
-    The images are proven to be the same ones by their hashes, so values from a machine that has the
-    weights are worth more than none.
+    Hashes prove that the images are the same, so the values of a machine with the weights hold.
     """
     kept = [name for name in scores.skipped if name in record.aggregates.get("macro", {})]
     if not kept:

@@ -1,4 +1,4 @@
-"""What a method gets to see: strategies, the training frame, training sets."""
+"""What a method may see under each strategy: training frame and training sets."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def make_parts(scene: Scene, store: ImageStore, strategy: str) -> tuple[Part, ..
 
 
 def check_scene(scene: Scene) -> None:
-    """Refuse what no method can train on or be tested on.
+    """Refuse scenes that no method can be trained or tested on.
 
     Raises:
         SceneError: If a camera is distorted, or there is no training or no test image.
@@ -101,7 +101,7 @@ def check_scene(scene: Scene) -> None:
                 scene.root,
                 expected=f"at least one {split} image",
                 found=f"none ({scene.split_rule})",
-                todo="change the split",
+                todo="change the split, for example with chronoscene split",
             )
 
 

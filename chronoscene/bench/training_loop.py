@@ -36,7 +36,7 @@ PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 
 
 class TrainingError(ChronoSceneError):
-    """A training that cannot go on: a loss or an image that is not finite, or of a wrong shape."""
+    """A training that cannot continue: a loss that is not finite, or an invalid image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +201,11 @@ WARM_UP_SECONDS = 3.0
 
 
 def warm_up(spec: MethodSpec, config: Any, *, num_periods: int, device: str) -> str | None:
-    """Use a method once; returns why that went wrong, if it did."""
+    """Train a few steps and render once on made-up images; returns what went wrong, if anything.
+
+    Kernels are compiled, or loaded from their cache, at first use. On the training clock that
+    would charge the first run of a method more than the next, and shorten a time budget.
+    """
     try:
         seed_everything(0)
         method: Method = import_object(spec.method)(config)
@@ -215,7 +219,7 @@ def warm_up(spec: MethodSpec, config: Any, *, num_periods: int, device: str) -> 
             elif time.perf_counter() - started > WARM_UP_SECONDS:
                 break
         method.render(train.views[0], 0.0)
-    except Exception as error:  # what is wrong shows in the run itself; here it only costs time
+    except Exception as error:  # the run itself will report it; here it only costs time
         return f"warm-up failed ({type(error).__name__}), compilation is on the training clock"
     return None
 
@@ -253,7 +257,7 @@ def _made_up_view(number: int, period: int) -> TrainingView:
 
 
 def forget_peak_memory() -> None:
-    """Start the peak of resident memory anew, where the system can; compilers are greedy."""
+    """Reset the peak of resident memory where the system can: compilers need much."""
     try:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except OSError:

@@ -132,7 +132,7 @@ def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
             raise ConfigError(
-                "--set", expected="KEY=VALUE", found=repr(text), todo="write the key, =, the value"
+                "--set", expected="KEY=VALUE", found=repr(text), todo="write KEY=VALUE"
             )
         parsed[key.strip()] = value.strip()
     return parsed

@@ -1,4 +1,4 @@
-"""What commands print or write, and errors that name the option a place was given with."""
+"""What commands print or write, with errors that name the option that a path came from."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
     Args:
         text: With the end of its last line.
         out: The file; None to print.
-        option: What the user named the file with.
+        option: The option that the file came from.
 
     Raises:
         ConfigError: If the file cannot be written.
@@ -44,7 +44,7 @@ def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
 def writing_to(
     option: str, place: Path, *, expected: str = "a place that can be written to"
 ) -> Iterator[None]:
-    """Tell what the disk refuses in the block under the option that names the place.
+    """Report an OSError in the block under the option that the path came from.
 
     Raises:
         ConfigError: Instead of an OSError.
@@ -61,7 +61,7 @@ def writing_to(
 
 
 def check_place(option: str, folder: Path) -> None:
-    """See that a folder can be made and written to, before long work; makes nothing.
+    """Check before long work that a folder can be created and written to; creates nothing.
 
     Raises:
         ConfigError: If it cannot.
@@ -73,10 +73,10 @@ def check_place(option: str, folder: Path) -> None:
 
 
 def check_file(option: str, file: Path | None) -> None:
-    """See that a file can be written, before long work; leaves nothing there.
+    """Check before long work that a file can be written; leaves nothing there.
 
     Args:
-        option: What the user named the file with.
+        option: The option that the file came from.
         file: None where there is none to write.
 
     Raises:

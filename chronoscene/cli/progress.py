@@ -1,4 +1,4 @@
-"""How far a long command is: one bar on stderr for all commands, or lines in a log.
+"""Progress of long commands: one bar on stderr, or lines in a log.
 
 `chronoscene bench` has a bar of its own for trainings, `chronoscene.bench.display`: it shows the
 loss, and trainings may end by the clock.
@@ -7,16 +7,15 @@ loss, and trainings may end by the clock.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import TypeVar
 
 import click
 
-T = TypeVar("T")
-Report = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and of how much."""
+from chronoscene.io.processes import Report
 
+T = TypeVar("T")
 BAR_WIDTH = 20
 """Characters: with the names of our steps, the rest of a line of 80 is for the numbers."""
 MEMORY = 300.0
@@ -25,13 +24,13 @@ MEMORY = 300.0
 
 @contextmanager
 def progress_bar(*, log: bool = False) -> Iterator[Report]:
-    """A function to tell the progress to.
+    """A function that reports progress.
 
-    On a terminal it draws a bar with counts, rate, time passed and time left, which goes when the
-    block ends. Pass ``partial(report, "images")`` to what counts images only.
+    On a terminal it draws a bar with counts, rate, elapsed and remaining time, which disappears
+    when the block ends. Pass ``partial(report, "images")`` to what counts only images.
 
     Args:
-        log: Elsewhere, print a line whenever a step begins. Without it, nothing is printed there.
+        log: Print a line whenever a step begins if there is no terminal; otherwise print nothing.
     """
     if sys.stderr.isatty():
         with _bar() as report:
@@ -41,11 +40,11 @@ def progress_bar(*, log: bool = False) -> Iterator[Report]:
 
 
 def tracked(items: Iterable[T], what: str, *, total: int | None = None) -> Iterator[T]:
-    """Pass items on with a bar that counts those that the caller is done with.
+    """Yield items while a bar counts those that the caller has finished.
 
     Args:
-        items: Any; what has no length needs a ``total``.
-        what: Said before the bar.
+        items: Any iterable; one without a length needs a ``total``.
+        what: Text before the bar.
         total: Number of items.
     """
     if total is None:

@@ -99,6 +99,6 @@ def split_list(option: str, text: str) -> tuple[str, ...]:
     items = [item.strip() for item in text.split(",")]
     if not all(items):
         raise ConfigError(
-            option, expected="names with commas between", found=repr(text), todo="correct the list"
+            option, expected="names separated by commas", found=repr(text), todo="correct the list"
         )
     return tuple(dict.fromkeys(items))

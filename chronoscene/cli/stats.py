@@ -209,7 +209,9 @@ def _scenes(folder: Path, dataset_format: str | None) -> list[Path]:
 
 def _lost(item: tuple[Path, str]) -> Unreadable:
     path = str(item[0])
-    return Unreadable(path, f"{path}: the process died; if memory ran out, read this one alone")
+    return Unreadable(
+        path, f"{path}: the process died; if memory ran out, run stats on this scene alone"
+    )
 
 
 def _width(out: Path | None) -> int | None:

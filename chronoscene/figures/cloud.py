@@ -1,4 +1,4 @@
-"""What figures and pages show of a scene, and how far they reach."""
+"""Points and cameras that figures and pages show, and the part of space that is shown."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 A scatter plot of half a million points shows only what was drawn last. Here the points of each
 period are counted per pixel; a pixel's opacity grows with the logarithm of all its points, and its
-colour is that of one of its periods, drawn by lot with their shares. Where periods overlap their
+colour is that of one of its periods, chosen at random by their shares. Where periods overlap their
 colours lie side by side as fine grain, none on top of the other and none mixed to mud.
 """
 
@@ -63,7 +63,7 @@ def count_points(xy: Array, group: NDArray[np.int64], groups: int, window: Windo
 
 
 def dot_radius(points: int, occupied: int) -> int:
-    """Radius in pixels of the dots, so that few points can be seen and many do not clot.
+    """Radius of the dots in pixels: few points stay visible, many do not merge.
 
     Args:
         points: Number of points.
@@ -99,7 +99,7 @@ def shade(counts: Counts, colors: Sequence[str], *, seed: int = 0) -> NDArray[np
     Args:
         counts: Points of each group per pixel. [G, H, W]
         colors: ``#rrggbb`` of each group.
-        seed: Of the lots.
+        seed: Of the random choice of a period.
 
     Returns:
         RGBA, transparent where there are no points. [H, W, 4]

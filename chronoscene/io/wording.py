@@ -1,4 +1,4 @@
-"""Names and numbers inside of sentences."""
+"""Names and numbers in sentences."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ MAX_NAME_LENGTH = 120
 
 
 def printable(text: str) -> str:
-    """Text with everything that could disturb a terminal or an encoder as escapes."""
+    """Text in which characters that could disturb a terminal or an encoding are escaped."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def quote(text: str) -> str:
-    """A name in quotes, cut where it is absurdly long."""
+    """A name in quotes, shortened if it is very long."""
     return repr(text if len(text) <= MAX_NAME_LENGTH else text[:MAX_NAME_LENGTH] + "...")
 
 

@@ -38,7 +38,7 @@ class Measures:
     of the points that it sees; median over the cameras that see any."""
     coverage: float | None
     """Share of the scene's space with points in which the period sees a point: of the cubes with
-    points of a grid that has 50 cubes along the scene's longest edge, strays aside."""
+    points of a grid that has 50 cubes along the scene's longest edge, without outliers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,29 +205,33 @@ def _median(values: NDArray[np.float64] | NDArray[np.int64]) -> float | None:
     return float(np.median(values)) if len(values) else None
 
 
+# How far a scene extends
+
 CORE = (10.0, 90.0)
-"""Percentiles between which the middle of a scene lies, even with many strays on every side."""
+"""Percentiles between which the middle of a scene lies, even with many outliers on every side."""
 REACH = 0.8
-"""Of the longest edge of the core, on every side: farther points are strays. One reach for all
-axes, as the towers of a flat place are no strays."""
+"""Of the longest edge of the core, on every side: farther points are outliers. One reach for
+all axes: the towers of a flat place are not outliers."""
 ENDS = (2.0, 98.0)
 """Percentiles of what is left that are the ends of the scene, and `BEYOND` that."""
 BEYOND = 0.08
 """Of the distance between the two ends: an even spread of points is inside as a whole."""
-ENOUGH = 50_000
-"""Points that tell: of more, an even choice is looked at."""
+MAX_SAMPLE = 50_000
+"""Points that are looked at: an even choice of a larger cloud is enough."""
 
 
 def robust_range(xyz: Array) -> Array:
-    """Ends of a cloud along each axis without strays: up to a tenth of all points on every side.
+    """Extent of a cloud along each axis without outliers.
+
+    Up to a tenth of all points on every side may be outliers.
 
     Args:
         xyz: Finite places, at least one. [n, 3]
 
     Returns:
-        The lowest and the highest coordinates; points beyond are strays. [2, 3]
+        The lowest and the highest coordinates; points beyond are outliers. [2, 3]
     """
-    xyz = xyz[:: -(-len(xyz) // ENOUGH)]
+    xyz = xyz[:: -(-len(xyz) // MAX_SAMPLE)]
     low, high = np.percentile(xyz, CORE, axis=0)
     reach = REACH * (high - low).max()
     near = xyz[((xyz >= low - reach) & (xyz <= high + reach)).all(axis=1)]

@@ -172,7 +172,7 @@ def test_separate_models_share_or_repeat(bench):
     [
         ({"preset": "best"}, "expected one of balanced, slow"),
         ({"overrides": {"rates": "1"}}, "did you mean 'rate'"),
-        ({"overrides": {"chronogs.rate": "1"}}, "name a method that is run"),
+        ({"overrides": {"chronogs.rate": "1"}}, "use the name of a method that is run"),
         ({"device": "cuda"}, "mean --device: expected one of cpu"),
         ({"overrides": {"iterations": "0"}}, "expected a positive number"),
         ({"strategies": ("mixed",)}, "expected one of joint, pooled, separate"),

@@ -137,7 +137,7 @@ def test_every_option_arrives(settings, tmp_path):
         (["--strategy", "both"], "expected one of joint, pooled, separate"),
         (["--budget", "5"], "--budget: expected a positive time"),
         (["--set", "x"], "--set: expected KEY=VALUE"),
-        (["--method", "a,,b"], "--method: expected names with commas between"),
+        (["--method", "a,,b"], "--method: expected names separated by commas"),
     ],
 )
 def test_wrong_options_are_told(arguments, message):

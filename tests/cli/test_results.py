@@ -108,7 +108,7 @@ def test_wrong_input_is_told(runs, tmp_path):
 
 def test_lists():
     assert split_list("--x", "a, b,a") == ("a", "b")
-    with pytest.raises(ConfigError, match="--x: expected names with commas"):
+    with pytest.raises(ConfigError, match="--x: expected names separated by commas"):
         split_list("--x", "a,")
 
 

@@ -141,7 +141,7 @@ def test_pixels_without_points_are_transparent_and_dense_ones_opaque():
     assert opacity(np.ones(5, np.float32)).tolist() == [MIN_OPACITY] * 5
 
 
-def test_strays_do_not_widen_the_panels(cloud):
+def test_outliers_do_not_widen_the_panels(cloud):
     expected = shown_box(cloud, cameras=False)
     xyz = cloud.xyz.copy()
     xyz[:15] = [1e6, -1e6, 1e6]

@@ -144,13 +144,13 @@ def test_coverage_is_that_of_the_cubes(scale: float) -> None:
     assert shares[2] == 1.0
 
 
-@pytest.mark.parametrize("strays", [20, 600])
-def test_strays_do_not_change_coverage(strays: int) -> None:
+@pytest.mark.parametrize("outliers", [20, 600])
+def test_outliers_do_not_change_coverage(outliers: int) -> None:
     rng = np.random.default_rng(0)
     xyz = rng.uniform(0, 1, (5000, 3))
     seen = np.column_stack([xyz[:, 0] < 0.3, np.ones(5000, bool)])
     before = period_coverage(xyz, seen)
-    xyz[:strays] += rng.uniform(-1e5, 1e5, (strays, 3))
+    xyz[:outliers] += rng.uniform(-1e5, 1e5, (outliers, 3))
     assert period_coverage(xyz, seen)[0] == pytest.approx(before[0], abs=0.02)
 
 
@@ -205,7 +205,7 @@ def test_real_scenes(shared_data) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.06, 0.15])
-def test_an_even_spread_is_inside_as_a_whole_and_strays_are_not(share: float) -> None:
+def test_an_even_spread_is_inside_as_a_whole_and_outliers_are_not(share: float) -> None:
     rng = np.random.default_rng(0)
     place = rng.uniform([-50, -15, -3], [50, 15, 3], (20_000, 3))
     far = rng.random(len(place)) < share
@@ -215,7 +215,7 @@ def test_an_even_spread_is_inside_as_a_whole_and_strays_are_not(share: float) ->
     assert (high - low <= 1.2 * np.ptp(place, axis=0) + 2).all()
 
 
-def test_towers_of_a_flat_place_are_no_strays() -> None:
+def test_towers_of_a_flat_place_are_no_outliers() -> None:
     rng = np.random.default_rng(0)
     xyz = rng.uniform([0, 0, 0], [100, 100, 0.2], (10_000, 3))
     xyz[:500, 2] = rng.uniform(0, 40, 500)
