@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from datetime import date, datetime
+from datetime import datetime
 from pathlib import Path, PurePosixPath
 
 from chronoscene.errors import SceneError
@@ -212,11 +212,7 @@ def _period_date(label: str, captures: Sequence[Capture]) -> str | None:
         return first.isoformat()
     if (first.year, first.month) == (last.year, last.month):
         return first.isoformat()[:7]
-    return str(first.year) if first.year == last.year else _middle(days).isoformat()[:4]
-
-
-def _middle(days: Sequence[date]) -> date:
-    return days[len(days) // 2]
+    return str(first.year) if first.year == last.year else str(days[len(days) // 2].year)
 
 
 def _date_remarks(periods: Sequence[CapturePeriod]) -> list[str]:

@@ -55,11 +55,7 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
     if has.sum() < 3:
         remark = f"{int(has.sum())} of {count} photos have a GPS position: too few for a frame"
         return Positions(None, nothing, nothing, none, (remark,))
-    latitude, longitude = (np.full(count, np.nan) for _ in range(2))
-    for i in np.flatnonzero(has).tolist():
-        gps = captures[i].gps
-        assert gps is not None
-        latitude[i], longitude[i] = gps.latitude, gps.longitude
+    latitude, longitude = (_stated(captures, name) for name in ("latitude", "longitude"))
     height, kind, remarks = _heights(captures, has)
     frame = frame or Georeference(
         latitude=round(float(np.nanmedian(latitude)), 7),
@@ -82,17 +78,16 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
     return Positions(frame, enu, sigma, plausible, tuple(remarks))
 
 
+def _stated(captures: Sequence[Capture], name: str) -> NDArray[np.float64]:
+    """A field of the GPS of each photo; NaN where it states none. [N]"""
+    return np.array([getattr(c.gps, name, None) for c in captures], np.float64)
+
+
 def _heights(
     captures: Sequence[Capture], has: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], HeightKind, list[str]]:
     """One kind of height for all photos: mixing kinds would tilt or distort the frame."""
-    count = len(captures)
-    stated, relative = np.full(count, np.nan), np.full(count, np.nan)
-    for i in np.flatnonzero(has).tolist():
-        gps = captures[i].gps
-        assert gps is not None
-        stated[i] = np.nan if gps.altitude is None else gps.altitude
-        relative[i] = np.nan if gps.relative_altitude is None else gps.relative_altitude
+    stated, relative = (_stated(captures, name) for name in ("altitude", "relative_altitude"))
     if np.isfinite(stated[has]).all():
         return stated, "as stated", []
     if np.isfinite(relative[has]).all():
@@ -102,7 +97,7 @@ def _heights(
         filled = np.where(known, stated, np.nanmedian(stated))
         missing = int((has & ~known).sum())
         return filled, "as stated", [f"{missing} photos state no height: the median is used"]
-    return np.zeros(count), "none", ["most photos state no height: 0 is used for all"]
+    return np.zeros(len(captures)), "none", ["most photos state no height: 0 is used for all"]
 
 
 def _plausible(

@@ -227,11 +227,12 @@ def _all_transfers(
     sampled[tracks[::step]] = True
     shift = held_out.track.max(initial=-1) + 1
     rays = Rays.join(held_out, replace(ties, track=ties.track + shift))
-    both = tuple(
-        Placed.join(evidence.held_out_placed[p], evidence.ties_placed[p].of(sampled), shift)
-        for p in (a, b)
-    )
-    return transfers(rays, model.periods, a, b, (both[0], both[1]))
+
+    def placed(p: int) -> Placed:
+        tied = evidence.ties_placed[p].of(sampled)
+        return Placed.join(evidence.held_out_placed[p], replace(tied, track=tied.track + shift))
+
+    return transfers(rays, model.periods, a, b, (placed(a), placed(b)))
 
 
 def _held_out(

@@ -8,7 +8,7 @@ camera, and pixels at the image centre for any other.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -53,9 +53,7 @@ class Rays:
 
     def where(self, mask: Mask | Ints) -> Rays:
         """Some of the observations, in their order."""
-        return Rays(
-            self.track[mask], self.image[mask], self.pose[mask], self.uv[mask], self.focal[mask]
-        )
+        return Rays(*(getattr(self, name)[mask] for name in self.__slots__))
 
     def finite(self) -> Rays:
         """Without the pixels that COLMAP finds no ray for."""
@@ -64,7 +62,7 @@ class Rays:
     @classmethod
     def join(cls, *parts: Rays) -> Rays:
         """Observations of several, one after the other; tracks keep their numbers."""
-        names = ("track", "image", "pose", "uv", "focal")
+        names = cls.__slots__
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
@@ -91,15 +89,18 @@ class Placed:
 
     def of(self, tracks: Mask) -> Placed:
         """The points of some tracks, by a mask over the numbers of all."""
-        keep = tracks[self.track]
-        return Placed(self.track[keep], self.xyz[keep], self.covariance[keep], self.error[keep])
+        return self.select(tracks[self.track])
+
+    def select(self, rows: Mask | Ints) -> Placed:
+        """Some of the points."""
+        return Placed(*(getattr(self, name)[rows] for name in self.__slots__))
 
     @classmethod
-    def join(cls, first: Placed, second: Placed, shift: int) -> Placed:
-        """Points of both; the tracks of the second come after those of the first."""
-        second = replace(second, track=second.track + shift)
-        names = ("track", "xyz", "covariance", "error")
-        return cls(*(np.concatenate([getattr(p, name) for p in (first, second)]) for name in names))
+    def join(cls, *parts: Placed) -> Placed:
+        """Points of several, by track."""
+        names = cls.__slots__
+        every = cls(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+        return every.select(np.argsort(every.track, kind="stable"))
 
 
 def rays_at(model: Registered, track: Ints, image: Ints, xy: Array) -> Rays:

@@ -80,11 +80,7 @@ def place_clicks(rays: Rays) -> Placed:
     placed = place(rays)
     missing = np.setdiff1d(rays.track, placed.track)
     rescued = [p for t in missing if (p := _without_one(rays.where(rays.track == t)))]
-    parts = [placed, *rescued]
-    names = ("track", "xyz", "covariance", "error")
-    whole = [np.concatenate([getattr(p, n) for p in parts]) for n in names]
-    order = np.argsort(whole[0], kind="stable")
-    return Placed(*(a[order] for a in whole))
+    return Placed.join(placed, *rescued)
 
 
 def _without_one(rays: Rays) -> Placed | None:
