@@ -17,6 +17,7 @@ u64 image id).
 from __future__ import annotations
 
 import struct
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -110,19 +111,23 @@ class _Reader:
         """Number of parts that the current record announces, for messages."""
 
     def records(self, kind: str, min_size: int) -> Iterator[int]:
-        """Index of each record; the caller reads the record before it asks for the next.
+        """Index of each record; the caller reads the record before it asks for the next."""
+        count = self.start(kind, min_size)
+        for self.index in range(count):
+            self.parts = ""
+            yield self.index
+        self.finish()
 
-        Raises:
-            _RecordError: If the file is too short for so many records of at least ``min_size``
-                bytes, or something follows the last.
-        """
+    def start(self, kind: str, min_size: int) -> int:
+        """Number of records, each of at least ``min_size`` bytes; refuses more than can fit."""
         (count,) = self.unpack(_COUNT)
         if count * min_size > len(self.data) - self.at:
             raise _RecordError(f"{count} records announced in {len(self.data)} bytes")
         self.kind = kind
-        for self.index in range(count):
-            self.parts = ""
-            yield self.index
+        return int(count)
+
+    def finish(self) -> None:
+        """Refuse bytes after the last record."""
         if self.at != len(self.data):
             raise _RecordError(f"{len(self.data) - self.at} bytes after the last record")
 
@@ -243,46 +248,30 @@ def _sensor(reader: _Reader) -> Sensor:
 
 def _walk_points(reader: _Reader) -> RawPoints:
     """One step per record, as each states only its own length; all else in whole columns."""
-    offsets = _quick_offsets(reader.data)
-    if offsets is None:
-        offsets = _checked_offsets(reader)
-    begin = np.array(offsets, np.int64)
+    begin = np.array(_point_offsets(reader), np.int64)
     lengths = (np.diff(begin) - POINT_HEAD.itemsize) // _TRACK_BYTES
     return _gather_points(reader.data, begin[:-1], lengths)
 
 
-def _quick_offsets(data: bytes) -> list[int] | None:
-    """Offsets of the records and of the end of the last; None if the file is damaged."""
-    if len(data) < _COUNT.size:
-        return None
-    (count,) = _COUNT.unpack_from(data)
-    if count * POINT_HEAD.itemsize > len(data):
-        return None
-    unpack, head, at = _COUNT.unpack_from, POINT_HEAD.itemsize, _COUNT.size
-    offsets = [at]
+def _point_offsets(reader: _Reader) -> list[int]:
+    """Offsets of the records, and of the end of the last, in a loop that does nothing else."""
+    count = reader.start("point", POINT_HEAD.itemsize)
+    data, end, at = reader.data, len(reader.data), reader.at
+    unpack, head, offsets = _COUNT.unpack_from, POINT_HEAD.itemsize, [at]
     try:
         for _ in range(count):
             at += head + _TRACK_BYTES * unpack(data, at + _LENGTH_AT)[0]
             offsets.append(at)
-    except (struct.error, OverflowError):  # a length leads out of the file
-        return None
-    return offsets if at == len(data) else None
-
-
-def _checked_offsets(reader: _Reader) -> list[int]:
-    """The same, step by step; the error names the damaged record."""
-    data, end = reader.data, len(reader.data)
-    offsets, at = [_COUNT.size], _COUNT.size
-    for _ in reader.records("point", POINT_HEAD.itemsize):
-        if at + POINT_HEAD.itemsize > end:
-            raise reader.ends()
-        (length,) = _COUNT.unpack_from(data, at + _LENGTH_AT)
-        at += POINT_HEAD.itemsize + _TRACK_BYTES * length
-        if at > end:
-            reader.parts = f"{length} observations"
-            raise reader.ends()
-        offsets.append(at)
-        reader.at = at
+    except (struct.error, OverflowError):
+        pass  # beyond the end of the file
+    if len(offsets) <= count or at > end:
+        reader.index = bisect_right(offsets, end) - 1
+        begin = offsets[reader.index]
+        if begin + head <= end:
+            reader.parts = f"{unpack(data, begin + _LENGTH_AT)[0]} observations"
+        raise reader.ends()
+    reader.at = at
+    reader.finish()
     return offsets
 
 

@@ -19,7 +19,6 @@ from pathlib import Path
 
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared.colmap_layout import (
-    as_pinhole,
     find_model,
     lost_labels,
     lost_names,
@@ -44,7 +43,7 @@ from chronoscene.formats.shared.transforms import (
 from chronoscene.formats.shared.transforms import make_scene as scene_from_shots
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Camera, Points, Scene
-from chronoscene.scene.cameras import PINHOLE_MODELS
+from chronoscene.scene.cameras import PINHOLE_MODELS, as_pinhole
 from chronoscene.scene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
 
 NAME = "cl-splats"

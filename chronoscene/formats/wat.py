@@ -22,7 +22,6 @@ from pathlib import Path
 
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared.colmap_layout import (
-    as_pinhole,
     find_model,
     layout,
     lost_labels,
@@ -37,6 +36,7 @@ from chronoscene.formats.shared.colmap_layout import (
 from chronoscene.formats.shared.grouping import group_labels
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Camera, Scene
+from chronoscene.scene.cameras import as_pinhole
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "wat"

@@ -18,7 +18,12 @@ from chronoscene.errors import SceneError
 from chronoscene.images.store import image_size, resize_camera
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.scene import Camera, Frame, Scene
-from chronoscene.scene.cameras import project_points, undistorted_camera, unproject_pixels
+from chronoscene.scene.cameras import (
+    as_pinhole,
+    project_points,
+    undistorted_camera,
+    unproject_pixels,
+)
 from chronoscene.scene.tracks import by_image
 
 ROWS = 128
@@ -77,12 +82,7 @@ def pinhole_camera(camera: Camera, *, center: bool = False) -> Camera:
     Raises:
         SceneError: If the camera is not perspective, or its principal point is not in the image.
     """
-    if camera.is_pinhole:
-        K = camera.K
-        params = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item())
-        camera = replace(camera, model="PINHOLE", params=params)
-    else:
-        camera = undistorted_camera(camera)
+    camera = as_pinhole(camera) if camera.is_pinhole else undistorted_camera(camera)
     if not np.isfinite(camera.params).all():
         raise _camera_error(camera, "a camera that can be undistorted")
     if center:

@@ -123,6 +123,12 @@ class Camera:
         return self.model == "EQUIRECTANGULAR" or bool((self.K[[0, 1], [0, 1]] > 0).all())
 
 
+def as_pinhole(camera: Camera) -> Camera:
+    """The same camera as a PINHOLE; it must have no distortion."""
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    return replace(camera, model="PINHOLE", params=(fx, fy, cx, cy))
+
+
 def project_points(camera: Camera, xyz: Array) -> Array:
     """Pixels at which a camera sees points, distortion included.
 

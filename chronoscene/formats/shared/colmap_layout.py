@@ -29,7 +29,7 @@ from chronoscene.formats.chronoscene import (
 from chronoscene.formats.shared.grouping import label_date, natural_key
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
-from chronoscene.scene import Camera, Period, Scene, WorldFrame
+from chronoscene.scene import Period, Scene, WorldFrame
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 MODELS = ("sparse/0", "sparse")
@@ -219,12 +219,6 @@ def new_names(scene: Scene, folders: list[str], *, deep: bool) -> dict[str, str]
         return {name: name for name in old}
     flat = {name: name if deep else name.replace("/", "_") for name in old}
     return {name: f"{folder}/{flat[name]}" for name, folder in old.items()}
-
-
-def as_pinhole(camera: Camera) -> Camera:
-    """The same camera as a PINHOLE; it must have no distortion."""
-    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
-    return replace(camera, model="PINHOLE", params=(fx, fy, cx, cy))
 
 
 def lost_labels(scene: Scene, labels: list[str]) -> list[str]:
