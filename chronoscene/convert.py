@@ -1,4 +1,4 @@
-"""Scenes from one format to another, and what is lost on the way."""
+"""Conversion of scenes between formats, and what each conversion loses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conversion:
-    """A conversion that was carried out."""
+    """The result of a conversion."""
 
     scene: Scene
     """As it was read."""
@@ -26,7 +26,7 @@ class Conversion:
     target: str
     """Name of the format written."""
     warnings: tuple[str, ...]
-    """What the result lacks, or what stands in the way of using it."""
+    """What was lost, and what prevents the result from being used."""
 
 
 def convert(
@@ -39,12 +39,12 @@ def convert(
     image_source: ImageSource = "copy",
     progress: Progress | None = None,
 ) -> Conversion:
-    """Read a scene in any format and write it in another; the source is left alone.
+    """Read a scene in any format and write it in another; the source is not changed.
 
     Args:
         source: Folder of one scene.
         out: Folder that does not exist yet, or is empty; not inside of ``source``.
-        source_format: None to find out.
+        source_format: None to detect it.
         target: A format that can be written.
         period_by: How images are grouped into periods, where the source leaves a choice.
         image_source: Copy or link the images.
@@ -63,17 +63,19 @@ def convert(
 
 
 def remarks_on(scene: Scene) -> list[str]:
-    """What the source has that we do not read."""
+    """What the source contains that is not read."""
     module = load_format(scene.format)
     said = list(module.remarks(scene.root)) if hasattr(module, "remarks") else []
     if scene.images_root != scene.root and (count := _unused_images(scene)):
         where = scene.images_root.relative_to(scene.root)
-        said.append(f"{count} image files in {where}/ are not in the scene, and not converted")
+        said.append(
+            f"{count} image files in {where}/ are not part of the scene and were not converted"
+        )
     return said
 
 
 def _unused_images(scene: Scene) -> int:
-    """Number of image files below the folder of images that no frame uses."""
+    """Number of files in the image folder that no frame uses."""
     used = {os.path.normpath(scene.image_path(frame)) for frame in scene.frames}
     found = (
         os.path.normpath(os.path.join(folder, file))
@@ -85,10 +87,10 @@ def _unused_images(scene: Scene) -> int:
 
 
 def losses(scene: Scene, target: str) -> list[str]:
-    """What a scene has that a format cannot hold."""
+    """What the scene contains that the format cannot store."""
     module = load_format(target)
     lost = module.losses(scene) if hasattr(module, "losses") else []
-    return [f"{target} has no place for {item}" for item in lost]
+    return [f"{target} cannot store {item}" for item in lost]
 
 
 def obstacles(scene: Scene) -> list[str]:
@@ -98,17 +100,19 @@ def obstacles(scene: Scene) -> list[str]:
     distorted = sorted({camera.model for camera in cameras if not camera.is_pinhole})
     if distorted:
         found.append(
-            f"cameras have distortion ({', '.join(distorted)}), which is kept; methods need "
-            "images without: chronoscene undistort"
+            f"cameras have lens distortion ({', '.join(distorted)}), which is kept; methods need "
+            "undistorted images: run chronoscene undistort"
         )
     points = scene.points
     if not len(points):
-        found.append("the scene has no points, which methods start from; triangulate some")
+        found.append(
+            "the scene has no points, and methods are initialised from points; triangulate some"
+        )
     elif not np.diff(points.track_start).any():
         found.append(
-            "no point is observed by an image, and methods start from observed points only: "
-            "colmap point_triangulator makes such points for known poses"
+            "no point is observed in an image, and methods are initialised from observed points "
+            "only; colmap point_triangulator triangulates points for known poses"
         )
     if not scene.select(split="test"):
-        found.append("there are no test images: chronoscene split chooses some")
+        found.append("there are no test images; chronoscene split chooses some")
     return found

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-LONGEST = 1000
-"""Characters of an expectation or a finding; what quotes a damaged file may have millions."""
+MAX_LENGTH = 1000
+"""Characters of ``expected`` and ``found``: text from a damaged file may have millions."""
 
 
 class ChronoSceneError(Exception):
@@ -14,7 +14,7 @@ class ChronoSceneError(Exception):
 
     Args:
         place: File, file and line, option or argument where the problem sits.
-        expected: What would have been right there. Shown up to `LONGEST` characters.
+        expected: What would have been right there. Shown up to `MAX_LENGTH` characters.
         found: What is there instead; likewise.
         todo: What the user can do about it.
     """
@@ -30,8 +30,8 @@ class ChronoSceneError(Exception):
 
 def _shortened(text: str) -> str:
     """Beginning and end of a long text."""
-    half = LONGEST // 2
-    return text if len(text) <= LONGEST else f"{text[:half]} ... {text[-half:]}"
+    half = MAX_LENGTH // 2
+    return text if len(text) <= MAX_LENGTH else f"{text[:half]} ... {text[-half:]}"
 
 
 class ConfigError(ChronoSceneError):
@@ -39,15 +39,15 @@ class ConfigError(ChronoSceneError):
 
 
 class SceneError(ChronoSceneError):
-    """A scene folder that cannot be read or does not say what it must."""
+    """A scene folder that cannot be read or lacks required information."""
 
 
 class ImageError(SceneError):
-    """An image that is missing, damaged or of a kind that we do not read."""
+    """An image that is missing, damaged or of an unsupported kind."""
 
 
 class RegistrationError(ChronoSceneError):
-    """Photos that do not give a model, or a step that stopped early; what was computed is kept."""
+    """Photos that cannot be registered, or a step that failed; what was computed is kept."""
 
 
 class CheckpointError(ChronoSceneError):

@@ -1,8 +1,8 @@
-"""Geodetic positions to metres in a local east-north-up frame, by PROJ.
+"""Geodetic positions in a local east-north-up frame in metres, by PROJ.
 
-The frame is topocentric (EPSG method 9837) around a position: no map projection, so no distortion,
-and no geoid grid is needed, because heights are taken as they are stated. Heights above the sea
-instead of the ellipsoid shift the frame upwards as a whole and bend nothing.
+The frame is topocentric (EPSG method 9837) around a position: there is no map projection and so
+no distortion. No geoid grid is needed, because heights are used as stated: heights above sea level
+instead of the ellipsoid shift the whole frame vertically and do not bend it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Georeference:
 
     @property
     def crs(self) -> str:
-        """The frame in words that PROJ understands: the last step of a pipeline."""
+        """PROJ string of the frame: the last step of a pipeline."""
         return (
             f"+proj=topocentric +ellps=WGS84 +lat_0={self.latitude!r} +lon_0={self.longitude!r} "
             f"+h_0={self.height!r}"
@@ -69,14 +69,14 @@ def from_crs(crs: str | None) -> Georeference | None:
 
 
 def median_longitude(degrees: NDArray[np.float64]) -> float:
-    """Median of longitudes, also across 180 degrees."""
+    """Median of longitudes in degrees, correct across the antimeridian."""
     first = degrees[0]
     turned = (degrees - first + 180) % 360 - 180
     return float((np.median(turned) + first + 180) % 360 - 180)
 
 
 def _pipeline(crs: str) -> Any:
-    """Longitude, latitude, height in degrees and metres to the frame."""
+    """Transformer from longitude, latitude (degrees) and height (metres) to the frame."""
     import pyproj
 
     return pyproj.Transformer.from_pipeline(

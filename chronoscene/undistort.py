@@ -1,7 +1,7 @@
-"""Scenes without distortion: images resampled to PINHOLE cameras, observations moved along.
+"""Undistortion of scenes: images are resampled to PINHOLE cameras, and observations follow.
 
-pycolmap chooses the cameras and knows the models; the pixels are interpolated here, bicubically, so
-that one step does what is to be done: undistortion, and the crop that centres the principal point.
+pycolmap chooses the cameras and evaluates the models; pixels are interpolated here, bicubically and
+only once, for both the undistortion and the crop that centres the principal point.
 Images whose camera does not change are copied byte for byte.
 """
 
@@ -36,11 +36,11 @@ WRITABLE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 _METADATA_FORMATS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
-LONGEST_EXIF = 65533
-"""Bytes; what a JPEG file can hold. Some cameras write two blocks, which come as a longer one."""
+MAX_EXIF_BYTES = 65533
+"""What a JPEG file can store. Some cameras write two blocks, which Pillow reads as a longer one."""
 
 _KEPT_TAGS = (0x010F, 0x0110, 0x0112, 0x0132)
-"""Maker, model, orientation and time; a TIFF has the layout of its pixels among its tags."""
+"""Make, model, orientation and time: the other tags of a TIFF describe its pixels."""
 
 _KEPT_BLOCKS = (0x8769, 0x8825)
 """EXIF proper, and GPS."""
@@ -48,13 +48,13 @@ _KEPT_BLOCKS = (0x8769, 0x8825)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Undistortion:
-    """What was done to a scene."""
+    """The result of an undistortion."""
 
     scene: Scene
     """The new scene."""
     changes: tuple[CameraChange, ...]
     observations_lost: int
-    """Observations outside of the new images."""
+    """Observations outside the new images."""
     points_lost: int
     """Points whose last observation was lost."""
 
@@ -77,7 +77,7 @@ def undistort(
         scene: Any scene.
         out: Folder that does not exist yet, or is empty.
         center: Crop the images so that the principal point is in their centre.
-        threads: Images that are worked on at the same time; None for one per processor.
+        threads: Images processed in parallel; None for one per processor.
         image_source: Copy or link the images that stay as they are.
         progress: Called after each image.
 
@@ -120,7 +120,7 @@ def _write_images(
     threads: int | None,
     progress: Progress | None,
 ) -> None:
-    """Write all images; those of one camera after each other, so that its map is made once."""
+    """Write all images, camera by camera, so that each sampling map is computed once."""
     order = sorted(range(len(changes)), key=lambda i: changes[i].target.camera_id)
     pool = ThreadPoolExecutor(threads or available_threads())
 
@@ -155,7 +155,7 @@ def _resample(source: Path, target: Path, change: CameraChange) -> None:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    """EXIF, which has the date of capture, and the colour profile if it is one of RGB colours."""
+    """EXIF, which has the capture date, and the colour profile if it is an RGB profile."""
     with Image.open(path) as image:
         kept: dict[str, Any] = {"exif": image.info.get("exif")}
         if image.format == "TIFF":
@@ -163,25 +163,25 @@ def _metadata(path: Path) -> dict[str, Any]:
         profile = image.info.get("icc_profile")
     if isinstance(profile, bytes) and profile[16:20] == b"RGB ":
         kept["icc_profile"] = profile
-    if isinstance(kept["exif"], bytes) and len(kept["exif"]) > LONGEST_EXIF:
+    if isinstance(kept["exif"], bytes) and len(kept["exif"]) > MAX_EXIF_BYTES:
         del kept["exif"]
     return {key: block for key, block in kept.items() if block}
 
 
 def _tiff_metadata(image: Image.Image) -> Image.Exif:
-    """What a TIFF says about its capture, without what it says about its pixels."""
+    """EXIF tags of a TIFF that describe the capture, without those that describe its pixels."""
     found, kept = image.getexif(), Image.Exif()
     kept.update({tag: found[tag] for tag in _KEPT_TAGS if tag in found and _fits(tag, found[tag])})
     for block in _KEPT_BLOCKS:
         tags = {tag: v for tag, v in found.get_ifd(block).items() if _fits(tag, v, block)}
         if tags:
             kept.get_ifd(block).update(tags)
-            kept[block] = 0  # Pillow puts the place of the block here
+            kept[block] = 0  # Pillow replaces this by the offset of the block
     return kept
 
 
 def _fits(tag: int, value: Any, block: int | None = None) -> bool:
-    """Whether Pillow can write a tag that it has read: not where its type is a wrong one."""
+    """Whether Pillow can write a tag that it has read; it cannot if the type is wrong."""
     probe = Image.Exif()
     if block is None:
         probe[tag] = value

@@ -71,7 +71,7 @@ def test_equal_file_names_stay_apart(make_scene_folder, tmp_path):
 def test_never_into_the_source(make_scene_folder, out):
     folder = make_scene_folder()
     before = snapshot(folder)
-    with pytest.raises(ConfigError, match="a place outside of the scene"):
+    with pytest.raises(ConfigError, match="a place outside the scene"):
         convert(folder, folder / out)
     assert snapshot(folder) == before
 
@@ -79,7 +79,7 @@ def test_never_into_the_source(make_scene_folder, out):
 def test_never_into_the_source_through_a_link(make_scene_folder, tmp_path):
     folder = make_scene_folder()
     (tmp_path / "link").symlink_to(folder)
-    with pytest.raises(ConfigError, match="a place outside of the scene"):
+    with pytest.raises(ConfigError, match="a place outside the scene"):
         convert(folder, tmp_path / "link" / "new")
 
 
@@ -162,14 +162,14 @@ def test_losses(make_scene_folder):
     (names,) = losses(scene, "colmap-folders")
     assert names.endswith("the image names, to which the period is added")
     assert losses(scene, "nerfstudio") == [
-        "nerfstudio has no place for the observations of points, their ids and errors"
+        "nerfstudio cannot store the observations of points, their ids and errors"
     ]
     dated = dataclasses.replace(
         scene,
         periods=(Period(0, "a", "2016"), Period(1, "2023", "2023")),
         world=WorldFrame("metre"),
     )
-    assert [text.split(" for ")[1] for text in losses(dated, "colmap-folders")] == [
+    assert [text.split(" cannot store ")[1] for text in losses(dated, "colmap-folders")] == [
         "the labels of the periods as they are (but: 0_a, 1_2023)",
         "the dates of the periods",
         "unit and reference system of the world",
@@ -190,7 +190,9 @@ def test_images_that_are_not_registered_are_remarked_upon(make_scene_folder, tmp
     (folder / "images/a/late.JPG").write_bytes(b"x")
     (folder / "images/notes.txt").write_text("")
     done = convert(folder, tmp_path / "out")
-    assert done.warnings == ("1 image files in images/ are not in the scene, and not converted",)
+    assert done.warnings == (
+        "1 image files in images/ are not part of the scene and were not converted",
+    )
 
 
 def test_other_files_are_remarked_upon(make_scene_folder, tmp_path):
@@ -231,7 +233,7 @@ def test_the_working_folder_is_refused(make_scene_folder, tmp_path, monkeypatch)
     folder, empty = make_scene_folder(), tmp_path / "empty"
     empty.mkdir()
     monkeypatch.chdir(empty)
-    with pytest.raises(SceneError, match="expected another folder than the one you are in"):
+    with pytest.raises(SceneError, match="expected a folder other than the current one"):
         convert(folder, Path())
     assert list(empty.iterdir()) == []
 

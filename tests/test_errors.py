@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from chronoscene.checks import check_choice, check_shape
-from chronoscene.errors import LONGEST, ChronoSceneError, ConfigError, SceneError, ShapeError
+from chronoscene.errors import MAX_LENGTH, ChronoSceneError, ConfigError, SceneError, ShapeError
 
 
 def test_message_has_place_expectation_finding_and_remedy():
@@ -16,7 +16,7 @@ def test_long_quotations_are_shortened():
     error = ChronoSceneError(
         "a.txt", expected="x" * 10**6, found="<" + "9" * 10**6 + ">", todo="no"
     )
-    assert len(str(error)) < 2 * LONGEST + 100
+    assert len(str(error)) < 2 * MAX_LENGTH + 100
     assert error.found.startswith("<9") and error.found.endswith("9>")
 
 

@@ -1,4 +1,4 @@
-"""Files and folders that appear complete or not at all, and never inside of a dataset."""
+"""Output files and folders appear complete or not at all, and never inside a dataset."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from chronoscene.errors import ConfigError, SceneError
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside a file, renamed to it if the block ends well, else deleted.
+    """A temporary name beside a file, renamed to it if the block succeeds, else deleted.
 
     Args:
         path: The file to write; its folder must exist. Another file of this name is replaced.
@@ -35,7 +35,7 @@ def write_text_atomic(path: Path, text: str) -> None:
 
 @contextmanager
 def staged_folder(out: Path) -> Iterator[Path]:
-    """A temporary folder beside ``out``, renamed to it if the block ends well, else deleted.
+    """A temporary folder beside ``out``, renamed to it if the block succeeds, else deleted.
 
     Raises:
         SceneError: If ``out`` is a file or has content, or the disk refuses.
@@ -44,9 +44,9 @@ def staged_folder(out: Path) -> Iterator[Path]:
         if out.resolve() == Path.cwd():  # a shell would stay in the folder that is replaced
             raise SceneError(
                 out,
-                expected="another folder than the one you are in",
-                found="that one",
-                todo="go up and name it, or name a new folder",
+                expected="a folder other than the current one",
+                found="the current folder",
+                todo="run the command from its parent folder, or name a new folder",
             )
         out = out.resolve()
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -74,16 +74,15 @@ def staged_folder(out: Path) -> Iterator[Path]:
 
 
 def check_outside(place: Path, scenes: Iterable[Path], *, option: str = "") -> None:
-    """Refuse a place in the folder of a scene, also where its parts are links to other folders.
+    """Refuse to write into the folder of a scene, or into folders that it links to.
 
     Args:
         place: Where something is to be written.
         scenes: Folders of scenes, or of photos.
-        option: What the user named the place with.
+        option: Option by which the user gave the place.
 
     Raises:
-        ConfigError: If the place is one of the folders, or below one or what a folder in it links
-            to.
+        ConfigError: If the place is in one of the folders, or in the target of a link in one.
     """
     resolved = place.resolve()
     for scene in scenes:
@@ -92,14 +91,14 @@ def check_outside(place: Path, scenes: Iterable[Path], *, option: str = "") -> N
             if resolved.is_relative_to(folder.resolve()):
                 raise ConfigError(
                     f"{option} {place}".strip(),
-                    expected="a place outside of the scene",
+                    expected="a place outside the scene",
                     found=f"one in {folder}",
                     todo="choose another place: nothing is written into a dataset",
                 )
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What is in a folder; nothing where it cannot be looked into."""
+    """Contents of a folder; nothing if it cannot be read."""
     try:
         return sorted(folder.iterdir())
     except OSError:

@@ -13,17 +13,17 @@ from chronoscene.scene.geometry import pose_from_rotation_translation
 Array = NDArray[np.float64]
 
 NUM_SAMPLES = 200
-"""Triples of points that are tried. With half of the points wrong, all of them would be useless
-once in 10^11 times."""
+"""Triples of points that are tried. With half of the points wrong, the chance that all
+of them have a wrong one is 3 x 10^-12."""
 
 MAX_JUDGED = 1000
-"""Points by which a triple is judged."""
+"""Points that a triple is evaluated on."""
 
 MAX_TRIPLES = 5000
 """Triples that are tried where points are few."""
 
 MIN_THICKNESS = 0.02
-"""Spread across a line as a share of that along it, below which points do not fix a rotation."""
+"""Spread across a line as a share of that along it, below which points fix no rotation."""
 
 SIGMA = 1.4826
 """Standard deviation of normal numbers in units of the median of their absolute values."""
@@ -106,11 +106,11 @@ class Similarity:
 
 
 def fit(source: Array, target: Array, *, mirror: bool = False) -> Similarity | None:
-    """Least squares similarity of corresponding points; None where they do not fix one.
+    """Least-squares similarity of corresponding points; None where they do not determine one.
 
     Args:
         source: At least three points, not on one line. [N, 3]
-        target: Where they should come to. [N, 3]
+        target: Their targets. [N, 3]
         mirror: Whether a reflection is allowed.
 
     Source: Umeyama 1991, equations 40 to 42.
@@ -134,29 +134,29 @@ def fit(source: Array, target: Array, *, mirror: bool = False) -> Similarity | N
 def fit_robustly(
     source: Array, target: Array, *, axes: int = 3, mirror: bool = False
 ) -> tuple[Similarity, Array] | None:
-    """Similarity that most of the points agree on, and the distance of every point to its target.
+    """Similarity that most points agree on, and the distance of every point to its target.
 
-    The best of many triples by the median distance, then least squares over what is within 2.5
-    standard deviations of it. The same points always give the same result.
+    The best of many triples by median distance, then least squares over the points within 2.5
+    standard deviations. Deterministic.
 
     Args:
         source: [N, 3]
         target: [N, 3]
-        axes: Of the target that distances are measured along: 2 leaves heights out.
+        axes: Number of target axes along which distances are measured: 2 ignores heights.
         mirror: Whether a reflection is allowed.
 
     Source: least median of squares, Rousseeuw 1984.
     """
     rng = np.random.default_rng(0)
     judges = rng.permutation(len(source))[:MAX_JUDGED]
-    best, least = None, np.inf
+    best, smallest = None, np.inf
     for _ in range(NUM_SAMPLES):
         triple = rng.choice(len(source), 3, replace=False)
         candidate = fit(source[triple], target[triple], mirror=mirror)
         if candidate is not None:
             median = np.median(_distances(candidate, source[judges], target[judges], axes))
-            if median < least:
-                best, least = candidate, median
+            if median < smallest:
+                best, smallest = candidate, median
     for _ in range(3):
         if best is None:
             return None
@@ -171,7 +171,7 @@ def _distances(similarity: Similarity, source: Array, target: Array, axes: int) 
 
 
 def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | None:
-    """Similarity of a few points, and which of them it rests on; None where they do not fix one.
+    """Similarity of a few points, and which of them it uses; None if they do not determine one.
 
     With five points or more, wrong ones are left out: of the similarities of all triples the one
     with the smallest median distance is taken, then all points within three deviations of it.
@@ -185,7 +185,7 @@ def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | No
         return None
     used = np.ones(count, bool)
     if count >= 5:
-        best, least = None, np.inf
+        best, smallest = None, np.inf
         for triple in islice(combinations(range(count), 3), MAX_TRIPLES):
             rows = list(triple)
             if _thickness(source[rows]) < MIN_THICKNESS:
@@ -193,11 +193,11 @@ def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | No
             if (trial := fit(source[rows], target[rows])) is not None:
                 # The three points of the trial fit by construction.
                 middle = float(np.sort(_distances(trial, source, target, 3))[(count + 3) // 2])
-                if middle < least:
-                    best, least = trial, middle
+                if middle < smallest:
+                    best, smallest = trial, middle
         if best is not None:
             distance = _distances(best, source, target, 3)
-            spread = 3 * SIGMA * max(least, 1e-4 * float(np.ptp(target, axis=0).max()))
+            spread = 3 * SIGMA * max(smallest, 1e-4 * float(np.ptp(target, axis=0).max()))
             if (distance <= spread).sum() >= 3:
                 used = distance <= spread
     whole = fit(source[used], target[used])

@@ -1,20 +1,19 @@
 """New splits of a scene: stratified, in blocks of space, by date of capture, or whole periods.
 
-A strategy gives the names of the test images. `make_split` applies one and says how near the test
-views are to the training views, because near ones make a split easy.
+A strategy chooses the test images. `make_split` applies one and measures how close the test views
+are to the training views, because close ones make a split easy.
 
-- ``stratified``: in each period, images in name order are cut into runs of equal length, and each
-  run gives one test image. Test views are everywhere, and each has training views beside it.
-- ``blocked``: the places of all cameras are cut into blocks of equally many, the same blocks for
-  all periods, and whole blocks are for testing. No camera of any period trains inside a test block.
-- ``date``: in each period, the images that were taken last are for testing. Whole days are held out
-  where a period has several.
-- ``periods``: all images of some periods are for testing; methods see nothing of these periods.
+- ``stratified``: in each period, images in name order are divided into runs of equal length, and
+  one image of each run is held out. Test views are everywhere, with training views next to them.
+- ``blocked``: the camera positions are divided into blocks of equal size, the same for all periods,
+  and whole blocks are held out. No camera of any period trains inside a test block.
+- ``date``: in each period, the images taken last are held out: whole days where a period has
+  several.
+- ``periods``: all images of some periods are held out; methods see nothing of these periods.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
@@ -23,10 +22,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from chronoscene.errors import ConfigError
-from chronoscene.scene import Frame, Scene
+from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.scene.split_blocks import blocked
-from chronoscene.scene.split_dates import latest
+from chronoscene.scene.split_strategies import blocked, latest, stratified, whole_periods
 from chronoscene.scene.splits import split_hash, split_of
 
 Strategy = Literal["stratified", "blocked", "date", "periods"]
@@ -42,33 +40,33 @@ class SplitSettings:
 
     strategy: Strategy = "stratified"
     fraction: float = FRACTION
-    """Of the images of each period (``blocked``: of all images) for testing."""
+    """Share of the images of each period (``blocked``: of all images) held out."""
     offset: int = 0
     """``stratified`` without a seed: index of the first test image of each period."""
     seed: int | None = None
-    """``stratified``: draw one image of each run, instead of its first. ``blocked``: which blocks
-    are for testing; None becomes 0."""
+    """``stratified``: draw one image of each run instead of the first. ``blocked``: chooses the
+    test blocks; None means 0."""
     blocks: int | None = None
     """``blocked``: number of blocks; None for two test blocks, or more if periods need them."""
     periods: tuple[int, ...] = ()
-    """``periods``: ids of those that are held out."""
+    """``periods``: ids of the periods held out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NewSplit:
-    """A scene with its new split, and what is to be known about it."""
+    """A scene with its new split, and how hard the split is."""
 
     scene: Scene
     settings: SplitSettings
     hash: str
     nearest: tuple[float, float] | None
     """Median and smallest distance from a test camera to the nearest training camera, in world
-    units; None where one of the two kinds is missing."""
+    units; None if there are no test or no training cameras."""
     nearest_same_period: tuple[float, float] | None
     """The same among training cameras of the same period."""
 
     def record(self) -> dict[str, Any]:
-        """All of it but the scene, for a JSON file."""
+        """Everything except the scene, for a JSON file."""
 
         def pair(values: tuple[float, float] | None) -> dict[str, float] | None:
             return None if values is None else {"median": values[0], "min": values[1]}
@@ -94,7 +92,7 @@ class NewSplit:
 
 
 def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
-    """Split a scene anew.
+    """Give a scene a new split.
 
     Raises:
         ConfigError: If the settings do not fit the scene.
@@ -109,7 +107,7 @@ def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
             "split",
             expected="training images",
             found="none left",
-            todo="hold out less",
+            todo="hold out fewer images",
         )
     frames = [replace(f, split=split_of(f.name, tests)) for f in scene.frames]
     new = replace(scene.with_frames(frames), split_rule=f"{settings.strategy} split")
@@ -132,9 +130,9 @@ def _check(settings: SplitSettings) -> None:
         if given and settings.strategy not in strategies:
             raise ConfigError(
                 option,
-                expected=f"no such option, or --strategy {' or '.join(strategies)}",
+                expected=f"--strategy {' or '.join(strategies)} with this option",
                 found=settings.strategy,
-                todo="leave the option out, or choose the other strategy",
+                todo="leave the option out, or choose another strategy",
             )
     wrong = None
     if not 0 < settings.fraction < 1:
@@ -150,44 +148,11 @@ def _check(settings: SplitSettings) -> None:
         raise ConfigError(place, expected=expected, found=str(found), todo="give another value")
 
 
-def _by_period(scene: Scene) -> list[tuple[Frame, ...]]:
-    """Frames of each period, in name order."""
-    return [scene.select(period=period.id) for period in scene.periods]
-
-
-def stratified(scene: Scene, settings: SplitSettings) -> set[str]:
-    """One image of each run of ``1 / fraction`` images, in every period."""
-    rng = None if settings.seed is None else np.random.default_rng(settings.seed)
-    length = 1 / settings.fraction
-    tests = set()
-    for frames in _by_period(scene):
-        for run in range(math.ceil(len(frames) * settings.fraction - 1e-9)):
-            first = math.floor(run * length + 1e-9)
-            last = min(len(frames), math.floor((run + 1) * length + 1e-9))
-            index = first + settings.offset if rng is None else int(rng.integers(first, last))
-            if index < len(frames):
-                tests.add(frames[index].name)
-    return tests
-
-
-def whole_periods(scene: Scene, settings: SplitSettings) -> set[str]:
-    """All images of the periods that are held out."""
-    known = {period.id for period in scene.periods}
-    if not settings.periods or not set(settings.periods) <= known:
-        raise ConfigError(
-            "--period",
-            expected=f"ids of periods to hold out, 0..{len(known) - 1}",
-            found=", ".join(map(str, settings.periods)) or "none",
-            todo="give --period ID, once for each",
-        )
-    return {f.name for f in scene.frames if f.period in settings.periods}
-
-
 _CHOOSE: Mapping[Strategy, Callable[[Scene, SplitSettings], set[str]]] = {
-    "stratified": stratified,
+    "stratified": lambda scene, s: stratified(scene, s.fraction, s.offset, s.seed),
     "blocked": lambda scene, s: blocked(scene, s.fraction, s.blocks, s.seed or 0),
     "date": lambda scene, s: latest(scene, s.fraction),
-    "periods": whole_periods,
+    "periods": lambda scene, s: whole_periods(scene, s.periods),
 }
 
 

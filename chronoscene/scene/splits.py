@@ -1,7 +1,7 @@
 """Period table (``split.txt``), test list (``test.txt``) and the default split.
 
-The parsers return what they could read and a list of problems, so that a reader can stop at the
-first one and a validator can report them all.
+The parsers return what they could read and a list of problems: readers raise the first one, and the
+validator reports them all.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ TEST_EVERY = 8
 DEFAULT_RULE = "every 8th image of each period in name order (index 0, 8, ...)"
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-"""Extensions that are cut off a name when it is compared without its extension."""
+"""Extensions that are removed when names are compared without them."""
 
 ProblemKind = Literal[
     "encoding",  # not text
     "fields",  # a line without two fields
     "period",  # a period id that is not a number 0, 1, ...
-    "ambiguous",  # a name that fits several images
+    "ambiguous",  # a name that matches several images
     "contradiction",  # an image with two different periods
     "duplicate",  # an image listed twice, with the same period
-    "unknown",  # a name that fits no registered image
+    "unknown",  # a name that matches no registered image
     "missing",  # a registered image without a period
     "ids",  # period ids that are not 0..T-1
     "empty",  # a period without any registered image
@@ -40,29 +40,29 @@ ProblemKind = Literal[
 FATAL: frozenset[ProblemKind] = frozenset(
     {"encoding", "fields", "period", "ambiguous", "contradiction", "missing", "ids", "empty"}
 )
-"""Kinds that make a scene unreadable; the others are worth a remark."""
+"""Kinds that make a scene unreadable; the others are only reported."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One finding about a file."""
+    """One problem of a file."""
 
     kind: ProblemKind
     line: int | None
-    """Line number from 1; None where the whole file is meant."""
+    """Line number from 1; None for the whole file."""
     expected: str
     found: str
     todo: str
 
     def error(self, path: Path) -> SceneError:
-        """The same finding as an exception that names the file."""
+        """The problem as an exception that names the file."""
         place = str(path) if self.line is None else f"{path}:{self.line}"
         return SceneError(place, expected=self.expected, found=self.found, todo=self.todo)
 
 
 @dataclass(frozen=True, slots=True)
 class SplitEntry:
-    """One line of ``split.txt``: an image by some form of its name, and its period."""
+    """One line of ``split.txt``: an image, by any form of its name, and its period."""
 
     line: int
     name: str
@@ -145,14 +145,14 @@ def _problem(kind: ProblemKind, line: int | None, expected: str, found: str) -> 
 class NameIndex:
     """Finds images by full name, file name, or file name without extension.
 
-    The forms are tried in this order, and the first that fits any image decides:
+    The forms are tried in this order, and the first that matches any image decides:
 
     1. the full name below ``images/``;
     2. the file name, without folders;
     3. either of these without extension;
     4. the file name up to its first dot, which is how the official loader identifies images.
 
-    An entry with folders is matched with its folders, unless no image has any.
+    Folders of an entry count, unless no image is in a folder.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -166,7 +166,7 @@ class NameIndex:
                     level.setdefault(key, []).append(name)
 
     def find(self, entry: str) -> list[str]:
-        """Images that an entry may mean: one if all is well, none or several if not."""
+        """Images that an entry matches: exactly one if the entry is valid."""
         entry = entry.removeprefix("./")
         if self._flat:
             entry = PurePosixPath(entry).name
@@ -187,10 +187,10 @@ def _image_keys(name: str) -> tuple[set[str], ...]:
 
 
 def _entry_keys(entry: str) -> tuple[str | None, ...]:
-    """Key of an entry on each level; None where the level cannot apply.
+    """Key of an entry on each level; None where the level does not apply.
 
-    Only a known extension is cut, so ``a.1`` never turns into ``a``; and on the last level a dot
-    that is left says that the entry means another image.
+    Only known extensions are removed, so ``a.1`` never becomes ``a``. On the last level, an entry
+    that still has a dot names another image.
     """
     suffix = PurePosixPath(entry).suffix
     bare = entry[: -len(suffix)] if suffix.lower() in IMAGE_SUFFIXES else entry
@@ -200,7 +200,7 @@ def _entry_keys(entry: str) -> tuple[str | None, ...]:
 def assign_periods(
     names: Sequence[str], entries: Sequence[SplitEntry]
 ) -> tuple[dict[str, int], list[Problem]]:
-    """Give each registered image its period.
+    """Assign a period to each registered image.
 
     Args:
         names: Full names of all registered images.
@@ -228,7 +228,7 @@ def assign_periods(
 def _place(
     entry: SplitEntry, found: list[str], periods: dict[str, int], lines: dict[str, int]
 ) -> Problem | None:
-    """Put one entry into ``periods``, or say why not."""
+    """Add one entry to ``periods``, or return why that is impossible."""
     if len(found) != 1:
         return _not_one(entry, found)
     (name,) = found
@@ -247,14 +247,14 @@ def _place(
 
 
 def _not_one(entry: SplitEntry | NameEntry, found: list[str]) -> Problem:
-    """The problem of a name that fits no image, or several."""
+    """The problem of a name that matches no image, or several."""
     if not found:
         return _problem("unknown", entry.line, "the name of a registered image", repr(entry.name))
     return Problem(
         "ambiguous",
         entry.line,
-        "a name that fits one image",
-        f"{entry.name!r}, which fits {', '.join(map(repr, found[:3]))}",
+        "a name that matches one image",
+        f"{entry.name!r}, which matches {', '.join(map(repr, found[:3]))}",
         "write the full names below images/",
     )
 

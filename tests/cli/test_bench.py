@@ -67,7 +67,7 @@ def test_runs_inside_a_scene_are_refused(make_scene_folder, tmp_path):
     (tmp_path / "link").symlink_to(scene)
     before = sorted(scene.rglob("*"))
     for out in (scene / "runs", scene, tmp_path / "link" / "runs"):
-        with pytest.raises(ConfigError, match=r"^--out .*: expected a place outside of the scene"):
+        with pytest.raises(ConfigError, match=r"^--out .*: expected a place outside the scene"):
             bench_module.command.main(
                 [str(scene), "--method", "3dgs", "--out", str(out)], standalone_mode=False
             )

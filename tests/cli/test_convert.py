@@ -29,7 +29,7 @@ def test_says_what_was_converted(make_scene_folder, tmp_path):
     assert lines[1:3] == ["  period 0: 1 train, 1 test", "  period 1: 1 train, 1 test"]
     assert split_hash(read_scene(folder)) in lines[3]
     assert result.stderr == (
-        "note: nerfstudio has no place for the observations of points, their ids and errors\n"
+        "note: nerfstudio cannot store the observations of points, their ids and errors\n"
     )
     assert read_scene(tmp_path / "out").format == "nerfstudio"
 
@@ -63,7 +63,7 @@ def test_help_lists_formats_and_groupings():
     ("arguments", "message"),
     [
         (["{tmp}/absent", "{tmp}/out"], "expected a scene folder, found nothing"),
-        (["{scene}", "{scene}/out"], "expected a place outside of the scene"),
+        (["{scene}", "{scene}/out"], "expected a place outside the scene"),
         (["{scene}", "{tmp}"], "expected a new or empty folder"),
         (["{scene}", "{tmp}/out", "--period-by", "year"], "--period-by: expected no such option"),
     ],

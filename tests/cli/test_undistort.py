@@ -56,7 +56,7 @@ def test_says_that_nothing_had_to_be_done(make_scene_folder, tmp_path):
     ("arguments", "message"),
     [
         (["{tmp}/absent", "{tmp}/out"], "expected a scene folder, found nothing"),
-        (["{scene}", "{scene}/out"], "expected a place outside of the scene"),
+        (["{scene}", "{scene}/out"], "expected a place outside the scene"),
         (["{scene}", "{tmp}"], "expected a new or empty folder"),
     ],
 )

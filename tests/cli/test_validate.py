@@ -176,7 +176,7 @@ def test_fix_into_the_scene_is_refused(good, monkeypatch, capsys):
     with pytest.raises(SystemExit) as stopped:
         main()
     assert stopped.value.code == 2
-    assert f"expected a place outside of the scene, found one in {good}" in capsys.readouterr().err
+    assert f"expected a place outside the scene, found one in {good}" in capsys.readouterr().err
 
 
 def test_explain():
@@ -198,7 +198,7 @@ def test_explain_nothing_that_is_there(capsys, monkeypatch):
 
 @pytest.mark.parametrize("option", ["--out", "--sarif", "--html"])
 def test_reports_are_not_written_into_a_scene(broken, option, monkeypatch):
-    with pytest.raises(ConfigError, match=f"{option} .*: expected a place outside of the scene"):
+    with pytest.raises(ConfigError, match=f"{option} .*: expected a place outside the scene"):
         run(broken, option, broken / "report")
     assert not (broken / "report").exists()
 

@@ -97,8 +97,8 @@ def test_lines_of_images_that_are_not_registered_have_no_effect(make_scene_folde
         ("a/0001.png 0\na/0002.png\n", 'split.txt:2: expected "<image name> <period id>"'),
         ("a/0001.png zero\n", "split.txt:1: expected a period id 0, 1, ..."),
         ("a/0001.png -1\n", "split.txt:1: expected a period id 0, 1, ..."),
-        ("0001.png 0\n", "split.txt:1: expected a name that fits one image, found '0001.png'"),
-        ("0001 0\n", "fits 'a/0001.png', 'b/0001.png'; write the full names"),
+        ("0001.png 0\n", "split.txt:1: expected a name that matches one image, found '0001.png'"),
+        ("0001 0\n", "matches 'a/0001.png', 'b/0001.png'; write the full names"),
         ("a/0001 0\na/0001.png 1\n", "split.txt:2: expected period 0 for 'a/0001.png' as in line"),
         ("a/0001 0\na/0002 0\nb/0001 1\n", "a period for every registered image, 'b/0003.png'"),
         ("a/0001 0\na/0002 0\nb/0001 2\nb/0003 2\n", "expected period ids 0..1 for 2 periods"),
@@ -116,7 +116,7 @@ def test_split_files_that_are_refused(make_scene_folder, text, message):
 
 
 def test_test_file_with_an_ambiguous_name_is_refused(make_scene_folder):
-    with pytest.raises(SceneError, match=r"test\.txt:2: expected a name that fits one image"):
+    with pytest.raises(SceneError, match=r"test\.txt:2: expected a name that matches one image"):
         read_scene(make_scene_folder(tests=["a/0001", "0001"]))
 
 

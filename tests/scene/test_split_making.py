@@ -11,9 +11,8 @@ from PIL import Image
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
-from chronoscene.scene.split_blocks import choose_blocks, cut_into_blocks
-from chronoscene.scene.split_dates import latest
 from chronoscene.scene.split_making import SplitSettings, make_split
+from chronoscene.scene.split_strategies import choose_blocks, cut_into_blocks, latest
 from chronoscene.scene.splits import default_tests, split_hash
 
 CAMERA = Camera(1, "PINHOLE", 64, 48, (50, 50, 32, 24))

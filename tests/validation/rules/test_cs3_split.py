@@ -169,7 +169,7 @@ def test_ambiguous(scene):
     for place in ("sparse/0/images.txt", "sparse/split.txt"):
         scene.replace(place, "a001.png", "a000.jpg")
     scene.write(TEST, ["a000", "b003"])
-    found = "'a000', which fits 'a000.jpg', 'a000.png'"
+    found = "'a000', which matches 'a000.jpg', 'a000.png'"
     scene.expect("CS325", place=f"{TEST}:1", found=found, also={"CS404", "CS702"})
 
 
