@@ -189,7 +189,7 @@ class Verdict:
 
     level: Level
     text: str
-    """One or two sentences for people."""
+    """One or two sentences."""
     findings: tuple[Finding, ...]
     """The most severe first."""
     pairs: dict[tuple[int, int], Level | None]

@@ -196,7 +196,7 @@ def register_rest(
 
 
 def triangulate(model: pycolmap.Reconstruction, job: Job, folder: str) -> pycolmap.Reconstruction:
-    """Points of a model triangulated anew from all matches; poses and cameras do not change."""
+    """Points of a model triangulated again from all matches; poses and cameras do not change."""
     scratch = job.scratch / folder
     scratch.mkdir(parents=True, exist_ok=True)
     return pycolmap.triangulate_points(

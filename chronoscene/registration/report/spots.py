@@ -45,7 +45,7 @@ class Spot:
     """A second image of the same period and the spot in it: a click needs two of each."""
     more_b: tuple[int, Array] | None
     tied: bool
-    """Whether the spot is a tie point; else it lies where there is none."""
+    """Whether the spot is a tie point; else it is where there is none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,103 @@
+"""Models against GPS: robust similarity, lines of cameras, the horizon."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from chronoscene.registration.reconstruct.gps_alignment import align_to_gps, upright_direction
+from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
+from chronoscene.scene.similarity import Sim3
+
+Array = NDArray[np.float64]
+
+TRUTH = Sim3(
+    2.5, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([5.0, 1.0, -3.0])
+)
+
+
+def looking_at(centre: Array, target: Array, up: tuple[float, float, float] = (0, 0, 1)) -> Array:
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return pose_from_rotation_translation(rotation, -rotation @ centre)
+
+
+def circle(count: int, radius: float = 20.0) -> Array:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.stack(
+        [
+            looking_at(np.array([radius * np.cos(a), radius * np.sin(a), 8.0]), np.zeros(3))
+            for a in angles
+        ]
+    )
+
+
+def test_gps_with_gross_outliers() -> None:
+    rng = np.random.default_rng(6)
+    world = circle(30)
+    model = TRUTH.inverse().apply_to_pose(world)
+    enu = camera_centre(world) + rng.normal(0, 0.3, (30, 3))
+    wrong = [3, 11, 25]
+    enu[wrong] += rng.uniform(50, 300, (3, 3))
+    enu[7] = np.nan
+    found = align_to_gps(model, enu, np.ones(30, bool))
+    assert found is not None
+    assert found.is_useful
+    assert not found.inliers[[*wrong, 7]].any()
+    assert found.inliers.sum() >= 24
+    np.testing.assert_allclose(
+        found.enu_from_model.apply(camera_centre(model)), camera_centre(world), atol=0.5
+    )
+    assert np.isnan(found.residuals[7])
+    assert found.rms == pytest.approx(0.3 * np.sqrt(3), rel=0.3)
+
+
+def test_gps_noise_as_large_as_the_scene_is_of_no_use() -> None:
+    rng = np.random.default_rng(7)
+    world = circle(12, radius=2.0)
+    enu = camera_centre(world) + rng.normal(0, 3.0, (12, 3))
+    found = align_to_gps(world, enu, np.ones(12, bool))
+    assert found is not None
+    assert not found.is_useful
+
+
+def test_a_straight_walk_stands_upright_by_its_horizon() -> None:
+    rng = np.random.default_rng(8)
+    world = np.stack(
+        [
+            looking_at(
+                np.array([2.0 * i, 0.0, 1.6]), np.array([2.0 * i + 5, rng.normal(0, 2), 1.6])
+            )
+            for i in range(20)
+        ]
+    )
+    model = TRUTH.inverse().apply_to_pose(world)
+    enu = camera_centre(world) + rng.normal(0, 0.2, (20, 3))
+    found = align_to_gps(model, enu, np.ones(20, bool))
+    assert found is not None
+    assert found.on_a_line
+    aligned = found.enu_from_model.apply_to_pose(model)
+    assert upright_direction(aligned)[2] > 0.999
+
+
+def test_fewer_than_three_positions_say_nothing() -> None:
+    world = circle(5)
+    enu = np.full((5, 3), np.nan)
+    enu[:2] = camera_centre(world)[:2]
+    assert align_to_gps(world, enu, np.ones(5, bool)) is None
+
+
+def test_up_of_photos_that_look_straight_down() -> None:
+    rng = np.random.default_rng(9)
+    poses = np.stack(
+        [
+            looking_at(
+                np.array([*rng.uniform(-9, 9, 2), 50.0]),
+                np.array([0.0, 0.0, 0.0]),
+                up=(rng.normal(), rng.normal(), 0.0),
+            )
+            for _ in range(10)
+        ]
+    )
+    assert upright_direction(poses)[2] > 0.9
