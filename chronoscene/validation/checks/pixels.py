@@ -217,7 +217,7 @@ def jpeg_damage(data: bytes) -> str | None:
             return f"compressed data with an impossible marker at byte {mark}"
         skip = mark + 2 + int.from_bytes(data[mark + 2 : mark + 4])
     if len(set(data[-PADDING:])) == 1:
-        return f"no end of the image, and {data[-1]:#04x} in all of the last bytes"
+        return f"no end of the image, and only {data[-1]:#04x} in the last bytes"
     return None
 
 
@@ -307,12 +307,12 @@ def read_pixels_of(path: Path) -> Pixels:
 
 def _problem(error: Exception) -> str:
     known = error.strerror if isinstance(error, OSError) else None
-    return known or re.sub(r"<_io\.[^>]*>", "it", str(error)) or type(error).__name__
+    return known or re.sub(r" ?<_io\.[^>]*>", "", str(error)) or type(error).__name__
 
 
 def _without_path(text: str, path: Path) -> str:
     """Pillow's message without the path, which is in the place of the finding."""
-    return text.replace(repr(str(path)), "it")
+    return text.replace(f" {str(path)!r}", "")
 
 
 def _size(path: Path) -> int:

@@ -29,6 +29,7 @@ UNEQUAL = 0.1
 """Relative difference of fx and fy; pixels are square to a few percent in any camera."""
 
 UNDISTORT = "undistort the images and the model: chronoscene undistort SCENE OUT"
+PERSPECTIVE = "render perspective views of the panoramas, and register those"
 DROP = "write the camera as PINHOLE or SIMPLE_PINHOLE; its distortion is below half a pixel"
 NO_DISTORTION = "PINHOLE, SIMPLE_PINHOLE, or a radial or OPENCV model without distortion"
 
@@ -55,7 +56,8 @@ def camera_model(scene: RawScene, cameras: Sequence[Camera]) -> Iterator[Hit]:
     """A camera model cannot be used as a pinhole camera."""
     for camera in cameras:
         if camera.model not in (*PINHOLE_MODELS, *POLYNOMIAL_MODELS):
-            yield Hit(scene.camera_place(camera), NO_DISTORTION, camera.model)
+            remedy = PERSPECTIVE if camera.model == "EQUIRECTANGULAR" else None
+            yield Hit(scene.camera_place(camera), NO_DISTORTION, camera.model, remedy)
 
 
 @rule.error("CS133", bad="`SIMPLE_RADIAL` with k = -0.16", remedy=UNDISTORT, needs=("cameras",))
@@ -182,7 +184,7 @@ def rigs_partial(scene: RawScene, model: RawModel) -> Iterator[Hit]:
     if len(present) == 1:
         missing = "frames" if present == ["rigs"] else "rigs"
         place = f"{scene.model_place or '.'}/{missing}{form}"
-        yield Hit(place, f"the file that belongs to {present[0]}{form}", "none")
+        yield Hit(place, f"the file that belongs to {present[0]}{form}", "no such file")
 
 
 @rule.error(

@@ -159,7 +159,7 @@ def periods_unequal(scene: RawScene) -> Iterator[Hit]:
     most = max(train.values(), default=0)
     for period, number in train.items():
         if 0 < number * UNEQUAL < most:
-            yield Hit(f"period {period}", f"a tenth of {most} training views", str(number))
+            yield Hit(f"period {period}", f"at least a tenth of {most} training views", str(number))
 
 
 def _views(scene: RawScene) -> dict[int, tuple[int, int]]:

@@ -86,7 +86,8 @@ def _short_tracks(scene: RawScene, points: RawPoints, *, few: bool) -> Iterator[
     if short and not lengths.any() and scene.tests is not None:
         return  # no tracks at all: CS514
     for number, found in ((0, "no observation"), (1, "one observation")):
-        yield from _some_points(scene, points, lengths == number, "two or more", found)
+        expected = "two or more observations of each point"
+        yield from _some_points(scene, points, lengths == number, expected, found)
 
 
 @rule.error(

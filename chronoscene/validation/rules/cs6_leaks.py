@@ -112,7 +112,7 @@ def near_leak(
     }
     for a, b, alike in relit_pairs(pixels, role):
         if pixels[a].digest != pixels[b].digest:
-            near.setdefault((a, b), f"that is, up to brightness, {alike:.2%} that")
+            near.setdefault((a, b), f"that, up to brightness, agrees to {alike:.2%} with that")
     for (a, b), how in near.items():
         place, other = (b, a) if role[b][1] and not role[a][1] else (a, b)
         found = f"a thumbnail {how} of {shown([other])}{_apart(scene, a, b)}"

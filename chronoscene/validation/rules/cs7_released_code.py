@@ -92,7 +92,7 @@ def official_name_collision(scene: RawScene) -> Iterator[Hit]:
         groups.setdefault(_cut(name), []).append(name)
     for key, names in groups.items():
         if len(names) > 1:
-            found = f"{shown(names)}, all of them {quote(key)} to it"
+            found = f"{shown(names)}, all known to it as {quote(key)}"
             files = {PurePosixPath(name).name for name in names}
             if len(files) == 1:
                 found += f", and all read from images/{files.pop()}"

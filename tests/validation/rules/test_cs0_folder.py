@@ -37,7 +37,7 @@ def test_empty_folders_beside_the_model_are_nothing(scene):
 
 def test_bad_periods_json(scene):
     scene.write("sparse/periods.json", '[{"id": 0}, {"id": 2}]')
-    scene.expect("CS004", place="sparse/periods.json", found="others")
+    scene.expect("CS004", place="sparse/periods.json", found="other ids")
 
 
 def test_good_side_files_are_silent(scene):

@@ -146,7 +146,7 @@ def test_good_model_with_rigs(rigs):
 @pytest.mark.parametrize(("gone", "left"), [("frames", "rigs"), ("rigs", "frames")])
 def test_rigs_partial(rigs, gone, left):
     rigs.path(f"sparse/0/{gone}.bin").unlink()
-    rigs.expect("CS141", place=f"sparse/0/{gone}.bin", found="none")
+    rigs.expect("CS141", place=f"sparse/0/{gone}.bin", found="no such file")
 
 
 def test_frame_of_an_unknown_rig(rigs):

@@ -52,7 +52,7 @@ def test_unregistered_image(scene):
 
 @pytest.mark.parametrize(
     ("data", "found"),
-    [(b"", "an empty file"), (b"hello", "cannot identify image file it"), (b"\x89PNG\r\n", "")],
+    [(b"", "an empty file"), (b"hello", "cannot identify image file"), (b"\x89PNG\r\n", "")],
 )
 def test_image_unreadable(scene, data, found):
     scene.write("images/a000.png", data)

@@ -59,7 +59,7 @@ def test_official_name_collision(scene):
     scene.path("images/a001.png").rename(scene.path("images/a000.1.png"))
     for place in ("sparse/0/images.txt", SPLIT):
         scene.replace(place, "a001.png", "a000.1.png")
-    found = "'a000.1.png', 'a000.png', all of them 'a000' to it"
+    found = "'a000.1.png', 'a000.png', all known to it as 'a000'"
     scene.expect("CS702", place="sparse/0/images.txt", found=found)
 
 
