@@ -1,1 +1,1 @@
-"""Outside of this process: files that appear complete or not at all, processes, pycolmap."""
+"""Input and output: staged files and folders, tables, pages, messages, processes, pycolmap."""

@@ -103,7 +103,7 @@ class Period:
 
     id: int
     label: str
-    """What people call it; the id as text where nothing better is known."""
+    """Name for people; the id where no name is known."""
     date: str | None = None
     """ISO 8601 date, if known."""
 
@@ -133,7 +133,7 @@ class Scene:
     periods: tuple[Period, ...]
     """Ids are 0..T-1 in this order."""
     split_rule: str
-    """How the split came about, in words: ``sparse/0/test.txt`` or the default rule."""
+    """Origin of the split, in words: ``sparse/0/test.txt`` or the default rule."""
     format: str
     world: WorldFrame = field(default_factory=WorldFrame)
 
@@ -181,7 +181,7 @@ class Scene:
     def with_frames(self, frames: Sequence[Frame]) -> Scene:
         """The same scene with other attributes on the same frames (same names, same order).
 
-        Tracks refer to frames by position, so frames cannot be added, dropped or moved here.
+        Tracks refer to frames by index, so frames cannot be added, removed or reordered here.
         """
         assert [f.name for f in frames] == [f.name for f in self.frames]
         return replace(self, frames=tuple(frames))

@@ -1,8 +1,8 @@
-"""Tracks in flat form: who sees a point, where it should be seen, and where its rays meet.
+"""Tracks in flat form: who sees a point, reprojection, and the intersection of rays.
 
 Observations of point i are ``start[i]:start[i + 1]`` (P points, M observations), as in
-`chronoscene.scene.Points`. Everything takes arrays, so that scenes, raw models and registrations
-share it.
+`chronoscene.scene.Points`. All functions take arrays, so that scenes, raw models and registrations
+can use them.
 """
 
 from __future__ import annotations
