@@ -100,8 +100,8 @@ def reproject(
     return offset, depth
 
 
-def meet(direction: Array, centre: Array, first: Ints) -> tuple[Array, Array]:
-    """Points nearest to bundles of rays, ``sum(I - d d^T) x = sum((I - d d^T) c)``.
+def intersect_rays(direction: Array, centre: Array, first: Ints) -> tuple[Array, Array]:
+    """Points nearest to bundles of rays: ``sum(I - d d^T) x = sum((I - d d^T) c)``.
 
     Args:
         direction: Unit vectors d in the world, bundle after bundle. [R, 3]
@@ -109,10 +109,11 @@ def meet(direction: Array, centre: Array, first: Ints) -> tuple[Array, Array]:
         first: First ray of each bundle. [B]
 
     Returns:
-        xyz: The points; of no use where there is no parallax. [B, 3]
-        parallax: To be compared with `MIN_PARALLAX`. [B]
+        xyz: The points; meaningless without parallax. [B, 3]
+        parallax: Smallest eigenvalue of the mean of ``I - d d^T``, see `MIN_PARALLAX`. [B]
     """
     count = np.diff(np.append(first, len(direction)))
+    # I - d d^T projects onto the plane across a ray.
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     left = np.add.reduceat(across, first)
     right = np.add.reduceat(np.einsum("nij,nj->ni", across, centre), first)

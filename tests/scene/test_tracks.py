@@ -13,7 +13,7 @@ from chronoscene.scene.tracks import (
     MIN_PARALLAX,
     by_image,
     count_views,
-    meet,
+    intersect_rays,
     reproject,
     seen_by_period,
     select_tracks,
@@ -72,7 +72,7 @@ def test_rays_meet_and_parallax_is_the_sine_of_half_their_angle() -> None:
     centre = np.array([[0.0, 0, 0], [3, 0, 0], [0, 0, 0], [0, 1e-3, 0]])
     direction = target - centre
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    xyz, parallax = meet(direction, centre, np.array([0, 2]))
+    xyz, parallax = intersect_rays(direction, centre, np.array([0, 2]))
     np.testing.assert_allclose(xyz[0], target)
     half = np.arccos(direction[0] @ direction[1]) / 2
     assert parallax[0] == pytest.approx(np.sin(half) ** 2)

@@ -18,7 +18,7 @@ from chronoscene.registration.result import Registered
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.scene.tracks import MIN_PARALLAX, meet, seen_by_period, track_owners
+from chronoscene.scene.tracks import MIN_PARALLAX, intersect_rays, seen_by_period, track_owners
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -174,7 +174,7 @@ def place(rays: Rays) -> Placed:
     local = np.column_stack([rays.uv, np.ones(len(rays))])
     direction = np.einsum("nji,nj->ni", rays.pose[:, :3, :3], local)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    xyz, parallax = meet(direction, camera_centre(rays.pose), first)
+    xyz, parallax = intersect_rays(direction, camera_centre(rays.pose), first)
     for _ in range(3):
         residual, jacobian, _ = project(rays, np.repeat(xyz, count, axis=0))
         normal, gradient = _normal_equations(residual, jacobian, first)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import Similarity, fit_robustly
-from chronoscene.scene.tracks import MIN_PARALLAX, meet
+from chronoscene.scene.tracks import MIN_PARALLAX, intersect_rays
 from chronoscene.validation.checks.reprojection import image_errors, period_errors, pose_limit
 from chronoscene.validation.scene_folder import RawScene, derived
 
@@ -189,7 +189,7 @@ class Rays:
             return rows, np.zeros((0, 3))
         rows = rows[np.argsort(self.point[rows], kind="stable")]
         index, first = np.unique(self.point[rows], return_index=True)
-        xyz, parallax = meet(direction[rows], self.centre[rows], first)
+        xyz, parallax = intersect_rays(direction[rows], self.centre[rows], first)
         good = parallax > MIN_PARALLAX
         return index[good], xyz[good]
 
