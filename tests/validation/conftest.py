@@ -63,6 +63,27 @@ class SceneFolder:
         lines[row] = " ".join(words)
         self.write(place, lines)
 
+    def set_track(self, row, track):
+        """Replace the track of a point, in the points and in the images."""
+        words = self.lines("sparse/0/points3D.txt")[row].split()
+        point_id = words[0]
+        old = {(int(i), int(k)) for i, k in zip(words[8::2], words[9::2], strict=True)}
+        lines = self.lines("sparse/0/points3D.txt")
+        lines[row] = " ".join(words[:8] + [f"{i} {k}" for i, k in track])
+        self.write("sparse/0/points3D.txt", lines)
+        images = self.lines("sparse/0/images.txt")
+        for image_id, keypoint in old - set(track):
+            keypoints = images[2 * image_id - 1].split()
+            assert keypoints[3 * keypoint + 2] == point_id
+            keypoints[3 * keypoint + 2] = "-1"
+            images[2 * image_id - 1] = " ".join(keypoints)
+        self.write("sparse/0/images.txt", images)
+
+    def keep_images(self, rows, kept):
+        """Let the points of some rows be seen by some images (ids) only."""
+        for row in rows:
+            self.set_track(row, [(i, row) for i in kept])
+
     def change_poses(self, change: Change, rows: Iterable[int]) -> None:
         """Apply a function of rotation and translation to the poses of some images."""
         lines = self.lines("sparse/0/images.txt")

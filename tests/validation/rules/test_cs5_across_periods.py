@@ -144,3 +144,56 @@ def test_absurd_metres(scene, scale):
     scene.write(WORLD, '{"unit": "metre"}')
     also = {"CS707"} if scale < 1 else ()
     scene.expect("CS520", place="period 0", found="m from the cameras", also=also, times=2)
+
+
+def test_period_without_points(scene):
+    scene.keep_images(range(40), range(1, 8))
+    scene.expect("CS506", place="period 1", found="0 of 40", also={"CS509"})
+
+
+def test_points_of_one_period(scene):
+    scene.keep_images(range(10), range(8, 15))
+    scene.expect(
+        "CS507", place=POINTS, found="10 of 40 in one only (25.0 %): period 0 0, period 1 10"
+    )
+
+
+def test_period_unconnected(scene):
+    scene.keep_images(range(10), range(8, 15))
+    scene.keep_images(range(10, 40), range(1, 8))
+    scene.expect("CS508", place="period 1", found="0 of 10")
+
+
+def test_period_hardly_connected(scene):
+    """Nine points in common are too few, ten are enough."""
+    scene.keep_images(range(9, 25), range(8, 15))
+    scene.keep_images(range(25, 40), range(1, 8))
+    scene.expect("CS508", place="period 0", found="9 of 24")
+
+
+def test_period_barely_connected(scene):
+    scene.keep_images(range(10, 25), range(8, 15))
+    scene.keep_images(range(25, 40), range(1, 8))
+    assert "CS508" not in {f.code for f in scene.validate().findings}
+
+
+def test_groups_of_periods_unconnected(scene):
+    """Periods 0 and 1 share points, 2 and 3 share points, no others do."""
+    names = sorted(p.name for p in scene.path("images").iterdir())
+    scene.write(
+        "sparse/split.txt",
+        [f"{n} {[0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 3, 3, 3, 3][i]}" for i, n in enumerate(names)],
+    )
+    scene.keep_images(range(15), range(8, 15))
+    scene.keep_images(range(15, 40), range(1, 8))
+    found = [f for f in scene.validate().findings if f.code == "CS508"]
+    assert [(f.place, f.found) for f in found] == [("periods 2, 3", "0 of 15")]
+
+
+def test_periods_connected_by_a_chain(scene):
+    """Periods 0 and 2 share nothing, but both share points with period 1."""
+    names = sorted(p.name for p in scene.path("images").iterdir())
+    scene.write("sparse/split.txt", [f"{n} {min(2, i // 5)}" for i, n in enumerate(names)])
+    scene.keep_images(range(20), range(1, 11))
+    scene.keep_images(range(20, 40), range(6, 15))
+    assert "CS508" not in {f.code for f in scene.validate().findings}

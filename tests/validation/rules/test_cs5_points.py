@@ -1,32 +1,10 @@
 import math
 import struct
 
+import numpy as np
 import pytest
 
 IMAGES, POINTS = "sparse/0/images.txt", "sparse/0/points3D.txt"
-
-
-def set_track(scene, row, track):
-    """Replace the track of a point, in the points and in the images."""
-    words = scene.lines(POINTS)[row].split()
-    point_id = words[0]
-    old = {(int(i), int(k)) for i, k in zip(words[8::2], words[9::2], strict=True)}
-    lines = scene.lines(POINTS)
-    lines[row] = " ".join(words[:8] + [f"{i} {k}" for i, k in track])
-    scene.write(POINTS, lines)
-    images = scene.lines(IMAGES)
-    for image_id, keypoint in old - set(track):
-        keypoints = images[2 * image_id - 1].split()
-        assert keypoints[3 * keypoint + 2] == point_id
-        keypoints[3 * keypoint + 2] = "-1"
-        images[2 * image_id - 1] = " ".join(keypoints)
-    scene.write(IMAGES, images)
-
-
-def keep_images(scene, rows, kept):
-    """Let the points of some rows be seen by some images (ids) only."""
-    for row in rows:
-        set_track(scene, row, [(i, row) for i in kept])
 
 
 def test_no_points(scene):
@@ -48,7 +26,7 @@ def test_point_not_finite(scene, value):
     ("track", "found"), [([], "no observation"), ([(3, 4)], "one observation")]
 )
 def test_short_track(scene, track, found):
-    set_track(scene, 4, track)
+    scene.set_track(4, track)
     scene.expect("CS503", place=POINTS, found=f"{found} for 1 of 40 points (ids 5)")
 
 
@@ -80,61 +58,8 @@ def test_keypoint_of_no_point_in_a_track(scene):
     scene.expect("CS505", place=POINTS, found="1 observation whose keypoint")
 
 
-def test_period_without_points(scene):
-    keep_images(scene, range(40), range(1, 8))
-    scene.expect("CS506", place="period 1", found="0 of 40", also={"CS509"})
-
-
-def test_points_of_one_period(scene):
-    keep_images(scene, range(10), range(8, 15))
-    scene.expect(
-        "CS507", place=POINTS, found="10 of 40 in one only (25.0 %): period 0 0, period 1 10"
-    )
-
-
-def test_period_unconnected(scene):
-    keep_images(scene, range(10), range(8, 15))
-    keep_images(scene, range(10, 40), range(1, 8))
-    scene.expect("CS508", place="period 1", found="0 of 10")
-
-
-def test_period_hardly_connected(scene):
-    """Nine points in common are too few, ten are enough."""
-    keep_images(scene, range(9, 25), range(8, 15))
-    keep_images(scene, range(25, 40), range(1, 8))
-    scene.expect("CS508", place="period 0", found="9 of 24")
-
-
-def test_period_barely_connected(scene):
-    keep_images(scene, range(10, 25), range(8, 15))
-    keep_images(scene, range(25, 40), range(1, 8))
-    assert "CS508" not in {f.code for f in scene.validate().findings}
-
-
-def test_groups_of_periods_unconnected(scene):
-    """Periods 0 and 1 share points, 2 and 3 share points, no others do."""
-    names = sorted(p.name for p in scene.path("images").iterdir())
-    scene.write(
-        "sparse/split.txt",
-        [f"{n} {[0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 3, 3, 3, 3][i]}" for i, n in enumerate(names)],
-    )
-    keep_images(scene, range(15), range(8, 15))
-    keep_images(scene, range(15, 40), range(1, 8))
-    found = [f for f in scene.validate().findings if f.code == "CS508"]
-    assert [(f.place, f.found) for f in found] == [("periods 2, 3", "0 of 15")]
-
-
-def test_periods_connected_by_a_chain(scene):
-    """Periods 0 and 2 share nothing, but both share points with period 1."""
-    names = sorted(p.name for p in scene.path("images").iterdir())
-    scene.write("sparse/split.txt", [f"{n} {min(2, i // 5)}" for i, n in enumerate(names)])
-    keep_images(scene, range(20), range(1, 11))
-    keep_images(scene, range(20, 40), range(6, 15))
-    assert "CS508" not in {f.code for f in scene.validate().findings}
-
-
 def test_image_without_points(scene):
-    keep_images(scene, range(40), [i for i in range(1, 15) if i != 3])
+    scene.keep_images(range(40), [i for i in range(1, 15) if i != 3])
     scene.expect("CS509", place=IMAGES, found="1 image without points: 'a002.png'")
 
 
@@ -155,7 +80,7 @@ def test_observation_not_finite(scene):
 
 def test_no_training_points(scene):
     """All points are seen by the two test images alone."""
-    keep_images(scene, range(40), (4, 11))
+    scene.keep_images(range(40), (4, 11))
     scene.expect("CS514", place=POINTS, found="0 of 40", also={"CS509"})
 
 
@@ -190,3 +115,42 @@ def test_points_without_any_track_are_one_finding(scene):
     scene.write(POINTS, [" ".join(line.split()[:8]) for line in scene.lines(POINTS)])
     found = {f.code for f in scene.validate().findings}
     assert "CS514" in found and not found & {"CS503", "CS506", "CS525"}
+
+
+def test_duplicate_points(scene):
+    lines = scene.lines(POINTS)
+    shared = lines[0].split()[1:4]
+    for row in range(1, 4):
+        scene.edit_fields(POINTS, row, {1: shared[0], 2: shared[1], 3: shared[2]})
+    scene.expect("CS517", place=POINTS, found="3 of 40")
+
+
+def test_points_that_were_rounded_are_the_same_points(scene):
+    """Copies that went through single precision."""
+    shared = [f"{np.float32(x):.9g}" for x in scene.lines(POINTS)[0].split()[1:4]]
+    for row in range(1, 4):
+        scene.edit_fields(POINTS, row, dict(enumerate(shared, start=1)))
+    found = [f.found for f in scene.validate().findings if f.code == "CS517"]
+    assert found in ([f"{n} of 40 that coincide with another one"] for n in (2, 3))
+
+
+def test_two_points_in_one_place_are_silent(scene):
+    x, y, z = scene.lines(POINTS)[0].split()[1:4]
+    scene.edit_fields(POINTS, 1, {1: x, 2: y, 3: z})
+    assert {f.code for f in scene.validate().findings} == {"CS507"}
+
+
+def test_points_with_one_equal_coordinate_are_silent(scene):
+    for row in range(20):
+        scene.edit_fields(POINTS, row, {1: "0.25"})
+    assert "CS517" not in {f.code for f in scene.validate().findings}
+
+
+def test_far_points(scene):
+    scene.edit_fields(POINTS, 5, {2: "4e4"})
+    scene.expect("CS518", place=POINTS, found="1 point up to 4e+04 away (ids 6)")
+
+
+def test_far_points_of_absurd_size(scene):
+    scene.edit_fields(POINTS, 5, {2: "1e300"})
+    scene.expect("CS518", place=POINTS, found="(ids 6)")
