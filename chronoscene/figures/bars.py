@@ -10,6 +10,7 @@ from typing import Any
 from chronoscene.figures.canvas import (
     GREY,
     GRID,
+    add_legend,
     new_figure,
     period_colors,
     plain,
@@ -117,21 +118,8 @@ def _period_names(counts: Sequence[SceneCount], periods: int) -> list[str]:
 
 def _legend(figure: Any, names: Sequence[str], colors: Sequence[str], top: float) -> None:
     """Names of the periods above the panels; of many only some."""
-    from matplotlib.patches import Patch
-
     fitting = int((WIDTH - 0.3) / (0.45 + 0.075 * max(map(len, names))))
     step = -(-len(colors) // min(MAX_LEGEND_ENTRIES, max(fitting, 1)))
     shown = range(0, len(colors), step)
-    figure.legend(
-        [Patch(color=colors[i]) for i in shown],
-        [plain(names[i]) for i in shown],
-        loc="upper center",
-        bbox_to_anchor=(0.5, top),
-        borderaxespad=0,
-        ncol=len(shown),
-        frameon=False,
-        fontsize=9,
-        handlelength=1.0,
-        handleheight=1.0,
-        columnspacing=1.4,
-    )
+    entries = [(names[i], colors[i]) for i in shown]
+    add_legend(figure, entries, loc="upper center", bbox_to_anchor=(0.5, top), ncol=len(shown))

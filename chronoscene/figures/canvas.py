@@ -1,7 +1,8 @@
-"""What all figures share: their look, and files that appear complete or not at all."""
+"""What all figures share: look, colours of periods, legend, and files that appear complete."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from warnings import catch_warnings, filterwarnings
@@ -56,6 +57,23 @@ def save(figure: Any, path: Path) -> None:
     with rc_context(settings), replacing(path) as partial, catch_warnings():
         filterwarnings("ignore", "Glyph .* missing")  # no font here has it: boxes stand for it
         figure.savefig(partial, format=form, dpi=DPI, **by_format[form])
+
+
+def add_legend(figure: Any, entries: Sequence[tuple[str, str]], **place: Any) -> None:
+    """Names of periods beside squares of their colours; ``place`` is for `Figure.legend`."""
+    from matplotlib.patches import Patch
+
+    figure.legend(
+        [Patch(color=color) for _, color in entries],
+        [plain(name) for name, _ in entries],
+        borderaxespad=0,
+        frameon=False,
+        fontsize=9,
+        handlelength=1.0,
+        handleheight=1.0,
+        columnspacing=1.4,
+        **place,
+    )
 
 
 def quiet_axes(axes: Any) -> None:

@@ -19,6 +19,7 @@ from chronoscene.figures.canvas import (
     DPI,
     GREY,
     GRID,
+    add_legend,
     new_figure,
     period_colors,
     plain,
@@ -235,22 +236,9 @@ def _write_texts(figure: Any, cloud: Cloud, box: Box, corner: tuple[float, float
 def _draw_legend(
     figure: Any, names: Sequence[str], colors: Sequence[str], columns: int, top: float
 ) -> None:
-    from matplotlib.patches import Patch
-
     columns = min(columns, len(names))
     # Legends are filled column by column; ours is read line by line.
     order = [i for column in range(columns) for i in range(column, len(names), columns)]
-    figure.legend(
-        [Patch(color=colors[i]) for i in order],
-        [plain(names[i]) for i in order],
-        loc="upper left",
-        bbox_to_anchor=(LEFT / figure.get_size_inches()[0], top),
-        borderaxespad=0,
-        borderpad=0,
-        ncol=columns,
-        frameon=False,
-        fontsize=9,
-        handlelength=1.0,
-        handleheight=1.0,
-        columnspacing=1.4,
-    )
+    entries = [(names[i], colors[i]) for i in order]
+    corner = (LEFT / figure.get_size_inches()[0], top)
+    add_legend(figure, entries, loc="upper left", bbox_to_anchor=corner, ncol=columns, borderpad=0)
