@@ -12,7 +12,7 @@ class GaussianSplatting(GaussianMethod):
     The period is not used: every period renders the same image.
 
     Source: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering".
-    Different on purpose: the principal point is kept, and the near plane is that of all methods here.
+    Different on purpose: the principal point is kept; the near plane is that of all methods here.
     """
 
     name = "3dgs"
