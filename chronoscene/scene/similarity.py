@@ -71,6 +71,13 @@ class Sim3:
         """The 4x4 matrix [[scale * rotation, translation], [0, 1]]."""
         return pose_from_rotation_translation(self.scale * self.rotation, self.translation)
 
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Sim3:
+        """Inverse of `to_matrix`: the ``training_from_world`` of a checkpoint, for example."""
+        m = np.asarray(matrix, dtype=np.float64)
+        scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
+        return cls(scale, m[:3, :3] / scale, m[:3, 3].copy())
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Similarity:

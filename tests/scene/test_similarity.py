@@ -45,6 +45,9 @@ def test_similarity_equals_its_matrix(sim, x):
     by_matrix = x @ matrix[:3, :3].T + matrix[:3, 3]
     size = magnitude(sim.scale * x, sim.translation)
     np.testing.assert_allclose(sim.apply(x), by_matrix, atol=1e-14 * size)
+    back = Sim3.from_matrix(matrix)
+    assert back.scale == pytest.approx(sim.scale, rel=1e-13)
+    np.testing.assert_allclose(back.rotation, sim.rotation, atol=1e-13)
 
 
 @given(sims, rotations, vectors, points)
