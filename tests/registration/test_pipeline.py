@@ -88,7 +88,7 @@ def test_every_photo_that_is_missing_has_a_reason(joint: tuple[Path, Registered]
     reasons = registered.unregistered
     assert reasons["2023/copy of 2016.jpg"].startswith("the same file as 2016/")
     assert reasons["2023/cut.jpg"].startswith("cannot be decoded")
-    assert "features only" in reasons["2023/grey.jpg"]
+    assert "features: blurred" in reasons["2023/grey.jpg"]
     assert {registered.unregistered_periods[n] for n in reasons} == {1}
     log = json.loads((out / "registration_log.json").read_text())
     assert {u["image"] for u in log["unregistered"]} == set(reasons)
