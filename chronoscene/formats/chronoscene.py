@@ -199,11 +199,7 @@ def read_world(path: Path) -> WorldFrame:
 
 
 def write(
-    scene: Scene,
-    out: Path,
-    *,
-    image_source: ImageSource = "copy",
-    progress: Progress | None = None,
+    scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
     """Write a scene in this format; the folder appears complete or not at all.
 

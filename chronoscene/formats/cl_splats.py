@@ -159,11 +159,7 @@ def remarks(path: Path) -> list[str]:
 
 
 def write(
-    scene: Scene,
-    out: Path,
-    *,
-    image_source: ImageSource = "copy",
-    progress: Progress | None = None,
+    scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
     """Write a real scene for the loader of CL-Splats; it appears complete or not at all.
 

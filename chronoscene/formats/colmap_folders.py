@@ -101,11 +101,7 @@ def _folder(path: Path, name: str) -> str:
 
 
 def write(
-    scene: Scene,
-    out: Path,
-    *,
-    image_source: ImageSource = "copy",
-    progress: Progress | None = None,
+    scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
     """Write a scene in this format; the folder appears complete or not at all.
 

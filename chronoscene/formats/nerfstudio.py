@@ -318,11 +318,7 @@ def _to_original(path: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
 
 
 def write(
-    scene: Scene,
-    out: Path,
-    *,
-    image_source: ImageSource = "copy",
-    progress: Progress | None = None,
+    scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
     """Write a scene in this format; the folder appears complete or not at all.
 

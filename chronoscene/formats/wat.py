@@ -93,11 +93,7 @@ def _task(path: Path, name: str) -> str:
 
 
 def write(
-    scene: Scene,
-    out: Path,
-    *,
-    image_source: ImageSource = "copy",
-    progress: Progress | None = None,
+    scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:
     """Write a scene for the loader of CLNeRF; the folder appears complete or not at all.
 

@@ -185,10 +185,7 @@ def _weights(t: float, out: NDArray[np.float64]) -> None:
 
 @kernel
 def _warp(
-    image: NDArray[np.uint8],
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    out: NDArray[np.uint8],
+    image: NDArray[np.uint8], x: NDArray[np.float32], y: NDArray[np.float32], out: NDArray[np.uint8]
 ) -> None:
     height, width, channels = image.shape
     wx, wy = np.empty(4), np.empty(4)

@@ -14,17 +14,22 @@ are to the training views, because close ones make a split easy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import date, datetime
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 from scipy.spatial import cKDTree
 
-from chronoscene.errors import ConfigError
+from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.scene.split_strategies import blocked, latest, stratified, whole_periods
 from chronoscene.scene.splits import split_hash, split_of
 
 Strategy = Literal["stratified", "blocked", "date", "periods"]
@@ -32,6 +37,11 @@ Strategy = Literal["stratified", "blocked", "date", "periods"]
 STRATEGIES: tuple[Strategy, ...] = ("stratified", "blocked", "date", "periods")
 
 FRACTION = 1 / 8
+
+_EXIF_IFD = 0x8769
+
+_CAPTURE_TAGS = (0x9003, 0x9004)
+"""DateTimeOriginal, DateTimeDigitized."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,10 +114,7 @@ def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
     tests = _CHOOSE[settings.strategy](scene, settings)
     if len(tests) == len(scene.frames):
         raise ConfigError(
-            "split",
-            expected="training images",
-            found="none left",
-            todo="hold out fewer images",
+            "split", expected="training images", found="none left", todo="hold out fewer images"
         )
     frames = [replace(f, split=split_of(f.name, tests)) for f in scene.frames]
     new = replace(scene.with_frames(frames), split_rule=f"{settings.strategy} split")
@@ -167,3 +174,189 @@ def _distances(scene: Scene, *, same_period: bool) -> tuple[float, float] | None
             a, b = (camera_centre(np.stack([f.cam_from_world for f in s])) for s in (test, train))
             found += cKDTree(b).query(a)[0].tolist()
     return (float(np.median(found)), float(np.min(found))) if found else None
+
+
+def stratified(scene: Scene, fraction: float, offset: int, seed: int | None) -> set[str]:
+    """One image of each run of ``1 / fraction`` images in name order, in every period.
+
+    The image is the one at ``offset`` in its run, or with a seed a random one.
+    """
+    rng = None if seed is None else np.random.default_rng(seed)
+    length = 1 / fraction
+    tests = set()
+    for period in scene.periods:
+        frames = scene.select(period=period.id)
+        for run in range(math.ceil(len(frames) * fraction - 1e-9)):
+            first = math.floor(run * length + 1e-9)
+            last = min(len(frames), math.floor((run + 1) * length + 1e-9))
+            index = first + offset if rng is None else int(rng.integers(first, last))
+            if index < len(frames):
+                tests.add(frames[index].name)
+    return tests
+
+
+def whole_periods(scene: Scene, periods: tuple[int, ...]) -> set[str]:
+    """All images of the periods held out."""
+    known = {period.id for period in scene.periods}
+    if not periods or not set(periods) <= known:
+        raise ConfigError(
+            "--period",
+            expected=f"ids of periods to hold out, 0..{len(known) - 1}",
+            found=", ".join(map(str, periods)) or "none",
+            todo="give --period ID once for each of them",
+        )
+    return {f.name for f in scene.frames if f.period in periods}
+
+
+def blocked(scene: Scene, fraction: float, blocks: int | None, seed: int) -> set[str]:
+    """The images of whole blocks of camera positions.
+
+    Args:
+        scene: Any scene.
+        fraction: Share of the blocks used for testing.
+        blocks: Number of blocks; None for two test blocks.
+        seed: Chooses the test blocks.
+
+    Raises:
+        ConfigError: If there are more blocks than images.
+    """
+    centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
+    count = blocks or max(2, round(2 / fraction))
+    if count > len(centres):
+        raise ConfigError(
+            "--blocks",
+            expected=f"at most one block for each of {len(centres)} images",
+            found=str(count),
+            todo="ask for fewer blocks",
+        )
+    block = cut_into_blocks(centres, count)
+    periods = scene.frame_periods
+    wanted = max(1, round(fraction * count))
+    chosen = choose_blocks(block, periods, wanted, seed)
+    return {f.name for f, b in zip(scene.frames, block.tolist(), strict=True) if b in chosen}
+
+
+def cut_into_blocks(centres: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Block of each camera; blocks are boxes in space with equally many cameras.
+
+    The cameras are split recursively across the longest side of their bounding box, in proportion
+    to the number of blocks on either side. [N, 3] -> [N]
+    """
+    block = np.zeros(len(centres), np.int64)
+
+    def cut(members: NDArray[np.int64], first: int, number: int) -> None:
+        if number == 1:
+            block[members] = first
+            return
+        places = centres[members]
+        axis = int(np.argmax(np.ptp(places, axis=0)))
+        order = members[np.argsort(places[:, axis], kind="stable")]
+        left = number // 2
+        middle = round(len(members) * left / number)
+        cut(order[:middle], first, left)
+        cut(order[middle:], first + left, number - left)
+
+    cut(np.arange(len(centres)), 0, count)
+    return block
+
+
+def choose_blocks(
+    block: NDArray[np.int64], periods: NDArray[np.int64], wanted: int, seed: int
+) -> set[int]:
+    """Blocks for testing: first those that give most periods their first test image.
+
+    Ties are broken by a random order. No block is taken that would leave a period without
+    training images. More than ``wanted`` are taken only while a period has no test image.
+
+    Args:
+        block: Block of each image. [N]
+        periods: Period of each image. [N]
+        wanted: Number of blocks.
+        seed: Seed of the random order.
+    """
+    order = np.random.default_rng(seed).permutation(int(block.max()) + 1)
+    kinds, period = np.unique(periods, return_inverse=True)
+    counts = np.zeros((len(order), len(kinds)), np.int64)
+    np.add.at(counts, (block, period), 1)
+    counts = counts[order]  # the first of equals is the first in this order
+    training, missing = counts.sum(axis=0), np.ones(len(kinds), bool)
+    free, chosen = np.ones(len(order), bool), set[int]()
+    while len(chosen) < wanted or missing.any():
+        possible = free & (counts < training).all(axis=1)
+        brings = np.where(possible, (counts[:, missing] > 0).sum(axis=1), -1)
+        best = int(np.argmax(brings))
+        if brings[best] < 0 or (len(chosen) >= wanted and not brings[best]):
+            break
+        chosen.add(int(order[best]))
+        free[best] = False
+        training -= counts[best]
+        missing &= counts[best] == 0
+    return chosen
+
+
+def latest(scene: Scene, fraction: float) -> set[str]:
+    """The last images of each period, as close to the fraction as whole days allow.
+
+    Raises:
+        SceneError: If an image has no date.
+    """
+    times = capture_times(scene)
+    tests = set()
+    for period in scene.periods:
+        frames = scene.select(period=period.id)
+        ordered = sorted(frames, key=lambda f: (times[f.name], f.name))
+        days = sorted({times[f.name].date() for f in ordered})
+        if len(days) > 1:
+            tests |= _last_days([(times[f.name].date(), f.name) for f in ordered], fraction)
+        else:
+            held_out = max(1, round(fraction * len(ordered)))
+            tests |= {f.name for f in ordered[len(ordered) - held_out :]}
+    return tests
+
+
+def _last_days(dated: Sequence[tuple[date, str]], fraction: float) -> set[str]:
+    """Images of the last days, at least one: as many days as come closest to the fraction."""
+    days = sorted({day for day, _ in dated})
+    after = [sum(day >= first for day, _ in dated) for first in days[1:]]
+    nearest = min(range(len(after)), key=lambda i: (abs(after[i] - fraction * len(dated)), -i))
+    return {name for day, name in dated if day >= days[1 + nearest]}
+
+
+def capture_times(scene: Scene) -> dict[str, datetime]:
+    """When each image was taken, by its EXIF block or else the beginning of its file name.
+
+    Raises:
+        SceneError: If an image has neither.
+    """
+    times = {f.name: _capture_time(scene.image_path(f)) for f in scene.frames}
+    if lost := [name for name, time in times.items() if time is None]:
+        raise SceneError(
+            scene.root,
+            expected="a date of capture of every image: EXIF DateTimeOriginal, or a file name that "
+            "begins with 2023-04-17 or 20230417",
+            found=f"none for {len(lost)} of {len(times)} images, {lost[0]!r} for example",
+            todo="choose another strategy, or hold out whole periods (--strategy periods)",
+        )
+    return {name: time for name, time in times.items() if time is not None}
+
+
+def _capture_time(path: Path) -> datetime | None:
+    try:
+        with Image.open(path) as image:
+            exif = image.getexif().get_ifd(_EXIF_IFD)
+    except Exception:  # Pillow raises anything for damaged EXIF; the name may still have a date
+        exif = {}
+    for tag in _CAPTURE_TAGS:
+        try:
+            return datetime.strptime(str(exif.get(tag, "")).strip("\0 "), "%Y:%m:%d %H:%M:%S")
+        except ValueError:
+            continue
+    return _time_in_name(path.name)
+
+
+def _time_in_name(name: str) -> datetime | None:
+    match = re.match("((?:19|20)[0-9]{2})-?([0-9]{2})-?([0-9]{2})(?![0-9])", name)
+    try:
+        return datetime(*map(int, match.groups())) if match else None  # type: ignore[arg-type]
+    except ValueError:
+        return None

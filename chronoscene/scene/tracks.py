@@ -1,4 +1,4 @@
-"""Tracks in flat form: who sees a point, reprojection, and the intersection of rays.
+"""Who sees a point: tracks in flat form, reprojection, intersection of rays, and common view.
 
 Observations of point i are ``start[i]:start[i + 1]`` (P points, M observations), as in
 `chronoscene.scene.Points`. All functions take arrays, so that scenes, raw models and registrations
@@ -22,6 +22,9 @@ MIN_PARALLAX = 3e-4
 """Smallest eigenvalue of the mean of ``I - d d^T`` over the rays of a point that still has a depth.
 Two rays at an angle of 2a give sin(a)^2: this is a = 1 degree, where noise of one pixel at a focal
 length of 1000 pixels moves the point by 3 % of its distance."""
+
+DIRECTIONS, MAX_TANGENT, STEPS = 8, 4.0, 400
+"""Where lenses are tried: so many directions, up to this hypot(x, y) / z, in so many steps."""
 
 
 def track_owners(track_start: Ints) -> Ints:
@@ -120,3 +123,73 @@ def intersect_rays(direction: Array, centre: Array, first: Ints) -> tuple[Array,
     parallax = np.linalg.eigvalsh(left / count[:, None, None])[:, 0]
     left += 1e-12 * np.eye(3)  # parallel rays have no single nearest point
     return np.linalg.solve(left, right[:, :, None])[:, :, 0], np.asarray(parallax, np.float64)
+
+
+def common_view(
+    xyz: Array,
+    owner: Ints,
+    views: Sequence[Sequence[tuple[Camera, Array]]],
+    reach: Array,
+) -> Array:
+    """Share of the points of each group that the cameras of each group have in view.
+
+    A point is in view if it lies in front of a camera, inside its image, and within reach. Whether
+    something hides it is not known.
+
+    Args:
+        xyz: Points in the world. [N, 3]
+        owner: Group of each point. [N]
+        views: Camera and cam_from_world of the images of each group. [T]
+        reach: Largest depth at which a group sees something; NaN where that is unknown. [T]
+
+    Returns:
+        Row a, column b: share of the points of a that b has in view; NaN if a has no points or the
+        reach of b is unknown. [T, T]
+    """
+    groups = len(views)
+    counts = np.bincount(owner, minlength=groups)
+    shares = np.full((groups, groups), np.nan)
+    for group in np.flatnonzero(np.isfinite(reach)).tolist():
+        viewed = _viewed(views[group], xyz, reach[group])
+        shares[:, group] = np.bincount(owner[viewed], minlength=groups) / np.maximum(counts, 1)
+    shares[counts == 0] = np.nan
+    return shares
+
+
+def _viewed(views: Sequence[tuple[Camera, Array]], xyz: Array, reach: float) -> Mask:
+    """Which points any of the images has in view. [n, 3] -> [n]"""
+    viewed = np.zeros(len(xyz), bool)
+    limits = {camera: _limit(camera) for camera in {camera for camera, _ in views}}
+    with np.errstate(all="ignore"):  # absurd poses and points are in no view
+        for camera, cam_from_world in views:
+            left = np.flatnonzero(~viewed)
+            local = xyz[left] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+            ahead = np.flatnonzero((local[:, 2] > 0) & (local[:, 2] <= reach))
+            inside = _inside(camera, local[ahead], limits[camera])
+            viewed[left[ahead[inside]]] = True
+    return viewed
+
+
+def _limit(camera: Camera) -> float:
+    """Largest hypot(x, y) / z up to which pixels move outward as points do.
+
+    Beyond it, the polynomials of lenses turn back and map points far outside into the image.
+    """
+    if camera.is_pinhole:
+        return np.inf
+    angle = np.arange(DIRECTIONS)[:, None] * (2 * np.pi / DIRECTIONS)
+    tangent = np.linspace(0, MAX_TANGENT, STEPS)
+    x, y = np.cos(angle) * tangent, np.sin(angle) * tangent
+    u, v = project_points(camera, np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)).T
+    u, v = u.reshape(x.shape), v.reshape(x.shape)
+    outward = np.diff(np.hypot(u - u[:, :1], v - v[:, :1]), axis=1) > 0
+    return float(tangent[outward.all(axis=0).argmin()]) if not outward.all() else np.inf
+
+
+def _inside(camera: Camera, local: Array, limit: float) -> Mask:
+    """Which points in front of a camera are in its image. [n, 3] -> [n]"""
+    u, v = project_points(camera, local).T
+    inside = (u >= 0) & (v >= 0) & (u <= camera.width) & (v <= camera.height)
+    if np.isfinite(limit):
+        inside &= np.hypot(local[:, 0], local[:, 1]) <= limit * local[:, 2]
+    return np.asarray(inside)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.scene import Scene
-from chronoscene.scene.common_view import common_view
+from chronoscene.scene.tracks import common_view
 
 Array = NDArray[np.float64]
 

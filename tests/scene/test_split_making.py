@@ -11,8 +11,13 @@ from PIL import Image
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
-from chronoscene.scene.split_making import SplitSettings, make_split
-from chronoscene.scene.split_strategies import cut_into_blocks, latest
+from chronoscene.scene.split_making import (
+    SplitSettings,
+    choose_blocks,
+    cut_into_blocks,
+    latest,
+    make_split,
+)
 from chronoscene.scene.splits import default_tests, split_hash
 
 CAMERA = Camera(1, "PINHOLE", 64, 48, (50, 50, 32, 24))
@@ -197,3 +202,33 @@ def test_frames_keep_all_but_their_split():
     for a, b in zip(scene.frames, new.frames, strict=True):
         assert (a.name, a.camera, a.period, a.image_id) == (b.name, b.camera, b.period, b.image_id)
         np.testing.assert_array_equal(a.cam_from_world, b.cam_from_world)
+
+
+@given(
+    st.integers(1, 60).flatmap(
+        lambda n: st.tuples(
+            st.lists(st.tuples(*[st.floats(-100, 100)] * 3), min_size=n, max_size=n),
+            st.integers(1, n),
+        )
+    )
+)
+def test_blocks_have_equally_many_cameras(case):
+    places, count = np.array(case[0]), case[1]
+    sizes = np.bincount(cut_into_blocks(places, count), minlength=count)
+    assert len(sizes) == count and sizes.sum() == len(places)
+    assert sizes.min() >= 1
+    assert sizes.max() <= 2 * len(places) / count + 2
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2)), min_size=3, max_size=40),
+    st.integers(1, 5),
+    st.integers(0, 99),
+)
+def test_every_period_keeps_training_images(pairs, wanted, seed):
+    used = sorted({b for b, _ in pairs})
+    block = np.array([used.index(b) for b, _ in pairs])
+    periods = np.array([p for _, p in pairs])
+    chosen = choose_blocks(block, periods, wanted, seed)
+    is_test = np.isin(block, list(chosen))
+    assert set(periods[~is_test]) == set(periods)

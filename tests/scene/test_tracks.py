@@ -1,4 +1,7 @@
-"""Tracks: who sees a point, reprojection, and where rays meet, against what loops say."""
+"""Who sees a point, reprojection, and where rays meet, against what loops say; common view.
+
+`tests/stats/test_view_overlap.py` has more of common view, by whole scenes.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from chronoscene.scene.geometry import pose_from_rotation_translation
 from chronoscene.scene.tracks import (
     MIN_PARALLAX,
     by_image,
+    common_view,
     count_views,
     intersect_rays,
     reproject,
@@ -20,6 +24,7 @@ from chronoscene.scene.tracks import (
     track_owners,
 )
 
+CAMERA = Camera(1, "PINHOLE", 100, 100, (50.0, 50.0, 50.0, 50.0))
 START = np.array([0, 2, 2, 5])
 IMAGE = np.array([1, 0, 2, 0, 1])
 
@@ -77,3 +82,21 @@ def test_rays_meet_and_parallax_is_the_sine_of_half_their_angle() -> None:
     half = np.arccos(direction[0] @ direction[1]) / 2
     assert parallax[0] == pytest.approx(np.sin(half) ** 2)
     assert parallax[0] > MIN_PARALLAX > parallax[1]
+
+
+def test_shares_by_owner_and_viewer() -> None:
+    xyz = np.array([[0, 0, 10], [9, 0, 10], [0, 0, -10], [0, 0, 50], [100, 0, 10.0]])
+    owner = np.array([0, 0, 1, 1, 1])
+    aside = np.eye(4)
+    aside[0, 3] = -100
+    views = [[(CAMERA, np.eye(4))], [(CAMERA, np.eye(4)), (CAMERA, aside)], []]
+    share = common_view(xyz, owner, views, np.array([20.0, 60.0, np.nan]))
+    nan = np.nan
+    np.testing.assert_allclose(share, [[1, 1, nan], [0, 2 / 3, nan], [nan, nan, nan]])
+
+
+def test_lenses_that_turn_back_do_not_map_points_into_the_image() -> None:
+    lens = Camera(2, "SIMPLE_RADIAL", 100, 100, (50.0, 50.0, 50.0, -0.3))
+    xyz = np.array([[0.1, 0, 1], [1.8, 0, 1.0]])  # the polynomial sends the second to (52.5, 50)
+    share = common_view(xyz, np.array([0, 1]), [[(lens, np.eye(4))]] * 2, np.array([9.0, 9.0]))
+    np.testing.assert_array_equal(share, [[1, 1], [0, 0]])

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import WORLD, read_world
-from chronoscene.scene.common_view import common_view
 from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
+from chronoscene.scene.tracks import common_view
 from chronoscene.validation import rule
 from chronoscene.validation.checks.period_frames import own_frames
 from chronoscene.validation.checks.photo_metadata import fit_gps
