@@ -23,7 +23,7 @@ from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, WorldFrame
 from chronoscene.scene.splits import TEST_EVERY, format_split_text
 from chronoscene.stats.counts import PAPER_COUNTS
-from chronoscene.synth.seeds import rng_for
+from chronoscene.synth.render.noise import rng_for
 from skeletons.geometry import (
     flying_height,
     make_camera,

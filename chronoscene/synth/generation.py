@@ -14,11 +14,11 @@ from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Frame, Period, Points, Scene, WorldFrame
 from chronoscene.synth.city.plan import make_world
 from chronoscene.synth.city.world import World
+from chronoscene.synth.flights import View, make_camera, plan_views
 from chronoscene.synth.render.renderer import PeriodRenderer, load_open3d
-from chronoscene.synth.scene.flights import View, make_camera, plan_views
-from chronoscene.synth.scene.sparse_points import make_points
-from chronoscene.synth.scene.truth import save_jpeg, write_truth
 from chronoscene.synth.settings import SynthSettings
+from chronoscene.synth.sparse_points import make_points
+from chronoscene.synth.truth import save_jpeg, write_truth
 
 Progress = Callable[[int, int, str], None]
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 
 KINDS = ("aerial", "street")
+
+
+def _within(low: float, high: float, default: float) -> Any:
+    """Field that must lie in a range."""
+    return field(default=default, metadata={"range": (low, high)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,61 +24,47 @@ class SynthSettings:
     """Name of the preset that this came from; informative."""
     kind: str = "aerial"
     """``aerial``: oblique orbits and grids. ``street``: walks along the roads."""
-    periods: int = 3
+    periods: int = _within(1, 50, 3)
     """Number of dates of capture, T."""
-    width: int = 320
+    width: int = _within(16, 8192, 320)
     """Pixels."""
-    height: int = 240
+    height: int = _within(16, 8192, 240)
     """Pixels."""
-    views: int = 33
+    views: int = _within(4, 5000, 33)
     """Mean number of images per period; the periods differ around it."""
-    points: int = 11_000
+    points: int = _within(0, 5_000_000, 11_000)
     """Sparse points to aim for."""
-    seed: int = 0
+    seed: int = _within(0, 2**31 - 1, 0)
     """Another seed is another place."""
     off_centre: bool = False
     """Whether the principal point lies away from the image centre (and fx differs from fy)."""
-    blocks: int = 3
+    blocks: int = _within(2, 9, 3)
     """Blocks of the city core per axis."""
-    block_size: float = 40.0
+    block_size: float = _within(15.0, 120.0, 40.0)
     """Mean edge of a block."""
-    supersample: int = 2
+    supersample: int = _within(1, 8, 2)
     """Rays per pixel and axis."""
-    rebuilt: float = 0.0
+    rebuilt: float = _within(0.0, 1.0, 0.0)
     """Share of the blocks that are torn down and rebuilt as something else at one date, beside the
     changes that every scene has. With 1 little more than the streets stays."""
-    probe_spacing: float = 3.0
+    probe_spacing: float = _within(0.5, 50.0, 3.0)
     """Grid step of the samples of indirect light."""
-    noise: float = 0.0
+    noise: float = _within(0.0, 100.0, 0.0)
     """Standard deviation of the noise on observed point positions, in pixels."""
 
     def __post_init__(self) -> None:
         check_choice("--kind", self.kind, KINDS)
-        for name, low, high in _RANGES:
-            value = getattr(self, name)
+        for option in fields(self):
+            value = getattr(self, option.name)
+            low, high = option.metadata.get("range", (value, value))
             if not low <= value <= high:
                 raise ConfigError(
-                    f"--{name}",
+                    f"--{option.name}",
                     expected=f"a value from {low} to {high}",
                     found=str(value),
                     todo="choose a value in this range",
                 )
 
-
-_RANGES: tuple[tuple[str, float, float], ...] = (
-    ("periods", 1, 50),
-    ("width", 16, 8192),
-    ("height", 16, 8192),
-    ("views", 4, 5000),
-    ("points", 0, 5_000_000),
-    ("seed", 0, 2**31 - 1),
-    ("blocks", 2, 9),
-    ("block_size", 15.0, 120.0),
-    ("supersample", 1, 8),
-    ("probe_spacing", 0.5, 50.0),
-    ("noise", 0.0, 100.0),
-    ("rebuilt", 0.0, 1.0),
-)
 
 PRESETS: dict[str, SynthSettings] = {
     "tiny": SynthSettings(

@@ -24,10 +24,10 @@ from chronoscene.synth.city.placing import (
     put_house,
     scatter_trees,
 )
-from chronoscene.synth.city.vegetation import grown
+from chronoscene.synth.city.vegetation import tree
 from chronoscene.synth.city.world import World, renewal_stages, site_stages, visits
 from chronoscene.synth.render.mesh import Part
-from chronoscene.synth.seeds import rng_for
+from chronoscene.synth.render.noise import rng_for
 
 Array = NDArray[np.float64]
 X = np.array([1.0, 0.0, 0.0])
@@ -218,7 +218,7 @@ def site(world: World, name: str, rect: Rect) -> None:
             for p, season in enumerate(world.seasons)
         ]
         at, label = inner.at(0.12 + 0.25 * i, 0.93), f"{name}/young_{i}"
-        world.add(label, "tree", young, partial(grown, label, at, world.seed, 2, True))
+        world.add(label, "tree", young, partial(tree, label, at, world.seed, 2, True))
 
 
 def _site_building(name: str, inner: Rect, rng: np.random.Generator) -> Building:
@@ -310,7 +310,7 @@ def suburb(world: World, name: str, rect: Rect) -> None:
             height = float(rng.uniform(5, 9))
             world.add(
                 label, "tree", [(height, season) for season in world.seasons],
-                partial(grown, label, at, world.seed, 2 if world.near else 1, False),
+                partial(tree, label, at, world.seed, 2 if world.near else 1, False),
             )  # fmt: skip
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.synth.city import palettes as pal
-from chronoscene.synth.city.facades import Front, facade
-from chronoscene.synth.city.roofs import flat_roof, pitched_roof
+from chronoscene.synth.city.facades import Front, Wall
+from chronoscene.synth.city.roofs import add_roof
 from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
-from chronoscene.synth.seeds import key_number, rng_for
+from chronoscene.synth.render.noise import key_number, rng_for
 
 Array = NDArray[np.float64]
 Z = np.array([0.0, 0.0, 1.0])
@@ -69,27 +69,16 @@ def finished(spec: Building, seed: int) -> Part:
     shape = rng_for(seed, spec.name, "shape")
     front = Front.random(b, spec.wall, rng, shape, spec.storey, spec.ground)
     for i, (corner, along, width) in enumerate(spec.sides):
-        facade(
-            b,
-            front,
-            corner,
-            along,
-            width,
-            spec.storeys,
-            blank=spec.blank[i],
-            shop=spec.shops[i],
-            balconies=spec.balconies and i % 2 == 0,
-            simple=spec.simple,
-            rng=shape,
-        )
+        wall = Wall(b, front, corner, along, width)
+        wall.add(
+            spec.storeys, shape, blank=spec.blank[i], shop=spec.shops[i],
+            balconies=spec.balconies and i % 2 == 0, simple=spec.simple,
+        )  # fmt: skip
     # The roof keeps its own random numbers: a new look of the walls must not move its parts.
     roof_rng = rng_for(seed, spec.name, "roof")
     top = np.array([spec.x0, spec.y0, SLAB + spec.wall_height])
     size = (spec.x1 - spec.x0, spec.y1 - spec.y0)
-    if spec.roof == "flat":
-        flat_roof(b, top, size, front.wall, roof_rng, plain=spec.simple)
-    else:
-        pitched_roof(b, top, size, spec.roof, front.wall, roof_rng, plain=spec.simple)
+    add_roof(b, spec.roof, top, size, front.wall, roof_rng, plain=spec.simple)
     return b.build()
 
 
@@ -191,8 +180,3 @@ def rubble(spec: Building, seed: int) -> Part:
     low = [spec.x0, spec.y0, SLAB]
     b.boxes(low, [0.4, 0, 0], [0, 0.6 * 2 * half[1], 0], 1.4 * Z, wall, bottom=False)
     return b.build()
-
-
-def reclad(spec: Building, wall: str, look: int) -> Building:
-    """The same volume with other walls."""
-    return replace(spec, wall=wall, look=look)

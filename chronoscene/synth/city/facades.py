@@ -70,41 +70,8 @@ class Front:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Wall:
-    """One side: its corner, axes and texture frame."""
-
-    corner: Array
-    along: Array
-    out: Array
-    width: float
-
-    def at(self, x: Array | float, z: Array | float, depth: float = 0.0) -> Array:
-        """World points of wall coordinates. [N, 3]"""
-        x, z = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(z))
-        inside: Array = self.corner + x[:, None] * self.along + z[:, None] * Z
-        return inside - depth * self.out
-
-    @property
-    def frame(self) -> tuple[Array, Array, Array]:
-        return self.corner, self.along, Z
-
-
-def facade(
-    b: PartBuilder,
-    front: Front,
-    corner: Array,
-    along: Array,
-    width: float,
-    storeys: int,
-    *,
-    blank: bool,
-    shop: bool,
-    balconies: bool,
-    simple: bool,
-    rng: np.random.Generator,
-) -> None:
-    """Add one side of a building.
+class Wall:
+    """One side of a building.
 
     Args:
         b: Receives the geometry.
@@ -112,152 +79,140 @@ def facade(
         corner: Lower left corner seen from outside. [3]
         along: Unit vector along the wall. [3]
         width: Metres.
-        storeys: Number of storeys.
-        blank: A fire wall without openings.
-        shop: Whether the ground floor has shop windows and signs.
-        balconies: Whether upper storeys have balconies.
-        simple: Windows without recess, for buildings in the distance.
-        rng: Draws doors and balconies.
     """
-    wall = _Wall(corner, along, np.cross(along, Z), width)
-    height = front.ground + front.storey * (storeys - 1)
-    bays = max(1, int((width - 0.8) // front.bay))
-    door = int(rng.integers(bays))
-    if blank or width < 2.4:
-        b.quads(wall.at(0, 0), width * along, height * Z, front.wall, frame=wall.frame)
-        return
-    pitch = width / bays
-    centres = np.linspace(0.5 * pitch, width - 0.5 * pitch, bays)
-    if simple:
-        b.quads(wall.at(0, 0), width * along, height * Z, front.wall, frame=wall.frame)
-        _flat_windows(b, front, wall, centres, storeys, pitch)
-        return
-    if shop:
-        _shop_row(b, front, wall, centres, pitch, door)
-    else:
-        _ground_row(b, front, wall, centres, pitch, door)
-    for level in range(1, storeys):
-        z = front.ground + front.storey * (level - 1)
+
+    def __init__(
+        self, b: PartBuilder, front: Front, corner: Array, along: Array, width: float
+    ) -> None:
+        self.b, self.front = b, front
+        self.corner, self.along, self.width = corner, along, width
+        self.out = np.cross(along, Z)
+        self.frame = (corner, along, Z)
+
+    def at(self, x: Array | float, z: Array | float, depth: float = 0.0) -> Array:
+        """World points of wall coordinates. [N, 3]"""
+        x, z = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(z))
+        inside: Array = self.corner + x[:, None] * self.along + z[:, None] * Z
+        return inside - depth * self.out
+
+    def box(
+        self, x: Array | float, z: float, w: float, h: float, depth: float, style: int,
+        gap: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Boxes in front of the wall, which end before it by a gap."""
+        corner = self.at(x, z, -depth)
+        self.b.boxes(corner, w * self.along, -(depth - gap) * self.out, h * Z, style)
+
+    def strip(self, z0: float, z1: float, depth: float) -> None:
+        """A moulding along the whole wall; longer by its depth, so that corners close."""
+        width = self.width + 2 * depth
+        self.box(-depth, z0, width, z1 - z0, depth, self.front.trim, gap=0.005)
+
+    def add(
+        self, storeys: int, rng: np.random.Generator, *, blank: bool, shop: bool, balconies: bool,
+        simple: bool,
+    ) -> None:  # fmt: skip
+        """Add the wall with its openings.
+
+        Args:
+            storeys: Number of storeys.
+            rng: Draws the door.
+            blank: A fire wall without openings.
+            shop: Whether the ground floor has shop windows and signs.
+            balconies: Whether upper storeys have balconies.
+            simple: Windows without recess, for buildings in the distance.
+        """
+        front, b = self.front, self.b
+        height = front.ground + front.storey * (storeys - 1)
+        bays = max(1, int((self.width - 0.8) // front.bay))
+        door = int(rng.integers(bays))
+        blank = blank or self.width < 2.4
+        if blank or simple:
+            whole = self.width * self.along, height * Z
+            b.quads(self.at(0, 0), *whole, front.wall, frame=self.frame)
+        if blank:
+            return
+        pitch = self.width / bays
+        centres = np.linspace(0.5 * pitch, self.width - 0.5 * pitch, bays)
         w, h = min(front.window[0], pitch - 0.7), front.window[1]
-        _row(b, front, wall, z, z + front.storey, centres - w / 2, w, 0.85, h, front.glass)
-        _sills(b, front, wall, centres - w / 2, w, z + 0.85)
-        if front.courses or level == 1:
-            _strip(b, front.trim, wall, z - 0.1, z + 0.12, 0.10)
-        if balconies and bays >= 2:
-            _balconies(b, front, wall, centres[(level + np.arange(bays)) % 2 == 0], z)
-    _strip(b, front.trim, wall, height - 0.35, height, front.cornice)
+        left = centres - w / 2
+        if simple:
+            z = front.ground - front.storey + front.storey * np.arange(storeys) + 0.85
+            xs, zs = (a.ravel() for a in np.meshgrid(left, z))
+            b.quads(self.at(xs, zs, -0.06), w * self.along, h * Z, front.glass)
+            return
+        if shop:
+            self._shops(centres, pitch, door)
+        else:
+            self._row(0.0, front.ground, left, w, 1.1, h, front.glass)
+            self._sills(left, w, 1.1)
+            self._door(centres[door] - 0.8)
+        for level in range(1, storeys):
+            z0 = front.ground + front.storey * (level - 1)
+            self._row(z0, z0 + front.storey, left, w, 0.85, h, front.glass)
+            self._sills(left, w, z0 + 0.85)
+            if front.courses or level == 1:
+                self.strip(z0 - 0.1, z0 + 0.12, 0.10)
+            if balconies and bays >= 2:
+                self._balconies(centres[(level + np.arange(bays)) % 2 == 0], z0)
+        self.strip(height - 0.35, height, front.cornice)
 
+    def _row(
+        self, z0: float, z1: float, xs: Array, w: float, sill: float, h: float, glass: int
+    ) -> None:
+        """Wall between two heights around equal openings at ``xs``, and what fills them."""
+        b, front, u, n, recess = self.b, self.front, self.along, self.out, 0.18
+        low, high = z0 + sill, z0 + sill + h
+        b.quads(self.at(0, z0), self.width * u, sill * Z, front.wall, frame=self.frame)
+        b.quads(self.at(0, high), self.width * u, (z1 - high) * Z, front.wall, frame=self.frame)
+        starts, ends = np.concatenate([[0.0], xs + w]), np.concatenate([xs, [self.width]])
+        piers = (ends - starts)[:, None] * u
+        b.quads(self.at(starts, low), piers, h * Z, front.wall, frame=self.frame)
+        b.quads(self.at(xs, low), w * u, -recess * n, front.trim)
+        b.quads(self.at(xs, high, recess), w * u, recess * n, front.trim)
+        b.quads(self.at(xs, low), -recess * n, h * Z, front.trim)
+        b.quads(self.at(xs + w, low, recess), recess * n, h * Z, front.trim)
+        b.quads(self.at(xs, low, recess), w * u, h * Z, glass, seed=int(z0 * 10))
 
-def _row(
-    b: PartBuilder,
-    front: Front,
-    wall: _Wall,
-    z0: float,
-    z1: float,
-    xs: Array,
-    w: float,
-    sill: float,
-    h: float,
-    glass: int,
-    recess: float = 0.18,
-) -> None:
-    """Wall between two heights around equal openings at ``xs``, and what fills them."""
-    u, n = wall.along, wall.out
-    low, high = z0 + sill, z0 + sill + h
-    if sill > 0:
-        b.quads(wall.at(0, z0), wall.width * u, sill * Z, front.wall, frame=wall.frame)
-    b.quads(wall.at(0, high), wall.width * u, (z1 - high) * Z, front.wall, frame=wall.frame)
-    starts, ends = np.concatenate([[0.0], xs + w]), np.concatenate([xs, [wall.width]])
-    piers = (ends - starts)[:, None] * u
-    b.quads(wall.at(starts, low), piers, h * Z, front.wall, frame=wall.frame)
-    b.quads(wall.at(xs, low), w * u, -recess * n, front.trim)
-    b.quads(wall.at(xs, high, recess), w * u, recess * n, front.trim)
-    b.quads(wall.at(xs, low), -recess * n, h * Z, front.trim)
-    b.quads(wall.at(xs + w, low, recess), recess * n, h * Z, front.trim)
-    b.quads(wall.at(xs, low, recess), w * u, h * Z, glass, seed=int(z0 * 10))
+    def _sills(self, xs: Array, w: float, z: float) -> None:
+        """Sill boards below windows."""
+        self.box(xs - 0.1, z - 0.1, w + 0.2, 0.1, 0.14, self.front.trim, gap=0.01)
 
+    def _door(self, x: float) -> None:
+        """A house door with its frame, canopy and step."""
+        trim = self.front.trim
+        self.b.boxes(self.at(x, 0.0), 1.6 * self.along, -0.12 * self.out, 3.0 * Z, trim)
+        self.box(x, 0.0, 1.6, 3.05, 0.12, trim)
+        leaf = self.at(x + 0.2, 0.16, -0.14)
+        self.b.quads(leaf, 1.2 * self.along, 2.6 * Z, self.front.door)
+        self.box(x - 0.3, 3.05, 2.2, 0.15, 0.8, trim)
+        self.box(x - 0.1, 0.0, 1.8, 0.15, 0.9, trim)
 
-def _ground_row(
-    b: PartBuilder, front: Front, wall: _Wall, centres: Array, pitch: float, door: int
-) -> None:
-    """Ground floor of a dwelling: windows, and a door in front of one of them."""
-    w = min(front.window[0], pitch - 0.7)
-    _row(b, front, wall, 0.0, front.ground, centres - w / 2, w, 1.1, front.window[1], front.glass)
-    _sills(b, front, wall, centres - w / 2, w, 1.1)
-    x = centres[door] - 0.8
-    b.boxes(wall.at(x, 0.0), 1.6 * wall.along, -0.12 * wall.out, 3.0 * Z, front.trim)
-    _proud_box(b, wall, x, 0.0, 1.6, 3.05, 0.12, front.trim)
-    b.quads(wall.at(x + 0.2, 0.16, -0.14), 1.2 * wall.along, 2.6 * Z, front.door)
-    _proud_box(b, wall, x - 0.3, 3.05, 2.2, 0.15, 0.8, front.trim)
-    _proud_box(b, wall, x - 0.1, 0.0, 1.8, 0.15, 0.9, front.trim)
+    def _shops(self, centres: Array, pitch: float, door: int) -> None:
+        """Ground floor with shop windows, a door, signs and awnings."""
+        b, front, u = self.b, self.front, self.along
+        w = pitch - 0.6
+        top = front.ground - 0.95
+        left = centres - w / 2
+        self._row(0.0, front.ground, left, w, 0.45, top - 0.45, front.shop_glass)
+        b.quads(self.at(left, front.ground - 0.8, -0.08), w * u, 0.6 * Z, front.sign, seed=5)
+        self.box(centres[door] - 0.6, 0.0, 1.2, 2.5, 0.1, front.trim)
+        b.quads(self.at(centres[door] - 0.5, 0.05, -0.12), u, 2.35 * Z, front.door)
+        slope = 1.3 * self.out - 0.5 * Z
+        for i, x in enumerate(left):
+            if i % 3 == 1:  # an awning that slopes away from the wall
+                b.quads(self.at(x, top + 0.1), slope, w * u, front.sign, seed=i)
+                b.quads(self.at(x, top + 0.04), w * u, slope, front.sign, seed=i + 50)
 
-
-def _shop_row(
-    b: PartBuilder, front: Front, wall: _Wall, centres: Array, pitch: float, door: int
-) -> None:
-    """Ground floor with shop windows, a door, signs and awnings."""
-    w = pitch - 0.6
-    top = front.ground - 0.95
-    _row(b, front, wall, 0.0, front.ground, centres - w / 2, w, 0.45, top - 0.45, front.shop_glass)
-    corner = wall.at(centres - w / 2, front.ground - 0.8, -0.08)
-    b.quads(corner, w * wall.along, 0.6 * Z, front.sign, seed=5)
-    _proud_box(b, wall, centres[door] - 0.6, 0.0, 1.2, 2.5, 0.1, front.trim)
-    b.quads(wall.at(centres[door] - 0.5, 0.05, -0.12), wall.along, 2.35 * Z, front.door)
-    cloth = front.sign
-    for i, x in enumerate(centres - w / 2):
-        if i % 3 == 1:  # an awning that slopes away from the wall
-            slope = 1.3 * wall.out - 0.5 * Z
-            b.quads(wall.at(x, top + 0.1), slope, w * wall.along, cloth, seed=i)
-            b.quads(wall.at(x, top + 0.04), w * wall.along, slope, cloth, seed=i + 50)
-
-
-def _flat_windows(
-    b: PartBuilder, front: Front, wall: _Wall, centres: Array, storeys: int, pitch: float
-) -> None:
-    w, h = min(front.window[0], pitch - 0.7), front.window[1]
-    z = front.ground - front.storey + front.storey * np.arange(storeys) + 0.85
-    xs, zs = (a.ravel() for a in np.meshgrid(centres - w / 2, z))
-    b.quads(wall.at(xs, zs, -0.06), w * wall.along, h * Z, front.glass)
-
-
-def _sills(b: PartBuilder, front: Front, wall: _Wall, xs: Array, w: float, z: float) -> None:
-    """Sill boards below windows."""
-    corner = wall.at(xs - 0.1, z - 0.1, -0.14)
-    b.boxes(corner, (w + 0.2) * wall.along, -0.13 * wall.out, 0.1 * Z, front.trim)
-
-
-def _strip(b: PartBuilder, style: int, wall: _Wall, z0: float, z1: float, depth: float) -> None:
-    """A moulding along the whole wall; longer by its depth, so that corners close."""
-    corner = wall.at(-depth, z0, -depth)
-    length = wall.width + 2 * depth
-    b.boxes(corner, length * wall.along, -(depth - 0.005) * wall.out, (z1 - z0) * Z, style)
-
-
-def _proud_box(
-    b: PartBuilder,
-    wall: _Wall,
-    x: float,
-    z: float,
-    w: float,
-    h: float,
-    depth: float,
-    style: int,
-) -> None:
-    """A box in front of the wall."""
-    b.boxes(wall.at(x, z, -depth), w * wall.along, -depth * wall.out, h * Z, style)
-
-
-def _balconies(b: PartBuilder, front: Front, wall: _Wall, centres: Array, z: float) -> None:
-    """Slabs with solid or barred railings in front of some windows."""
-    if len(centres) == 0:
-        return
-    w, depth = 2.1, 1.15
-    u, n = wall.along, wall.out
-    corner = wall.at(centres - w / 2, z + 0.02, -depth)
-    b.boxes(corner, w * u, -depth * n, 0.16 * Z, front.trim)
-    b.boxes(corner + 0.95 * Z, w * u, -0.06 * n, 0.08 * Z, front.rail)
-    for i in range(9):
-        bar = corner + (i * (w - 0.05) / 8) * u + 0.16 * Z
-        b.boxes(bar, 0.05 * u, -0.05 * n, 0.8 * Z, front.rail)
-    for side in (0.0, w - 0.05):
-        b.boxes(corner + side * u + 0.16 * Z, 0.05 * u, -(depth - 0.02) * n, 0.85 * Z, front.rail)
+    def _balconies(self, centres: Array, z: float) -> None:
+        """Slabs with barred railings in front of some windows."""
+        w, depth = 2.1, 1.15
+        b, rail, u, n = self.b, self.front.rail, self.along, self.out
+        corner = self.at(centres - w / 2, z + 0.02, -depth)
+        b.boxes(corner, w * u, -depth * n, 0.16 * Z, self.front.trim)
+        b.boxes(corner + 0.95 * Z, w * u, -0.06 * n, 0.08 * Z, rail)
+        for i in range(9):
+            bar = corner + (i * (w - 0.05) / 8) * u + 0.16 * Z
+            b.boxes(bar, 0.05 * u, -0.05 * n, 0.8 * Z, rail)
+        for side in (0.0, w - 0.05):
+            b.boxes(corner + side * u + 0.16 * Z, 0.05 * u, -(depth - 0.02) * n, 0.85 * Z, rail)

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.vegetation import trunk
-from chronoscene.synth.render.mesh import Color, Part, PartBuilder, srgb
+from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import CORRUGATED, PAINT, SIGN, WATER
-from chronoscene.synth.seeds import key_number, rng_for
 
 Array = NDArray[np.float64]
 Z = np.array([0.0, 0.0, 1.0])
@@ -276,16 +276,4 @@ def digger(name: str, base: Array, turn: float) -> Part:
     p.b.boxes(elbow, 0.4 * p.x + 0.2 * Z, 0.5 * p.y, -0.6 * p.x + 0.4 * Z, yellow)
     p.b.boxes(p.at(4.4, -0.2, 0.9), 0.35 * p.x, 0.4 * p.y, -0.4 * p.x + 2.8 * Z, yellow)
     p.box((4.0, -0.6, 0.3), (0.9, 1.1, 0.8), dark)
-    return p.b.build()
-
-
-def board(name: str, base: Array, turn: float, color: Color) -> Part:
-    """Advertising board on two posts."""
-    p = Placed(name, base, turn)
-    sign = p.b.style(SIGN, color, pal.WHITE, srgb(30, 30, 32))
-    iron = pal.plain_style(p.b, srgb(60, 62, 64))
-    for x in (-1.5, 1.4):
-        p.box((x, -0.06, 0.0), (0.12, 0.12, 2.2), iron)
-    p.box((-2.0, -0.1, 2.2), (4.0, 0.2, 2.0), iron)
-    p.b.quads(p.at(-1.95, -0.11, 2.25), 3.9 * p.x, 1.9 * Z, sign)
     return p.b.build()

@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.buildings import SLAB, Building, finished
-from chronoscene.synth.city.vegetation import grown
+from chronoscene.synth.city.vegetation import tree
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import FIELDS, PAVING
-from chronoscene.synth.seeds import key_number, rng_for
 
 Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
@@ -102,7 +102,7 @@ def surroundings(world: World, xs: Array, ys: Array) -> None:
             height = float(rng.uniform(7, 15))
             states = [(height, season) for season in world.seasons]
             label = f"far_tree_{i}"
-            world.add(label, "tree", states, partial(grown, label, base, world.seed, 0, False))
+            world.add(label, "tree", states, partial(tree, label, base, world.seed, 0, False))
 
 
 def _farm(world: World, name: str, at: Array, z: float, rng: np.random.Generator) -> None:

@@ -7,24 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from chronoscene.synth.render import textures as tex
 from chronoscene.synth.render.mesh import Color, PartBuilder, srgb
-from chronoscene.synth.render.textures import (
-    ASPHALT,
-    BRICK,
-    CONCRETE,
-    CORRUGATED,
-    FLAT_ROOF,
-    GLASS,
-    GRASS,
-    LEAVES,
-    PAINT,
-    PANEL,
-    PLAIN,
-    PLASTER,
-    SOIL,
-    TILES,
-    WOOD,
-)
 
 T = TypeVar("T")
 
@@ -85,8 +69,6 @@ CROWNS = {
 EVERGREEN = (srgb(34, 66, 42), srgb(52, 84, 50), srgb(70, 96, 56))
 
 SOILS = (srgb(150, 124, 92), srgb(118, 96, 72), srgb(176, 164, 148))
-STEEL = srgb(120, 122, 124)
-DARK = srgb(34, 34, 36)
 WHITE = srgb(232, 230, 224)
 
 
@@ -98,11 +80,8 @@ def pick(rng: np.random.Generator, options: Sequence[T]) -> T:
 def tint(rng: np.random.Generator, color: Color, amount: float = 0.08) -> Color:
     """A colour varied a little in brightness and hue."""
     f = np.exp(rng.normal(0, amount)) * np.exp(rng.normal(0, amount / 3, 3))
-    return (
-        float(min(color[0] * f[0], 0.85)),
-        float(min(color[1] * f[1], 0.85)),
-        float(min(color[2] * f[2], 0.85)),
-    )
+    red, green, blue = np.minimum(color * f, 0.85).tolist()
+    return red, green, blue
 
 
 def wall_style(b: PartBuilder, kind: str, rng: np.random.Generator, storey: float) -> int:
@@ -111,86 +90,88 @@ def wall_style(b: PartBuilder, kind: str, rng: np.random.Generator, storey: floa
         first, second = pick(rng, BRICKS)
         mortar = srgb(176, 168, 156)
         numbers = (0.25, 0.08, storey)
-        return b.style(BRICK, tint(rng, first), tint(rng, second), mortar, numbers)
+        return b.style(tex.BRICK, tint(rng, first), tint(rng, second), mortar, numbers)
     if kind == "panel":
         first, second = pick(rng, PANELS)
         size = (float(rng.uniform(1.1, 1.9)), storey / 2, float(rng.uniform(0.1, 0.35)))
         return b.style(
-            PANEL, tint(rng, first), tint(rng, second), srgb(50, 52, 54), size, reflect=0.03
+            tex.PANEL, tint(rng, first), tint(rng, second), srgb(50, 52, 54), size, reflect=0.03
         )
     if kind == "concrete":
         c = tint(rng, srgb(158, 152, 142))
-        return b.style(CONCRETE, c, srgb(112, 106, 98), None, (2.4, storey / 2))
+        return b.style(tex.CONCRETE, c, srgb(112, 106, 98), None, (2.4, storey / 2))
     c = tint(rng, pick(rng, PLASTERS))
     below = srgb(120, 106, 88)
     wear = float(rng.uniform(0.0, 0.35))
     line = storey if rng.random() < 0.5 else 0.0
-    return b.style(PLASTER, c, srgb(168, 152, 130), below, (wear, line, 0.2))
+    return b.style(tex.PLASTER, c, srgb(168, 152, 130), below, (wear, line, 0.2))
 
 
 def glass_style(b: PartBuilder, frame: Color, panes: tuple[int, int] = (2, 2)) -> int:
     """Style of a window; each pane of glass gets its own curtains from its seed."""
     room, curtain = srgb(42, 50, 60), srgb(206, 196, 176)
-    return b.style(GLASS, frame, room, curtain, (0.07, *panes), reflect=0.12, sharp=0.9)
+    return b.style(tex.GLASS, frame, room, curtain, (0.07, *panes), reflect=0.12, sharp=0.9)
 
 
 def roof_tile_style(b: PartBuilder, rng: np.random.Generator) -> int:
     """Style of a pitched roof."""
     first, second = pick(rng, ROOFS)
     moss = float(rng.uniform(0.05, 0.35))
-    return b.style(TILES, tint(rng, first), tint(rng, second), srgb(96, 100, 62), (0.3, 0.36, moss))
+    return b.style(
+        tex.TILES, tint(rng, first), tint(rng, second), srgb(96, 100, 62), (0.3, 0.36, moss)
+    )
 
 
 def flat_roof_style(b: PartBuilder, rng: np.random.Generator) -> int:
     """Style of a flat roof."""
     gravel = float(rng.random() < 0.5)
     c = tint(rng, srgb(150, 144, 134) if gravel else srgb(104, 104, 108))
-    return b.style(FLAT_ROOF, c, srgb(66, 66, 68), srgb(112, 106, 96), (1.1, gravel))
+    return b.style(tex.FLAT_ROOF, c, srgb(66, 66, 68), srgb(112, 106, 96), (1.1, gravel))
 
 
 def asphalt_style(b: PartBuilder, marking: int, parking: float = 0.0) -> int:
     """Style of a road; marking 0 none, 1 lanes, 2 zebra, 3 parking lot."""
     return b.style(
-        ASPHALT, srgb(84, 84, 88), srgb(112, 110, 108), srgb(224, 222, 212), (marking, parking)
+        tex.ASPHALT, srgb(84, 84, 88), srgb(112, 110, 108), srgb(224, 222, 212), (marking, parking)
     )
 
 
 def grass_style(b: PartBuilder, season: str, wear: float, stripes: float = 0.0) -> int:
     """Style of a lawn in a season."""
     first, second, litter = GRASSES[season]
-    return b.style(GRASS, first, second, srgb(132, 110, 80), (wear, litter, stripes))
+    return b.style(tex.GRASS, first, second, srgb(132, 110, 80), (wear, litter, stripes))
 
 
 def leaf_style(b: PartBuilder, season: str, species: int, size: float) -> int:
     """Style of a crown in a season; species 2 keeps its needles."""
     c0, c1, c2 = EVERGREEN if species == 2 else CROWNS[season][species]
-    return b.style(LEAVES, c0, c1, c2, (size, 0.10), translucent=0.35)
+    return b.style(tex.LEAVES, c0, c1, c2, (size, 0.10), translucent=0.35)
 
 
 def soil_style(b: PartBuilder, stones: float, ruts: float) -> int:
     """Style of bare ground."""
-    return b.style(SOIL, *SOILS, (stones, ruts))
+    return b.style(tex.SOIL, *SOILS, (stones, ruts))
 
 
 def metal_style(b: PartBuilder, color: Color, stripe: float = 0.0, dust: float = 0.15) -> int:
     """Style of painted metal."""
     return b.style(
-        PAINT, color, WHITE, srgb(130, 118, 100), (dust, stripe), reflect=0.04, sharp=0.6
+        tex.PAINT, color, WHITE, srgb(130, 118, 100), (dust, stripe), reflect=0.04, sharp=0.6
     )
 
 
 def plain_style(b: PartBuilder, color: Color, strength: float = 0.25, size: float = 0.6) -> int:
     """Style of anything without a pattern of its own."""
     dark = (0.8 * color[0], 0.8 * color[1], 0.8 * color[2])
-    return b.style(PLAIN, color, dark, None, (strength, size))
+    return b.style(tex.PLAIN, color, dark, None, (strength, size))
 
 
 def wood_style(b: PartBuilder, color: Color, board: float = 0.16) -> int:
     """Style of boards."""
     dark = (0.6 * color[0], 0.6 * color[1], 0.6 * color[2])
-    return b.style(WOOD, color, dark, None, (board, 0.02))
+    return b.style(tex.WOOD, color, dark, None, (board, 0.02))
 
 
 def sheet_style(b: PartBuilder, color: Color, rust: float, band: bool) -> int:
     """Style of corrugated metal."""
-    return b.style(CORRUGATED, color, srgb(110, 62, 36), WHITE, (0.3, rust, float(band)))
+    return b.style(tex.CORRUGATED, color, srgb(110, 62, 36), WHITE, (0.3, rust, float(band)))

@@ -13,11 +13,11 @@ from chronoscene.synth.city import furniture as fur
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.buildings import SLAB, Building, finished
 from chronoscene.synth.city.ground import PARKING, pavement
-from chronoscene.synth.city.vegetation import grown, hedge
+from chronoscene.synth.city.vegetation import hedge, tree
 from chronoscene.synth.city.world import World, looks, tree_heights
 from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import PAVING
-from chronoscene.synth.seeds import key_number, rng_for
 
 Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
@@ -126,7 +126,7 @@ def plant(
     states = [
         None if h is None else (h, season) for h, season in zip(heights, world.seasons, strict=True)
     ]
-    world.add(name, "tree", states, partial(grown, name, at, world.seed, 2, broad))
+    world.add(name, "tree", states, partial(tree, name, at, world.seed, 2, broad))
 
 
 def plant_hedge(world: World, name: str, low: Array, high: Array) -> None:

@@ -12,7 +12,7 @@ from chronoscene.synth.city.ground import road_network, surroundings
 from chronoscene.synth.city.placing import Rect, curb_side
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.light import make_lights
-from chronoscene.synth.seeds import rng_for
+from chronoscene.synth.render.noise import rng_for
 from chronoscene.synth.settings import SynthSettings
 
 Array = NDArray[np.float64]

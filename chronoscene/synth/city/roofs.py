@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,25 +15,51 @@ Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
 
 
-def flat_roof(
-    b: PartBuilder,
-    corner: Array,
-    size: tuple[float, float],
-    wall: int,
-    rng: np.random.Generator,
-    *,
-    plain: bool,
-) -> None:
-    """Parapet, surface, and boxes: stair heads, ventilation, solar panels.
+EAVE = 0.45
+"""How far pitched roofs reach beyond the walls."""
+
+
+def add_roof(
+    b: PartBuilder, kind: str, corner: Array, size: tuple[float, float], wall: int,
+    rng: np.random.Generator, *, plain: bool,
+) -> None:  # fmt: skip
+    """Add a roof with what stands on it.
 
     Args:
         b: Receives the geometry.
+        kind: ``flat``, or ``gable`` or ``hip`` with the ridge along the longer side.
         corner: Lowest corner of the roof. [3]
         size: Extent along x and y.
-        wall: Style of the parapet's outside.
-        rng: Draws the boxes.
+        wall: Style of parapets and gables.
+        rng: Draws slopes and colours, boxes, chimneys and dormers.
         plain: Leave the small things out.
     """
+    if kind == "flat":
+        _flat_roof(b, corner, size, wall, rng, plain)
+        return
+    dx, dy = size
+    tiles, fascia = pal.roof_tile_style(b, rng), pal.wood_style(b, srgb(110, 84, 62))
+    slope = float(rng.uniform(0.62, 0.9))
+    if dx >= dy:
+        roof = _PitchedRoof(b, corner, X, Y, dx, dy, slope, tiles, fascia, wall)
+    else:
+        roof = _PitchedRoof(b, corner + dx * X, Y, -X, dy, dx, slope, tiles, fascia, wall)
+    if kind == "hip":
+        roof.add_hip()
+    else:
+        roof.add_gable()
+    if plain:
+        return
+    roof.add_chimneys(rng)
+    if kind == "gable" and roof.length > 9:
+        roof.add_dormers(rng)
+
+
+def _flat_roof(
+    b: PartBuilder, corner: Array, size: tuple[float, float], wall: int,
+    rng: np.random.Generator, plain: bool,
+) -> None:  # fmt: skip
+    """Parapet, surface, and boxes: stair heads, ventilation, solar panels."""
     dx, dy = size
     roof = pal.flat_roof_style(b, rng)
     coping = pal.plain_style(b, srgb(170, 164, 154))
@@ -82,148 +110,102 @@ def _roof_boxes(
                 b.boxes(o, 0.5 * X, 0.5 * Y, 1.3 * Z, house, bottom=False)
 
 
-def pitched_roof(
-    b: PartBuilder,
-    corner: Array,
-    size: tuple[float, float],
-    kind: str,
-    wall: int,
-    rng: np.random.Generator,
-    *,
-    plain: bool,
-) -> None:
-    """Gable or hip roof with its ridge along the longer side, chimneys and dormers.
+@dataclass(frozen=True, slots=True, eq=False)
+class _PitchedRoof:
+    """Roof in axes of its own: ``a`` along the ridge and ``c`` across it, from corner ``o``."""
 
-    Args:
-        b: Receives the geometry.
-        corner: Lowest corner of the roof. [3]
-        size: Extent along x and y.
-        kind: ``gable`` or ``hip``.
-        wall: Style of the gables.
-        rng: Draws slope, chimneys, dormers.
-        plain: Leave the small things out.
-    """
-    tiles = pal.roof_tile_style(b, rng)
-    fascia = pal.wood_style(b, srgb(110, 84, 62))
-    dx, dy = size
-    if dx >= dy:
-        o, a, c, length, depth = corner, X, Y, dx, dy
-    else:
-        o, a, c, length, depth = corner + dx * X, Y, -X, dy, dx
-    slope = float(rng.uniform(0.62, 0.9))
-    eave = 0.45
-    rise = slope * depth / 2
-    drop = slope * eave
-    if kind == "hip":
-        _hip(b, o, a, c, length, depth, rise, eave, drop, tiles, fascia)
-    else:
-        _gable(b, o, a, c, length, depth, rise, eave, drop, tiles, fascia, wall)
-    if plain:
-        return
-    brick = pal.wall_style(b, "brick", rng, 9.0)
-    for f in rng.uniform(0.2, 0.8, int(rng.integers(1, 3))):
-        side = float(rng.uniform(0.3, 0.42))
-        at = o + f * length * a + side * depth * c + (2 * side * rise - 0.5) * Z
-        b.boxes(at, 0.7 * a, 0.5 * c, 2.1 * Z, brick, bottom=False)
-    if kind == "gable" and length > 9:
-        _dormers(b, o, a, c, length, depth, rise, tiles, wall, rng)
+    b: PartBuilder
+    o: Array
+    a: Array
+    c: Array
+    length: float
+    depth: float
+    slope: float
+    """Rise per metre."""
+    tiles: int
+    fascia: int
+    wall: int
 
+    @property
+    def rise(self) -> float:
+        """Height of the ridge."""
+        return self.slope * self.depth / 2
 
-def _gable(
-    b: PartBuilder,
-    o: Array,
-    a: Array,
-    c: Array,
-    length: float,
-    depth: float,
-    rise: float,
-    eave: float,
-    drop: float,
-    tiles: int,
-    fascia: int,
-    wall: int,
-) -> None:
-    """Two slopes with thickness and two gable walls."""
-    over = 0.3
-    ridge = rise * Z + depth / 2 * c
-    low = o - over * a - eave * c - drop * Z
-    span = (length + 2 * over) * a
-    up = ridge + eave * c + drop * Z
-    low2 = o + (length + over) * a + (depth + eave) * c - drop * Z
-    up2 = ridge - depth * c - eave * c + drop * Z
-    b.quads(low + 0.2 * Z, span, up, tiles)
-    b.quads(low2 + 0.2 * Z, -span, up2, tiles, seed=3)
-    for corner, s, u in ((low, span, up), (low2, -span, up2)):
-        b.quads(corner, u, s, fascia)
-        b.quads(corner, s, 0.2 * Z, fascia)
-        b.quads(corner + s, u, 0.2 * Z, fascia)
-        b.quads(corner + u, -u, 0.2 * Z, fascia)
-    east = o + length * a
-    b.polygon([east, east + depth * c, east + ridge], wall, frame=(east, c, Z))
-    west = o + depth * c
-    b.polygon([west, o, o + ridge], wall, frame=(west, -c, Z))
+    @property
+    def drop(self) -> float:
+        """How far the eaves hang below the corner."""
+        return self.slope * EAVE
 
+    def add_gable(self) -> None:
+        """Two slopes with thickness and two gable walls."""
+        b, o, a, c, length, depth = self.b, self.o, self.a, self.c, self.length, self.depth
+        over = 0.3
+        ridge = self.rise * Z + depth / 2 * c
+        low = o - over * a - EAVE * c - self.drop * Z
+        span = (length + 2 * over) * a
+        up = ridge + EAVE * c + self.drop * Z
+        low2 = o + (length + over) * a + (depth + EAVE) * c - self.drop * Z
+        up2 = ridge - depth * c - EAVE * c + self.drop * Z
+        b.quads(low + 0.2 * Z, span, up, self.tiles)
+        b.quads(low2 + 0.2 * Z, -span, up2, self.tiles, seed=3)
+        for corner, s, u in ((low, span, up), (low2, -span, up2)):
+            b.quads(corner, u, s, self.fascia)
+            b.quads(corner, s, 0.2 * Z, self.fascia)
+            b.quads(corner + s, u, 0.2 * Z, self.fascia)
+            b.quads(corner + u, -u, 0.2 * Z, self.fascia)
+        east, west = o + length * a, o + depth * c
+        b.polygon([east, east + depth * c, east + ridge], self.wall, frame=(east, c, Z))
+        b.polygon([west, o, o + ridge], self.wall, frame=(west, -c, Z))
 
-def _hip(
-    b: PartBuilder,
-    o: Array,
-    a: Array,
-    c: Array,
-    length: float,
-    depth: float,
-    rise: float,
-    eave: float,
-    drop: float,
-    tiles: int,
-    fascia: int,
-) -> None:
-    """Four slopes; the ridge is shorter than the house by its depth."""
-    run = min(depth, length) / 2
-    p = [
-        o - eave * a - eave * c - drop * Z,
-        o + (length + eave) * a - eave * c - drop * Z,
-        o + (length + eave) * a + (depth + eave) * c - drop * Z,
-        o - eave * a + (depth + eave) * c - drop * Z,
-    ]
-    r0 = o + run * a + depth / 2 * c + rise * Z
-    r1 = o + (length - run) * a + depth / 2 * c + rise * Z
-    lift = 0.02 * Z
-    for i, top in enumerate(([r1, r0], [r1], [r0, r1], [r0])):
-        first, second = p[i], p[(i + 1) % 4]
-        u = (second - first) / np.linalg.norm(second - first)
-        normal = np.cross(second - first, top[0] - first)
-        v = np.cross(normal / np.linalg.norm(normal), u)
-        b.polygon([first + lift, second + lift, *(t + lift for t in top)], tiles,
-                  frame=(first, u, v), seed=i)  # fmt: skip
-        b.quads(first - 0.16 * Z, second - first, 0.18 * Z, fascia)
-    b.quads(p[0] - 0.16 * Z, p[3] - p[0], p[1] - p[0], fascia)
+    def add_hip(self) -> None:
+        """Four slopes; the ridge is shorter than the house by its depth."""
+        b, o, a, c, length, depth = self.b, self.o, self.a, self.c, self.length, self.depth
+        run = min(depth, length) / 2
+        p = [
+            o + x * a + y * c - self.drop * Z
+            for x, y in (
+                (-EAVE, -EAVE),
+                (length + EAVE, -EAVE),
+                (length + EAVE, depth + EAVE),
+                (-EAVE, depth + EAVE),
+            )
+        ]
+        r0, r1 = (o + x * a + depth / 2 * c + self.rise * Z for x in (run, length - run))
+        lift = 0.02 * Z
+        for i, top in enumerate(([r1, r0], [r1], [r0, r1], [r0])):
+            first, second = p[i], p[(i + 1) % 4]
+            u = (second - first) / np.linalg.norm(second - first)
+            normal = np.cross(second - first, top[0] - first)
+            v = np.cross(normal / np.linalg.norm(normal), u)
+            corners = [first + lift, second + lift, *(t + lift for t in top)]
+            b.polygon(corners, self.tiles, frame=(first, u, v), seed=i)
+            b.quads(first - 0.16 * Z, second - first, 0.18 * Z, self.fascia)
+        b.quads(p[0] - 0.16 * Z, p[3] - p[0], p[1] - p[0], self.fascia)
 
+    def add_chimneys(self, rng: np.random.Generator) -> None:
+        """One or two, near the ridge."""
+        brick = pal.wall_style(self.b, "brick", rng, 9.0)
+        for f in rng.uniform(0.2, 0.8, int(rng.integers(1, 3))):
+            side = float(rng.uniform(0.3, 0.42))
+            at = self.o + f * self.length * self.a + side * self.depth * self.c
+            at = at + (2 * side * self.rise - 0.5) * Z
+            self.b.boxes(at, 0.7 * self.a, 0.5 * self.c, 2.1 * Z, brick, bottom=False)
 
-def _dormers(
-    b: PartBuilder,
-    o: Array,
-    a: Array,
-    c: Array,
-    length: float,
-    depth: float,
-    rise: float,
-    tiles: int,
-    wall: int,
-    rng: np.random.Generator,
-) -> None:
-    """Small houses in the slopes, with a window each."""
-    glass = pal.glass_style(b, pal.WHITE)
-    for side in (0, 1):
-        count = int(rng.integers(0, max(2, int(length // 5))))
-        for i in range(count):
-            x = (i + 0.5) * length / count
-            axis, start = (a, o) if side == 0 else (-a, o + length * a + depth * c)
-            inwards = c if side == 0 else -c
-            at = start + (x - 0.75) * axis + 0.16 * depth * inwards
-            base = at + (0.32 * rise - 0.1) * Z
-            deep = 0.26 * depth
-            b.boxes(base, 1.5 * axis, deep * inwards, 1.5 * Z, wall, bottom=False)
-            out = -0.02 * inwards
-            b.quads(base + out + 0.25 * axis + 0.35 * Z, axis, 1.0 * Z, glass, seed=i + 7 * side)
-            roof = base + 1.5 * Z - 0.2 * axis - 0.25 * inwards
-            b.boxes(roof, 1.9 * axis, (deep + 0.3) * inwards, 0.14 * Z, tiles)
+    def add_dormers(self, rng: np.random.Generator) -> None:
+        """Small houses in the slopes, with a window each."""
+        b, length, depth = self.b, self.length, self.depth
+        glass = pal.glass_style(b, pal.WHITE)
+        far = self.o + length * self.a + depth * self.c
+        slopes = ((self.o, self.a, self.c), (far, -self.a, -self.c))
+        for side, (start, axis, inwards) in enumerate(slopes):
+            count = int(rng.integers(0, max(2, int(length // 5))))
+            for i in range(count):
+                x = (i + 0.5) * length / count
+                at = start + (x - 0.75) * axis + 0.16 * depth * inwards
+                base = at + (0.32 * self.rise - 0.1) * Z
+                deep = 0.26 * depth
+                b.boxes(base, 1.5 * axis, deep * inwards, 1.5 * Z, self.wall, bottom=False)
+                window = base - 0.02 * inwards + 0.25 * axis + 0.35 * Z
+                b.quads(window, axis, 1.0 * Z, glass, seed=i + 7 * side)
+                roof = base + 1.5 * Z - 0.2 * axis - 0.25 * inwards
+                b.boxes(roof, 1.9 * axis, (deep + 0.3) * inwards, 0.14 * Z, self.tiles)

@@ -1,4 +1,4 @@
-"""Trees, hedges and bushes: crowns of lumpy blobs fringed with loose leaves."""
+"""Trees and hedges: crowns of lumpy balls fringed with loose leaves."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.render.mesh import Part, PartBuilder, cross, srgb
-from chronoscene.synth.seeds import key_number, rng_for
+from chronoscene.synth.render.noise import key_number, rng_for
 
 Array = NDArray[np.float64]
 Z = np.array([0.0, 0.0, 1.0])
@@ -19,19 +19,11 @@ Z = np.array([0.0, 0.0, 1.0])
 def icosphere(level: int) -> tuple[Array, NDArray[np.int64]]:
     """Unit sphere of 20 * 4**level triangles. [V, 3], [F, 3]"""
     g = (1 + 5**0.5) / 2
-    v: list[tuple[float, float, float]] = [
-        (-1, g, 0),
-        (1, g, 0),
-        (-1, -g, 0),
-        (1, -g, 0),
-        (0, -1, g),
-        (0, 1, g),
-    ]
-    v += [(0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)]
+    first = [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0)]
+    vertices = np.concatenate([np.roll(first, i, axis=1) for i in range(3)]) / np.sqrt(1 + g * g)
     f = [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4)]
     f += [(11, 10, 2), (10, 7, 6), (7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8)]
     f += [(3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)]
-    vertices = np.array(v, np.float64) / np.sqrt(1 + g * g)
     faces = np.array(f)
     for _ in range(level):
         a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -46,49 +38,46 @@ def icosphere(level: int) -> tuple[Array, NDArray[np.int64]]:
     return vertices, faces
 
 
-def blob(
-    b: PartBuilder,
-    center: Array,
-    radii: Array,
-    style: int,
-    rng: np.random.Generator,
-    *,
-    level: int,
-    heart: Array,
-    rough: float = 0.16,
-) -> None:
-    """Lumpy ball. Its normals lean away from the ``heart`` of the crown, so that the crown is
-    shaded as one volume."""
-    v, f = icosphere(level)
-    # Equal directions at the seams get equal bumps: noise depends on the direction alone.
-    waves = rng.normal(0, 2.6, (4, 3))
-    phase = rng.uniform(0, 6.28, 4)
-    bumps = 1 + rough * np.sin(v @ waves.T + phase).sum(axis=1) / 1.6
-    points = center + radii * v * bumps[:, None]
-    normals = 0.65 * v + 0.5 * _unit(points - heart) + rng.normal(0, 0.12, v.shape)
-    b.triangles(points[f], _unit(normals)[f], style, origin=heart)
+class Foliage(PartBuilder):
+    """Builder of a plant: lumpy balls and loose leaves.
 
+    Their normals lean away from the ``heart`` of a crown: the crown is shaded as one volume.
 
-def leaves(
-    b: PartBuilder,
-    center: Array,
-    radii: Array,
-    style: int,
-    rng: np.random.Generator,
-    *,
-    count: int,
-    size: float,
-    heart: Array,
-) -> None:
-    """Loose triangles on the surface of a blob."""
-    out = _unit(rng.normal(0, 1, (count, 3)))
-    at = center + radii * out * rng.uniform(0.9, 1.18, (count, 1))
-    e = _unit(rng.normal(0, 1, (count, 3)) + 0.4 * out)
-    side = _unit(cross(e, rng.normal(0, 1, (count, 3))))
-    s = size * rng.uniform(0.6, 1.4, (count, 1))
-    tris = np.stack([at - 0.5 * s * e, at + 0.5 * s * e, at + 0.8 * s * side], axis=1)
-    normals = _unit(0.8 * _unit(at - heart) + 0.4 * out + rng.normal(0, 0.2, out.shape))
-    b.triangles(tris, np.repeat(normals[:, None], 3, axis=1), style, origin=heart)
+    Args:
+        name: Name of the plant.
+        rng: Draws its shape.
+    """
+
+    def __init__(self, name: str, rng: np.random.Generator) -> None:
+        super().__init__(key_number(name))
+        self.rng = rng
+
+    def ball(
+        self, center: Array, radii: Array, heart: Array, leaf: int, level: int, rough: float = 0.16
+    ) -> None:
+        """Lumpy ball of 20 * 4**level triangles."""
+        v, f = icosphere(level)
+        # Equal directions at the seams get equal bumps: noise depends on the direction alone.
+        waves = self.rng.normal(0, 2.6, (4, 3))
+        phase = self.rng.uniform(0, 6.28, 4)
+        bumps = 1 + rough * np.sin(v @ waves.T + phase).sum(axis=1) / 1.6
+        points = center + radii * v * bumps[:, None]
+        normals = 0.65 * v + 0.5 * _unit(points - heart) + self.rng.normal(0, 0.12, v.shape)
+        self.triangles(points[f], _unit(normals)[f], leaf, origin=heart)
+
+    def leaves(
+        self, center: Array, radii: Array, heart: Array, leaf: int, count: int, size: float
+    ) -> None:
+        """Loose triangles on the surface of a ball."""
+        rng = self.rng
+        out = _unit(rng.normal(0, 1, (count, 3)))
+        at = center + radii * out * rng.uniform(0.9, 1.18, (count, 1))
+        e = _unit(rng.normal(0, 1, (count, 3)) + 0.4 * out)
+        side = _unit(cross(e, rng.normal(0, 1, (count, 3))))
+        s = size * rng.uniform(0.6, 1.4, (count, 1))
+        tris = np.stack([at - 0.5 * s * e, at + 0.5 * s * e, at + 0.8 * s * side], axis=1)
+        normals = _unit(0.8 * _unit(at - heart) + 0.4 * out + rng.normal(0, 0.2, out.shape))
+        self.triangles(tris, np.repeat(normals[:, None], 3, axis=1), leaf, origin=heart)
 
 
 def trunk(b: PartBuilder, base: Array, top: Array, radius: float, style: int) -> None:
@@ -96,44 +85,31 @@ def trunk(b: PartBuilder, base: Array, top: Array, radius: float, style: int) ->
     turn = np.linspace(0, 2 * np.pi, 8)
     ring = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(8)])
     low, high = base + radius * ring, top + 0.5 * radius * ring
-    tris = np.concatenate(
-        [
-            np.stack([low[:-1], low[1:], high[1:]], axis=1),
-            np.stack([low[:-1], high[1:], high[:-1]], axis=1),
-        ]
-    )
-    normals = np.concatenate(
-        [
-            np.stack([ring[:-1], ring[1:], ring[1:]], axis=1),
-            np.stack([ring[:-1], ring[1:], ring[:-1]], axis=1),
-        ]
-    )
-    b.triangles(tris, normals, style, origin=base)
+    b.triangles(_facets(low, high), _facets(ring, ring), style, origin=base)
+
+
+def _facets(low: Array, high: Array) -> Array:
+    """Two triangles between each pair of neighbours on two rings. [N, 3, 3]"""
+    quads = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
 def tree(
-    name: str,
-    base: Array,
-    height: float,
-    season: str,
-    seed: int,
-    *,
-    detail: int = 2,
-    broad: bool = False,
+    name: str, base: Array, seed: int, detail: int, broad: bool, state: tuple[float, str]
 ) -> Part:
     """A tree; name and seed fix species and shape, height and season change with time.
 
     Args:
         name: Name of the tree.
         base: Foot of the stem. [3]
-        height: Metres.
-        season: Palette of the leaves.
         seed: Seed of the scene.
         detail: 0 far away, 1 middle, 2 near.
         broad: No conifer; they would stand in the way along a street.
+        state: Height in metres, and season: the palette of the leaves.
     """
+    height, season = state
     rng = rng_for(seed, name, "tree")
-    b = PartBuilder(key_number(name))
+    b = Foliage(name, rng)
     species = int(rng.choice(3, p=[0.45, 0.4, 0.15]))
     species = species % 2 if broad else species
     bark = pal.plain_style(b, srgb(96, 78, 60), 0.5, 0.2)
@@ -141,18 +117,16 @@ def tree(
     lean = rng.normal(0, 0.03, 2) * height
     top = base + np.array([lean[0], lean[1], 0.75 * height])
     trunk(b, base, top, 0.022 * height + 0.05, bark)
-    if season == "winter" and species != 2:
-        _bare(b, base, top, height, bark, leaf, rng)
-    elif species == 2:
-        _conifer(b, base, height, leaf, rng, detail)
+    if species == 2:
+        _conifer(b, base, height, leaf, detail)
+    elif season == "winter":
+        _bare(b, base, top, height, bark, leaf)
     else:
-        _broadleaf(b, base, top, height, leaf, rng, detail, slim=bool(rng.random() < 0.25))
+        _broadleaf(b, base, top, height, leaf, detail)
     return b.build()
 
 
-def _conifer(
-    b: PartBuilder, base: Array, height: float, leaf: int, rng: np.random.Generator, detail: int
-) -> None:
+def _conifer(b: Foliage, base: Array, height: float, leaf: int, detail: int) -> None:
     """Tiers that get smaller towards the top."""
     tiers = (3, 5, 6)[detail]
     heart = base + 0.4 * height * Z
@@ -161,22 +135,14 @@ def _conifer(
         center = base + height * (0.24 + 0.7 * f) * Z
         r = 0.24 * height * (1.05 - f)
         radii = np.array([r, r, 0.13 * height * (1.2 - 0.5 * f)])
-        blob(b, center, radii, leaf, rng, level=min(detail, 2), heart=heart, rough=0.28)
+        b.ball(center, radii, heart, leaf, detail, rough=0.28)
         if detail == 2:
-            leaves(b, center, radii, leaf, rng, count=70, size=0.5, heart=heart)
+            b.leaves(center, radii, heart, leaf, count=70, size=0.5)
 
 
-def _bare(
-    b: PartBuilder,
-    base: Array,
-    top: Array,
-    height: float,
-    bark: int,
-    leaf: int,
-    rng: np.random.Generator,
-) -> None:
+def _bare(b: Foliage, base: Array, top: Array, height: float, bark: int, leaf: int) -> None:
     """Branches and twigs in two orders, with a few brown leaves that stayed."""
-    stem = top - base
+    rng, stem = b.rng, top - base
     for _ in range(9):
         start = base + stem * rng.uniform(0.45, 1.0)
         way = _unit(rng.normal(0, 1, 3) * [1, 1, 0.4] + 0.7 * Z)
@@ -188,57 +154,38 @@ def _bare(
             out = _unit(way + rng.normal(0, 0.6, 3) + 0.2 * Z)
             tip = fork + 0.45 * length * out
             trunk(b, fork, tip, 0.005 * height, bark)
-            leaves(b, tip, np.full(3, 0.09 * height), bark, rng, count=9, size=0.5, heart=base)
-    leaves(b, top, np.full(3, 0.2 * height), leaf, rng, count=30, size=0.3, heart=base)
+            b.leaves(tip, np.full(3, 0.09 * height), base, bark, count=9, size=0.5)
+    b.leaves(top, np.full(3, 0.2 * height), base, leaf, count=30, size=0.3)
 
 
-def _broadleaf(
-    b: PartBuilder,
-    base: Array,
-    top: Array,
-    height: float,
-    leaf: int,
-    rng: np.random.Generator,
-    detail: int,
-    *,
-    slim: bool,
-) -> None:
-    """Blobs scattered in an ellipsoid around the upper stem."""
+def _broadleaf(b: Foliage, base: Array, top: Array, height: float, leaf: int, detail: int) -> None:
+    """Balls scattered in an ellipsoid around the upper stem."""
+    rng = b.rng
+    slim = rng.random() < 0.25
     wide = (0.17 if slim else 0.36) * height
     tall = (0.40 if slim else 0.35) * height
     heart = np.array([top[0], top[1], base[2] + height - tall])
-    count = (3, 7, 13)[detail]
-    for i in range(count):
+    for i in range((3, 7, 13)[detail]):
         out = _unit(rng.normal(0, 1, 3)) * rng.uniform(0.5, 0.75)
         center = heart + out * [wide, wide, tall] if i else heart
         r = (0.62 if i == 0 else rng.uniform(0.36, 0.5)) * np.array([wide, wide, 0.85 * tall])
         r = np.maximum(r, 0.3 * wide)
-        blob(b, center, r, leaf, rng, level=min(detail, 2), heart=heart)
+        b.ball(center, r, heart, leaf, detail)
         if detail == 2:
-            number = int(40 + 30 * min(4.0, r[0]))
-            leaves(b, center, r, leaf, rng, count=number, size=0.42, heart=heart)
-
-
-def grown(
-    name: str, base: Array, seed: int, detail: int, broad: bool, state: tuple[float, str]
-) -> Part:
-    """A tree in a state: height and season."""
-    return tree(name, base, state[0], state[1], seed, detail=detail, broad=broad)
+            b.leaves(center, r, heart, leaf, count=int(40 + 30 * min(4.0, r[0])), size=0.42)
 
 
 def hedge(name: str, low: Array, high: Array, seed: int, season: str) -> Part:
-    """A row of blobs between two corners of a flat box."""
-    rng = rng_for(seed, name, "hedge")
-    b = PartBuilder(key_number(name))
+    """A row of balls between two corners of a flat box."""
+    b = Foliage(name, rng_for(seed, name, "hedge"))
     leaf = pal.leaf_style(b, season, 1, 0.2)
-    length = float(np.linalg.norm((high - low)[:2]))
-    count = max(1, int(length / 0.9))
+    count = max(1, int(float(np.linalg.norm((high - low)[:2])) / 0.9))
     for i in range(count):
         f = (i + 0.5) / count
         c = low + f * (high - low)
-        c = np.array([c[0], c[1], low[2] + 0.45 + rng.uniform(-0.05, 0.08)])
-        blob(b, c, np.array([0.62, 0.62, 0.6]), leaf, rng, level=2, heart=c - 0.5 * Z)
-        leaves(b, c, np.full(3, 0.62), leaf, rng, count=24, size=0.3, heart=c)
+        c = np.array([c[0], c[1], low[2] + 0.45 + b.rng.uniform(-0.05, 0.08)])
+        b.ball(c, np.array([0.62, 0.62, 0.6]), c - 0.5 * Z, leaf, level=2)
+        b.leaves(c, np.full(3, 0.62), c, leaf, count=24, size=0.3)
     return b.build()
 
 

@@ -8,8 +8,8 @@ pixel would have.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import prange
@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.synth.render.mesh import MISS
-from chronoscene.synth.render.noise import fbm, smooth
-from chronoscene.synth.seeds import rng_for
+from chronoscene.synth.render.noise import fbm, rng_for, smooth
 
 Array = NDArray[np.float64]
 Color = tuple[float, float, float]
@@ -95,22 +94,14 @@ def make_lights(seed: int, periods: int) -> list[Light]:
         azimuth = (mood.azimuth + turn + float(rng.uniform(-15, 15))) % 360
         # Later rounds through the moods must not repeat the earlier ones.
         azimuth = (azimuth + 67.0 * (p // len(MOODS))) % 360
-        lights.append(
-            Light(
-                mood.name,
-                mood.season,
-                round(azimuth, 2),
-                round(mood.elevation + float(rng.uniform(-3, 3)), 2),
-                mood.sun,
-                mood.zenith,
-                mood.horizon,
-                mood.cloud,
-                mood.haze,
-                round(mood.exposure * float(rng.uniform(0.94, 1.06)), 3),
-                mood.white,
-                100 * (p + 1) + seed % 89,
-            )
+        light = replace(
+            mood,
+            azimuth=round(azimuth, 2),
+            elevation=round(mood.elevation + float(rng.uniform(-3, 3)), 2),
+            exposure=round(mood.exposure * float(rng.uniform(0.94, 1.06)), 3),
+            sky_seed=100 * (p + 1) + seed % 89,
         )
+        lights.append(light)
     return lights
 
 
@@ -129,18 +120,10 @@ class SkyArgs(NamedTuple):
 
 
 def sky_args(light: Light) -> SkyArgs:
-    """Arrays of a light for compiled code."""
-    return SkyArgs(
-        light.direction,
-        np.array(light.sun),
-        np.array(light.zenith),
-        np.array(light.horizon),
-        light.cloud,
-        light.haze,
-        light.exposure,
-        np.array(light.white),
-        light.sky_seed,
-    )
+    """A light for compiled code, with its colours as arrays."""
+    values: dict[str, Any] = {name: getattr(light, name) for name in SkyArgs._fields}
+    colors = {name: np.array(v) for name, v in values.items() if isinstance(v, tuple)}
+    return SkyArgs(**(values | colors))
 
 
 @inner

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -42,9 +41,8 @@ def srgb(red: float, green: float, blue: float) -> Color:
     return (float(linear[0]), float(linear[1]), float(linear[2]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Part:
-    """A finished piece of geometry with its own tables (T triangles, P patches, S styles)."""
+class Part(NamedTuple):
+    """Geometry with its own tables (T triangles, P patches, S styles); kernels read it as it is."""
 
     vertices: NDArray[np.float32]
     """World metres, counter-clockwise seen from outside. [T, 3, 3]"""
@@ -276,24 +274,10 @@ MISS = 0xFFFFFFFF
 """Primitive id that the ray caster gives to rays that hit nothing."""
 
 
-class Tables(NamedTuple):
-    """Geometry of one period as flat arrays; see `chronoscene.synth.render.mesh`."""
-
-    corners: NDArray[np.float32]
-    """[T, 3, 3]"""
-    normals: NDArray[np.float32]
-    """[T, 3, 3]"""
-    tri_patch: NDArray[np.int32]
-    patches: Array
-    patch_style: NDArray[np.int32]
-    patch_seed: NDArray[np.int32]
-    styles: Array
-
-
 @inner
 def hit_normals(tables, tri, u, v, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Flat and smooth unit normals of a hit, both turned towards the viewer."""
-    a, b, c = tables.corners[tri, 0], tables.corners[tri, 1], tables.corners[tri, 2]
+    a, b, c = tables.vertices[tri, 0], tables.vertices[tri, 1], tables.vertices[tri, 2]
     e0, e1, e2 = float(b[0] - a[0]), float(b[1] - a[1]), float(b[2] - a[2])
     f0, f1, f2 = float(c[0] - a[0]), float(c[1] - a[1]), float(c[2] - a[2])
     gx, gy, gz = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0

@@ -1,16 +1,31 @@
-"""Hashes, value noise and box-filtered patterns for textures; all compiled, all pure.
+"""Random numbers: seeded generators for the layout, hashes and noise for textures.
 
-Every function takes ``fw``, the width of a pixel on the surface in metres where it matters, and
-fades or averages detail that is smaller, so that textures do not alias.
+Generators are keyed by names, so that adding one object leaves the others as they were. The
+compiled functions are pure. Those that draw detail take ``fw``, the width of a pixel on the
+surface in metres, and fade or average what is smaller, so that textures do not alias.
 """
 
 from __future__ import annotations
 
 import math
+import zlib
+
+import numpy as np
 
 from chronoscene.kernels.compilation import inner
 
 MASK = 0xFFFFFFFF
+
+
+def rng_for(seed: int, *keys: object) -> np.random.Generator:
+    """Generator for a named purpose; equal seed and keys give equal numbers on any machine."""
+    words = [zlib.crc32(str(key).encode()) for key in keys]
+    return np.random.default_rng(np.random.SeedSequence([seed, *words]))
+
+
+def key_number(*keys: object) -> int:
+    """Small positive integer of a name, for the hashes inside textures."""
+    return zlib.crc32("/".join(map(str, keys)).encode()) % 65_521
 
 
 @inner

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from chronoscene.errors import BackendError
 from chronoscene.scene import Camera
 from chronoscene.synth.render.light import Light, Probes, probe_values, sky_args
-from chronoscene.synth.render.mesh import MISS, Part, Tables
+from chronoscene.synth.render.mesh import MISS, Part
 from chronoscene.synth.render.shade import albedo_at, camera_rays, shade, shadow_rays
 
 Array = NDArray[np.float64]
@@ -73,15 +73,7 @@ class PeriodRenderer:
         self._element = tri_element
         self._ss = supersample
         self._box, self._spacing = probe_box, probe_spacing
-        self.tables = Tables(
-            part.vertices,
-            part.normals,
-            part.tri_patch,
-            part.patches,
-            part.patch_style,
-            part.patch_seed,
-            part.styles,
-        )
+        self.tables = part
         self._scene = load_open3d().t.geometry.RaycastingScene()
         corners = np.ascontiguousarray(part.vertices.reshape(-1, 3))
         index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)

@@ -21,7 +21,7 @@ from chronoscene.synth.render.noise import (
 
 
 @inner
-def flat_roof_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
+def flat_roof(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Bitumen sheets or gravel. Numbers: sheet width, gravel (0 or 1)."""
     c0, c1, c2 = colors(s)
     sheet = math.floor(u / s[10])
@@ -39,7 +39,7 @@ def flat_roof_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def tiles_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
+def tiles(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Roof tiles, v up the slope; c0 and c1 tiles, c2 moss. Numbers: width, height, moss."""
     c0, c1, c2 = colors(s)
     width, height = s[10], s[11]
@@ -62,7 +62,7 @@ def tiles_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def asphalt_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
+def asphalt(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Road, u along it. Numbers: marking (0 none, 1 lanes, 2 zebra, 3 parking lot), parking."""
     c0, c1, paint = colors(s)
     color = mix(c0, c1, smooth(-0.5, 0.6, fbm(u, v, 3.5, 6, seed, fw)))
@@ -108,7 +108,7 @@ def _marking(s, u, v, su, sv, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def paving_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
+def paving(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Slabs. Numbers: length, height, bond shift, pattern (0 plain, 1 bands, 2 rings), scale."""
     c0, c1, c2 = colors(s)
     length, height = s[10], s[11]
@@ -137,7 +137,7 @@ def paving_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def grass_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
+def grass(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     """Meadow in world axes; c0 and c1 grass, c2 bare soil. Numbers: wear, litter, stripes."""
     c0, c1, c2 = colors(s)
     broad = fbm(x, y, 6.0, 5, seed, fw)
@@ -159,7 +159,7 @@ def grass_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def soil_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
+def soil(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Bare ground with stones and ruts. Numbers: stones, ruts."""
     c0, c1, c2 = colors(s)
     color = mix(c0, c1, smooth(-0.5, 0.5, fbm(u, v, 4.0, 6, seed, fw)))
@@ -174,7 +174,7 @@ def soil_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def fields_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
+def fields(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     """Countryside in world axes: parcels with furrows, hedges, woods. Numbers: litness."""
     c0, c1, c2 = colors(s)
     wx = x + 9.0 * fbm(x, y, 60.0, 2, seed + 1, 0.01)
@@ -199,6 +199,6 @@ def fields_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def water_color(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
+def water(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     c0, c1, _ = colors(s)
     return mix(c0, c1, smooth(-0.4, 0.6, fbm(x, y, 0.9, 4, seed, fw)))

@@ -21,7 +21,7 @@ from chronoscene.synth.render.noise import (
 
 
 @inner
-def plain_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
+def plain(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Noise only. Numbers: strength, size."""
     c0, c1, _ = colors(s)
     n = fbm(u, v, max(s[11], 0.05), 4, seed, fw)
@@ -29,7 +29,7 @@ def plain_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def plaster_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
+def plaster(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Plaster with a dirty base and spots where it came off (c1). Numbers: wear, storey, rows."""
     c0, c1, c2 = colors(s)
     color = weather(c0, u, v, seed, fw, 0.22)
@@ -44,7 +44,7 @@ def plaster_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def brick_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
+def brick(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Running bond; c0 and c1 bricks, c2 mortar. Numbers: length, height, band period."""
     c0, c1, c2 = colors(s)
     length, height = s[10], s[11]
@@ -63,7 +63,7 @@ def brick_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def panel_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
+def panel(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Cladding panels with dark joints (c2). Numbers: width, height, share of c1, gloss bands."""
     c0, c1, c2 = colors(s)
     col, row = math.floor(u / s[10]), math.floor(v / s[11])
@@ -77,7 +77,7 @@ def panel_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def concrete_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
+def concrete(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
     """Cast concrete. Numbers: formwork width, height."""
     c0, c1, _ = colors(s)
     col, row = math.floor(u / s[10]), math.floor(v / s[11])
@@ -90,7 +90,7 @@ def concrete_color(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def glass_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
+def glass(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Window: frame c0, room c1, curtain c2. Numbers: frame width, panes across, panes up."""
     c0, c1, c2 = colors(s)
     f = s[10]
@@ -112,7 +112,7 @@ def glass_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def sign_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
+def sign(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Board c0 with letters c1 made of random strokes, border c2."""
     c0, c1, c2 = colors(s)
     height = 0.56 * sv
@@ -146,7 +146,7 @@ def sign_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def door_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
+def door(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Door leaf c0 with sunk panels, glass c1 above, frame c2."""
     c0, c1, c2 = colors(s)
     panel = pulse(u - 0.15, 0.5 * su, 0.5 * su - 0.3, fw) * pulse(v - 0.2, 0.9, 0.6, fw)
@@ -157,7 +157,7 @@ def door_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def corrugated_color(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
+def corrugated(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """Sheet metal with ribs, rust (c1) and a lettered band (c2). Numbers: pitch, rust, band."""
     c0, c1, c2 = colors(s)
     rib = pulse(u, s[10], 0.5 * s[10], fw) - 0.5

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 
 from chronoscene.kernels.compilation import inner
+from chronoscene.synth.render import texture_ground as ground
+from chronoscene.synth.render import texture_walls as walls
 from chronoscene.synth.render.noise import (
     colors,
     fade,
@@ -22,27 +24,6 @@ from chronoscene.synth.render.noise import (
     smooth,
     span,
     value_noise_3d,
-)
-from chronoscene.synth.render.texture_ground import (
-    asphalt_color,
-    fields_color,
-    flat_roof_color,
-    grass_color,
-    paving_color,
-    soil_color,
-    tiles_color,
-    water_color,
-)
-from chronoscene.synth.render.texture_walls import (
-    brick_color,
-    concrete_color,
-    corrugated_color,
-    door_color,
-    glass_color,
-    panel_color,
-    plain_color,
-    plaster_color,
-    sign_color,
 )
 
 PLAIN, PLASTER, BRICK, PANEL, CONCRETE, TILES, FLAT_ROOF, ASPHALT, PAVING, GRASS = range(10)
@@ -111,25 +92,25 @@ def albedo(s, u, v, x, y, z, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     """
     kind = int(s[0])
     if kind == PLASTER:
-        c = plaster_color(s, u, v, seed, fw)
+        c = walls.plaster(s, u, v, seed, fw)
     elif kind == BRICK:
-        c = brick_color(s, u, v, seed, fw)
+        c = walls.brick(s, u, v, seed, fw)
     elif kind == PANEL:
-        c = panel_color(s, u, v, seed, fw)
+        c = walls.panel(s, u, v, seed, fw)
     elif kind == CONCRETE:
-        c = concrete_color(s, u, v, seed, fw)
+        c = walls.concrete(s, u, v, seed, fw)
     elif kind == TILES:
-        c = tiles_color(s, u, v, seed, fw)
+        c = ground.tiles(s, u, v, seed, fw)
     elif kind == FLAT_ROOF:
-        c = flat_roof_color(s, u, v, su, sv, seed, fw)
+        c = ground.flat_roof(s, u, v, su, sv, seed, fw)
     elif kind == ASPHALT:
-        c = asphalt_color(s, u, v, su, sv, seed, fw)
+        c = ground.asphalt(s, u, v, su, sv, seed, fw)
     elif kind == PAVING:
-        c = paving_color(s, u, v, su, sv, seed, fw)
+        c = ground.paving(s, u, v, su, sv, seed, fw)
     elif kind == GRASS:
-        c = grass_color(s, x, y, seed, fw)
+        c = ground.grass(s, x, y, seed, fw)
     elif kind == SOIL:
-        c = soil_color(s, u, v, seed, fw)
+        c = ground.soil(s, u, v, seed, fw)
     elif kind == LEAVES:
         c = _leaves(s, x, y, z, seed, fw)
     elif kind == WOOD:
@@ -137,21 +118,21 @@ def albedo(s, u, v, x, y, z, su, sv, seed, fw):  # type: ignore[no-untyped-def]
     elif kind == PAINT:
         c = _paint(s, u, v, su, sv, seed, fw)
     elif kind == CORRUGATED:
-        c = corrugated_color(s, u, v, su, sv, seed, fw)
+        c = walls.corrugated(s, u, v, su, sv, seed, fw)
     elif kind == FIELDS:
-        c = fields_color(s, x, y, seed, fw)
+        c = ground.fields(s, x, y, seed, fw)
     elif kind == GLASS:
-        c = glass_color(s, u, v, su, sv, seed, fw)
+        c = walls.glass(s, u, v, su, sv, seed, fw)
     elif kind == SIGN:
-        c = sign_color(s, u, v, su, sv, seed, fw)
+        c = walls.sign(s, u, v, su, sv, seed, fw)
     elif kind == WATER:
-        c = water_color(s, x, y, seed, fw)
+        c = ground.water(s, x, y, seed, fw)
     elif kind == SOLAR:
         c = _solar(s, u, v, seed, fw)
     elif kind == DOOR:
-        c = door_color(s, u, v, su, sv, seed, fw)
+        c = walls.door(s, u, v, su, sv, seed, fw)
     else:
-        c = plain_color(s, u, v, seed, fw)
+        c = walls.plain(s, u, v, seed, fw)
     return (
         min(0.92, max(0.004, c[0])),
         min(0.92, max(0.004, c[1])),

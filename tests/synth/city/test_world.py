@@ -102,8 +102,8 @@ def test_cameras_keep_their_distance(made, renderers) -> None:  # type: ignore[n
 
 def test_street_views_walk_between_the_houses() -> None:
     from chronoscene.synth.city.plan import make_world
+    from chronoscene.synth.flights import make_camera, plan_views
     from chronoscene.synth.generation import make_renderers
-    from chronoscene.synth.scene.flights import make_camera, plan_views
 
     wanted = preset("tiny", kind="street", views=6)
     world = make_world(wanted)

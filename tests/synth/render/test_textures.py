@@ -10,7 +10,7 @@ from numba import njit
 
 from chronoscene.synth.render import noise
 from chronoscene.synth.render import textures as tex
-from chronoscene.synth.render.mesh import PartBuilder, Tables, srgb
+from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
 from chronoscene.synth.render.shade import albedo_at
 
 # Inner functions have no entry for Python; these give them one.
@@ -67,16 +67,13 @@ ORDER = sorted(KINDS)
 SIZE = 12.0
 
 
-def sheet() -> Tables:
+def sheet() -> Part:
     """One square of 12 m per kind, all in the same place; triangle 2 * i is of kind ORDER[i]."""
     b = PartBuilder(seed=77)
     for kind in ORDER:
         colors = srgb(150, 80, 60), srgb(90, 110, 140), srgb(200, 200, 190)
         b.quads(np.zeros(3), [SIZE, 0, 0], [0, SIZE, 0], b.style(kind, *colors, KINDS[kind]))
-    p = b.build()
-    return Tables(
-        p.vertices, p.normals, p.tri_patch, p.patches, p.patch_style, p.patch_seed, p.styles
-    )
+    return b.build()
 
 
 def color(kind: int, uv: np.ndarray, fw: float) -> np.ndarray:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from chronoscene.scene import Camera, Period
 from chronoscene.synth.city.world import World
+from chronoscene.synth.flights import View
 from chronoscene.synth.render.renderer import PeriodRenderer, PixelMaps
-from chronoscene.synth.scene.flights import View
 
 UNCHANGED, APPEARANCE, GEOMETRY = 0, 127, 255
 """Values of change masks."""

@@ -13,8 +13,8 @@ from chronoscene.errors import ConfigError
 from chronoscene.scene import Camera, Split
 from chronoscene.scene.geometry import pose_from_rotation_translation
 from chronoscene.synth.city.world import World
+from chronoscene.synth.render.noise import rng_for
 from chronoscene.synth.render.renderer import PeriodRenderer
-from chronoscene.synth.seeds import rng_for
 from chronoscene.synth.settings import SynthSettings
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from chronoscene.synth.city.buildings import SLAB
-from chronoscene.synth.scene.truth import APPEARANCE, GEOMETRY, UNCHANGED, change_mask
+from chronoscene.synth.truth import APPEARANCE, GEOMETRY, UNCHANGED, change_mask
 
 
 def stem(name: str) -> str:

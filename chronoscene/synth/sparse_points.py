@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.scene import Camera, Points
+from chronoscene.synth.flights import View
 from chronoscene.synth.render.mesh import MISS
+from chronoscene.synth.render.noise import rng_for
 from chronoscene.synth.render.renderer import PeriodRenderer
-from chronoscene.synth.scene.flights import View
-from chronoscene.synth.seeds import rng_for
 from chronoscene.synth.settings import SynthSettings
 
 Array = NDArray[np.float64]

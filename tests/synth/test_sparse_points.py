@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from chronoscene.synth import preset
-from chronoscene.synth.scene.sparse_points import SAME_ALBEDO
+from chronoscene.synth.sparse_points import SAME_ALBEDO
 
 
 @pytest.fixture(scope="module")

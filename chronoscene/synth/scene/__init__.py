@@ -1,1 +1,0 @@
-"""From renders to a dataset: flights, sparse points with tracks, ground truth."""
