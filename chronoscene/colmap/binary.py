@@ -18,9 +18,10 @@ from __future__ import annotations
 
 import struct
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,6 @@ from chronoscene.colmap.raw_model import (
 )
 from chronoscene.errors import SceneError
 from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES, Camera
-
-T = TypeVar("T")
 
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
 """A keypoint of an image."""
@@ -60,7 +59,17 @@ def read_cameras(path: Path) -> tuple[Camera, ...]:
     Raises:
         SceneError: If the file cannot be read, ends inside a record, or has an unknown model.
     """
-    return _read(path, _walk_cameras)
+    cameras = []
+    with _records_of(path) as reader:
+        for _ in reader.records("camera", _CAMERA_HEAD.size):
+            camera_id, model, width, height = reader.unpack(_CAMERA_HEAD)
+            if not 0 <= model < len(MODEL_NAMES):
+                found = f"the unknown model id {model} for camera {camera_id}"
+                raise _RecordError(f"{found}, not 0..{len(MODEL_NAMES) - 1}")
+            name = MODEL_NAMES[model]
+            params = reader.unpack(struct.Struct(f"<{len(CAMERA_MODELS[name].params)}d"))
+            cameras.append(Camera(camera_id, name, width, height, params))
+    return tuple(cameras)
 
 
 def read_images(path: Path) -> RawImages:
@@ -69,7 +78,29 @@ def read_images(path: Path) -> RawImages:
     Raises:
         SceneError: If the file cannot be read or ends inside a record.
     """
-    return _read(path, _walk_images)
+    heads, names, lengths, keypoints = [], [], [], []
+    with _records_of(path) as reader:
+        whole = memoryview(reader.data)
+        for _ in reader.records("image", _IMAGE_HEAD.size + 1 + _COUNT.size):
+            heads.append(reader.unpack(_IMAGE_HEAD))
+            names.append(reader.text().decode("utf-8", "surrogateescape"))
+            (length,) = reader.unpack(_COUNT)
+            reader.parts = f"{length} keypoints"
+            begin = reader.skip(length * KEYPOINT.itemsize)
+            lengths.append(length)
+            keypoints.append(whole[begin : reader.at])
+    table = np.array(heads, np.float64).reshape(-1, 9)  # ids of 32 bits are exact
+    records = np.frombuffer(b"".join(keypoints), KEYPOINT)
+    return RawImages(
+        ids=table[:, 0].astype(np.int64),
+        names=tuple(names),
+        quaternions=np.ascontiguousarray(table[:, 1:5]),
+        translations=np.ascontiguousarray(table[:, 5:8]),
+        camera_ids=table[:, 8].astype(np.int64),
+        keypoint_start=np.cumsum([0, *lengths]),
+        keypoint_xy=np.ascontiguousarray(records["xy"]),
+        keypoint_point=np.ascontiguousarray(records["point_id"]),
+    )
 
 
 def read_points(path: Path) -> RawPoints:
@@ -78,7 +109,11 @@ def read_points(path: Path) -> RawPoints:
     Raises:
         SceneError: If the file cannot be read, ends inside a record, or has duplicate ids.
     """
-    return _read(path, _walk_points)
+    with _records_of(path) as reader:
+        # One step per record, as each states only its own length; all else in whole columns.
+        begin = np.array(_point_offsets(reader), np.int64)
+        lengths = (np.diff(begin) - POINT_HEAD.itemsize) // _TRACK_BYTES
+        return _gather_points(reader.data, begin[:-1], lengths)
 
 
 def read_rigs(folder: Path) -> RawRigs | None:
@@ -88,8 +123,8 @@ def read_rigs(folder: Path) -> RawRigs | None:
         SceneError: If a file cannot be read or ends inside a record.
     """
     rigs, frames = folder / "rigs.bin", folder / "frames.bin"
-    found = _read(rigs, _walk_rigs) if rigs.exists() else None
-    posed = _read(frames, _walk_frames) if frames.exists() else None
+    found = _read_rigs(rigs) if rigs.exists() else None
+    posed = _read_frames(frames) if frames.exists() else None
     return None if found is None or posed is None else RawRigs(found, posed)
 
 
@@ -110,12 +145,12 @@ class _Reader:
         self.parts = ""
         """Number of parts that the current record announces, for messages."""
 
-    def records(self, kind: str, min_size: int) -> Iterator[int]:
-        """Index of each record; the caller reads the record before it asks for the next."""
+    def records(self, kind: str, min_size: int) -> Iterator[None]:
+        """One step per record, which the caller reads before it asks for the next."""
         count = self.start(kind, min_size)
         for self.index in range(count):
             self.parts = ""
-            yield self.index
+            yield
         self.finish()
 
     def start(self, kind: str, min_size: int) -> int:
@@ -159,10 +194,12 @@ class _Reader:
         return _RecordError(f"a file that ends inside {self.kind} record {self.index}{announced}")
 
 
-def _read(path: Path, walk: Callable[[_Reader], T]) -> T:
-    """What a walk makes of the records of a file."""
+@contextmanager
+def _records_of(path: Path) -> Iterator[_Reader]:
+    """Reads a file, whose errors name the path."""
     try:
-        return walk(_Reader(path.read_bytes()))
+        yield _Reader(path.read_bytes())
+        return
     except OSError as error:
         found = error.strerror or "unreadable"
     except _RecordError as error:
@@ -175,82 +212,39 @@ def _read(path: Path, walk: Callable[[_Reader], T]) -> T:
     )
 
 
-def _walk_cameras(reader: _Reader) -> tuple[Camera, ...]:
-    cameras = []
-    for _ in reader.records("camera", _CAMERA_HEAD.size):
-        camera_id, model, width, height = reader.unpack(_CAMERA_HEAD)
-        if not 0 <= model < len(MODEL_NAMES):
-            known = f"0..{len(MODEL_NAMES) - 1}"
-            raise _RecordError(f"the unknown model id {model} for camera {camera_id}, not {known}")
-        name = MODEL_NAMES[model]
-        params = reader.unpack(struct.Struct(f"<{len(CAMERA_MODELS[name].params)}d"))
-        cameras.append(Camera(camera_id, name, width, height, params))
-    return tuple(cameras)
-
-
-def _walk_images(reader: _Reader) -> RawImages:
-    heads, names, lengths, keypoints = [], [], [], []
-    whole = memoryview(reader.data)
-    for _ in reader.records("image", _IMAGE_HEAD.size + 1 + _COUNT.size):
-        heads.append(reader.unpack(_IMAGE_HEAD))
-        names.append(reader.text().decode("utf-8", "surrogateescape"))
-        (length,) = reader.unpack(_COUNT)
-        reader.parts = f"{length} keypoints"
-        begin = reader.skip(length * KEYPOINT.itemsize)
-        lengths.append(length)
-        keypoints.append(whole[begin : reader.at])
-    table = np.array(heads, np.float64).reshape(-1, 9)  # ids of 32 bits are exact
-    records = np.frombuffer(b"".join(keypoints), KEYPOINT)
-    return RawImages(
-        ids=table[:, 0].astype(np.int64),
-        names=tuple(names),
-        quaternions=np.ascontiguousarray(table[:, 1:5]),
-        translations=np.ascontiguousarray(table[:, 5:8]),
-        camera_ids=table[:, 8].astype(np.int64),
-        keypoint_start=np.cumsum([0, *lengths]),
-        keypoint_xy=np.ascontiguousarray(records["xy"]),
-        keypoint_point=np.ascontiguousarray(records["point_id"]),
-    )
-
-
-def _walk_rigs(reader: _Reader) -> dict[int, dict[Sensor, Pose | None]]:
+def _read_rigs(path: Path) -> dict[int, dict[Sensor, Pose | None]]:
     rigs = {}
-    for _ in reader.records("rig", _U32_PAIR.size):
-        rig_id, count = reader.unpack(_U32_PAIR)
-        reader.parts = f"{count} sensors"
-        sensors: dict[Sensor, Pose | None] = {}
-        if count:
-            sensors[_sensor(reader)] = IDENTITY
-        for _ in range(count - 1):
-            sensor = _sensor(reader)
-            (known,) = reader.unpack(_FLAG)
-            sensors[sensor] = reader.unpack(_POSE) if known else None
-        rigs[rig_id] = sensors
+    with _records_of(path) as reader:
+        for _ in reader.records("rig", _U32_PAIR.size):
+            rig_id, count = reader.unpack(_U32_PAIR)
+            reader.parts = f"{count} sensors"
+            sensors: dict[Sensor, Pose | None] = {}
+            if count:
+                sensors[_sensor(reader)] = IDENTITY
+            for _ in range(count - 1):
+                sensor = _sensor(reader)
+                (known,) = reader.unpack(_FLAG)
+                sensors[sensor] = reader.unpack(_POSE) if known else None
+            rigs[rig_id] = sensors
     return rigs
 
 
-def _walk_frames(reader: _Reader) -> tuple[RawFrame, ...]:
+def _read_frames(path: Path) -> tuple[RawFrame, ...]:
     frames = []
-    for _ in reader.records("frame", _U32_PAIR.size + _POSE.size + _U32.size):
-        frame_id, rig_id = reader.unpack(_U32_PAIR)
-        pose = reader.unpack(_POSE)
-        (count,) = reader.unpack(_U32)
-        reader.parts = f"{count} images"
-        data = tuple((_sensor(reader), reader.unpack(_COUNT)[0]) for _ in range(count))
-        frames.append(RawFrame(frame_id, rig_id, pose, data))
+    with _records_of(path) as reader:
+        for _ in reader.records("frame", _U32_PAIR.size + _POSE.size + _U32.size):
+            frame_id, rig_id = reader.unpack(_U32_PAIR)
+            pose = reader.unpack(_POSE)
+            (count,) = reader.unpack(_U32)
+            reader.parts = f"{count} images"
+            data = tuple((_sensor(reader), reader.unpack(_COUNT)[0]) for _ in range(count))
+            frames.append(RawFrame(frame_id, rig_id, pose, data))
     return tuple(frames)
 
 
 def _sensor(reader: _Reader) -> Sensor:
     kind, sensor_id = reader.unpack(_SENSOR)
     return kind, sensor_id
-
-
-def _walk_points(reader: _Reader) -> RawPoints:
-    """One step per record, as each states only its own length; all else in whole columns."""
-    begin = np.array(_point_offsets(reader), np.int64)
-    lengths = (np.diff(begin) - POINT_HEAD.itemsize) // _TRACK_BYTES
-    return _gather_points(reader.data, begin[:-1], lengths)
 
 
 def _point_offsets(reader: _Reader) -> list[int]:

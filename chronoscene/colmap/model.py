@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -67,19 +67,17 @@ def read_raw_model(folder: Path) -> RawModel:
     Never raises for what is in the files.
     """
     files = model_files(folder)
-    readers: dict[str, Callable[[Path], Any]] = {
-        "cameras.bin": binary.read_cameras,
-        "images.bin": binary.read_images,
-        "points3D.bin": binary.read_points,
-        "cameras.txt": text.read_cameras,
-        "images.txt": text.read_images,
-        "points3D.txt": text.read_points,
-    }
     parts: dict[str, Any] = {}
     damages: list[Damage] = []
     for stem, file in files.items():
+        form: Any = text if file.endswith(".txt") else binary
+        read = {
+            "cameras": form.read_cameras,
+            "images": form.read_images,
+            "points3D": form.read_points,
+        }[stem]
         try:
-            parts[stem] = readers[file](folder / file)
+            parts[stem] = read(folder / file)
         except DamagedError as error:
             damages.extend(error.damages)
         except (OSError, SceneError) as error:
@@ -136,11 +134,8 @@ def read_poses(folder: Path, images: RawImages) -> tuple[PosedImage, ...]:
     """Registered images of a binary model as COLMAP understands them, sorted by name.
 
     pycolmap checks everything that a pose depends on: cameras, rigs, frames, names. It gets the
-    model without points and keypoints, which takes a fraction of the time.
-
-    Args:
-        folder: Of the model.
-        images: What its ``images.bin`` says.
+    model without points and keypoints, which takes a fraction of the time. ``images`` is what
+    ``images.bin`` says.
 
     Raises:
         SceneError: If pycolmap refuses the model, or an id or a name occurs twice.
@@ -154,11 +149,7 @@ def read_poses(folder: Path, images: RawImages) -> tuple[PosedImage, ...]:
 
 
 def read_reconstruction(folder: Path, *, place: Path | None = None) -> pycolmap.Reconstruction:
-    """Read a model as a pycolmap object.
-
-    Args:
-        folder: Of the model.
-        place: What an error names instead.
+    """Read a model as a pycolmap object; an error names the folder, or ``place`` instead.
 
     Raises:
         SceneError: If pycolmap refuses it.
@@ -169,12 +160,8 @@ def read_reconstruction(folder: Path, *, place: Path | None = None) -> pycolmap.
         return pycolmap.Reconstruction(str(folder))
     except Exception as error:  # ValueError, RuntimeError, IndexError, MemoryError were all seen
         message = str(error).strip().splitlines() or [type(error).__name__]
-        raise SceneError(
-            place or folder,
-            expected="a model that COLMAP reads",
-            found=re.sub(r"^\[[^]]*\] ", "", message[-1]),
-            todo="write the model again with COLMAP",
-        ) from error
+        found = re.sub(r"^\[[^]]*\] ", "", message[-1])
+        raise _model_error(place or folder, "a model that COLMAP reads", found) from error
     finally:
         pycolmap.logging.minloglevel = level
 
@@ -215,7 +202,7 @@ def copy_poses(source: Path, folder: Path) -> int:
         folder: Binary model without rigs and frames, as `write_model` writes it.
 
     Returns:
-        The number of images that got a pose.
+        Number of images that got a pose.
     """
     old, new = read_raw_model(source).images, read_raw_model(folder)
     assert old is not None and new.cameras and new.images is not None and new.points is not None
@@ -245,26 +232,20 @@ def _checked_points(
     # One past the end stands for ids above all known ones, and for all where there are none.
     lost = np.append(known, -1)[slot] != image
     if lost.any():
-        raise _model_error(
-            folder, "tracks over images of the model", f"image {image[lost].min()}, which it lacks"
-        )
+        found = f"image {image[lost].min()}, which it lacks"
+        raise _model_error(folder, "tracks over images of the model", found)
     row = order[slot]
     lengths = np.diff(raw.keypoint_start)[row]
     wrong = np.flatnonzero((keypoint < 0) | (keypoint >= lengths))
     if len(wrong):
         i = wrong[0]
-        raise _model_error(
-            folder,
-            "tracks over keypoints of the images",
-            f"keypoint {keypoint[i]} of image {image[i]}, which has {lengths[i]}",
-        )
+        found = f"keypoint {keypoint[i]} of image {image[i]}, which has {lengths[i]}"
+        raise _model_error(folder, "tracks over keypoints of the images", found)
     index = {posed.image_id: i for i, posed in enumerate(images)}
     frame = np.array([index.get(i, -1) for i in raw.ids.tolist()], np.int32)[row]
     if (frame < 0).any():
-        lost_id = image[frame < 0][0]
-        raise _model_error(
-            folder, "tracks over registered images", f"image {lost_id} without a pose"
-        )
+        found = f"image {image[frame < 0][0]} without a pose"
+        raise _model_error(folder, "tracks over registered images", found)
     return Points(
         ids=points.ids,
         xyz=points.xyz,

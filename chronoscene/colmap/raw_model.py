@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.scene import Camera
-from chronoscene.scene.tracks import select_tracks
+from chronoscene.scene.scene import PointTable
 
 MODEL_FILES = ("cameras", "images", "points3D")
 """Stems of the files that every model has."""
@@ -50,43 +50,13 @@ class RawImages:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RawPoints:
-    """Sparse points sorted by id (P points, M observations)."""
+class RawPoints(PointTable):
+    """Sparse points sorted by id, with tracks over what the model calls images and keypoints."""
 
-    ids: NDArray[np.int64]
-    """[P]"""
-    xyz: NDArray[np.float64]
-    """World units. [P, 3]"""
-    rgb: NDArray[np.uint8]
-    """[P, 3]"""
-    error: NDArray[np.float64]
-    """As stored, in pixels. [P]"""
-    track_start: NDArray[np.int64]
-    """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
     track_image: NDArray[np.int64]
     """Image id. [M]"""
     track_keypoint: NDArray[np.int64]
     """Index among the keypoints of the image. [M]"""
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def select(self, keep: NDArray[np.bool_]) -> RawPoints:
-        """Some of the points, in the same order, each with all of its observations.
-
-        Args:
-            keep: Which points. [P]
-        """
-        track_start, observed = select_tracks(self.track_start, keep)
-        return RawPoints(
-            ids=self.ids[keep],
-            xyz=self.xyz[keep],
-            rgb=self.rgb[keep],
-            error=self.error[keep],
-            track_start=track_start,
-            track_image=self.track_image[observed],
-            track_keypoint=self.track_keypoint[observed],
-        )
 
 
 Pose = tuple[float, ...]

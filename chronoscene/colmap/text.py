@@ -61,7 +61,7 @@ def read_cameras(path: Path) -> tuple[Camera, ...]:
         if isinstance(camera, Camera):
             cameras.append(camera)
         else:
-            damages.append(Damage(f"{path.name}:{number}", camera, quote(line)))
+            damages.append(_damage(path, (number, line), camera))
     _raise_any(damages)
     return tuple(cameras)
 
@@ -99,16 +99,13 @@ def read_images(path: Path) -> RawImages:
             heads.append([ids[0], *map(float, fields[1:8]), ids[1]])
             names.append(fields[9])
         except (ValueError, IndexError, OverflowError):
-            damages.append(Damage(f"{path.name}:{number}", _IMAGE_LINE, quote(line)))
+            damages.append(_damage(path, (number, line), _IMAGE_LINE))
     values, lengths = _numbers(path, keypoint_lines, _KEYPOINT_LINE, lambda n: n % 3 == 0, damages)
     _raise_any(damages)
     infinite = np.flatnonzero(~np.isfinite(values))
-    for row in np.unique(np.searchsorted(np.cumsum(lengths), infinite, "right")):
-        number, line = keypoint_lines[row]  # COLMAP stops reading there
-        damages.append(
-            Damage(f"{path.name}:{number}", "finite positions of keypoints", quote(line))
-        )
-    _raise_any(damages)
+    rows = np.unique(np.searchsorted(np.cumsum(lengths), infinite, "right"))
+    finite = "finite positions of keypoints"  # COLMAP stops reading elsewhere
+    _raise_any([_damage(path, keypoint_lines[row], finite) for row in rows])
     table = np.array(heads, np.float64).reshape(-1, 9)
     keypoints = values.reshape(-1, 3)
     return RawImages(
@@ -136,10 +133,9 @@ def read_points(path: Path) -> RawPoints:
     start = np.concatenate([[0], np.cumsum(lengths)])
     heads = values[start[:-1, None] + np.arange(8)]
     rgb = heads[:, 4:7]
-    for row in np.flatnonzero(~((rgb >= 0) & (rgb <= 255) & (rgb == np.floor(rgb))).all(axis=1)):
-        number, line = lines[row]
-        damages.append(Damage(f"{path.name}:{number}", "a colour of three 0..255", quote(line)))
-    _raise_any(damages)
+    is_colour = ((rgb >= 0) & (rgb <= 255) & (rgb == np.floor(rgb))).all(axis=1)
+    bad = np.flatnonzero(~is_colour)
+    _raise_any([_damage(path, lines[row], "a colour of three 0..255") for row in bad])
     order = np.argsort(heads[:, 0], kind="stable")
     ids = _integers(heads[order, 0])
     if len(twice := ids[1:][ids[1:] == ids[:-1]]):
@@ -236,9 +232,7 @@ def _numbers(
             bad = [i for i, count in enumerate(counts) if not fits(count)]
         except ValueError:
             bad = [i for i, row in enumerate(fields) if not (fits(len(row)) and _all_numbers(row))]
-        for i in bad:
-            number, line = block[i]
-            damages.append(Damage(f"{path.name}:{number}", expected, quote(line)))
+        damages.extend(_damage(path, block[i], expected) for i in bad)
         lengths.append(np.array(counts, np.int64))
     return np.concatenate(blocks), np.concatenate(lengths)
 
@@ -255,6 +249,10 @@ def _all_numbers(fields: Sequence[str]) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _damage(path: Path, line: Line, expected: str) -> Damage:
+    return Damage(f"{path.name}:{line[0]}", expected, quote(line[1]))
 
 
 def _raise_any(damages: list[Damage]) -> None:

@@ -40,14 +40,9 @@ def write_raw_model(
 
 
 def write_without_observations(source: Path, images: RawImages, folder: Path) -> None:
-    """Write a binary model with the cameras, rigs, frames and poses of another, and no points.
+    """Write the binary model ``source``, which has ``images``, without keypoints and points.
 
     pycolmap reads it in a fraction of the time.
-
-    Args:
-        source: Folder of the other model, of which cameras, rigs and frames are copied.
-        images: Its images.
-        folder: Exists.
     """
     for file in ("cameras.bin", "rigs.bin", "frames.bin"):
         if (source / file).is_file():

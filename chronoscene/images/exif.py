@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from PIL import Image
 
@@ -30,7 +30,6 @@ _EXIF, _APP1, _START_OF_SCAN = b"Exif\0\0", 0xE1, 0xDA
 _SHORT, _LONG = 3, 4
 
 MAX_XMP_BYTES = 1_000_000
-
 MAX_NAME_LENGTH = 100
 
 MIN_YEAR = 1990
@@ -48,15 +47,6 @@ class DroneData:
 
     relative_altitude: float | None = None
     """Metres above the take-off point, by barometer."""
-    absolute_altitude: float | None = None
-    """Metres."""
-    gimbal_yaw: float | None = None
-    """Degrees from north, clockwise."""
-    gimbal_pitch: float | None = None
-    """Degrees; -90 looks straight down."""
-    gimbal_roll: float | None = None
-    rtk_flag: int | None = None
-    """50 for a fixed solution, 34 for a floating one, 16 for none, 0 for a failure."""
     rtk_std: tuple[float, float, float] | None = None
     """Standard deviations of longitude, latitude and height in metres."""
 
@@ -72,9 +62,7 @@ class ExifData:
     longitude: float | None = None
     """Degrees, east positive (WGS 84)."""
     altitude: float | None = None
-    """Metres, below the reference negative."""
-    altitude_ref: Literal["above", "below"] | None = None
-    """As stated; whether the reference is the sea or the ellipsoid differs from maker to maker."""
+    """Metres, negative below the reference: the sea or the ellipsoid, which the maker decides."""
     focal_mm: float | None = None
     focal_35mm: float | None = None
     """Focal length on 36 x 24 mm film with the same view, in millimetres."""
@@ -140,7 +128,6 @@ def _parse(
         latitude=latitude,
         longitude=longitude,
         altitude=altitude if altitude is None or not below else -altitude,
-        altitude_ref=None if altitude is None else "below" if below else "above",
         focal_mm=_positive(exif.get(_FOCAL)),
         focal_35mm=_positive(exif.get(_FOCAL_35)),
         make=_text(main.get(_MAKE)),
@@ -167,11 +154,6 @@ def _drone(xmp: Any) -> DroneData | None:
     known = [deviation for deviation in deviations if deviation is not None]
     return DroneData(
         relative_altitude=value("RelativeAltitude"),
-        absolute_altitude=value("AbsoluteAltitude"),
-        gimbal_yaw=value("GimbalYawDegree"),
-        gimbal_pitch=value("GimbalPitchDegree"),
-        gimbal_roll=value("GimbalRollDegree"),
-        rtk_flag=_integer(value("RtkFlag")),
         rtk_std=(known[0], known[1], known[2]) if len(known) == 3 else None,
     )
 

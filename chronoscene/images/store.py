@@ -16,15 +16,14 @@ import struct
 import threading
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ImageError, SceneError
@@ -42,7 +41,6 @@ IMAGE_SOURCES: tuple[ImageSource, ...] = ("copy", "link", "symlink", "none")
 Progress = Callable[[int, int], None]
 """Called with the number of images done and their total."""
 
-_ORIENTATION_TAG = 0x0112
 _UNDO_ORIENTATION = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -87,7 +85,7 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     Raises:
         SceneError: If the model has no focal length in pixels.
     """
-    if (width, height) == (camera.width, camera.height):
+    if (width, height) == camera.size:
         return camera
     model, params = camera.model, camera.params
     if model == "EQUIRECTANGULAR":
@@ -154,7 +152,7 @@ def load_rgb(
 
 
 def _orientation(image: Image.Image) -> int:
-    value = image.getexif().get(_ORIENTATION_TAG, 1)
+    value = image.getexif().get(ExifTags.Base.Orientation, 1)
     return value if value in _UNDO_ORIENTATION else 1
 
 
@@ -235,8 +233,7 @@ class ImageStore:
 
     def camera(self, frame: Frame) -> Camera:
         """Camera of a frame at the evaluation size."""
-        camera = frame.camera
-        return resize_camera(camera, *evaluation_size(camera.width, camera.height, self._max_width))
+        return resize_camera(frame.camera, *evaluation_size(*frame.camera.size, self._max_width))
 
     def load(self, frame: Frame) -> NDArray[np.uint8]:
         """Image of a frame at the evaluation size. Shared: do not write to it.
@@ -252,23 +249,9 @@ class ImageStore:
             if image is not None:
                 self._cache.move_to_end(frame.name)
                 return image
-        camera = frame.camera
-        image = load_rgb(
-            self._scene.image_path(frame),
-            size=evaluation_size(camera.width, camera.height, self._max_width),
-            background=self._background,
-        )
-        return self._keep(frame.name, image)
-
-    def warm(self, frames: Iterable[Frame], *, threads: int = 2) -> None:
-        """Decode frames ahead of time, until the cache is full."""
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(self._load_if_room, frames))
-
-    def _load_if_room(self, frame: Frame) -> None:
-        width, height = evaluation_size(frame.camera.width, frame.camera.height, self._max_width)
-        if self._bytes + 3 * width * height <= self._limit:
-            self.load(frame)
+        size = evaluation_size(*frame.camera.size, self._max_width)
+        path = self._scene.image_path(frame)
+        return self._keep(frame.name, load_rgb(path, size=size, background=self._background))
 
     def _keep(self, name: str, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Put an image into the cache; another thread may have been faster."""

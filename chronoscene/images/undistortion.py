@@ -47,10 +47,7 @@ class CameraChange:
     @property
     def is_copy(self) -> bool:
         """Whether pixels stay as they are."""
-        same_size = (self.source.width, self.source.height) == (
-            self.target.width,
-            self.target.height,
-        )
+        same_size = self.source.size == self.target.size
         same_K = np.array_equal(self.source.K, self.target.K)
         return self.source.is_pinhole and same_size and same_K
 
@@ -121,11 +118,9 @@ def move_observations(scene: Scene, changes: list[CameraChange]) -> tuple[Scene,
     rows_of = by_image(points.track_frame, len(scene.frames))
     frames: list[Frame] = []
     for frame, change, mine in zip(scene.frames, changes, rows_of, strict=True):
-        size = np.array([frame.camera.width, frame.camera.height])
-        file_size = np.array([change.source.width, change.source.height])
-        xy[mine] = move_pixels(change, points.track_xy[mine] * (file_size / size))
-        limits = np.array([change.target.width, change.target.height])
-        inside[mine] = ((xy[mine] >= 0) & (xy[mine] <= limits)).all(axis=1)
+        ratio = np.divide(change.source.size, frame.camera.size)
+        xy[mine] = move_pixels(change, points.track_xy[mine] * ratio)
+        inside[mine] = ((xy[mine] >= 0) & (xy[mine] <= change.target.size)).all(axis=1)
         frames.append(replace(frame, camera=change.target))
     rank = np.arange(len(frames), dtype=np.int32)
     moved = replace(points, track_xy=xy).select_observations(inside, rank)

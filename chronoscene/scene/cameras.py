@@ -95,6 +95,11 @@ class Camera:
     """In COLMAP's order: ``f, cx, cy, ...`` or ``fx, fy, cx, cy, ...``."""
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height."""
+        return self.width, self.height
+
+    @property
     def K(self) -> Array:
         """Calibration matrix with unequal fx, fy and the principal point kept. [3, 3]"""
         single_focal = CAMERA_MODELS[self.model].num_focals == 1

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +31,11 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Points:
-    """Sparse points with their tracks, as flat arrays (P points, M observations)."""
+class PointTable:
+    """Sparse points with their tracks, as flat arrays (P points, M observations).
+
+    Subclasses add ``track_*`` columns, which say what the observations refer to. [M]
+    """
 
     ids: NDArray[np.int64]
     """COLMAP's point ids. [P]"""
@@ -44,13 +47,27 @@ class Points:
     """Mean reprojection error in pixels as stored in the model. [P]"""
     track_start: NDArray[np.int64]
     """Observations of point i are ``track_start[i]:track_start[i + 1]``. [P + 1]"""
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, keep: NDArray[np.bool_]) -> Self:
+        """Some of the points [P], in the same order, each with all of its observations."""
+        track_start, observed = select_tracks(self.track_start, keep)
+        of_points = {name: getattr(self, name)[keep] for name in ("ids", "xyz", "rgb", "error")}
+        added = [f.name for f in fields(self) if f.name not in (*of_points, "track_start")]
+        of_tracks = {name: getattr(self, name)[observed] for name in added}
+        return replace(self, **of_points, track_start=track_start, **of_tracks)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points(PointTable):
+    """Sparse points of a scene."""
+
     track_frame: NDArray[np.int32]
     """Index into ``Scene.frames``. [M]"""
     track_xy: NDArray[np.float64]
     """Pixel position of the observation. [M, 2]"""
-
-    def __len__(self) -> int:
-        return len(self.xyz)
 
     @classmethod
     def empty(cls) -> Points:
@@ -62,23 +79,6 @@ class Points:
             track_start=np.zeros(1, np.int64),
             track_frame=np.zeros(0, np.int32),
             track_xy=np.zeros((0, 2)),
-        )
-
-    def select(self, keep: NDArray[np.bool_]) -> Points:
-        """Some of the points, in the same order, each with all of its observations.
-
-        Args:
-            keep: Which points. [P]
-        """
-        track_start, observed = select_tracks(self.track_start, keep)
-        return Points(
-            ids=self.ids[keep],
-            xyz=self.xyz[keep],
-            rgb=self.rgb[keep],
-            error=self.error[keep],
-            track_start=track_start,
-            track_frame=self.track_frame[observed],
-            track_xy=self.track_xy[observed],
         )
 
     def select_observations(self, keep: NDArray[np.bool_], rank: NDArray[np.int32]) -> Points:

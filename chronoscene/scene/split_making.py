@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 from scipy.spatial import cKDTree
 
 from chronoscene.errors import ConfigError, SceneError
@@ -34,14 +34,7 @@ from chronoscene.scene.splits import split_hash, split_of
 
 Strategy = Literal["stratified", "blocked", "date", "periods"]
 
-STRATEGIES: tuple[Strategy, ...] = ("stratified", "blocked", "date", "periods")
-
 FRACTION = 1 / 8
-
-_EXIF_IFD = 0x8769
-
-_CAPTURE_TAGS = (0x9003, 0x9004)
-"""DateTimeOriginal, DateTimeDigitized."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +104,7 @@ def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
     _check(settings)
     if settings.strategy == "blocked" and settings.seed is None:
         settings = replace(settings, seed=0)
-    tests = _CHOOSE[settings.strategy](scene, settings)
+    tests = STRATEGIES[settings.strategy](scene, settings)
     if len(tests) == len(scene.frames):
         raise ConfigError(
             "split", expected="training images", found="none left", todo="hold out fewer images"
@@ -155,12 +148,13 @@ def _check(settings: SplitSettings) -> None:
         raise ConfigError(place, expected=expected, found=str(found), todo="give another value")
 
 
-_CHOOSE: Mapping[Strategy, Callable[[Scene, SplitSettings], set[str]]] = {
+STRATEGIES: Mapping[Strategy, Callable[[Scene, SplitSettings], set[str]]] = {
     "stratified": lambda scene, s: stratified(scene, s.fraction, s.offset, s.seed),
     "blocked": lambda scene, s: blocked(scene, s.fraction, s.blocks, s.seed or 0),
     "date": lambda scene, s: latest(scene, s.fraction),
     "periods": lambda scene, s: whole_periods(scene, s.periods),
 }
+"""By name, what chooses the test images of a scene."""
 
 
 def _distances(scene: Scene, *, same_period: bool) -> tuple[float, float] | None:
@@ -211,12 +205,6 @@ def whole_periods(scene: Scene, periods: tuple[int, ...]) -> set[str]:
 def blocked(scene: Scene, fraction: float, blocks: int | None, seed: int) -> set[str]:
     """The images of whole blocks of camera positions.
 
-    Args:
-        scene: Any scene.
-        fraction: Share of the blocks used for testing.
-        blocks: Number of blocks; None for two test blocks.
-        seed: Chooses the test blocks.
-
     Raises:
         ConfigError: If there are more blocks than images.
     """
@@ -230,9 +218,8 @@ def blocked(scene: Scene, fraction: float, blocks: int | None, seed: int) -> set
             todo="ask for fewer blocks",
         )
     block = cut_into_blocks(centres, count)
-    periods = scene.frame_periods
     wanted = max(1, round(fraction * count))
-    chosen = choose_blocks(block, periods, wanted, seed)
+    chosen = choose_blocks(block, scene.frame_periods, wanted, seed)
     return {f.name for f, b in zip(scene.frames, block.tolist(), strict=True) if b in chosen}
 
 
@@ -267,12 +254,7 @@ def choose_blocks(
 
     Ties are broken by a random order. No block is taken that would leave a period without
     training images. More than ``wanted`` are taken only while a period has no test image.
-
-    Args:
-        block: Block of each image. [N]
-        periods: Period of each image. [N]
-        wanted: Number of blocks.
-        seed: Seed of the random order.
+    Blocks and periods are those of each image. [N]
     """
     order = np.random.default_rng(seed).permutation(int(block.max()) + 1)
     kinds, period = np.unique(periods, return_inverse=True)
@@ -343,10 +325,10 @@ def capture_times(scene: Scene) -> dict[str, datetime]:
 def _capture_time(path: Path) -> datetime | None:
     try:
         with Image.open(path) as image:
-            exif = image.getexif().get_ifd(_EXIF_IFD)
+            exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
     except Exception:  # Pillow raises anything for damaged EXIF; the name may still have a date
         exif = {}
-    for tag in _CAPTURE_TAGS:
+    for tag in (ExifTags.Base.DateTimeOriginal, ExifTags.Base.DateTimeDigitized):
         try:
             return datetime.strptime(str(exif.get(tag, "")).strip("\0 "), "%Y:%m:%d %H:%M:%S")
         except ValueError:

@@ -109,13 +109,11 @@ def parse_split_text(text: str) -> tuple[list[SplitEntry], list[Problem]]:
     for number, line in _lines(text):
         fields = line.rsplit(maxsplit=1)
         if len(fields) < 2:
-            problems.append(
-                _problem("fields", number, '"<image name> <period id>"', f"one field: {line!r}")
-            )
+            expected = '"<image name> <period id>"'
+            problems.append(_problem("fields", number, expected, f"one field: {line!r}"))
         elif not re.fullmatch("[0-9]{1,9}", fields[1]):
-            problems.append(
-                _problem("period", number, "a period id 0, 1, ... as the last field", f"{line!r}")
-            )
+            expected = "a period id 0, 1, ... as the last field"
+            problems.append(_problem("period", number, expected, repr(line)))
         else:
             entries.append(SplitEntry(number, fields[0].strip(), int(fields[1])))
     return entries, problems
@@ -157,8 +155,7 @@ class NameIndex:
 
     def __init__(self, names: Iterable[str]) -> None:
         self.names = tuple(names)
-        flat = not any("/" in name for name in self.names)
-        self._flat = flat
+        self._flat = not any("/" in name for name in self.names)
         self._levels: tuple[dict[str, list[str]], ...] = ({}, {}, {}, {})
         for name in self.names:
             for level, keys in zip(self._levels, _image_keys(name), strict=True):
@@ -212,11 +209,8 @@ def assign_periods(
     index = NameIndex(names)
     periods: dict[str, int] = {}
     lines: dict[str, int] = {}
-    problems: list[Problem] = []
-    for entry in entries:
-        problem = _place(entry, index.find(entry.name), periods, lines)
-        if problem is not None:
-            problems.append(problem)
+    placed = [_place(entry, index.find(entry.name), periods, lines) for entry in entries]
+    problems = [problem for problem in placed if problem is not None]
     problems += [
         _problem("missing", None, f"a period for every registered image, {name!r} too", "none")
         for name in names
@@ -236,13 +230,10 @@ def _place(
         periods[name], lines[name] = entry.period, entry.line
         return None
     if periods[name] != entry.period:
-        return Problem(
-            "contradiction",
-            entry.line,
-            f"period {periods[name]} for {name!r} as in line {lines[name]}",
-            f"period {entry.period}",
-            "keep one of the two lines",
-        )
+        expected = f"period {periods[name]} for {name!r} as in line {lines[name]}"
+        found_period = f"period {entry.period}"
+        todo = "keep one of the two lines"
+        return Problem("contradiction", entry.line, expected, found_period, todo)
     return _problem("duplicate", entry.line, "each image once", f"{name!r} as in {lines[name]}")
 
 
@@ -250,13 +241,9 @@ def _not_one(entry: SplitEntry | NameEntry, found: list[str]) -> Problem:
     """The problem of a name that matches no image, or several."""
     if not found:
         return _problem("unknown", entry.line, "the name of a registered image", repr(entry.name))
-    return Problem(
-        "ambiguous",
-        entry.line,
-        "a name that matches one image",
-        f"{entry.name!r}, which matches {', '.join(map(repr, found[:3]))}",
-        "write the full names below images/",
-    )
+    several = f"{entry.name!r}, which matches {', '.join(map(repr, found[:3]))}"
+    todo = "write the full names below images/"
+    return Problem("ambiguous", entry.line, "a name that matches one image", several, todo)
 
 
 def check_period_ids(entries: Iterable[SplitEntry], used: Iterable[int]) -> list[Problem]:
@@ -266,23 +253,11 @@ def check_period_ids(entries: Iterable[SplitEntry], used: Iterable[int]) -> list
         return [_problem("ids", None, "at least one line", "none")]
     if ids != list(range(len(ids))):
         shown = ", ".join(map(str, ids[:10])) + (", ..." if len(ids) > 10 else "")
-        return [
-            Problem(
-                "ids",
-                None,
-                f"period ids 0..{len(ids) - 1} for {len(ids)} periods",
-                shown,
-                "number the periods from 0 without gaps",
-            )
-        ]
+        expected = f"period ids 0..{len(ids) - 1} for {len(ids)} periods"
+        return [Problem("ids", None, expected, shown, "number the periods from 0 without gaps")]
+    todo = "register images of this period, or renumber the others"
     return [
-        Problem(
-            "empty",
-            None,
-            f"a registered image of period {i}",
-            "none",
-            "register images of this period, or renumber the others",
-        )
+        Problem("empty", None, f"a registered image of period {i}", "none", todo)
         for i in ids
         if i not in used
     ]

@@ -267,14 +267,6 @@ def test_a_store_without_cache_still_loads(scene):
     assert store.cached_bytes == 0
 
 
-def test_warm_stops_when_the_cache_is_full(scene):
-    store = ImageStore(scene, memory_limit=3 * IMAGE_BYTES)
-    store.warm(scene.frames, threads=1)
-    assert store.cached_bytes == 3 * IMAGE_BYTES
-    first = store.load(scene.frames[0])
-    assert store.load(scene.frames[0]) is first
-
-
 def test_many_threads(scene):
     truth = {f.name: np.array(Image.open(scene.image_path(f))) for f in scene.frames}
     store = ImageStore(scene, memory_limit=3 * IMAGE_BYTES)
