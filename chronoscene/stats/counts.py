@@ -224,9 +224,7 @@ def format_counts(
 
 
 def document(
-    scenes: Sequence[dict[str, Any]],
-    counts: Sequence[SceneCount],
-    unreadable: Sequence[Unreadable],
+    scenes: Sequence[dict[str, Any]], counts: Sequence[SceneCount], unreadable: Sequence[Unreadable]
 ) -> str:
     """JSON of some scenes. Keys are only added; the version changes when one changes meaning."""
     data = {

@@ -129,11 +129,7 @@ def _csv(statistics: Sequence[SceneStatistics]) -> str:
 def _scene_item(statistics: SceneStatistics) -> dict[str, Any]:
     item = asdict(statistics.counts) | asdict(statistics.whole)
     periods = zip(
-        item["periods"],
-        statistics.periods,
-        statistics.overlap,
-        statistics.in_view,
-        strict=True,
+        item["periods"], statistics.periods, statistics.overlap, statistics.in_view, strict=True
     )
     item["periods"] = [
         count | asdict(measures) | {"overlap": list(overlap), "in_view": list(in_view)}
