@@ -14,12 +14,12 @@ from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted, printable
 from chronoscene.kernels.runtime import keep_freed_memory
-from chronoscene.validation.finding import SceneReport, is_valid
 from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.report.html import write_html
 from chronoscene.validation.report.json import write_json, write_sarif
 from chronoscene.validation.report.rule_list import describe_rule
 from chronoscene.validation.report.text import write_text
+from chronoscene.validation.rule import SceneReport, is_valid
 from chronoscene.validation.rules import choose_rules
 from chronoscene.validation.run import find_folders, lost_report, validate_scene
 from chronoscene.validation.scene_folder import Track, no_progress

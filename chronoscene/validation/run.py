@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -11,24 +12,27 @@ from pathlib import Path
 
 import numpy as np
 
+from chronoscene import formats
 from chronoscene.colmap.raw_model import model_files
-from chronoscene.errors import SceneError
+from chronoscene.convert import remarks_on
+from chronoscene.errors import ChronoSceneError, SceneError
+from chronoscene.formats import chronoscene as our_format
+from chronoscene.images.store import place_image
 from chronoscene.io.wording import printable
 from chronoscene.validation.checks.reprojection import period_errors
-from chronoscene.validation.finding import (
+from chronoscene.validation.rule import (
     SEVERITIES,
     Finding,
     Hit,
     PeriodSummary,
+    Rule,
     SceneReport,
     Skipped,
     Summary,
 )
-from chronoscene.validation.other_formats import in_our_format, other_format
-from chronoscene.validation.rule import Rule
 from chronoscene.validation.rules import all_rules
 from chronoscene.validation.rules.cs0_folder import RULES_ON_ORIGINS
-from chronoscene.validation.scene_folder import RawScene, Track, no_progress
+from chronoscene.validation.scene_folder import Origin, RawScene, Track, no_progress
 
 RULE_FAILED = "CS000"
 """Code of the finding that a rule itself failed: a bug of ours, reported as such."""
@@ -70,6 +74,43 @@ def find_folders(path: Path) -> list[Path]:
 def _looks_like_scene(path: Path) -> bool:
     ours = any((path / name).is_dir() for name in ("sparse", "images")) or bool(model_files(path))
     return ours or other_format(path) is not None
+
+
+def other_format(path: Path) -> str | None:
+    """The format of a folder that is certainly not in the ChronoScene format, else None.
+
+    A model in ``sparse/0/`` without ``split.txt`` counts as a faulty ChronoScene folder: its images
+    may be in subfolders for other reasons than periods.
+    """
+    if our_format.matches(path) or model_files(path / our_format.MODEL):
+        return None
+    try:
+        return formats.detect_format(path)
+    except (ChronoSceneError, OSError):
+        return None
+
+
+@contextmanager
+def in_our_format(path: Path) -> Iterator[tuple[Path, Origin | None]]:
+    """The folder itself, or a temporary ChronoScene folder of the same scene and its origin."""
+    name = other_format(path)
+    if name is None:
+        yield path, None
+        return
+    with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
+        ours = Path(temporary) / "scene"
+        try:
+            scene = formats.read_scene(path, format=name)
+            our_format.write(scene, ours, image_source="none")
+            (ours / "images").mkdir(exist_ok=True)
+            for frame in scene.frames:
+                source = scene.image_path(frame)
+                if source.is_file():
+                    place_image(source, ours / "images" / frame.name, "symlink")
+            origin = Origin(name, remarks=tuple(remarks_on(scene)))
+        except ChronoSceneError as error:
+            origin = Origin(name, error)
+        yield path if origin.error else ours, origin
 
 
 def validate_scene(
@@ -117,15 +158,19 @@ def _validate(scene: RawScene, rules: Sequence[Rule]) -> SceneReport:
                 continue
             findings.extend(_finding(rule, hit) for hit in rule.hits(scene))
         except Exception as error:  # a bug of ours must not hide what other rules find
-            findings.append(_failure(rule, error))
+            found = printable(f"{type(error).__name__}: {error}")
+            expected, todo = (
+                "a rule that runs on every scene",
+                "report this bug; the scene is not at fault",
+            )
+            findings.append(_failure(f"rule {rule.code}", expected, found, todo))
+    try:
+        summary = _summarise(scene)
+    except Exception:  # the rules that need the same part have said so
+        summary = UNKNOWN
     findings.sort(key=lambda f: (SEVERITIES.index(f.severity), f.code))
-    return SceneReport(
-        name=printable(scene.name),
-        path=scene.root,
-        summary=_summary(scene),
-        findings=tuple(findings),
-        skipped=tuple(sorted(skipped, key=lambda s: s.code)),
-    )
+    skipped.sort(key=lambda s: s.code)
+    return SceneReport(printable(scene.name), scene.root, summary, tuple(findings), tuple(skipped))
 
 
 def _reason_to_skip(rule: Rule, scene: RawScene, findings: Sequence[Finding]) -> str | None:
@@ -141,39 +186,22 @@ def _reason_to_skip(rule: Rule, scene: RawScene, findings: Sequence[Finding]) ->
 
 
 def _finding(rule: Rule, hit: Hit) -> Finding:
-    return Finding(
-        code=rule.code,
-        name=rule.name,
-        severity=rule.severity,
-        place=printable(hit.place),
-        expected=printable(hit.expected),
-        found=printable(hit.found),
-        remedy=printable(hit.remedy or rule.remedy),
-        count=hit.count,
-        also=tuple(map(printable, hit.also)),
-    )
+    place, expected, found = map(printable, (hit.place, hit.expected, hit.found))
+    remedy, also = printable(hit.remedy or rule.remedy), tuple(map(printable, hit.also))
+    head = rule.code, rule.name, rule.severity
+    return Finding(*head, place, expected, found, remedy, hit.count, also)
 
 
-def _failure(rule: Rule, error: Exception) -> Finding:
-    place, expected = f"rule {rule.code}", "a rule that runs on every scene"
-    remedy = "report this bug; the scene is not at fault"
-    found = printable(f"{type(error).__name__}: {error}")
+def _failure(place: str, expected: str, found: str, remedy: str) -> Finding:
+    """A finding on ourselves, not on the scene."""
     return Finding(RULE_FAILED, "rule-failed", "error", place, expected, found, remedy, 1)
 
 
 def lost_report(path: Path) -> SceneReport:
     """The report on a scene whose process died."""
-    expected, found = "a scene that can be checked", "one whose checking process died"
-    remedy = "if memory ran out, check this scene by itself; otherwise report the bug"
-    finding = Finding(RULE_FAILED, "rule-failed", "error", ".", expected, found, remedy, 1)
+    todo = "if memory ran out, check this scene by itself; otherwise report the bug"
+    finding = _failure(".", "a scene that can be checked", "one whose checking process died", todo)
     return SceneReport(printable(path.resolve().name), path, UNKNOWN, (finding,), ())
-
-
-def _summary(scene: RawScene) -> Summary:
-    try:
-        return _summarise(scene)
-    except Exception:  # the rules that need the same part have said so
-        return UNKNOWN
 
 
 def _summarise(scene: RawScene) -> Summary:
@@ -183,21 +211,16 @@ def _summarise(scene: RawScene) -> Summary:
     # Medians are shown, but not computed, if no rule has needed the reprojections.
     reprojected = "reprojections" in vars(scene) and scene.reprojections is not None
     medians = period_errors(scene) if reprojected else {}
-    known = scene.tests is not None
+    in_periods = []
+    for period in scene.period_ids:
+        total, test = images[period], tests[period] if scene.tests is not None else None
+        train = None if test is None else total - test
+        in_periods.append(PeriodSummary(period, total, train, test, medians.get(period)))
     return Summary(
         images=None if scene.images is None else len(scene.images),
         cameras=None if scene.cameras is None else len(scene.cameras),
         points=None if scene.points is None else len(scene.points),
         observations=None if scene.points is None else len(scene.points.track_image),
         image_files=len(scene.files),
-        periods=tuple(
-            PeriodSummary(
-                period,
-                images[period],
-                images[period] - tests[period] if known else None,
-                tests[period] if known else None,
-                medians.get(period),
-            )
-            for period in scene.period_ids
-        ),
+        periods=tuple(in_periods),
     )

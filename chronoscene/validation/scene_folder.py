@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, wraps
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -25,6 +25,7 @@ from chronoscene.colmap.raw_model import (
     RawPoints,
     numbered_models,
 )
+from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST
 from chronoscene.scene import Camera
 from chronoscene.scene.geometry import rotation_from_quaternion
@@ -56,7 +57,6 @@ from chronoscene.validation.checks.pixels import (
     read_headers,
     read_pixels,
 )
-from chronoscene.validation.other_formats import Origin
 
 T = TypeVar("T")
 Track = Callable[[Sequence[T], str], Iterable[T]]
@@ -98,31 +98,30 @@ class TextFile:
     text: str
 
 
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """The format that a scene was converted from."""
+
+    format: str
+    """Name in `chronoscene.formats`."""
+    error: ChronoSceneError | None = None
+    """Why the scene cannot be read; then there is nothing to check."""
+    remarks: tuple[str, ...] = ()
+    """What the conversion leaves out."""
+
+
+@dataclass(eq=False)
 class RawScene:
     """One scene folder. Every attribute is read when it is first used, then kept."""
 
-    def __init__(
-        self,
-        root: Path,
-        *,
-        decode: bool = False,
-        track: Track = no_progress,
-        origin: Origin | None = None,
-    ) -> None:
-        """Read nothing yet.
-
-        Args:
-            root: The scene folder.
-            decode: Whether rules may decode all images.
-            track: Shows the progress of slow parts.
-            origin: The other format that the scene was converted from.
-        """
-        self.root = root
-        self.decode = decode
-        self.origin = origin
-        self._track = track
-        self.memory: dict[Callable[[RawScene], Any], Any] = {}
-        """What `derived` functions have computed of this scene."""
+    root: Path
+    decode: bool = False
+    """Whether rules may decode all images."""
+    track: Track = no_progress
+    """Shows the progress of slow parts."""
+    origin: Origin | None = None
+    memory: dict[Callable[[RawScene], Any], Any] = field(default_factory=dict, init=False)
+    """What `derived` functions have computed of this scene."""
 
     def reason(self, attribute: str) -> str:
         """Why an attribute is None."""
@@ -335,14 +334,14 @@ class RawScene:
     @cached_property
     def digests(self) -> dict[str, bytes]:
         """SHA-256 of the present files that have the same size as another; the rest are unique."""
-        return hash_files(self.root / "images", self.present, self._track)
+        return hash_files(self.root / "images", self.present, self.track)
 
     @cached_property
     def pixels(self) -> dict[str, Pixels] | None:
         """Digests and thumbnails of the readable images, if they may be decoded."""
         if not self.decode:
             return None
-        return read_pixels(self.root / "images", self.readable, self._track)
+        return read_pixels(self.root / "images", self.readable, self.track)
 
 
 def derived(compute: Callable[[RawScene], T]) -> Callable[[RawScene], T]:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from chronoscene.colmap.model import read_reconstruction
 from chronoscene.scene.geometry import quaternion_from_rotation, rotation_from_quaternion
-from chronoscene.validation.finding import SceneReport
+from chronoscene.validation.rule import SceneReport
 from chronoscene.validation.run import validate_scene
 
 PERIODS = {f"{'ab'[period]}{i:03d}.png": period for period in (0, 1) for i in range(7)}

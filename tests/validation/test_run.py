@@ -9,8 +9,7 @@ import pytest
 
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import read_scene
-from chronoscene.validation.finding import SEVERITIES, Hit
-from chronoscene.validation.rule import Rule
+from chronoscene.validation.rule import SEVERITIES, Hit, Rule
 from chronoscene.validation.run import find_folders, validate_scene
 
 

@@ -18,7 +18,6 @@ from chronoscene.io.staging import check_outside, staged_folder, write_text_atom
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
 from chronoscene.validation.checks.names import spelling
-from chronoscene.validation.other_formats import other_format
 from chronoscene.validation.repair.contents import (
     Repair,
     plain_table,
@@ -28,7 +27,7 @@ from chronoscene.validation.repair.contents import (
 )
 from chronoscene.validation.rules.cs2_image_files import images_of_other_shape
 from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE, TEST_ELSEWHERE
-from chronoscene.validation.run import quiet_numbers
+from chronoscene.validation.run import other_format, quiet_numbers
 from chronoscene.validation.scene_folder import RawScene, TextFile, read_text_file
 
 

@@ -18,8 +18,9 @@ from PIL import Image
 from chronoscene import __version__
 from chronoscene.io.pages import render_page
 from chronoscene.validation.checks.names import is_safe
-from chronoscene.validation.finding import (
+from chronoscene.validation.rule import (
     NOTHING,
+    RULES,
     SEVERITIES,
     Finding,
     SceneReport,
@@ -27,7 +28,6 @@ from chronoscene.validation.finding import (
     counts,
     is_valid,
 )
-from chronoscene.validation.rule import RULES
 
 MAX_PICTURES = 24
 """Pictures of one scene."""

@@ -16,8 +16,15 @@ from urllib.parse import quote
 
 from chronoscene import __version__
 from chronoscene.formats.chronoscene import SPLIT
-from chronoscene.validation.finding import Finding, SceneReport, Severity, counts, is_valid
-from chronoscene.validation.rule import GROUPS, Rule
+from chronoscene.validation.rule import (
+    GROUPS,
+    Finding,
+    Rule,
+    SceneReport,
+    Severity,
+    counts,
+    is_valid,
+)
 from chronoscene.validation.rules import all_rules
 from chronoscene.validation.run import RULE_FAILED
 

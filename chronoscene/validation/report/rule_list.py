@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import click
 
-from chronoscene.validation.finding import Severity
-from chronoscene.validation.rule import GROUPS, Rule
+from chronoscene.validation.rule import GROUPS, Rule, Severity
 from chronoscene.validation.rules import all_rules
 
 COLOURS: dict[Severity, str] = {"error": "red", "warning": "yellow", "info": "cyan"}

@@ -11,8 +11,10 @@ from itertools import groupby
 import click
 
 from chronoscene.io.wording import counted
-from chronoscene.validation.finding import (
+from chronoscene.validation.report.rule_list import COLOURS
+from chronoscene.validation.rule import (
     NOTHING,
+    RULES,
     SEVERITIES,
     Finding,
     SceneReport,
@@ -20,8 +22,6 @@ from chronoscene.validation.finding import (
     counts,
     is_valid,
 )
-from chronoscene.validation.report.rule_list import COLOURS
-from chronoscene.validation.rule import RULES
 
 MAX_PLACES = 3
 """Places listed of findings that differ only in their place."""

@@ -13,7 +13,7 @@ from chronoscene.formats import chronoscene as our_format
 from chronoscene.io.wording import shown
 from chronoscene.scene import Points
 from chronoscene.validation import rule
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
 RULES_ON_ORIGINS = ("CS006", "CS007")

@@ -14,7 +14,7 @@ from chronoscene.scene.cameras import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
 from chronoscene.scene.geometry import camera_centre, rotation_from_quaternion
 from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import good_poses
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene, derived
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
 from chronoscene.validation import rule
 from chronoscene.validation.checks.names import is_portable, is_safe, spelling
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
 MAX_ID = 2**31 - 2

@@ -13,7 +13,7 @@ from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import good_poses
 from chronoscene.validation.checks.reprojection import image_errors, pose_limit
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene, derived
 
 Array = NDArray[np.float64]

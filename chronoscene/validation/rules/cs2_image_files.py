@@ -14,7 +14,7 @@ from chronoscene.scene import Camera
 from chronoscene.validation import rule
 from chronoscene.validation.checks.names import Spellings
 from chronoscene.validation.checks.pixels import Pixels
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
 KINDS = {

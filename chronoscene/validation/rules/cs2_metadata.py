@@ -24,7 +24,7 @@ from chronoscene.validation.checks.photo_metadata import (
     of_other_period,
     stated_dates,
 )
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
 SLACK = 31

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from chronoscene.io.wording import quote, shown
 from chronoscene.validation import rule
 from chronoscene.validation.checks.pixels import Pixels
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
 Array = NDArray[np.float64]

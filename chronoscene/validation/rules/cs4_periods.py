@@ -8,7 +8,7 @@ from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted
 from chronoscene.scene.splits import SplitEntry, check_period_ids
 from chronoscene.validation import rule
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs3_split import meant_in_split, names_on_bad_lines, problem_hit
 from chronoscene.validation.scene_folder import RawScene
 

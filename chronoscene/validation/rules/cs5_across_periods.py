@@ -15,7 +15,7 @@ from chronoscene.validation import rule
 from chronoscene.validation.checks.period_frames import own_frames
 from chronoscene.validation.checks.photo_metadata import fit_gps
 from chronoscene.validation.checks.reprojection import depth_percentiles
-from chronoscene.validation.finding import NOTHING, Hit
+from chronoscene.validation.rule import NOTHING, Hit
 from chronoscene.validation.scene_folder import RawScene, derived
 
 Table = NDArray[np.bool_]

@@ -12,7 +12,7 @@ from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import counted, shown
 from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import Observations
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
 MAX_SHORT = 0.01

@@ -25,7 +25,7 @@ from chronoscene.validation.checks.reprojection import (
     period_errors,
     pose_limit,
 )
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs1_poses import other_convention
 from chronoscene.validation.scene_folder import RawScene, derived
 

@@ -17,7 +17,7 @@ from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation import rule
 from chronoscene.validation.checks.pixels import THUMBNAIL, Pixels
 from chronoscene.validation.checks.reprojection import typical_depth
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene, derived
 
 SAME_PLACE = 1e-3

@@ -17,7 +17,7 @@ from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene.splits import TEST_EVERY
 from chronoscene.validation import rule
-from chronoscene.validation.finding import Hit
+from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs3_split import test_elsewhere
 from chronoscene.validation.scene_folder import RawScene, TextFile
 

@@ -7,7 +7,9 @@ import click
 import pytest
 
 from chronoscene.io.wording import counted, printable, quote, shown
-from chronoscene.validation.finding import (
+from chronoscene.validation.report.json import SCHEMA_VERSION, write_json
+from chronoscene.validation.report.text import write_text
+from chronoscene.validation.rule import (
     Finding,
     PeriodSummary,
     SceneReport,
@@ -15,8 +17,6 @@ from chronoscene.validation.finding import (
     Summary,
     counts,
 )
-from chronoscene.validation.report.json import SCHEMA_VERSION, write_json
-from chronoscene.validation.report.text import write_text
 
 
 def finding(i=0, *, code="CS201", severity="error", found="nothing", remedy="copy it"):

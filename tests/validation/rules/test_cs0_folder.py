@@ -5,9 +5,8 @@ import pytest
 from chronoscene.convert import convert
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.validation.other_formats import other_format
 from chronoscene.validation.repair.fix import fix_scene
-from chronoscene.validation.run import find_folders, validate_scene
+from chronoscene.validation.run import find_folders, other_format, validate_scene
 
 
 def test_no_images_folder(scene):
