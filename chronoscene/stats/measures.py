@@ -1,8 +1,9 @@
-"""Tracks, reprojection error, overlap, baseline and coverage of the periods of a scene."""
+"""Tracks, reprojection error, overlap, views, baseline and coverage of the periods of a scene."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 from chronoscene.scene import Scene, tracks
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.stats.counts import CountRule, SceneCount, count_scene
-from chronoscene.stats.view_overlap import in_view
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -53,7 +53,7 @@ class SceneStatistics:
     """Row a, column b: share of the points that period a sees which period b sees, too. [T, T]"""
     in_view: tuple[tuple[float | None, ...], ...]
     """Row a, column b: share of the points that period a sees which cameras of period b have in
-    view, whether b sees them or not; see `chronoscene.stats.view_overlap`. [T, T]"""
+    view, whether b sees them or not; see `in_view`. [T, T]"""
     unit: str
     """Of the world: ``metre`` or ``unknown``."""
 
@@ -67,39 +67,35 @@ def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatis
     coverage = period_coverage(scene.points.xyz, seen > 0)
     observed_in = periods[scene.points.track_frame]
     by_period = tuple(
-        Measures(
-            points_seen=int(np.count_nonzero(seen[:, p])),
-            observations=int(seen[:, p].sum()),
-            track_mean=_mean(_positive(seen[:, p])),
-            track_median=_median(_positive(seen[:, p])),
-            reprojection_error=_mean(found.residual[observed_in == p]),
-            baseline=_median(baselines[periods == p]),
-            coverage=coverage[p],
-        )
-        for p in range(scene.num_periods)
+        _measures(seen[:, p], found.residual[observed_in == p], baselines[periods == p], share)
+        for p, share in enumerate(coverage)
     )
-    length = _positive(seen.sum(axis=1))
-    whole = Measures(
-        points_seen=len(length),
-        observations=int(seen.sum()),
-        track_mean=_mean(length),
-        track_median=_median(length),
-        reprojection_error=_mean(found.residual),
-        baseline=_median(baselines),
-        coverage=None if not len(length) else 1.0,
-    )
+    length = seen.sum(axis=1)
     return SceneStatistics(
         counts=count_scene(scene, count=count),
         periods=by_period,
-        whole=whole,
+        whole=_measures(length, found.residual, baselines, 1.0 if length.any() else None),
         overlap=period_overlap(seen > 0),
         in_view=in_view(scene, seen > 0, found.depth),
         unit=scene.world.unit,
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Reprojection:
+def _measures(views: Index, residual: Array, baselines: Array, coverage: float | None) -> Measures:
+    """Measures of some frames; ``views``: how many of them see each point."""
+    length = views[views > 0]
+    return Measures(
+        points_seen=len(length),
+        observations=int(length.sum()),
+        track_mean=_mean(length),
+        track_median=_median(length),
+        reprojection_error=_mean(residual),
+        baseline=_median(baselines),
+        coverage=coverage,
+    )
+
+
+class Reprojection(NamedTuple):
     """Where the points of a scene lie for the cameras that see them."""
 
     residual: Array
@@ -118,16 +114,13 @@ def reproject(scene: Scene) -> Reprojection:
     offset, depth = tracks.reproject(
         views, points.xyz, points.track_start, points.track_frame, points.track_xy
     )
-    seen = (depth.take(rows) for rows in tracks.by_image(points.track_frame, len(views)))
-    return Reprojection(
-        residual=np.hypot(offset[:, 0], offset[:, 1]),
-        depth=depth,
-        depth_of_frame=np.array([_median_depth(d[~np.isnan(d)]) for d in seen]),
-    )
-
-
-def _median_depth(depth: Array) -> float:
-    return float(np.median(depth)) if len(depth) else np.nan
+    depth_of_frame = np.full(len(views), np.nan)
+    for frame, rows in enumerate(tracks.by_image(points.track_frame, len(views))):
+        ahead = depth.take(rows)
+        ahead = ahead[~np.isnan(ahead)]
+        if len(ahead):
+            depth_of_frame[frame] = np.median(ahead)
+    return Reprojection(np.hypot(offset[:, 0], offset[:, 1]), depth, depth_of_frame)
 
 
 def camera_baselines(scene: Scene, depths: Array) -> Array:
@@ -143,34 +136,21 @@ def camera_baselines(scene: Scene, depths: Array) -> Array:
     centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
     periods = scene.frame_periods
     nearest = np.full(len(centres), np.nan)
-    for p in range(scene.num_periods):
-        mine = np.flatnonzero(periods == p)
-        nearest[mine] = _nearest_distance(centres[mine])
+    for i, centre in enumerate(centres):
+        others = np.delete(centres, i, axis=0)[np.delete(periods, i) == periods[i]]
+        if len(others):
+            nearest[i] = np.linalg.norm(others - centre, axis=1).min()
     return nearest / depths
-
-
-def _nearest_distance(centres: Array, rows: int = 512) -> Array:
-    """Distance of each place to the nearest other one; NaN if there is none. [n, 3] -> [n]"""
-    nearest = np.full(len(centres), np.nan)
-    if len(centres) < 2:
-        return nearest
-    for begin in range(0, len(centres), rows):  # a few rows at a time: n may be thousands
-        block = slice(begin, begin + rows)
-        distance = np.linalg.norm(centres[block, None] - centres, axis=2)
-        within = np.arange(len(distance))
-        distance[within, begin + within] = np.inf
-        nearest[block] = distance.min(axis=1)
-    return nearest
 
 
 def period_overlap(seen: NDArray[np.bool_]) -> tuple[tuple[float | None, ...], ...]:
     """Share of the points of each period that each other sees, too. [P, T] -> [T, T]"""
     columns = seen.astype(np.float32)  # exact up to 16 million points
     both = (columns.T @ columns).astype(np.float64)
-    rows = []
-    for p, own in enumerate(np.diag(both)):
-        rows.append(tuple(float(n / own) if own else None for n in both[p]))
-    return tuple(rows)
+    return tuple(
+        tuple(float(n / own) if own else None for n in row)
+        for row, own in zip(both, np.diag(both), strict=True)
+    )
 
 
 def period_coverage(xyz: Array, seen: NDArray[np.bool_]) -> list[float | None]:
@@ -191,22 +171,65 @@ def period_coverage(xyz: Array, seen: NDArray[np.bool_]) -> list[float | None]:
     return [n / total for n in covered]
 
 
-def _positive(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    return counts[counts > 0]
+def in_view(
+    scene: Scene, seen: NDArray[np.bool_], depths: Array
+) -> tuple[tuple[float | None, ...], ...]:
+    """Share of the points of each period that the cameras of each have in view.
+
+    A point is in view if it lies in front of a camera, inside of its image, and not much farther
+    than what the camera's period sees. Whether something hides it is not known.
+
+    Args:
+        scene: The scene.
+        seen: Whether images of a period see a point. [P, T]
+        depths: Of every observation; NaN where there is none. [M]
+
+    Returns:
+        Row a, column b: of the points that period a sees, those that b has in view; None if a sees
+        no point. [T, T]
+    """
+    periods = seen.shape[1]
+    count = max(MAX_POINTS // periods, MIN_POINTS_PER_PERIOD)
+    chosen = [_evenly(np.flatnonzero(column), count) for column in seen.T]
+    owner = np.repeat(np.arange(periods), [len(rows) for rows in chosen])
+    views = [[(f.camera, f.cam_from_world) for f in scene.select(period=p)] for p in range(periods)]
+    ahead = np.isfinite(depths)
+    observed_in = scene.frame_periods[scene.points.track_frame]
+    reach = np.full(periods, np.nan)  # depth up to which the images of each period see
+    for period in range(periods) if ahead.any() else ():
+        mine = depths[ahead & (observed_in == period)]
+        sample = mine if len(mine) else depths[ahead]  # that of all if they see nothing
+        reach[period] = REACH_FACTOR * np.percentile(sample, DEPTH_PERCENTILE)
+    xyz = scene.points.xyz[np.concatenate(chosen)]
+    shares = tracks.common_view(xyz, owner, views, reach)
+    return tuple(tuple(None if np.isnan(x) else float(x) for x in row) for row in shares)
 
 
-def _mean(values: NDArray[np.float64] | NDArray[np.int64]) -> float | None:
+def _evenly(rows: Index, count: int) -> Index:
+    """At most ``count`` of them, evenly spread."""
+    if len(rows) <= count:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
+
+
+def _mean(values: Array | Index) -> float | None:
     values = values[np.isfinite(values)]
     return float(values.mean()) if len(values) else None
 
 
-def _median(values: NDArray[np.float64] | NDArray[np.int64]) -> float | None:
+def _median(values: Array | Index) -> float | None:
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else None
 
 
-# How far a scene extends
+# What of a scene is looked at
 
+MAX_POINTS, MIN_POINTS_PER_PERIOD = 4000, 400
+"""Points of all periods together that are looked for, and of each: a share is known to a percent or
+two."""
+DEPTH_PERCENTILE, REACH_FACTOR = 95.0, 1.5
+"""Percentile of the depths at which the images of a period see points, and how many times as far
+they could see some."""
 CORE = (10.0, 90.0)
 """Percentiles between which the middle of a scene lies, even with many outliers on every side."""
 REACH = 0.8

@@ -8,9 +8,16 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chronoscene.colmap.raw_model import CAMERA, RawFrame, RawImages, RawModel
+from chronoscene.colmap.raw_model import CAMERA, RawImages, RawModel
 from chronoscene.io.wording import counted, shown
-from chronoscene.scene.cameras import PINHOLE_MODELS, POLYNOMIAL_MODELS, Camera
+from chronoscene.scene.cameras import (
+    PINHOLE_MODELS,
+    POLYNOMIAL_MODELS,
+    Camera,
+    as_pinhole,
+    project_points,
+    unproject_pixels,
+)
 from chronoscene.scene.geometry import camera_centre, rotation_from_quaternion
 from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import good_poses
@@ -143,32 +150,14 @@ def _polynomial(scene: RawScene) -> list[Camera]:
 
 
 def displacement(camera: Camera) -> float:
-    """Largest distance in pixels by which distortion moves a pixel on the border of the image.
-
-    Source: Brown's model as in COLMAP and OpenCV, with the rational factor of FULL_OPENCV.
-    """
+    """Largest distance in pixels by which distortion moves a pixel on the border of the image."""
     along = np.linspace(0.0, 1.0, 65)
     edges = [(along, 0 * along), (along, 0 * along + 1), (0 * along, along), (0 * along + 1, along)]
-    u, v = np.concatenate(edges, axis=1) * [[camera.width], [camera.height]]
-    K = camera.K
-    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
-    with np.errstate(all="ignore"):
-        moved_x, moved_y = _distort(camera, x, y)
-        shift = np.hypot((moved_x - x) * K[0, 0], (moved_y - y) * K[1, 1])
+    pixels = np.concatenate(edges, axis=1).T * [camera.width, camera.height]
+    rays = np.ones((len(pixels), 3))
+    rays[:, :2] = unproject_pixels(as_pinhole(camera), pixels)
+    shift = np.linalg.norm(project_points(camera, rays) - pixels, axis=1)
     return float(shift.max()) if np.isfinite(shift).all() else float("inf")
-
-
-def _distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
-    given = camera.distortion
-    k1, k2, p1, p2, k3, k4, k5, k6 = (*given, *(0.0,) * (8 - len(given)))
-    r2 = x * x + y * y
-    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    factor = numerator / denominator
-    return (
-        x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * factor + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
 
 
 @rule.error(
@@ -212,7 +201,7 @@ def _contradictions(scene: RawScene) -> dict[str, set[str]]:
     cameras = {camera.camera_id for camera in scene.cameras}
     images = dict(zip(scene.images.ids.tolist(), scene.images.names, strict=True))
     camera_of = dict(zip(images, scene.images.camera_ids.tolist(), strict=False))
-    taken = Counter(image for frame in raw.frames for image in _images(frame))
+    taken = Counter(i for frame in raw.frames for (kind, _), i in frame.data if kind == CAMERA)
     return {
         "rigs of cameras in the model": {
             f"camera {i} of rig {rig}"
@@ -268,13 +257,14 @@ def rig_pose_differs(scene: RawScene, model: RawModel, images: RawImages) -> Ite
     if not triples:
         return
     index = np.array([i for i, _, _ in triples])
-    stored = np.concatenate([images.quaternions[index], images.translations[index]], axis=1)
+    stored = pose_matrices(np.column_stack([images.quaternions, images.translations])[index])
     # cam_from_world = cam_from_rig @ rig_from_world
-    composed = pose_matrices([pose for _, pose, _ in triples]) @ pose_matrices(
-        [rig_from_world for _, _, rig_from_world in triples]
-    )
+    _, cam_from_rig, rig_from_world = zip(*triples, strict=True)
+    composed = pose_matrices(cam_from_rig) @ pose_matrices(rig_from_world)
+    turned = np.linalg.norm(stored[:, :3, :3] - composed[:, :3, :3], axis=(1, 2))
+    moved = np.linalg.norm(camera_centre(stored) - camera_centre(composed), axis=1)
     extent = float(np.max(np.ptp(scene.centres[good], axis=0)))
-    same = _same_pose(pose_matrices(stored), composed, extent)
+    same = (turned <= 2 * SAME_ANGLE) & (moved <= SAME_PLACE * extent + 1e-9)  # not where NaN
     different = [images.names[i] for i in index[~same].tolist()]
     if different:
         found = f"other poses for {counted(len(different), 'image')}: {shown(sorted(different))}"
@@ -289,17 +279,6 @@ def pose_matrices(poses: ArrayLike) -> Array:
     matrices[:, :3, :3] = rotation_from_quaternion(values[:, :4])
     matrices[:, :3, 3] = values[:, 4:]
     return matrices
-
-
-def _same_pose(a: Array, b: Array, extent: float) -> NDArray[np.bool_]:
-    """Whether poses [n, 4, 4] agree; false where one is not finite. [n]"""
-    turned = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2))
-    moved = np.linalg.norm(camera_centre(a) - camera_centre(b), axis=1)
-    return np.asarray((turned <= 2 * SAME_ANGLE) & (moved <= SAME_PLACE * extent + 1e-9))
-
-
-def _images(frame: RawFrame) -> list[int]:
-    return [image for (kind, _), image in frame.data if kind == CAMERA]
 
 
 def _form(model: RawModel) -> str:

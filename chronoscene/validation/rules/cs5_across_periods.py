@@ -12,9 +12,8 @@ from chronoscene.formats.chronoscene import WORLD, read_world
 from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
 from chronoscene.scene.tracks import common_view
 from chronoscene.validation import rule
-from chronoscene.validation.checks.period_frames import own_frames
 from chronoscene.validation.checks.photo_metadata import fit_gps
-from chronoscene.validation.checks.reprojection import depth_percentiles
+from chronoscene.validation.checks.reprojection import depth_percentiles, own_frames
 from chronoscene.validation.rule import NOTHING, Hit
 from chronoscene.validation.scene_folder import RawScene, derived
 

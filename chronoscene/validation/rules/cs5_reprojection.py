@@ -10,21 +10,9 @@ import numpy as np
 from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import shown
 from chronoscene.validation import rule
+from chronoscene.validation.checks import reprojection
 from chronoscene.validation.checks.observations import Reprojection
-from chronoscene.validation.checks.period_frames import (
-    MIN_ERROR,
-    WORSE,
-    Rays,
-    focal_factor,
-    own_frames,
-    period_limit,
-)
-from chronoscene.validation.checks.reprojection import (
-    image_errors,
-    judged_images,
-    period_errors,
-    pose_limit,
-)
+from chronoscene.validation.checks.reprojection import image_errors, outlier_limit, own_frames
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs1_poses import other_convention
 from chronoscene.validation.scene_folder import RawScene, derived
@@ -88,8 +76,8 @@ def points_behind_cameras(scene: RawScene, reprojections: list[Reprojection]) ->
 )
 def pose_disagrees(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     """The points that an image sees are reprojected far from where it sees them."""
-    errors, judged = image_errors(scene), judged_images(scene)
-    limits = {image: pose_limit(scene, image) for image in judged}
+    errors, judged = image_errors(scene), reprojection.judged_images(scene)
+    limits = {image: reprojection.pose_limit(scene, image) for image in judged}
     wrong = [image for image in judged if not errors[image] <= limits[image]]
     if wrong and other_convention(scene):
         return  # CS125 gives the reason for all of them
@@ -126,7 +114,7 @@ def period_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
         known = np.flatnonzero((scene.image_periods == index) & ~np.isnan(errors))
         worst = known[np.argsort(-errors[known])]
         named = shown([images.names[i] for i in worst])
-        found = f"{period_errors(scene)[period]:.3g} px; the worst are {named}"
+        found = f"{reprojection.period_errors(scene)[period]:.3g} px; the worst are {named}"
         found += _other_focal(scene, index, limit)
         yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
 
@@ -134,19 +122,21 @@ def period_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
 @derived
 def _worse_periods(scene: RawScene) -> dict[int, float]:
     """Periods that stand out, with the limit for their median error in pixels."""
-    limit, judged = period_limit(scene), judged_images(scene)
-    if not judged or limit > WORSE * np.median([pose_limit(scene, i) for i in judged]):
+    limit, judged = reprojection.period_limit(scene), reprojection.judged_images(scene)
+    if not judged or limit > reprojection.WORSE * np.median(
+        [reprojection.pose_limit(scene, i) for i in judged]
+    ):
         return {}  # no period fits: nothing to compare with
     explained = {scene.period_ids[index] for index in own_frames(scene)}
-    worse = (period for period, median in period_errors(scene).items() if median > limit)
-    return {period: limit for period in worse if period not in explained}
+    errors = reprojection.period_errors(scene).items()
+    return {p: limit for p, median in errors if median > limit and p not in explained}
 
 
 def _other_focal(scene: RawScene, index: int, limit: float) -> str:
     """A hint that other focal lengths explain the errors of a period, if they do."""
     if scene.point_periods is None:
         return ""
-    factor = focal_factor(Rays(scene, index), limit)
+    factor = reprojection.focal_factor(reprojection.Rays(scene, index), limit)
     return "" if factor is None else f"; it fits with focal lengths multiplied by {factor:.4g}"
 
 
@@ -158,11 +148,14 @@ def _other_focal(scene: RawScene, index: int, limit: float) -> str:
 )
 def image_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     """The reprojection error of an image is far above that of its period."""
-    for image in judged_images(scene):
+    for image in reprojection.judged_images(scene):
         index, error = int(scene.image_periods[image]), float(image_errors(scene)[image])
         period = scene.period_ids[index] if index >= 0 else -1
-        limit = max(MIN_ERROR, WORSE * period_errors(scene).get(period, np.inf))
-        if limit < error <= pose_limit(scene, image):  # CS513 reports larger ones
+        limit = max(
+            MIN_ERROR,
+            reprojection.WORSE * reprojection.period_errors(scene).get(period, np.inf),
+        )
+        if limit < error <= reprojection.pose_limit(scene, image):  # CS513 reports larger ones
             place = scene.image_place(images.names[image])
             yield Hit(place, f"a median error below {limit:.3g} px", f"{error:.3g} px")
 
@@ -180,11 +173,11 @@ def error_outdated(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
     stored = points.error[(points.error > 0) & np.isfinite(points.error)]
     if len(stored) < MIN_STORED * len(points) or not len(stored):
         return  # not every program stores them
-    errors, judged = image_errors(scene), judged_images(scene)
+    errors, judged = image_errors(scene), reprojection.judged_images(scene)
     if not judged:
         return
     found, expected = float(np.median(errors[judged])), float(np.median(stored))
-    fits = all(errors[i] <= pose_limit(scene, i) for i in judged)
-    if fits and found > max(MIN_ERROR, WORSE * expected) and not _worse_periods(scene):
+    fits = all(errors[i] <= reprojection.pose_limit(scene, i) for i in judged)
+    if fits and found > outlier_limit(expected) and not _worse_periods(scene):
         text = f"{found:.3g} px (median)"
         yield Hit(scene.model_file("points3D"), f"errors around {expected:.3g} px", text)

@@ -8,8 +8,7 @@ from skeletons.dataset import write_skeleton
 
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
-from chronoscene.stats.measures import reproject
-from chronoscene.stats.view_overlap import DEPTH_PERCENTILE, REACH_FACTOR, in_view
+from chronoscene.stats.measures import DEPTH_PERCENTILE, REACH_FACTOR, in_view, reproject
 
 PINHOLE = Camera(1, "PINHOLE", 100, 100, (50.0, 50.0, 50.0, 50.0))
 """Sees 45 degrees to every side."""
