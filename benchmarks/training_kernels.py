@@ -35,7 +35,7 @@ from chronoscene.anchors.decode import (
     decode_reference,
 )
 from chronoscene.kernels.runtime import available_threads, set_threads
-from chronoscene.training.adam import Adam, DenseTable, Table
+from chronoscene.training.adam import Adam, DenseTable
 from chronoscene.training.losses import photometric_loss, photometric_loss_reference
 from chronoscene.training.row_adam import RowAdam
 
@@ -205,7 +205,9 @@ def time_tables(anchors: int, repeats: int) -> None:
             turns = (np.arange(t, anchors, round(1 / share)) for t in cycle(range(10)))
             leaf = torch.zeros(0)
 
-            def fetch(table: Table = table, turns: Iterator[NDArray[np.int64]] = turns) -> None:
+            def fetch(
+                table: DenseTable | RowAdam = table, turns: Iterator[NDArray[np.int64]] = turns
+            ) -> None:
                 nonlocal leaf
                 leaf = table.fetch(next(turns), (0, 1))
                 leaf.grad = torch.full_like(leaf, 1e-3)

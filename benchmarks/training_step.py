@@ -29,9 +29,9 @@ import chronoscene  # noqa: F401
 # isort: split
 import torch
 
+from chronogs import SPEC
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
-from chronogs.presets import PRESETS
 from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.anchors.model import AnchorModel
@@ -100,7 +100,7 @@ def timed_parts(watch: Stopwatch) -> Iterator[None]:
 
 def train(part: Part, preset: str, steps: int, anchors: int, seed: int) -> AnchorTrainer:
     """Train as the harness does for some steps of the preset's schedule."""
-    config = ChronoGSConfig(**{**PRESETS[preset], "max_anchors": anchors})
+    config = ChronoGSConfig(**{**SPEC.presets[preset], "max_anchors": anchors})
     method = ChronoGS(config)
     method.setup(part.train, seed=seed, device="cpu")
     for index in range(steps):
@@ -111,7 +111,7 @@ def train(part: Part, preset: str, steps: int, anchors: int, seed: int) -> Ancho
 
 def resume(part: Part, preset: str, model: Path, seed: int) -> AnchorTrainer:
     """A trainer of the model of a checkpoint, with an optimiser that starts anew."""
-    config = ChronoGSConfig(**PRESETS[preset])
+    config = ChronoGSConfig(**SPEC.presets[preset])
     method = ChronoGS(config)
     method.load(model, device="cpu")
     return AnchorTrainer(
@@ -160,7 +160,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("scene", type=Path)
     parser.add_argument("--model", type=Path, help="checkpoint folder to start from")
-    parser.add_argument("--preset", default="balanced", choices=sorted(PRESETS))
+    parser.add_argument("--preset", default="balanced", choices=sorted(SPEC.presets))
     parser.add_argument("--train", type=int, default=1_500, help="steps before, without --model")
     parser.add_argument("--anchors", type=int, default=31_000, help="limit, without --model")
     parser.add_argument("--steps", type=int, default=200, help="timed steps")

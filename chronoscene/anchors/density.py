@@ -1,8 +1,9 @@
-"""Density control of anchors: statistics, where new anchors appear, which ones are pruned.
+"""Where anchors are: one per occupied voxel of the sparse cloud of all periods at first, then
+density control by statistics of the views: where new anchors appear, which ones are pruned.
 
 Source: Scaffold-GS (Lu et al., CVPR 2024), section 3.3, and the official code of Scaffold-GS and
-ChronoGS, which agree here. Everything is numpy or Numba on arrays of a fixed order, so a seed gives
-the same anchors for any number of threads.
+ChronoGS; differences from the papers are named options of `AnchorConfig`. Everything is numpy or
+Numba on arrays of a fixed order, so a seed gives the same anchors for any number of threads.
 """
 
 from __future__ import annotations
@@ -14,11 +15,107 @@ from numba import prange
 from numpy.typing import NDArray
 
 from chronoscene.anchors.config import AnchorConfig
-from chronoscene.anchors.voxels import cell_indices, pack_cells
 from chronoscene.kernels.compilation import kernel
+from chronoscene.training.splatting import rms_spacing
 
 Float = NDArray[np.float32]
+MIN_DISTANCE = 1e-7
+"""Lower bound of a neighbour distance: keeps the log-scales of coinciding points finite."""
 _COUNTERS = ("opacity_sum", "visits", "motion", "grad_sum", "hits")
+
+
+def cell_indices(
+    positions: NDArray[np.floating], size: float, origin: NDArray[np.float64] | None = None
+) -> NDArray[np.int64]:
+    """Cell of each position: the nearest multiple of ``size``, halves to even. [P, 3] -> [P, 3]"""
+    shifted = positions.astype(np.float64)
+    if origin is not None:
+        shifted -= origin
+    return np.round(shifted / size).astype(np.int64)
+
+
+def pack_cells(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One integer per cell, equal exactly where the cells are equal. [P, 3] -> [P]
+
+    Keys of different calls are not comparable: pack everything that is compared in one call.
+    """
+    if len(cells) == 0:
+        return np.zeros(0, np.int64)
+    low = cells.min(axis=0)
+    extent = [int(n) for n in cells.max(axis=0) - low + 1]
+    if extent[0] * extent[1] * extent[2] < 2**62:
+        ranks = cells - low
+    else:  # far outliers: ranks per axis are below the number of rows
+        ranks = np.stack([np.unique(c, return_inverse=True)[1] for c in cells.T], axis=1)
+        extent = [int(n) for n in ranks.max(axis=0) + 1]
+    return (ranks[:, 0] * extent[1] + ranks[:, 1]) * extent[2] + ranks[:, 2]
+
+
+def neighbour_distances(points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Root mean square distance to the three nearest other points, at least `MIN_DISTANCE`. [P]"""
+    return np.maximum(rms_spacing(points), MIN_DISTANCE)
+
+
+def median_spacing(points: NDArray[np.floating]) -> float:
+    """Median distance of a point to its nearest other point; 1 for a lone point."""
+    return float(max(np.median(rms_spacing(points, 1)), MIN_DISTANCE)) if len(points) > 1 else 1.0
+
+
+def resolve_voxel_size(
+    points: NDArray[np.floating], value: float, unit: str, *, training_from_world: float
+) -> float:
+    """Voxel edge in training units.
+
+    Args:
+        points: Sparse points in the training frame. [P, 3]
+        value: The configured size; 0 means the median over the points of the mean *squared*
+            distance to three neighbours, a unit slip that Scaffold-GS and ChronoGS share.
+        unit: See `AnchorConfig.voxel_unit`.
+        training_from_world: Scale of the similarity from world to training frame.
+    """
+    if value == 0:
+        return float(np.median(np.square(neighbour_distances(points))))
+    if unit == "spacing":
+        return value * median_spacing(points)
+    return value * (training_from_world if unit == "world" else 1.0)
+
+
+def voxelize(
+    points: NDArray[np.floating], size: float, origin: str = "zero"
+) -> NDArray[np.float32]:
+    """Occupied voxels as positions, sorted by cell. [P, 3] -> [A, 3]
+
+    Args:
+        points: [P, 3]
+        size: Voxel edge, in the units of the points.
+        origin: See `AnchorConfig.voxel_origin`.
+    """
+    corner = points.min(axis=0).astype(np.float64) if origin == "box" else np.zeros(3)
+    cells = cell_indices(points, size, corner)
+    _, first = np.unique(pack_cells(cells), return_index=True)
+    return (cells[first] * size + corner).astype(np.float32)
+
+
+def initial_anchors(
+    points: NDArray[np.floating], size: float, *, origin: str = "zero", limit: int = 0
+) -> tuple[NDArray[np.float32], float]:
+    """Anchors of a cloud, with a coarser voxel where there would be more than ``limit``.
+
+    Returns:
+        anchors: [A, 3]
+        size: The voxel edge that was used.
+    """
+    anchors = voxelize(points, size, origin)
+    while limit > 0 and len(anchors) > limit:
+        size *= 1.1
+        anchors = voxelize(points, size, origin)
+    return anchors, size
+
+
+def initial_log_scales(anchors: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Log of the neighbour distance, in all six columns. [A, 3] -> [A, 6]"""
+    column = np.log(neighbour_distances(anchors)).astype(np.float32)
+    return np.repeat(column[:, None], 6, axis=1)
 
 
 class DensityStatistics:

@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
+from chronoscene.anchors.density import initial_anchors, resolve_voxel_size
 from chronoscene.anchors.model import AnchorLayout, AnchorModel
 from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer, learning_rates
-from chronoscene.anchors.voxels import initial_anchors, resolve_voxel_size
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
-from chronoscene.training.sparse_points import finite_rows
-from chronoscene.training.splatting import SplattingMethod, draw
+from chronoscene.training.splatting import SplattingMethod, draw, finite_rows
 
 
 class AnchorMethod(SplattingMethod):

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -21,8 +21,8 @@ from torch import Tensor
 
 from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.decode import DecodeInputs, HeadWeights, decode, decode_active
+from chronoscene.anchors.density import initial_log_scales
 from chronoscene.anchors.visibility import visible_anchors
-from chronoscene.anchors.voxels import initial_log_scales
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import View
 from chronoscene.rasterizer import NEAR_PLANE
@@ -31,8 +31,8 @@ from chronoscene.training.splatting import Splats, camera_centre_tensor
 PER_ANCHOR = ("offsets", "features", "log_scales")
 """Trained tensors with one row per anchor."""
 
+LAYERS = HeadWeights._fields
 _OUTPUTS = {"opacity": 1, "covariance": 7, "color": 3}
-_LAYERS = ("w1", "b1", "w2", "b2")
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,37 +89,24 @@ class AnchorLayout:
         return cls(**values)
 
 
+@dataclass(eq=False)
 class AnchorModel:
-    """Tensors of a model.
+    """Tensors of a model."""
 
-    Args:
-        layout: Sizes and rules.
-        anchors: Positions in the training frame; never trained. [A, 3]
-        offsets: [A, k, 3]
-        features: Base feature, then one block per period. [A, Fb + T * Fv]
-        log_scales: Columns 0..2 for the offsets, 3..5 for the Gaussians. [A, 6]
-        global_features: [T, G]
-        heads: Three two-layer MLPs by name; ``w1`` holds only the inputs that the MLP sees.
-    """
-
-    def __init__(
-        self,
-        layout: AnchorLayout,
-        *,
-        anchors: Tensor,
-        offsets: Tensor,
-        features: Tensor,
-        log_scales: Tensor,
-        global_features: Tensor,
-        heads: Mapping[str, HeadWeights],
-    ) -> None:
-        self.layout = layout
-        self.anchors = anchors
-        self.offsets = offsets
-        self.features = features
-        self.log_scales = log_scales
-        self.global_features = global_features
-        self.heads = dict(heads)
+    layout: AnchorLayout
+    _: KW_ONLY
+    anchors: Tensor
+    """Positions in the training frame; never trained. [A, 3]"""
+    offsets: Tensor
+    """[A, k, 3]"""
+    features: Tensor
+    """Base feature, then one block per period. [A, Fb + T * Fv]"""
+    log_scales: Tensor
+    """Columns 0..2 for the offsets, 3..5 for the Gaussians. [A, 6]"""
+    global_features: Tensor
+    """[T, G]"""
+    heads: Mapping[str, HeadWeights]
+    """Three two-layer MLPs by name; ``w1`` holds only the inputs that the MLP sees."""
 
     def __len__(self) -> int:
         return len(self.anchors)
@@ -137,7 +124,18 @@ class AnchorModel:
         generator: torch.Generator,
     ) -> Self:
         """The model before training. Draws the heads first, so equal layouts start equal."""
-        heads = {name: cls._start_head(layout, name, generator) for name in HEADS}
+        heads = {}
+        for name in HEADS:
+            # Weights and biases uniform within 1/sqrt(inputs), as usual for linear layers.
+            inputs, hidden = cls.input_dim(layout, name), layout.hidden_dim
+            outputs = _OUTPUTS[name] * layout.offsets
+            first, second = 1.0 / math.sqrt(max(inputs, 1)), 1.0 / math.sqrt(hidden)
+            heads[name] = HeadWeights(
+                w1=draw_start((hidden, inputs), "uniform", first, generator),
+                b1=draw_start((hidden,), "uniform", first, generator),
+                w2=draw_start((outputs, hidden), "uniform", second, generator),
+                b2=draw_start((outputs,), "uniform", second, generator),
+            )
         shape = (len(anchors), layout.feature_dim)
         return cls(
             layout,
@@ -149,30 +147,17 @@ class AnchorModel:
             heads=heads,
         )
 
-    @classmethod
-    def _start_head(
-        cls, layout: AnchorLayout, name: str, generator: torch.Generator
-    ) -> HeadWeights:
-        """Weights and biases uniform within 1/sqrt(inputs), as usual for linear layers."""
-        inputs, hidden = cls.input_dim(layout, name), layout.hidden_dim
-        outputs = _OUTPUTS[name] * layout.offsets
-        w1, w2 = 1.0 / math.sqrt(max(inputs, 1)), 1.0 / math.sqrt(hidden)
-        shapes = ((hidden, inputs), (hidden,), (outputs, hidden), (outputs,))
-        bounds = (w1, w1, w2, w2)
-        pairs = zip(shapes, bounds, strict=True)
-        return HeadWeights(*(draw_start(s, "uniform", b, generator) for s, b in pairs))
-
     def tensors(self) -> dict[str, Tensor]:
         """Everything that is stored, by name."""
         named = {name: getattr(self, name) for name in ("anchors", *PER_ANCHOR, "global_features")}
         for head in HEADS:
-            named |= {f"{head}.{layer}": getattr(self.heads[head], layer) for layer in _LAYERS}
+            named |= {f"{head}.{layer}": getattr(self.heads[head], layer) for layer in LAYERS}
         return named
 
     @classmethod
     def from_tensors(cls, layout: AnchorLayout, tensors: Mapping[str, Tensor]) -> Self:
         """Inverse of `tensors`."""
-        heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in _LAYERS)) for h in HEADS}
+        heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in LAYERS)) for h in HEADS}
         named = {name: tensors[name] for name in ("anchors", *PER_ANCHOR, "global_features")}
         return cls(layout, **named, heads=heads)
 

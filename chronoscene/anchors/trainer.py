@@ -15,27 +15,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.anchors.config import AnchorConfig
+from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
-from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
+from chronoscene.anchors.model import LAYERS, PER_ANCHOR, AnchorModel
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
-from chronoscene.training.adam import Adam
+from chronoscene.training.adam import Adam, DenseTable
 from chronoscene.training.losses import mean_volume, photometric_loss
 from chronoscene.training.row_adam import make_table
-from chronoscene.training.schedule import (
-    ViewSampler,
-    downscale_image,
-    downscale_view,
-    log_linear,
-)
-from chronoscene.training.sparse_points import finite_rows
-from chronoscene.training.splatting import camera_centre_tensor, draw
+from chronoscene.training.schedule import ViewSampler, downscale_image, downscale_view, log_linear
+from chronoscene.training.splatting import camera_centre_tensor, draw, finite_rows
 
 Rates = Mapping[str, tuple[float, float]]
 AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]
 
-_ADAM_EPS = 1e-15
 _MARGIN = 1e-9
 """Shares of the training this close are equal: progress is a quotient of rounded numbers."""
 
@@ -48,13 +41,8 @@ def learning_rates(config: AnchorConfig, camera_extent: float) -> dict[str, tupl
         "features": config.feature_lr,
         "log_scales": config.scaling_lr,
     }
-    by_head = {
-        "opacity": config.opacity_lr,
-        "covariance": config.covariance_lr,
-        "color": config.color_lr,
-    }
-    for head, rate in by_head.items():
-        rates |= {f"{head}.{layer}": rate for layer in ("w1", "b1", "w2", "b2")}
+    for head in HEADS:
+        rates |= {f"{head}.{layer}": getattr(config, f"{head}_lr") for layer in LAYERS}
     return rates
 
 
@@ -93,14 +81,12 @@ class AnchorTrainer:
         layout = model.layout
         blocks = [layout.base_dim, *[layout.period_dim] * layout.num_periods]
         self.tables = {
-            "offsets": make_table(model.offsets, None, _ADAM_EPS, lazy=True),
-            "features": make_table(model.features, blocks, _ADAM_EPS, lazy=True),
+            "offsets": make_table(model.offsets),
+            "features": make_table(model.features, blocks),
             # Culling reads the scales of all anchors in every step.
-            "log_scales": make_table(model.log_scales, None, _ADAM_EPS, lazy=False),
+            "log_scales": DenseTable(model.log_scales),
         }
-        self.optimizer = Adam(
-            {n: t for n, t in trained.items() if n not in PER_ANCHOR}, eps=_ADAM_EPS
-        )
+        self.optimizer = Adam({n: t for n, t in trained.items() if n not in PER_ANCHOR})
         self._seen_layout = dataclasses.replace(layout, num_periods=1)
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
@@ -190,15 +176,9 @@ class AnchorTrainer:
         assert info.means2d.grad is not None
         if self.statistics is None:
             self.statistics = DensityStatistics(len(self.model), self.model.layout.offsets)
-        self.statistics.update(
-            visible,
-            positions.cpu().numpy(),
-            opacities.detach().cpu().numpy(),
-            info.radii[0].cpu().numpy(),
-            info.means2d.grad[0].cpu().numpy(),
-            view.width,
-            view.height,
-        )
+        tensors = (positions, opacities, info.radii[0], info.means2d.grad[0])
+        at, alphas, radii, grads = (tensor.detach().cpu().numpy() for tensor in tensors)
+        self.statistics.update(visible, at, alphas, radii, grads, view.width, view.height)
 
     def _densify_if_due(self, index: int, done: float) -> bool:
         """Grow and prune; whether the rows of the anchors changed."""
@@ -221,12 +201,10 @@ class AnchorTrainer:
         names = AnchorRows._fields
         rows = AnchorRows(*(getattr(model, n).detach().cpu().numpy() for n in names))
         new = grow(rows, statistics, self.config, self.voxel_size, self.growth_generator)
+        added = {n: torch.from_numpy(rows).to(model.device) for n, rows in new._asdict().items()}
         for name, table in self.tables.items():
-            setattr(
-                model, name, table.extend(torch.from_numpy(getattr(new, name)).to(model.device))
-            )
-        positions = torch.from_numpy(new.anchors).to(model.device)
-        model.anchors = torch.cat([model.anchors, positions])
+            setattr(model, name, table.extend(added[name]))
+        model.anchors = torch.cat([model.anchors, added["anchors"]])
         statistics.extend(len(new.anchors))
 
     def _prune(self, statistics: DensityStatistics) -> None:

@@ -132,10 +132,7 @@ def _split(
 
 
 def _useless(
-    parameters: dict[str, Tensor],
-    extent: float,
-    prune_large: bool,
-    config: GaussianConfig,
+    parameters: dict[str, Tensor], extent: float, prune_large: bool, config: GaussianConfig
 ) -> Tensor:
     """Rows that are too faint or too large. bool [N]"""
     useless = opacities_of(parameters["logit_opacities"]) < config.min_opacity

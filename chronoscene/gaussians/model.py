@@ -12,8 +12,7 @@ from torch import Tensor
 
 from chronoscene.gaussians.spherical_harmonics import NUM_BASES, dc_from_rgb, evaluate
 from chronoscene.methods import TrainingSet, View
-from chronoscene.training.sparse_points import finite_rows, rms_spacing
-from chronoscene.training.splatting import Splats, camera_centre_tensor
+from chronoscene.training.splatting import Splats, camera_centre_tensor, finite_rows, rms_spacing
 
 SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -20,6 +19,8 @@ from chronoscene.kernels.compilation import kernel
 
 BETA1 = 0.9
 BETA2 = 0.999
+EPS = 1e-15
+"""Added to the root of the second moment, as in 3DGS."""
 # Rounded once: 1 - float32(0.999) would be off by 5e-5.
 GAIN1 = float32(1 - BETA1)
 KEEP2 = float32(BETA2)
@@ -33,8 +34,6 @@ results are equal bit by bit, for any number of threads."""
 # 1e-18 of a learning rate. Left to decay they end up as denormals, which are slow on many CPUs.
 TINY_MEAN = float32(1e-34)
 TINY_SQUARE = float32(1e-37)
-
-_NAME = "table"
 
 
 @dataclass(slots=True, eq=False)
@@ -55,12 +54,10 @@ class Adam:
 
     Args:
         params: Contiguous leaf tensors that require a gradient.
-        eps: Added to the root of the second moment.
     """
 
-    def __init__(self, params: Mapping[str, Tensor], eps: float = 1e-15) -> None:
+    def __init__(self, params: Mapping[str, Tensor]) -> None:
         self.params: dict[str, Tensor] = {}
-        self.eps = eps
         self._moments: dict[str, _Moments] = {}
         for name, value in params.items():
             if not (value.is_leaf and value.requires_grad and value.is_contiguous()):
@@ -94,16 +91,11 @@ class Adam:
             moments.steps += 1
             rate = lrs[name] / (1 - BETA1**moments.steps)
             root = (1 - BETA2**moments.steps) ** -0.5
-            update = _step_compiled if _is_compiled(value) else _step_torch
-            update(value, value.grad, moments, rate, root, self.eps)
+            update = _step_compiled if is_cpu_float32(value) else _step_torch
+            update(value, value.grad, moments, rate, root)
 
     def extend(self, name: str, new_rows: Tensor) -> Tensor:
-        """Append rows with zero moments; returns the parameter's new leaf, which has no gradient.
-
-        Args:
-            name: Parameter.
-            new_rows: [n, ...]
-        """
+        """Append rows [n, ...] with zero moments; returns the new leaf, which has no gradient."""
         value = self.params[name]
         check_shape(f"new rows of {name}", new_rows, (None, *value.shape[1:]))
         moments = self._moments[name]
@@ -113,12 +105,7 @@ class Adam:
         return self._replace(name, torch.cat((value.detach(), new_rows.detach().to(value.dtype))))
 
     def keep(self, name: str, mask: Tensor) -> Tensor:
-        """Keep the rows where the mask holds; returns the new leaf, which has no gradient.
-
-        Args:
-            name: Parameter.
-            mask: bool [rows]
-        """
+        """Keep the rows of a mask, bool [rows]; returns the new leaf, which has no gradient."""
         value = self.params[name]
         check_shape(f"mask of {name}", mask, (value.shape[0],))
         moments = self._moments[name]
@@ -155,30 +142,25 @@ class Adam:
         return self.params[name]
 
 
-def _is_compiled(value: Tensor) -> bool:
+def is_cpu_float32(value: Tensor) -> bool:
+    """Whether the compiled updates can work on a tensor."""
     return value.device.type == "cpu" and value.dtype == torch.float32
 
 
 def _step_compiled(
-    value: Tensor, grad: Tensor, moments: _Moments, rate: float, root: float, eps: float
+    value: Tensor, grad: Tensor, moments: _Moments, rate: float, root: float
 ) -> None:
-    arrays = [_flat(tensor) for tensor in (value, grad.contiguous(), moments.mean, moments.square)]
-    scalars = [np.float32(number) for number in (rate, root, eps)]
+    tensors = (value, grad.contiguous(), moments.mean, moments.square)
+    arrays = [tensor.detach().view(-1).numpy() for tensor in tensors]
     # Starting the threads costs more than a small update.
-    kernel = adam_blocks if value.numel() > BLOCK else adam_block
-    kernel(*arrays, *scalars)
+    update = adam_blocks if value.numel() > BLOCK else adam_block
+    update(*arrays, float32(rate), float32(root), float32(EPS))
 
 
-def _flat(tensor: Tensor) -> NDArray[np.float32]:
-    return tensor.detach().view(-1).numpy()
-
-
-def _step_torch(
-    value: Tensor, grad: Tensor, moments: _Moments, rate: float, root: float, eps: float
-) -> None:
+def _step_torch(value: Tensor, grad: Tensor, moments: _Moments, rate: float, root: float) -> None:
     moments.mean.lerp_(grad, 1 - BETA1)
     moments.square.mul_(BETA2).addcmul_(grad, grad, value=1 - BETA2)
-    value.addcdiv_(moments.mean, (moments.square.sqrt() * root).add_(eps), value=-rate)
+    value.addcdiv_(moments.mean, (moments.square.sqrt() * root).add_(EPS), value=-rate)
 
 
 @kernel(fastmath={"contract", "nsz", "arcp"})
@@ -214,13 +196,26 @@ def adam_blocks(values, grads, means, squares, rate, root, eps):  # type: ignore
         adam_block(values[part], grads[part], means[part], squares[part], rate, root, eps)
 
 
-class Table(ABC):
-    """A trained tensor with one row per anchor. [R, ...]"""
+class DenseTable:
+    """A trained tensor with one row per anchor, of which a step reads some rows. [R, ...]
 
-    value: Tensor
-    """The table; up to date after `flush`."""
+    The usual `Adam`, which moves every row in every step.
 
-    @abstractmethod
+    Args:
+        value: The table. [R, ...]
+        blocks: Columns of each block; None for one block.
+    """
+
+    def __init__(self, value: Tensor, blocks: Sequence[int] | None = None) -> None:
+        self._adam = Adam({"table": value.detach().requires_grad_()})
+        self._blocks = blocks
+        self._fetched: tuple[tuple[Tensor, ...], Tensor] | None = None
+
+    @property
+    def value(self) -> Tensor:
+        """The table; up to date after `flush`."""
+        return self._adam.params["table"].detach()
+
     def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
         """Copies of some rows and blocks, up to date, as a leaf that collects a gradient.
 
@@ -234,50 +229,6 @@ class Table(ABC):
         Returns:
             [M, ...], with the table's own shape of a row if there is one block.
         """
-
-    @abstractmethod
-    def step(self, rate: float) -> None:
-        """One step with a learning rate; what was not fetched has the gradient zero."""
-
-    @abstractmethod
-    def flush(self) -> Tensor:
-        """Bring all rows up to date; returns the table."""
-
-    @abstractmethod
-    def snapshot(self) -> Tensor:
-        """What `flush` would return, perhaps a copy. Changes nothing: later steps round as if it
-        had not been called."""
-
-    @abstractmethod
-    def extend(self, new_rows: Tensor) -> Tensor:
-        """Append rows with zero moments; returns the table. [n, ...]"""
-
-    @abstractmethod
-    def keep(self, mask: Tensor) -> Tensor:
-        """Keep the rows where the mask holds; returns the table. bool [R]"""
-
-
-class DenseTable(Table):
-    """The usual `Adam`, which moves every row in every step.
-
-    Args:
-        value: The table. [R, ...]
-        blocks: Columns of each block; None for one block.
-        eps: Added to the root of the second moment.
-    """
-
-    def __init__(
-        self, value: Tensor, blocks: Sequence[int] | None = None, eps: float = 1e-15
-    ) -> None:
-        self._adam = Adam({_NAME: value.detach().requires_grad_()}, eps)
-        self._blocks = blocks
-        self._fetched: tuple[tuple[Tensor, ...], Tensor] | None = None
-
-    @property
-    def value(self) -> Tensor:  # type: ignore[override]
-        return self._adam.params[_NAME].detach()
-
-    def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
         cells: tuple[Tensor, ...] = (torch.from_numpy(rows).to(self.value.device),)
         if self._blocks is not None:
             columns = torch.arange(sum(self._blocks)).split(list(self._blocks))
@@ -288,24 +239,30 @@ class DenseTable(Table):
         return leaf
 
     def step(self, rate: float) -> None:
+        """One step with a learning rate; what was not fetched has the gradient zero."""
         grad = torch.zeros_like(self.value)
         if self._fetched is not None and (found := self._fetched[1].grad) is not None:
             grad[self._fetched[0]] = found
         self._fetched = None
-        self._adam.params[_NAME].grad = grad
-        self._adam.step({_NAME: rate})
+        self._adam.params["table"].grad = grad
+        self._adam.step({"table": rate})
         self._adam.zero_grad()
 
     def flush(self) -> Tensor:
+        """Bring all rows up to date; returns the table."""
         return self.value
 
     def snapshot(self) -> Tensor:
+        """What `flush` would return, perhaps a copy. Changes nothing: later steps round as if it
+        had not been called."""
         return self.value
 
     def extend(self, new_rows: Tensor) -> Tensor:
+        """Append rows with zero moments; returns the table. [n, ...]"""
         self._fetched = None
-        return self._adam.extend(_NAME, new_rows).detach()
+        return self._adam.extend("table", new_rows).detach()
 
     def keep(self, mask: Tensor) -> Tensor:
+        """Keep the rows where the mask holds; returns the table. bool [R]"""
         self._fetched = None
-        return self._adam.keep(_NAME, mask).detach()
+        return self._adam.keep("table", mask).detach()

@@ -35,16 +35,7 @@ def build_meta(
     num_periods: int,
     **extra: Any,
 ) -> dict[str, Any]:
-    """What every model says about itself.
-
-    Args:
-        method: Name of the method on the command line.
-        version: Version of the implementation.
-        config: The method's frozen config dataclass.
-        training_from_world: Leads from the world to the frame that the model lives in.
-        num_periods: Number of periods that the model knows.
-        extra: Further entries that JSON can hold.
-    """
+    """What every model says about itself; ``extra`` is whatever else JSON can hold."""
     return {
         "method": method,
         "version": version,
@@ -59,7 +50,6 @@ def save_tensors(folder: Path, tensors: Mapping[str, Tensor], meta: Mapping[str,
     """Write ``model.safetensors`` and ``model.json`` into an existing folder.
 
     Args:
-        folder: Where to write.
         tensors: Stored contiguous, in the order of their names, from any device.
         meta: What `build_meta` returns, or any mapping that JSON can hold without NaN.
     """
@@ -76,16 +66,12 @@ def save_tensors(folder: Path, tensors: Mapping[str, Tensor], meta: Mapping[str,
 def load_tensors(
     folder: Path, *, device: str = "cpu", method: str | None = None
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `save_tensors` wrote.
+    """Tensors by name and the content of ``model.json``, as `save_tensors` wrote them.
 
     Args:
         folder: Folder of the model.
         device: Where the tensors go.
         method: Name of the method that the model must be of, if given.
-
-    Returns:
-        tensors: By name.
-        meta: The content of ``model.json``.
 
     Raises:
         CheckpointError: If a file is missing or damaged, or the model is of another method.
@@ -136,12 +122,8 @@ def _read_meta(path: Path) -> dict[str, Any]:
 
 
 def _damaged(path: Path, expected: str, found: str) -> CheckpointError:
-    return CheckpointError(
-        path,
-        expected=expected,
-        found=found,
-        todo="the file is damaged or was edited: copy it again or train again",
-    )
+    todo = "the file is damaged or was edited: copy it again or train again"
+    return CheckpointError(path, expected=expected, found=found, todo=todo)
 
 
 def _sha256(path: Path) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,13 +24,14 @@ from chronoscene.kernels.vectors import LANES, select, splat, sqrt
 from chronoscene.training.adam import (
     BETA1,
     BETA2,
+    EPS,
     GAIN1,
     GAIN2,
     KEEP2,
     TINY_MEAN,
     TINY_SQUARE,
     DenseTable,
-    Table,
+    is_cpu_float32,
 )
 
 _HORIZON = 256
@@ -46,15 +46,15 @@ CHUNK = 256
 ZERO = float32(0)
 
 
-def make_table(value: Tensor, blocks: Sequence[int] | None, eps: float, *, lazy: bool) -> Table:
-    """A `RowAdam` where its kernels run and it is asked for, else a `DenseTable`."""
-    if lazy and value.device.type == "cpu" and value.dtype == torch.float32:
-        return RowAdam(value, blocks, eps)
-    return DenseTable(value, blocks, eps)
+def make_table(value: Tensor, blocks: Sequence[int] | None = None) -> RowAdam | DenseTable:
+    """A `RowAdam` where its kernels run, else a `DenseTable`."""
+    if is_cpu_float32(value):
+        return RowAdam(value, blocks)
+    return DenseTable(value, blocks)
 
 
-class RowAdam(Table):
-    """The update of `Adam`, without touching what is not read.
+class RowAdam:
+    """A `DenseTable`, its methods explained there, that does not touch what is not read.
 
     With s steps done, a number that gets no gradient in the steps s + 1 .. t moves by
 
@@ -69,18 +69,14 @@ class RowAdam(Table):
     Args:
         value: The table. [R, ...]
         blocks: Columns of the blocks that are read together or not at all; None for one block.
-        eps: Added to the root of the second moment.
     """
 
-    def __init__(
-        self, value: Tensor, blocks: Sequence[int] | None = None, eps: float = 1e-15
-    ) -> None:
+    def __init__(self, value: Tensor, blocks: Sequence[int] | None = None) -> None:
         self.value = value.detach().contiguous()
         self.steps = 0
         self._columns = int(np.prod(value.shape[1:]))
         self._widths = np.array([self._columns] if blocks is None else blocks, np.int64)
         self._starts = np.cumsum(self._widths) - self._widths
-        self._eps = eps
         self._mean, self._square = (torch.zeros_like(self.value) for _ in range(2))
         self._stamps = np.zeros((len(value), len(self._widths)), np.int64)
         self._speeds: list[float] = []
@@ -89,29 +85,32 @@ class RowAdam(Table):
         self._settled = np.empty(_HORIZON, np.float32)
         """The whole way of what was last read at each step, known up to `_HORIZON` steps ago; the
         rest is spare room."""
-        self._fetched: tuple[_Rows, Tensor] | None = None
+        self._fetched: tuple[NDArray[np.int64], NDArray[np.int64], Tensor] | None = None
+        """Rows and places (see `_Part`) of the last copies, and these."""
 
     def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
-        chosen = _Rows(np.ascontiguousarray(rows, np.int64), self._places(blocks))
-        out = torch.empty(len(rows), chosen.columns)
+        rows, chosen = np.ascontiguousarray(rows, np.int64), np.array(blocks, np.int64)
+        widths = self._widths[chosen]
+        starts = np.cumsum(widths) - widths
+        places = np.stack([chosen, self._starts[chosen], widths, starts], axis=1)
+        out = torch.empty(len(rows), int(widths.sum()))
         # In units of the root of the second moment without bias correction.
-        eps = np.float32(self._eps * (1 - BETA2 ** max(self.steps, 1)) ** 0.5)
-        _fetch(*self._addresses(chosen), eps, out.data_ptr())
+        eps = float32(EPS * (1 - BETA2 ** max(self.steps, 1)) ** 0.5)
+        _fetch(*self._addresses(rows, places), eps, out.data_ptr())
         if len(self._widths) == 1:
             out = out.view(len(rows), *self.value.shape[1:])
-        leaf = out.requires_grad_()
-        self._fetched = chosen, leaf
-        return leaf
+        self._fetched = rows, places, out.requires_grad_()
+        return out
 
     def step(self, rate: float) -> None:
         root = (1 - BETA2 ** (self.steps + 1)) ** -0.5
         corrected = rate / (1 - BETA1 ** (self.steps + 1))
-        if self._fetched is not None and (found := self._fetched[1].grad) is not None:
-            chosen, copies = self._fetched
+        if self._fetched is not None and (found := self._fetched[2].grad) is not None:
+            rows, places, copies = self._fetched
             grads = found.contiguous()
-            scalars = (np.float32(corrected), np.float32(root), np.float32(self._eps))
+            scalars = (float32(corrected), float32(root), float32(EPS))
             addresses = (copies.data_ptr(), grads.data_ptr())
-            _update(*self._addresses(chosen), *addresses, scalars)
+            _update(*self._addresses(rows, places), *addresses, scalars)
         self._fetched = None
         self.steps += 1
         self._speeds.append(corrected / root)
@@ -163,24 +162,17 @@ class RowAdam(Table):
         self._stamps = np.full((len(self.value), len(self._widths)), self.steps, np.int64)
         self._fetched = None
 
-    def _places(self, blocks: Sequence[int]) -> NDArray[np.int64]:
-        """(block, first column, columns, first column in the copy) of each. [b, 4]"""
-        chosen = np.array(blocks, np.int64)
-        widths = self._widths[chosen]
-        return np.stack([chosen, self._starts[chosen], widths, np.cumsum(widths) - widths], axis=1)
-
-    def _addresses(self, chosen: _Rows) -> tuple[_Table, _Part, int, int, int, int]:
+    def _addresses(
+        self, rows: NDArray[np.int64], places: NDArray[np.int64]
+    ) -> tuple[_Table, _Part, _Waits]:
         """The first arguments of both kernels."""
         tables = (self.value.data_ptr(), self._mean.data_ptr(), self._square.data_ptr())
-        rows, places = chosen.rows, chosen.places
+        columns = int(places[:, 2].sum())
         ways, settled = self._ways, self._settled
         return (
             _Table(*tables, self._columns, self._stamps.ctypes.data, len(self._widths)),
-            _Part(rows.ctypes.data, len(rows), places.ctypes.data, len(places), chosen.columns),
-            self.steps,
-            ways.ctypes.data,
-            len(ways) - 1,
-            settled.ctypes.data,
+            _Part(rows.ctypes.data, len(rows), places.ctypes.data, len(places), columns),
+            _Waits(self.steps, ways.ctypes.data, len(ways) - 1, settled.ctypes.data),
         )
 
     def _new_ways(self) -> NDArray[np.float32]:
@@ -193,18 +185,6 @@ class RowAdam(Table):
         sums = np.cumsum((speeds * powers)[::-1]) / np.concatenate([[1.0], powers])[:-1][::-1]
         columns = (np.concatenate([[0.0], sums]), BETA1**gaps, BETA2**gaps)
         return np.stack(columns, axis=1).astype(np.float32)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    """What a step reads of a table; see `row_adam__Part`."""
-
-    rows: NDArray[np.int64]
-    places: NDArray[np.int64]
-
-    @property
-    def columns(self) -> int:
-        return int(self.places[:, 2].sum())
 
 
 class _Table(NamedTuple):
@@ -233,6 +213,19 @@ class _Part(NamedTuple):
     """Of the copy."""
 
 
+class _Waits(NamedTuple):
+    """How far what was not read for a while has moved, and what is left of its moments."""
+
+    now: int
+    """Present step."""
+    ways: int
+    """Address of numbers for each wait of 0..longest steps. float32 [G + 1, WAY_PARTS]"""
+    longest: int
+    """G; what waited longer has gone all its way."""
+    settled: int
+    """Address of the way of those, by their stamp. float32"""
+
+
 @inner
 def _clean(mean, square):  # type: ignore[no-untyped-def]
     """Moments without denormal numbers; see `TINY_MEAN`."""
@@ -242,14 +235,14 @@ def _clean(mean, square):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _wait_of(table, stamp_at, now, ways, longest, settled):  # type: ignore[no-untyped-def]
+def _wait_of(table, stamp_at, waits):  # type: ignore[no-untyped-def]
     """Way, and what is left of the moments, of a row and block that was not read for a while."""
     stamp = read_index(table.stamps, stamp_at)
-    gap = now - stamp
-    if gap <= longest:
+    gap = waits.now - stamp
+    if gap <= waits.longest:
         at = WAY_PARTS * gap
-        return read(ways, at), read(ways, at + 1), read(ways, at + 2)
-    return read(settled, stamp), ZERO, float32(math.exp(gap * LOG_BETA2))
+        return read(waits.ways, at), read(waits.ways, at + 1), read(waits.ways, at + 2)
+    return read(waits.settled, stamp), ZERO, float32(math.exp(gap * LOG_BETA2))
 
 
 @inner
@@ -276,30 +269,18 @@ def _copy(table, at, width, way, eps, out, to):  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def _fetch(table, part, now, ways, longest, settled, eps, out):  # type: ignore[no-untyped-def]
-    """Copy rows as they are at the present step.
-
-    Args:
-        table: `_Table`.
-        part: `_Part`.
-        now: Present step.
-        ways: Address of numbers for each wait of 0..longest steps. float32 [G + 1, WAY_PARTS]
-        longest: G; what waited longer has gone all its way.
-        settled: Address of the way of those, by their stamp. float32
-        eps: As a part of the root.
-        out: Address of the copies. [M, columns]
-    """
+def _fetch(table, part, waits, eps, out):  # type: ignore[no-untyped-def]
+    """Copy rows as they are at the present step to the address ``out``. [M, columns]"""
     for task in prange((part.num_rows + CHUNK - 1) // CHUNK):
         for m in range(task * CHUNK, min((task + 1) * CHUNK, part.num_rows)):
             for b in range(part.num_places):
                 stamp_at, at, width, to = _place(table, part, m, b)
-                way, _, _ = _wait_of(table, stamp_at, now, ways, longest, settled)
+                way, _, _ = _wait_of(table, stamp_at, waits)
                 _copy(table, at, width, way, eps, out, to)
 
 
 @inner
-def _step(table, at, width, keep, copies, grads, to, scalars):  # type: ignore[no-untyped-def]
-    keep1, keep2 = keep
+def _step(table, at, width, keep1, keep2, copies, grads, to, scalars):  # type: ignore[no-untyped-def]
     rate, root, eps = scalars
     for c in range(0, width, LANES):
         left = width - c
@@ -315,12 +296,10 @@ def _step(table, at, width, keep, copies, grads, to, scalars):  # type: ignore[n
 
 
 @kernel(parallel=True)
-def _update(table, part, now, ways, longest, settled, copies, grads, scalars):  # type: ignore[no-untyped-def]
-    """One step of Adam for rows that were fetched; see `TINY_MEAN`.
+def _update(table, part, waits, copies, grads, scalars):  # type: ignore[no-untyped-def]
+    """One step of Adam for rows that `_fetch` wrote to the address ``copies``.
 
     Args:
-        table, part, now, ways, longest, settled: As in `_fetch`.
-        copies: Address of what it wrote.
         grads: Address of the gradients of the copies.
         scalars: rate, root and eps, as in `adam_block`.
     """
@@ -328,6 +307,6 @@ def _update(table, part, now, ways, longest, settled, copies, grads, scalars):  
         for m in range(task * CHUNK, min((task + 1) * CHUNK, part.num_rows)):
             for b in range(part.num_places):
                 stamp_at, at, width, to = _place(table, part, m, b)
-                _, keep1, keep2 = _wait_of(table, stamp_at, now, ways, longest, settled)
-                _step(table, at, width, (keep1, keep2), copies, grads, to, scalars)
-                write_index(table.stamps, stamp_at, now + 1)
+                _, keep1, keep2 = _wait_of(table, stamp_at, waits)
+                _step(table, at, width, keep1, keep2, copies, grads, to, scalars)
+                write_index(table.stamps, stamp_at, waits.now + 1)

@@ -1,4 +1,5 @@
-"""What all methods that splat Gaussians have in common: how they draw, and the plug-in's frame.
+"""What all methods that splat Gaussians have in common: the sparse points that they start from, how
+they draw, and the plug-in's frame.
 
 A subclass of `SplattingMethod` brings a model that gives `Splats` for a view and a period, and a
 trainer that changes its tensors.
@@ -8,16 +9,49 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
+from chronoscene.errors import SceneError
 from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
 from chronoscene.rasterizer import Rasterization, rasterize
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.checkpoint import build_meta, load_tensors, save_tensors
+
+
+def finite_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which points have finite coordinates. [P, 3] -> [P]
+
+    Raises:
+        SceneError: If there is none.
+    """
+    finite: NDArray[np.bool_] = np.isfinite(points).all(axis=1)
+    if not finite.any():
+        raise SceneError(
+            "sparse points",
+            expected="at least one point with finite coordinates",
+            found=f"{len(points)} points",
+            todo="triangulate the scene: models start from its sparse points",
+        )
+    return finite
+
+
+def rms_spacing(points: NDArray[np.floating], neighbours: int = 3) -> NDArray[np.float64]:
+    """Root mean square distance of each point to its nearest others. [P, 3] -> [P]
+
+    With fewer others than ``neighbours``, to those that there are; 0 for a lone point.
+    """
+    neighbours = min(neighbours, len(points) - 1)
+    if neighbours < 1:
+        return np.zeros(len(points))
+    # The first neighbour is the point itself, or a twin at distance 0, which is the same.
+    distances, _ = cKDTree(points).query(points, k=neighbours + 1)
+    return np.sqrt(np.square(distances[:, 1:]).mean(axis=1))
 
 
 class Splats(NamedTuple):
@@ -85,13 +119,6 @@ def camera_centre_tensor(view: View, device: str | torch.device = "cpu") -> Tens
     return torch.from_numpy(centre.astype(np.float32)).to(device)
 
 
-class Trainer(Protocol):
-    """What changes the tensors of a model."""
-
-    def step(self, index: int, progress: float) -> StepReport:
-        """One training step; arguments as `chronoscene.methods.Method.step`."""
-
-
 class SplattingMethod(ABC):
     """Fulfils `chronoscene.methods.Method`; a subclass says how a model starts and is drawn.
 
@@ -114,11 +141,11 @@ class SplattingMethod(ABC):
         self.meta: dict[str, Any] = {}
         """Content of ``model.json``; subclasses add what `restore` needs."""
         self.trainer: Any = None
-        """A `Trainer`; None after `load`."""
+        """What `start` gave; None after `load`."""
 
     @abstractmethod
-    def start(self, train: TrainingSet, *, seed: int, device: str) -> Trainer:
-        """Build the initial model; returns what trains it."""
+    def start(self, train: TrainingSet, *, seed: int, device: str) -> Any:
+        """Build the initial model; returns what trains it by ``step``, arguments as there."""
 
     @abstractmethod
     def draw(self, view: View, period: float) -> Rasterization:

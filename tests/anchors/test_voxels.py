@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.anchors.voxels import (
+from chronoscene.anchors.density import (
     MIN_DISTANCE,
     cell_indices,
     initial_anchors,

@@ -11,13 +11,7 @@ import math
 from numba import prange
 from numpy import float32
 
-from chronoscene.anchors.decode.layout import (
-    BLOCK,
-    CHUNK,
-    MIN_DISTANCE,
-    MIN_QUAT_NORM,
-    Work,
-)
+from chronoscene.anchors.decode.layout import BLOCK, CHUNK, MIN_DISTANCE, MIN_QUAT_NORM, Work
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.matmul import product, relu_product
 from chronoscene.kernels.memory import (
