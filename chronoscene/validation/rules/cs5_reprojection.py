@@ -12,7 +12,7 @@ from chronoscene.io.wording import shown
 from chronoscene.validation import rule
 from chronoscene.validation.checks import reprojection
 from chronoscene.validation.checks.observations import Reprojection
-from chronoscene.validation.checks.reprojection import image_errors, outlier_limit, own_frames
+from chronoscene.validation.checks.reprojection import image_errors, own_frames, pose_limit
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs1_poses import other_convention
 from chronoscene.validation.scene_folder import RawScene, derived
@@ -77,7 +77,7 @@ def points_behind_cameras(scene: RawScene, reprojections: list[Reprojection]) ->
 def pose_disagrees(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     """The points that an image sees are reprojected far from where it sees them."""
     errors, judged = image_errors(scene), reprojection.judged_images(scene)
-    limits = {image: reprojection.pose_limit(scene, image) for image in judged}
+    limits = {image: pose_limit(scene, image) for image in judged}
     wrong = [image for image in judged if not errors[image] <= limits[image]]
     if wrong and other_convention(scene):
         return  # CS125 gives the reason for all of them
@@ -123,9 +123,7 @@ def period_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
 def _worse_periods(scene: RawScene) -> dict[int, float]:
     """Periods that stand out, with the limit for their median error in pixels."""
     limit, judged = reprojection.period_limit(scene), reprojection.judged_images(scene)
-    if not judged or limit > reprojection.WORSE * np.median(
-        [reprojection.pose_limit(scene, i) for i in judged]
-    ):
+    if not judged or limit > reprojection.WORSE * np.median([pose_limit(scene, i) for i in judged]):
         return {}  # no period fits: nothing to compare with
     explained = {scene.period_ids[index] for index in own_frames(scene)}
     errors = reprojection.period_errors(scene).items()
@@ -151,11 +149,9 @@ def image_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     for image in reprojection.judged_images(scene):
         index, error = int(scene.image_periods[image]), float(image_errors(scene)[image])
         period = scene.period_ids[index] if index >= 0 else -1
-        limit = max(
-            MIN_ERROR,
-            reprojection.WORSE * reprojection.period_errors(scene).get(period, np.inf),
-        )
-        if limit < error <= reprojection.pose_limit(scene, image):  # CS513 reports larger ones
+        usual = reprojection.period_errors(scene).get(period, np.inf)
+        limit = reprojection.outlier_limit(usual)
+        if limit < error <= pose_limit(scene, image):  # CS513 reports larger ones
             place = scene.image_place(images.names[image])
             yield Hit(place, f"a median error below {limit:.3g} px", f"{error:.3g} px")
 
@@ -177,7 +173,7 @@ def error_outdated(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
     if not judged:
         return
     found, expected = float(np.median(errors[judged])), float(np.median(stored))
-    fits = all(errors[i] <= reprojection.pose_limit(scene, i) for i in judged)
-    if fits and found > outlier_limit(expected) and not _worse_periods(scene):
+    fits = all(errors[i] <= pose_limit(scene, i) for i in judged)
+    if fits and found > reprojection.outlier_limit(expected) and not _worse_periods(scene):
         text = f"{found:.3g} px (median)"
         yield Hit(scene.model_file("points3D"), f"errors around {expected:.3g} px", text)
