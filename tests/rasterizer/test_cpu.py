@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numba import njit
 from rasterizer_cases.comparison import everything
+from rasterizer_cases.scenes import NAMES
 
 from chronoscene.kernels.thread_pool import launch
 from chronoscene.rasterizer import rasterize
@@ -227,6 +228,36 @@ def test_lists_grow_when_gaussians_cover_many_tiles(
     """Every Gaussian covers all 20 tiles: more pairs than the first guess has room for."""
     scene = tools.random_scene(30, 150, 120, seed=4)
     check_agreement(scene.with_(scales=np.full((30, 3), 3.0, np.float32)))
+
+
+@pytest.mark.parametrize(
+    ("width", "height"), [(96, 96), (160, 96), (224, 224), (352, 32), (33, 416)]
+)
+def test_lists_have_room_for_any_number_of_huge_gaussians(
+    width: int, height: int, tools: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the first guess on: every count of Gaussians that all cover every tile."""
+    # The room may at most be asked for once for each factor of four, and once exactly.
+    monkeypatch.setattr(passes, "_MAX_ATTEMPTS", 6)
+    scene = tools.random_scene(64, width, height)
+    scene = scene.with_(scales=np.full((64, 3), 30.0, np.float32))
+    arrays = {name: getattr(scene, name) for name in NAMES}
+    for count in range(1, 65):
+        passes.clear_workspaces()
+        few = scene.with_(**{name: array[:count] for name, array in arrays.items()})
+        with torch.no_grad():
+            assert few.render("cpu")[0].alphas.min() > 0
+
+
+def test_lists_that_never_have_room_are_an_error(
+    tools: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = tools.random_scene(30, 96, 96).with_(scales=np.full((30, 3), 30.0, np.float32))
+    monkeypatch.setattr(passes, "_LIST_GROWTH", 1)
+    passes.clear_workspaces()
+    with torch.no_grad(), pytest.raises(AssertionError, match="no room for 270 pairs of 30 Gaus"):
+        scene.render("cpu")
+    passes.clear_workspaces()
 
 
 @pytest.mark.slow

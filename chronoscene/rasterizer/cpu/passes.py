@@ -23,6 +23,12 @@ Gaussians = tuple[Array, Array, Array, Array, Array]
 """Means, quats, scales, opacities and colors of `layout.LANES` Gaussians or more, flat float32."""
 
 _GROWTH = 1.25
+_PAIRS_PER_GAUSSIAN = 3
+"""Room for (Gaussian, tile) pairs at first; most Gaussians touch one or two tiles. Memory that is
+not used is not touched."""
+_LIST_GROWTH = 4
+_MAX_ATTEMPTS = 64
+"""More than 64-bit numbers of pairs can need: room grows by `_LIST_GROWTH` each time."""
 _MAX_FREE_WORKSPACES = 4
 _CACHE_LINE = 64
 _MARGIN = 16
@@ -37,9 +43,8 @@ class Workspace:
 
     def __init__(self) -> None:
         self._arrays: dict[str, Array] = {}
-        self.pairs_per_gaussian = 3.0
-        """Room for (Gaussian, tile) pairs; most Gaussians touch one or two tiles. It grows with
-        need. Memory that is not used is not touched."""
+        self.max_pairs = 0
+        """Most (Gaussian, tile) pairs that an image has needed room for in one part of its list."""
 
     def array(self, name: str, size: int, dtype: type) -> Array:
         """Array of ``size`` elements with any content."""
@@ -114,8 +119,8 @@ class Rendering:
         )
         ends, tile_starts = np.empty(parts, np.int64), w("tile_starts", view.tiles + 1, np.int64)
         tile_order = w("tile_order", view.tiles, np.int32)
-        while True:
-            room = int(self.workspace.pairs_per_gaussian * (n // parts + 1))
+        room = max(_PAIRS_PER_GAUSSIAN * (n // parts + 1), self.workspace.max_pairs)
+        for _ in range(_MAX_ATTEMPTS):
             listed = self._make_lists(room * parts)
             counts = w("tile_counts", parts * view.tiles, np.int64).reshape(parts, -1)
             launch(
@@ -135,10 +140,15 @@ class Rendering:
             )
             if sorting[3][3] == 0:
                 break
-            # A part has at most all rows; this is asked for once, then remembered.
-            needed = self.numbering[1][-1] / (n // parts + 1)
-            self.workspace.pairs_per_gaussian = min(needed, 4 * self.workspace.pairs_per_gaussian)
+            # A part has at most all pairs; this is asked for once, then remembered.
+            pairs = int(self.numbering[1][-1])
+            room = self.workspace.max_pairs = min(pairs, _LIST_GROWTH * room)
             sorting[3][3] = 0
+        else:
+            raise AssertionError(
+                f"no room for {pairs} pairs of {n} Gaussians and {view.tiles} tiles "
+                f"in {parts} lists of {room} pairs"
+            )
         self.tiles = (tile_starts, w("tile_stops", view.tiles, np.int64), tile_order)
         pixels = view.tiles * layout.TILE_PIXELS
         self.planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
