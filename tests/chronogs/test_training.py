@@ -55,6 +55,24 @@ def test_learning_rates_at_start_middle_and_end(method: Make) -> None:
     assert set(rates) == trained
 
 
+def test_learning_rates_follow_the_share_that_is_done(
+    method: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = method()
+    trainer = made.trainer
+    assert trainer is not None
+    optimizer, table = trainer.optimizer, trainer.tables["offsets"]
+    taken: dict[str, float] = {}
+    step, table_step = optimizer.step, table.step
+    monkeypatch.setattr(optimizer, "step", lambda rates: (taken.update(rates), step(rates)))
+    monkeypatch.setattr(table, "step", lambda rate: (taken.update(offsets=rate), table_step(rate)))
+    for index in range(40):
+        made.step(index, index / 40)
+        for name in ("opacity.w1", "offsets", "global_features"):
+            start, end = made.rates(1.1)[name]
+            assert taken[name] == pytest.approx(start * (end / start) ** ((index + 1) / 40)), index
+
+
 def rounds(config: ChronoGSConfig, train_set: TrainingSet, total: int) -> list[int]:
     """Steps, counted from 1, after which anchors would grow, without doing the steps' work."""
     made = ChronoGS(config)

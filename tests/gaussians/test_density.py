@@ -7,8 +7,14 @@ import torch
 from toy_scene import EXTENT
 
 from chronoscene.gaussians.config import GaussianConfig
-from chronoscene.gaussians.density import choose_growth, densify, reset_opacities
+from chronoscene.gaussians.density import (
+    GradientStatistics,
+    choose_growth,
+    densify,
+    reset_opacities,
+)
 from chronoscene.gaussians.model import SHAPES, logit, opacities_of, scales_of
+from chronoscene.rasterizer import RasterInfo
 from chronoscene.scene.geometry import rotation_from_quaternion
 
 
@@ -31,6 +37,21 @@ def run_round(parameters, gradient, *, prune_large=False, config=None, seed=0):
         config=config or GaussianConfig(),
         generator=np.random.default_rng(seed),
     )
+
+
+def view_of(gradients, radii):
+    """Of a call with one camera whose ``backward`` is done."""
+    means2d = torch.zeros(1, len(gradients), 2, requires_grad=True)
+    means2d.grad = torch.tensor([gradients])
+    return RasterInfo(means2d, torch.tensor([radii], dtype=torch.int32), torch.ones(1, 1))
+
+
+def test_gradients_count_in_half_images_and_are_averaged_over_the_views():
+    statistics = GradientStatistics(3, "cpu")
+    statistics.add(view_of([[3e-3, 4e-3], [1e-3, 0], [9.0, 9.0]], [[1, 1], [2, 2], [0, 4]]), 20, 40)
+    statistics.add(view_of([[0, 1e-3], [9.0, 9.0], [9.0, 9.0]], [[1, 1], [0, 0], [3, 0]]), 20, 40)
+    expected = [(np.hypot(0.03, 0.08) + 0.02) / 2, 0.01, 0]
+    np.testing.assert_allclose(statistics.mean(), expected, rtol=1e-6)
 
 
 def test_a_small_gaussian_is_copied():

@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy_scene import SHORT, toy_scene
+from toy_scene import EXTENT, HEIGHT, SHORT, WIDTH, toy_scene
 
 from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.model import SHAPES, logit
 from chronoscene.gaussians.trainer import Timeline
+from chronoscene.training.schedule import ViewSampler
+from chronoscene.training.splatting import draw
 
 
 def test_the_published_schedule():
@@ -50,6 +52,35 @@ def test_a_run_that_ends_by_the_clock_follows_progress():
     due = [timeline.at(i, i / 300) for i in range(300)]
     assert sum(d.reset for d in due) == 4
     assert due[-1].sh_degree == 3 and not due[-1].collect
+
+
+def test_positions_learn_in_units_of_the_camera_extent():
+    """Adam's first step is as long as the learning rate, whatever the gradient."""
+    scene, config = toy_scene(), GaussianConfig()
+    for extent in (EXTENT, 3.0):
+        method = GaussianSplatting(SHORT)
+        method.setup(replace(scene, camera_extent=extent), seed=0, device="cpu")
+        before = method.model.parameters["means"].detach().clone()
+        method.step(0, 0.0)
+        moved = (method.model.parameters["means"].detach() - before).abs().max()
+        assert float(moved) == pytest.approx(config.position_lr_initial * extent, rel=0.01)
+
+
+def test_a_step_counts_its_gradients_once():
+    scene = toy_scene()
+    method = GaussianSplatting(SHORT)
+    method.setup(scene, seed=0, device="cpu")
+    number = ViewSampler(len(scene.views), 0).next()
+    view, trainer = scene.views[number], method.trainer
+    raster = draw(
+        method.model.splats(view, 0), view, trainer.background, near_plane=SHORT.near_plane
+    )
+    trainer.loss(raster, number).backward()
+    pixels = raster.info.means2d.grad[0].numpy() * [0.5 * WIDTH, 0.5 * HEIGHT]
+    expected = np.where((raster.info.radii[0] > 0).all(-1), np.linalg.norm(pixels, axis=-1), 0)
+    method.step(0, 0.0)
+    assert expected.max() > 0
+    np.testing.assert_allclose(trainer.statistics.mean(), expected, rtol=1e-5)
 
 
 def test_moments_of_survivors_stay_and_new_rows_have_none():

@@ -14,7 +14,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from rasterizer_cases.comparison import Comparison, compare, steady_pixels, thresholds
-from rasterizer_cases.scenes import SmallScene, random_scene, scenes, well_posed
+from rasterizer_cases.scenes import SmallScene, crowd, random_scene, scenes, well_posed
 
 
 @pytest.fixture(scope="session")
@@ -29,6 +29,7 @@ def tools() -> SimpleNamespace:
         SmallScene=SmallScene,
         compare=compare,
         random_scene=random_scene,
+        crowd=crowd,
         scenes=scenes,
         well_posed=well_posed,
         steady_pixels=steady_pixels,

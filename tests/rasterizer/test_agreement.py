@@ -66,6 +66,34 @@ def test_any_number_of_channels(
     )
 
 
+@pytest.mark.parametrize(("count", "width", "height"), [(9_000, 70, 50), (60_000, 96, 64)])
+def test_lists_of_several_parts(
+    count: int, width: int, height: int, tools: SimpleNamespace, check_agreement: Check
+) -> None:
+    """From 4,096 Gaussians on, several workers list them; every one of them must be there."""
+    scene = tools.crowd(count, width, height)
+    with tools.thresholds(TILE=4):  # the reference is then faster where Gaussians are small
+        comparison = check_agreement(scene)
+    assert comparison.steady.mean() > 0.99
+    assert 0.3 < comparison.expected["alphas"].mean() < 0.95
+    got, expected = (x["grad colors"] for x in (comparison.got, comparison.expected))
+    present = np.abs(expected).max(-1) > 1e-6 * np.abs(expected).max()
+    assert present.mean() > 0.9 and got[present].any(-1).all()
+    assert_elements_agree(comparison)
+
+
+def assert_elements_agree(comparison: Any) -> None:
+    """Also each Gaussian by itself: one that is missing hides among the errors of all."""
+    for name in ("grad opacities", "grad colors", "grad means2d"):
+        got, expected = (
+            x[name].reshape(comparison.scene.opacities.size, -1)
+            for x in (comparison.got, comparison.expected)
+        )
+        size = np.linalg.norm(expected, axis=-1)
+        error = np.linalg.norm(got - expected, axis=-1)
+        assert (error <= 1e-3 * (size + np.median(size))).all(), name
+
+
 def test_several_cameras(tools: SimpleNamespace, check_agreement: Check) -> None:
     scene = tools.random_scene(80, 34, 30)
     viewmats = np.tile(scene.viewmats, (3, 1, 1))

@@ -58,6 +58,20 @@ def test_bits_do_not_depend_on_the_number_of_threads(
         assert_equal_bits(results[0], other)
 
 
+@pytest.mark.skipif(MAX_THREADS < 2, reason="needs two threads")
+@pytest.mark.parametrize(("count", "size"), [(9_000, 70), (60_000, 96)])
+def test_workers_that_share_lists_wait_for_each_other(
+    count: int, size: int, tools: SimpleNamespace, threads: Any
+) -> None:
+    """Many times, as a worker that does not wait is not always too early."""
+    scene = tools.crowd(count, size, size - 6)
+    threads(1)
+    alone = everything(scene)
+    threads(2)
+    for _ in range(40):
+        assert_equal_bits(alone, everything(scene))
+
+
 def test_buffers_of_other_scenes_leave_no_trace(tools: SimpleNamespace) -> None:
     """A small scene after a large one, and after one that has other pixels ended."""
     small = tools.random_scene(50, 45, 30, seed=1)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from chronoscene.rasterizer import rasterize
-from chronoscene.rasterizer.constants import ALPHA_MAX, ALPHA_MIN, EPS2D
+from chronoscene.rasterizer import constants, rasterize
 
+# Numbers of gsplat's classic mode, written out so that changing a constant fails here.
+EPS2D, ALPHA_MIN, ALPHA_MAX = 0.3, 1 / 255, float(np.float32(0.999))
 F, Z, SIZE = 50.0, 4.0, 31
 K = torch.tensor([[[F, 0.0, SIZE / 2], [0.0, F, SIZE / 2], [0.0, 0.0, 1.0]]]).double()
 
@@ -76,6 +77,51 @@ def test_off_axis_gaussian_is_stretched_by_the_jacobian() -> None:
     alpha = 0.9 * np.exp(-0.5 * power)
     alpha[alpha < ALPHA_MIN] = 0
     np.testing.assert_allclose(result.alphas[0, ..., 0], alpha, atol=1e-12)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_radii_end_where_alpha_reaches_its_threshold(backend: str, tools: SimpleNamespace) -> None:
+    scene = tools.random_scene(40, 64, 64, seed=2)
+    means = scene.means * np.array([0.1, 0.1, 1], np.float32)  # no Jacobian at its margin
+    scene = scene.with_(means=means, scales=scene.scales.max(-1, keepdims=True).repeat(3, -1))
+    radii = scene.render(backend, torch.float32)[0].info.radii[0].numpy()
+    x, y, z = scene.means.astype(np.float64).T
+    f, s = scene.Ks[0].diagonal()[:2].astype(np.float64), scene.scales[:, 0]
+    tilt = np.stack([x, y], -1) / z[:, None]
+    variances = (f * (s / z)[:, None]) ** 2 * (1 + tilt**2) + 0.3
+    extents = np.sqrt(2 * np.log(255 * scene.opacities)[:, None] * variances)
+    assert (np.abs(radii - np.ceil(extents)) <= (np.abs(extents - extents.round()) < 1e-4)).all()
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_what_is_drawn_begins_at_the_default_near_plane(
+    backend: str, tools: SimpleNamespace
+) -> None:
+    scene = tools.random_scene(4, 16, 16)
+    means = np.array([[0, 0, 0.0099], [0, 0, 0.0101], [0, 0, 0.99e10], [0, 0, 1.01e10]])
+    scales = np.repeat(means[:, 2:] * 0.1, 3, axis=1)
+    scene = scene.with_(means=means.astype(np.float32), scales=scales.astype(np.float32))
+    radii = scene.render(backend)[0].info.radii[0]
+    assert (radii > 0).all(-1).tolist() == [False, True, True, False]
+
+
+def test_constants_are_those_of_the_readme() -> None:
+    assert {name: x for name, x in vars(constants).items() if name.isupper()} == {
+        "ALPHA_MIN": 1 / 255,
+        "ALPHA_MAX": float(np.float32(0.999)),
+        "TRANSMITTANCE_MIN": 1e-4,
+        "EPS2D": 0.3,
+        "CLAMP_MARGIN": 0.3,
+        "NEAR_PLANE": 0.01,
+        "FAR_PLANE": 1e10,
+        "QUATERNION_MIN": 2**-66,
+        "EXTENT_MAX": 1e15,
+        "VALUE_MAX": 1e30,
+        "DEPTH_MAX": 1e18,
+        "SIZE_MAX": 65536,
+        "FOCAL_MIN": 1e-3,
+        "RADIUS_MAX": 2_000_000_000,
+    }
 
 
 @pytest.mark.parametrize("near_first", [True, False])

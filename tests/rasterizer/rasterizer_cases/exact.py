@@ -8,23 +8,25 @@ import mpmath  # type: ignore[import-untyped]
 import numpy as np
 from mpmath import mp, mpf
 
-from chronoscene.rasterizer.constants import (
-    ALPHA_MAX,
-    ALPHA_MIN,
-    CLAMP_MARGIN,
-    TRANSMITTANCE_MIN,
-)
-
 from .scenes import SmallScene
 
 DIGITS = 60
+
+# Numbers of gsplat's classic mode. Written out, not imported: who changes a constant of the
+# rasterizer is told so here.
+ALPHA_MIN = mpf(1) / 255
+ALPHA_MAX = float(np.float32(0.999))
+TRANSMITTANCE_MIN = mpf("1e-4")
+CLAMP_MARGIN = mpf("0.3")
+EPS2D = 0.3
+NEAR_PLANE = 0.01
 
 
 def exact_pixels(scene: SmallScene, pixels: list[tuple[int, int]]) -> np.ndarray:
     """Colours and opacity of pixels (column, row) of the first camera. [P, D + 1]"""
     with mp.workdps(DIGITS):
         splats = [_project(scene, i) for i in range(len(scene.means))]
-        near = mpf(dict(scene.options).get("near_plane", 0.01))
+        near = mpf(dict(scene.options).get("near_plane", NEAR_PLANE))
         drawn = [s for s in splats if s is not None and s["depth"] >= near]
         drawn.sort(key=lambda s: s["depth"])
         return np.array([_composite(scene, drawn, *pixel) for pixel in pixels], np.float64)
@@ -59,11 +61,11 @@ def _project(scene: SmallScene, i: int) -> dict[str, Any] | None:
     jacobian, centre = mpmath.zeros(2, 3), []
     for k, size in enumerate((scene.width, scene.height)):
         f, c, ratio = K[k, k], K[k, 2], p[k] / p[2]
-        margin = mpf(CLAMP_MARGIN) * size / (2 * f)
+        margin = CLAMP_MARGIN * size / (2 * f)
         jacobian[k, k] = f / p[2]
         jacobian[k, 2] = -f / p[2] * min(max(ratio, -c / f - margin), (size - c) / f + margin)
         centre.append(f * ratio + c)
-    blur = mpf(dict(scene.options).get("eps2d", 0.3))
+    blur = mpf(dict(scene.options).get("eps2d", EPS2D))
     covariance = (jacobian * axes) * (jacobian * axes).T + blur * mpmath.eye(2)
     return {"i": i, "depth": p[2], "centre": centre, "conic": covariance**-1}
 
@@ -75,10 +77,10 @@ def _composite(
     for s in splats:
         d = mpmath.matrix([column + mpf(0.5) - s["centre"][0], row + mpf(0.5) - s["centre"][1]])
         alpha = float(scene.opacities[s["i"]]) * mpmath.exp(-(d.T * s["conic"] * d)[0] / 2)
-        if alpha < mpf(ALPHA_MIN):
+        if alpha < ALPHA_MIN:
             continue
         alpha = min(alpha, mpf(ALPHA_MAX))
-        if light * (1 - alpha) <= mpf(TRANSMITTANCE_MIN):
+        if light * (1 - alpha) <= TRANSMITTANCE_MIN:
             break
         color = scene.colors[s["i"]]
         values = [v + alpha * light * float(c) for v, c in zip(values, color, strict=True)]

@@ -145,6 +145,23 @@ def random_scene(count: int, width: int, height: int, seed: int = 0, **changes: 
     return scene.with_(**changes)
 
 
+def crowd(count: int, width: int, height: int, seed: int = 0) -> SmallScene:
+    """Many Gaussians of about a pixel, all inside the image, so faint that all of them are seen."""
+    scene = random_scene(count, width, height, seed)
+    g = np.random.default_rng((seed, 1))
+    z = scene.means[:, 2:]
+    pixels = g.uniform(0, 1, (count, 2)) * [width, height]
+    sideways = (pixels - scene.Ks[0, :2, 2]) / np.diag(scene.Ks[0])[:2] * z
+    means = np.concatenate([sideways, z], axis=1).astype(np.float32)
+    spacing = np.sqrt(width * height / count)  # pixels from one to the next
+    opacities = np.minimum(0.5, 0.4 * spacing**2 * g.uniform(0.5, 1.5, count))
+    return scene.with_(
+        means=means,
+        scales=(0.5 / width * np.exp(g.uniform(-0.5, 0.5, (count, 3)))).astype(np.float32),
+        opacities=np.maximum(opacities, 0.02).astype(np.float32),
+    )
+
+
 @st.composite
 def extreme_scenes(draw: st.DrawFn) -> SmallScene:
     """Scales of 1e-8 to 1e4, quaternions of any length, opacities at their ends, distances from the
