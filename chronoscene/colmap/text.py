@@ -104,7 +104,7 @@ def read_images(path: Path) -> RawImages:
     _raise_any(damages)
     infinite = np.flatnonzero(~np.isfinite(values))
     rows = np.unique(np.searchsorted(np.cumsum(lengths), infinite, "right"))
-    finite = "finite positions of keypoints"  # COLMAP stops reading elsewhere
+    finite = "finite positions of keypoints"  # COLMAP stops reading at others
     _raise_any([_damage(path, keypoint_lines[row], finite) for row in rows])
     table = np.array(heads, np.float64).reshape(-1, 9)
     keypoints = values.reshape(-1, 3)

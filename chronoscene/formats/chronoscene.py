@@ -19,20 +19,7 @@ from chronoscene.formats.shared.json_values import (
 )
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
-from chronoscene.scene import Frame, Period, Scene, WorldFrame
-from chronoscene.scene.splits import (
-    DEFAULT_RULE,
-    FATAL,
-    Problem,
-    assign_periods,
-    assign_tests,
-    default_tests,
-    format_split_text,
-    parse_split_text,
-    parse_test_text,
-    read_text,
-    split_of,
-)
+from chronoscene.scene import Frame, Period, Scene, WorldFrame, splits
 
 NAME = "chronoscene"
 MARKS = "sparse/split.txt"
@@ -70,13 +57,13 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
         SceneError: If files are missing, damaged, or contradict each other.
     """
     path = Path(path)
-    entries, problems = parse_split_text(read_text(path / SPLIT))
+    entries, problems = splits.parse_split_text(splits.read_text(path / SPLIT))
     raise_first(path / SPLIT, problems)
     model = model or read_model(path / MODEL)
-    names = [image.name for image in model.images]
     for image in model.images:
         check_image(path / MODEL, image)
-    periods, problems = assign_periods(names, entries)
+    names = [image.name for image in model.images]
+    periods, problems = splits.assign_periods(names, entries)
     raise_first(path / SPLIT, problems)
     tests, rule = read_tests(path, names, periods)
     return Scene(
@@ -94,15 +81,15 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
 
 def remarks(path: Path) -> list[str]:
     """What of a folder is not part of the format."""
-    others = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
-    others = [name for name in others if name not in ("images/", "sparse/")]
+    names = {p.name + "/" * p.is_dir() for p in path.iterdir()}
+    others = sorted(names - {"images/", "sparse/"})
     return [f"not part of the format, and not converted: {', '.join(others)}"] if others else []
 
 
-def raise_first(path: Path, problems: Iterable[Problem]) -> None:
+def raise_first(path: Path, problems: Iterable[splits.Problem]) -> None:
     """Raise the first problem that makes a scene unreadable."""
     for problem in problems:
-        if problem.kind in FATAL:
+        if problem.kind in splits.FATAL:
             raise problem.error(path)
 
 
@@ -110,20 +97,15 @@ def check_image(place: Path, image: PosedImage) -> None:
     """Refuse an image whose name, pose or camera no method could use."""
     check_name(place, image.name)
     camera, pose = image.camera, image.cam_from_world
+    wrong = None
     if not (np.abs(pose) < MAX_COORDINATE).all():
-        raise SceneError(
-            place,
-            expected=f"a finite pose of {image.name!r}",
-            found="NaN, infinity, or absurdly large numbers",
-            todo="remove the image from the model, or register it again",
-        )
-    if np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > NOT_RIGID:
-        raise SceneError(
-            place,
-            expected=f"a rotation in the pose of {image.name!r}",
-            found="a different matrix, from a quaternion that is too large or too small",
-            todo="remove the image from the model, or register it again",
-        )
+        wrong = f"a finite pose of {image.name!r}", "NaN, infinity, or absurdly large numbers"
+    elif np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() > NOT_RIGID:
+        found = "a different matrix, from a quaternion that is too large or too small"
+        wrong = f"a rotation in the pose of {image.name!r}", found
+    if wrong is not None:
+        todo = "remove the image from the model, or register it again"
+        raise SceneError(place, expected=wrong[0], found=wrong[1], todo=todo)
     if not camera.is_usable:
         raise SceneError(
             place,
@@ -156,7 +138,7 @@ def make_frames(model: Model, periods: dict[str, int], tests: set[str]) -> tuple
             camera=image.camera,
             cam_from_world=image.cam_from_world,
             period=periods[image.name],
-            split=split_of(image.name, tests),
+            split=splits.split_of(image.name, tests),
         )
         for image in model.images
     )
@@ -165,8 +147,9 @@ def make_frames(model: Model, periods: dict[str, int], tests: set[str]) -> tuple
 def read_tests(path: Path, names: list[str], periods: dict[str, int]) -> tuple[set[str], str]:
     """Names of the test images, and the rule that chose them in words."""
     if not (path / TEST).exists():
-        return default_tests(periods), DEFAULT_RULE
-    tests, problems = assign_tests(names, parse_test_text(read_text(path / TEST)))
+        return splits.default_tests(periods), splits.DEFAULT_RULE
+    entries = splits.parse_test_text(splits.read_text(path / TEST))
+    tests, problems = splits.assign_tests(names, entries)
     raise_first(path / TEST, problems)
     return tests, TEST
 
@@ -224,7 +207,7 @@ def write(
 def check_writable_name(place: Path, frame: Frame) -> None:
     """Refuse a name that would leave the folder or that one line of text cannot hold."""
     check_name(place, frame.name)
-    entries, _ = parse_split_text(format_split_text({frame.name: frame.period}))
+    entries, _ = splits.parse_split_text(splits.format_split_text({frame.name: frame.period}))
     if [(entry.name, entry.period) for entry in entries] != [(frame.name, frame.period)]:
         raise SceneError(
             place,
@@ -240,7 +223,7 @@ def write_texts(scene: Scene, root: Path) -> None:
     write_model(root / MODEL, scene.frames, scene.points)
     tests = [f.name for f in scene.frames if f.split == "test"]
     files = {
-        SPLIT: format_split_text({f.name: f.period for f in scene.frames}),
+        SPLIT: splits.format_split_text({f.name: f.period for f in scene.frames}),
         TEST: "".join(f"{name}\n" for name in tests),
         PERIODS: json.dumps(period_items(scene.periods), indent=1, ensure_ascii=False) + "\n",
         WORLD: json.dumps(world_item(scene.world)) + "\n",

@@ -18,29 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from chronoscene.errors import SceneError
-from chronoscene.formats.shared.colmap_layout import (
-    find_model,
-    lost_labels,
-    lost_names,
-    lost_split,
-    make_scene,
-    read_images,
-    scan,
-    write_renamed,
-)
+from chronoscene.formats.shared import colmap_layout, transforms
 from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
 from chronoscene.formats.shared.json_values import read_json
 from chronoscene.formats.shared.ply import read_points
-from chronoscene.formats.shared.transforms import (
-    CameraTable,
-    Shot,
-    check_distinct,
-    image_name,
-    matrix,
-    pose_from_opengl,
-    read_frames,
-)
-from chronoscene.formats.shared.transforms import make_scene as scene_from_shots
+from chronoscene.formats.shared.transforms import CameraTable, Shot
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Camera, Points, Scene
 from chronoscene.scene.cameras import PINHOLE_MODELS, as_pinhole
@@ -72,7 +54,9 @@ def _is_level(path: Path) -> bool:
 
 
 def _is_real(path: Path) -> bool:
-    return find_model(path) is not None and any(map(_DAY.match, scan(path / "images")[1]))
+    if colmap_layout.find_model(path) is None:
+        return False
+    return any(map(_DAY.match, colmap_layout.scan(path / "images")[1]))
 
 
 def read(path: Path, *, period_by: str = "step") -> Scene:
@@ -87,10 +71,10 @@ def read(path: Path, *, period_by: str = "step") -> Scene:
         return _read_level(path, period_by)
     if period_by != "step":
         raise rule_error(period_by, ["step"])
-    model = read_images(path, path / "images")
+    model = colmap_layout.read_images(path, path / "images")
     steps = {image.name: _step(image.name) for image in model.images}
     order = sorted(set(steps.values()), key=natural_key)
-    return make_scene(
+    return colmap_layout.make_scene(
         path,
         path / "images",
         model,
@@ -118,16 +102,16 @@ def _read_level(path: Path, period_by: str) -> Scene:
     tests: set[str] = set()
     for label in (BASE, *changes):
         folder = "" if label == BASE else label
-        for file in (TRAIN, TEST):
-            if file == TEST and not (path / folder / TEST).exists():
-                continue
-            new = _read_file(path, folder, file, cameras)
-            shots += new
-            labels |= {shot.name: label for shot in new}
-            tests |= {shot.name for shot in new if file == TEST}
-    check_distinct(path, shots)
+        new = _read_file(path, folder, TRAIN, cameras)
+        if (path / folder / TEST).exists():
+            held_out = _read_file(path, folder, TEST, cameras)
+            tests |= {shot.name for shot in held_out}
+            new += held_out
+        shots += new
+        labels |= {shot.name: label for shot in new}
+    transforms.check_distinct(path, shots)
     grouped = group_labels(labels, [BASE, *changes])
-    return scene_from_shots(
+    return transforms.make_scene(
         path,
         shots,
         grouped,
@@ -142,10 +126,11 @@ def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list
     place = path / folder / file
     data = read_json(place, dict)
     shots = []
-    for i, frame in enumerate(read_frames(place, data)):
+    for i, frame in enumerate(transforms.read_frames(place, data)):
         where = f"{place}: frames[{i}]"
-        name = image_name(where, path, folder, frame.get("file_path"))
-        pose = pose_from_opengl(where, matrix(where, frame.get("transform_matrix")))
+        name = transforms.image_name(where, path, folder, frame.get("file_path"))
+        world_from_cam = transforms.matrix(where, frame.get("transform_matrix"))
+        pose = transforms.pose_from_opengl(where, world_from_cam)
         keys = {key: value for key, value in data.items() if key != "frames"} | frame
         shots.append(Shot(name, cameras.camera(where, keys, path / name), pose))
     return shots
@@ -169,7 +154,7 @@ def write(
         SceneError: If ``out`` is in use, an image is missing or its camera is not a pinhole,
             or names without their folders are equal.
     """
-    return write_renamed(
+    return colmap_layout.write_renamed(
         scene.with_frames([replace(f, camera=_readable(f.camera)) for f in scene.frames]),
         Path(out),
         _written_names(scene),
@@ -200,9 +185,9 @@ def losses(scene: Scene) -> list[str]:
     order = sorted({_step(name) for name in old}, key=natural_key)
     rule = f"every {TEST_EVERY}th image of all"
     return [
-        *lost_labels(scene, order),
-        *lost_names(names),
-        *lost_split(scene, {old[name] for name in sorted(old)[::TEST_EVERY]}, rule),
+        *colmap_layout.lost_labels(scene, order),
+        *colmap_layout.lost_names(names),
+        *colmap_layout.lost_split(scene, {old[name] for name in sorted(old)[::TEST_EVERY]}, rule),
     ]
 
 

@@ -11,35 +11,10 @@ from pathlib import Path
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import wat
-from chronoscene.formats.chronoscene import TEST, raise_first
-from chronoscene.formats.shared.colmap_layout import (
-    find_model,
-    layout,
-    lost_labels,
-    lost_names,
-    make_scene,
-    new_names,
-    period_folders,
-    read_images,
-    scan,
-    write_renamed,
-)
-from chronoscene.formats.shared.grouping import (
-    TABLE,
-    group_by_table,
-    group_labels,
-    natural_key,
-    rule_error,
-)
+from chronoscene.formats.chronoscene import read_tests
+from chronoscene.formats.shared import colmap_layout, grouping
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Scene
-from chronoscene.scene.splits import (
-    DEFAULT_RULE,
-    assign_tests,
-    default_tests,
-    parse_test_text,
-    read_text,
-)
 
 NAME = "colmap-folders"
 MARKS = "images/<period>/ and sparse/0/"
@@ -51,15 +26,11 @@ PERIOD_BY = ("folder", "table:FILE")
 
 def matches(path: Path) -> bool:
     """Whether a folder has images in folders and a model, and is not clearly of WAT."""
-    if find_model(path) is None or layout(path / "images") != "folders":
+    if colmap_layout.find_model(path) is None or colmap_layout.layout(path / "images") != "folders":
         return False
-    return not (wat.matches(path) and _is_same_to_wat(path))
-
-
-def _is_same_to_wat(path: Path) -> bool:
-    """Whether both formats put the folders in the same order; else the reader must be named."""
-    folders, _ = scan(path / "images")
-    return sorted(folders) == sorted(folders, key=natural_key)
+    folders, _ = colmap_layout.scan(path / "images")
+    # Where both formats put the folders in the same order, WAT wins; else one must be named.
+    return not (wat.matches(path) and folders == sorted(folders, key=grouping.natural_key))
 
 
 def read(path: Path, *, period_by: str = "folder") -> Scene:
@@ -70,21 +41,20 @@ def read(path: Path, *, period_by: str = "folder") -> Scene:
         ConfigError: If ``period_by`` is not in `PERIOD_BY`.
     """
     path = Path(path)
-    model = read_images(path, path / "images")
+    model = colmap_layout.read_images(path, path / "images")
     names = [image.name for image in model.images]
-    if period_by.startswith(TABLE):
-        grouped = group_by_table(names, Path(period_by.removeprefix(TABLE)))
+    if period_by.startswith(grouping.TABLE):
+        grouped = grouping.group_by_table(names, Path(period_by.removeprefix(grouping.TABLE)))
     elif period_by == "folder":
         labels = {name: _folder(path, name) for name in names}
-        grouped = group_labels(labels, sorted(set(labels.values()), key=natural_key))
+        order = sorted(set(labels.values()), key=grouping.natural_key)
+        grouped = grouping.group_labels(labels, order)
     else:
-        raise rule_error(period_by, PERIOD_BY)
-    tests, rule = default_tests(grouped[0]), DEFAULT_RULE
-    if (path / TEST).exists():
-        tests, problems = assign_tests(names, parse_test_text(read_text(path / TEST)))
-        raise_first(path / TEST, problems)
-        rule = TEST
-    return make_scene(path, path / "images", model, grouped, tests, rule=rule, format=NAME)
+        raise grouping.rule_error(period_by, PERIOD_BY)
+    tests, rule = read_tests(path, names, grouped[0])
+    return colmap_layout.make_scene(
+        path, path / "images", model, grouped, tests, rule=rule, format=NAME
+    )
 
 
 def _folder(path: Path, name: str) -> str:
@@ -111,7 +81,7 @@ def write(
     Raises:
         SceneError: If ``out`` is in use, or an image is missing.
     """
-    return write_renamed(
+    return colmap_layout.write_renamed(
         scene,
         Path(out),
         _names(scene),
@@ -123,8 +93,9 @@ def write(
 
 def losses(scene: Scene) -> list[str]:
     """What a scene has that this format cannot hold."""
-    return lost_labels(scene, period_folders(scene.periods)) + lost_names(_names(scene))
+    labels = colmap_layout.period_folders(scene.periods)
+    return colmap_layout.lost_labels(scene, labels) + colmap_layout.lost_names(_names(scene))
 
 
 def _names(scene: Scene) -> dict[str, str]:
-    return new_names(scene, period_folders(scene.periods), deep=True)
+    return colmap_layout.new_names(scene, colmap_layout.period_folders(scene.periods), deep=True)

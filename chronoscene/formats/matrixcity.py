@@ -26,20 +26,11 @@ from typing import Any
 import numpy as np
 
 from chronoscene.errors import SceneError
+from chronoscene.formats.shared import transforms
 from chronoscene.formats.shared.colmap_layout import scan
 from chronoscene.formats.shared.grouping import Grouped, group_labels, natural_key, rule_error
 from chronoscene.formats.shared.json_values import json_error, read_json
-from chronoscene.formats.shared.transforms import (
-    CameraTable,
-    Shot,
-    check_distinct,
-    head_has,
-    image_name,
-    make_scene,
-    matrix,
-    pose_from_opengl,
-    read_frames,
-)
+from chronoscene.formats.shared.transforms import CameraTable, Shot
 from chronoscene.images.store import image_size
 from chronoscene.scene import Period, Points, Scene, WorldFrame
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
@@ -118,7 +109,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
             if file.is_test:
                 tests.add(shot.name)
     grouped = _group(path, labels, period_by)
-    scene = make_scene(
+    scene = transforms.make_scene(
         path,
         list(shots.values()),
         grouped,
@@ -163,7 +154,7 @@ def _walk(path: Path) -> Iterator[tuple[list[PoseFile], str | None]]:
     while waiting and visited < MAX_FOLDERS:
         folder, visited = waiting.pop(), visited + 1
         here = path / folder
-        if head_has(here / RAW, RAW_KEY):
+        if transforms.head_has(here / RAW, RAW_KEY):
             yield [PoseFile(folder, RAW)], None
             continue
         folders, images = scan(here)
@@ -203,25 +194,25 @@ def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[Shot]:
     place = path / file.folder / file.name
     data = read_json(place, dict)
     shots: list[Shot] = []
-    for i, frame in enumerate(read_frames(place, data)):
+    for i, frame in enumerate(transforms.read_frames(place, data)):
         where = f"{place}: frames[{i}]"
         if file.name == RAW:
-            world_from_cam = matrix(where, frame.get("rot_mat"))
+            world_from_cam = transforms.matrix(where, frame.get("rot_mat"))
             world_from_cam[:3, :3] *= ROTATION_SCALE
             file_path: object = _raw_file_path(where, frame)
         else:
-            world_from_cam = matrix(where, frame.get("transform_matrix"))
+            world_from_cam = transforms.matrix(where, frame.get("transform_matrix"))
             world_from_cam[:3, 3] *= PREPARED_UNIT
             file_path = frame.get("file_path")
-        name = image_name(where, path, file.folder, file_path)
+        name = transforms.image_name(where, path, file.folder, file_path)
         keys = {key: value for key, value in data.items() if key != "frames"} | frame
         if "w" not in keys or "h" not in keys:  # images of a block are of one size
             known = shots[0].camera if shots else None
             size = (known.width, known.height) if known else image_size(path / name)
             keys |= {"w": size[0], "h": size[1]}
         camera = cameras.camera(where, keys, path / name)
-        shots.append(Shot(name, camera, pose_from_opengl(where, world_from_cam)))
-    check_distinct(place, shots)
+        shots.append(Shot(name, camera, transforms.pose_from_opengl(where, world_from_cam)))
+    transforms.check_distinct(place, shots)
     return shots
 
 

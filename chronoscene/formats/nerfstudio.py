@@ -28,14 +28,8 @@ from numpy.typing import NDArray
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.chronoscene import MAX_COORDINATE, MAX_PERIODS, check_name
-from chronoscene.formats.shared.grouping import (
-    OPTION,
-    TABLE,
-    Grouped,
-    group_by_table,
-    group_times,
-    rule_error,
-)
+from chronoscene.formats.matrixcity import RAW_KEY
+from chronoscene.formats.shared import grouping, transforms
 from chronoscene.formats.shared.json_values import (
     json_error,
     number,
@@ -46,20 +40,7 @@ from chronoscene.formats.shared.json_values import (
     world_item,
 )
 from chronoscene.formats.shared.ply import read_points, write_points
-from chronoscene.formats.shared.transforms import (
-    MODEL_KEYS,
-    CameraTable,
-    Shot,
-    file_name,
-    head_has,
-    image_name,
-    make_scene,
-    matrix,
-    nearest_rotation,
-    opengl_from_pose,
-    pose_from_opengl,
-    read_frames,
-)
+from chronoscene.formats.shared.transforms import CameraTable, Shot
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Points, Scene, WorldFrame
@@ -67,16 +48,14 @@ from chronoscene.scene.similarity import Sim3
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "nerfstudio"
-
 FILE = "transforms.json"
+MARKS = FILE
+"""What `matches` looks for."""
 
 POINTS = "sparse_points.ply"
 """Where points are written to."""
 
 FISHEYE = "OPENCV_FISHEYE"
-
-MARKS = FILE
-"""What `matches` looks for."""
 
 PERIOD_BY = ("period", "time", "gap:X", "count:N", "table:FILE")
 """The key ``period`` or ``time``, groups of times, or a CSV file with columns file and period."""
@@ -87,16 +66,13 @@ COLMAP = "colmap/sparse/0"
 HISTORICAL = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))
 """The undocumented change of axes that these versions applied to the world of that model."""
 
-RAW_MATRIXCITY = '"rot_mat"'
-"""A key of the raw files of MatrixCity, which have the same name."""
-
 
 def matches(path: Path) -> bool:
     """Whether a folder has a ``transforms.json`` that is not a raw file of MatrixCity."""
     place = path / FILE
     if (path / "sparse/split.txt").exists() or not place.is_file():
         return False
-    return not head_has(place, RAW_MATRIXCITY)
+    return not transforms.head_has(place, RAW_KEY)
 
 
 def read(path: Path, *, period_by: str | None = None) -> Scene:
@@ -109,11 +85,11 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     path = Path(path)
     place = path / FILE
     data = read_json(place, dict)
-    frames = read_frames(place, data)
+    frames = transforms.read_frames(place, data)
     named = _by_name(path, frames)
     shots, tests, rule = _apply_lists(path, data, _read_shots(path, data, named), named)
     grouped = _group(place, data, {shot.name: named[shot.name][1] for shot in shots}, period_by)
-    scene = make_scene(
+    scene = transforms.make_scene(
         path,
         shots,
         grouped,
@@ -132,7 +108,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
 def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
     data = read_json(path / FILE, dict)
-    frames = read_frames(path / FILE, data)
+    frames = transforms.read_frames(path / FILE, data)
     found = [
         f"{what} of {count} frames are not read"
         for key, what in (("mask_path", "masks"), ("depth_file_path", "depth maps"))
@@ -162,7 +138,7 @@ def _by_name(path: Path, frames: list[dict[str, Any]]) -> dict[str, tuple[str, d
     named: dict[str, tuple[str, dict[str, Any]]] = {}
     for i, frame in enumerate(frames):
         place = f"{path / FILE}: frames[{i}]"
-        name = image_name(place, path, "", frame.get("file_path"))
+        name = transforms.image_name(place, path, "", frame.get("file_path"))
         if name in named:
             raise json_error(path / FILE, "each image once", f"{name!r} twice")
         named[name] = place, frame
@@ -182,13 +158,13 @@ def _read_shots(
     for name, (place, frame) in named.items():
         if not os.path.isfile(path / name):
             continue
-        world_from_cam = matrix(place, frame.get("transform_matrix"), (3, 4))
+        world_from_cam = transforms.matrix(place, frame.get("transform_matrix"), (3, 4))
         image_id = frame.get("colmap_im_id")
         shots.append(
             Shot(
                 name=name,
                 camera=cameras.camera(place, {**shared, **frame}, path / name),
-                cam_from_world=pose_from_opengl(place, world_from_cam),
+                cam_from_world=transforms.pose_from_opengl(place, world_from_cam),
                 image_id=image_id if type(image_id) is int else 0,
             )
         )
@@ -227,7 +203,7 @@ def _names(
         return None
     if not isinstance(names, list):
         raise json_error(place, "a list", type(names).__name__)
-    found = {image_name(place, path, "", name) for name in names}
+    found = {transforms.image_name(place, path, "", name) for name in names}
     if lost := sorted(found.difference(known)):
         raise json_error(place, "names of frames", repr(lost[0]), "correct the list")
     return found
@@ -235,16 +211,15 @@ def _names(
 
 def _group(
     place: Path, data: Mapping[str, Any], frames: Mapping[str, Mapping[str, Any]], by: str | None
-) -> Grouped:
+) -> grouping.Grouped:
     """Periods of the frames by the keys that they have, or as the option says."""
     if by is None:
-        by = next(
-            (key for key in ("period", "time") if any(key in f for f in frames.values())), "one"
-        )
-        if by == "one":
+        keys = (key for key in ("period", "time") if any(key in f for f in frames.values()))
+        by = next(keys, None)
+        if by is None:
             return dict.fromkeys(frames, 0), (Period(0, "0"),)
-    if by.startswith(TABLE):
-        return group_by_table(sorted(frames), Path(by.removeprefix(TABLE)))
+    if by.startswith(grouping.TABLE):
+        return grouping.group_by_table(sorted(frames), Path(by.removeprefix(grouping.TABLE)))
     if by == "period":
         return _group_by_ids(place, data, frames)
     if by == "time" or by.startswith(("gap:", "count:")):
@@ -252,13 +227,13 @@ def _group(
         distinct = len(set(times.values()))
         if by == "time" and distinct > max(1, len(times) // 2):
             raise ConfigError(
-                OPTION,
+                grouping.OPTION,
                 expected="times that the frames of a period share",
                 found=f"{distinct} times of {len(times)} frames in {place}",
                 todo="group them with count:N or gap:X",
             )
-        return group_times(times, f"count:{distinct}" if by == "time" else by)
-    raise rule_error(by, PERIOD_BY)
+        return grouping.group_times(times, f"count:{distinct}" if by == "time" else by)
+    raise grouping.rule_error(by, PERIOD_BY)
 
 
 def _time(place: Path, name: str, frame: Mapping[str, Any]) -> float:
@@ -270,28 +245,27 @@ def _time(place: Path, name: str, frame: Mapping[str, Any]) -> float:
 
 def _group_by_ids(
     place: Path, data: Mapping[str, Any], frames: Mapping[str, Mapping[str, Any]]
-) -> Grouped:
-    ids = {name: frame.get("period") for name, frame in frames.items()}
-    for name, value in ids.items():
-        if type(value) is not int or not 0 <= value < MAX_PERIODS:
-            raise json_error(f"{place}: {name}", "a period 0, 1, ...", repr(value)[:40])
-    used = sorted({value for value in ids.values() if value is not None})
+) -> grouping.Grouped:
+    ids: dict[str, int] = {}
+    for name, frame in frames.items():
+        period = frame.get("period")
+        if type(period) is not int or not 0 <= period < MAX_PERIODS:
+            raise json_error(f"{place}: {name}", "a period 0, 1, ...", repr(period)[:40])
+        ids[name] = period
+    used = sorted(set(ids.values()))
     if used != list(range(len(used))):
         raise json_error(place, f"periods 0..{len(used) - 1} without gaps", str(used)[:60])
     table = data.get("periods")
-    periods = (
-        parse_periods(place, table, len(used))
-        if isinstance(table, list)
-        else tuple(Period(i, str(i)) for i in used)
-    )
-    return {name: value for name, value in ids.items() if value is not None}, periods
+    if isinstance(table, list):
+        return ids, parse_periods(place, table, len(used))
+    return ids, tuple(Period(i, str(i)) for i in used)
 
 
 def _read_points(path: Path, data: Mapping[str, Any]) -> Points:
     file = data.get("ply_file_path")
     if file is None:
         return Points.empty()
-    return read_points(path / file_name(f"{path / FILE}: ply_file_path", "", file))
+    return read_points(path / transforms.file_name(f"{path / FILE}: ply_file_path", "", file))
 
 
 def _to_original(path: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
@@ -306,8 +280,10 @@ def _to_original(path: Path, data: Mapping[str, Any], scene: Scene) -> Scene:
     scale = 1.0 if scale is None else scale
     if not 1 / MAX_COORDINATE < scale < MAX_COORDINATE:
         raise json_error(place, "a positive applied_scale", f"{scale:g}")
-    full = np.eye(4) if applied is None else matrix(f"{place}: applied_transform", applied, (3, 4))
-    rotation = nearest_rotation(f"{place}: applied_transform", full[:3, :3])
+    matrix_place, full = f"{place}: applied_transform", np.eye(4)
+    if applied is not None:
+        full = transforms.matrix(matrix_place, applied, (3, 4))
+    rotation = transforms.nearest_rotation(matrix_place, full[:3, :3])
     original_from_file = Sim3(scale, rotation, scale * full[:3, 3]).inverse()
     frames = [
         replace(f, cam_from_world=original_from_file.apply_to_pose(f.cam_from_world))
@@ -375,7 +351,7 @@ def _to_json(scene: Scene) -> dict[str, Any]:
         "frames": [
             {
                 "file_path": f"images/{frame.name}",
-                "transform_matrix": opengl_from_pose(frame.cam_from_world).tolist(),
+                "transform_matrix": transforms.opengl_from_pose(frame.cam_from_world).tolist(),
                 "colmap_im_id": frame.image_id,
                 "period": frame.period,
                 "time": frame.period / max(1, scene.num_periods - 1),
@@ -387,13 +363,13 @@ def _to_json(scene: Scene) -> dict[str, Any]:
 
 
 def _camera_keys(camera: Camera) -> dict[str, Any]:
-    model, keys = camera.model, MODEL_KEYS.get(camera.model)
+    model, keys = camera.model, transforms.MODEL_KEYS.get(camera.model)
     if model == "FULL_OPENCV" and not any(camera.distortion[5:]):
-        model, keys = "OPENCV", (*MODEL_KEYS["OPENCV"], "k3")
+        model, keys = "OPENCV", (*transforms.MODEL_KEYS["OPENCV"], "k3")
     if keys is None:
         raise SceneError(
             f"camera {camera.camera_id}",
-            expected=f"a camera model that nerfstudio has: {', '.join(MODEL_KEYS)}",
+            expected=f"a camera model that nerfstudio has: {', '.join(transforms.MODEL_KEYS)}",
             found=model,
             todo="run chronoscene undistort first",
         )

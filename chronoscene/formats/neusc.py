@@ -24,12 +24,7 @@ from pathlib import Path, PurePosixPath
 
 from chronoscene.colmap.model import Model
 from chronoscene.errors import SceneError
-from chronoscene.formats.shared.colmap_layout import (
-    find_model,
-    keep_images,
-    make_scene,
-    read_images,
-)
+from chronoscene.formats.shared import colmap_layout
 from chronoscene.formats.shared.grouping import group_dates
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import NameIndex, parse_test_text, read_text
@@ -49,7 +44,7 @@ LISTS = ("annots", "")
 
 def matches(path: Path) -> bool:
     """Whether a folder has an undistorted model below ``dense/``."""
-    return (path / "dense/images").is_dir() and find_model(path / "dense") is not None
+    return (path / "dense/images").is_dir() and colmap_layout.find_model(path / "dense") is not None
 
 
 def read(path: Path, *, period_by: str = "year") -> Scene:
@@ -60,7 +55,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
         ConfigError: If ``period_by`` is not in `PERIOD_BY`.
     """
     path = Path(path)
-    model = read_images(path / "dense", path / "dense/images")
+    model = colmap_layout.read_images(path / "dense", path / "dense/images")
     used = _used_names(path, model)
     dates = {name: when for name in used if (when := _date(path, name)) is not None}
     if not dates:
@@ -71,10 +66,10 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
             todo="see DATASET.md, Other formats",
         )
     dated = [name for name in used if name in dates]
-    return make_scene(
+    return colmap_layout.make_scene(
         path,
         path / "dense/images",
-        keep_images(model, dates.keys()),
+        colmap_layout.keep_images(model, dates.keys()),
         group_dates(dates, period_by),
         set(dated[::TEST_EVERY]),
         rule=f"every {TEST_EVERY}th image of the list (index 0, {TEST_EVERY}, ...)",
@@ -84,7 +79,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
 
 def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
-    model = read_images(path / "dense", path / "dense/images")
+    model = colmap_layout.read_images(path / "dense", path / "dense/images")
     left_out = len(model.images) - len([n for n in _used_names(path, model) if _date(path, n)])
     found = []
     if left_out:
@@ -94,7 +89,7 @@ def remarks(path: Path) -> list[str]:
         )
     index = NameIndex(image.name for image in model.images)
     for file in ("train.txt", "trash.txt"):
-        places = [path / folder / file for folder in LISTS if (path / folder / file).exists()]
+        places = _lists(path, file)
         if len(places) > 1:
             found.append(f"{file} beside {LISTS[0]}/ is not read, as there is one in it")
         entries = parse_test_text(read_text(places[0])) if places else []
@@ -113,20 +108,23 @@ def _used_names(path: Path, model: Model) -> list[str]:
     return [name for name in (names if train is None else train) if name not in trash]
 
 
+def _lists(path: Path, file: str) -> list[Path]:
+    places = (path / folder / file for folder in LISTS)
+    return [place for place in places if place.exists()]
+
+
 def _listed(path: Path, file: str, names: list[str]) -> list[str] | None:
     """Registered images that a list names, in its order; None without such a list."""
-    place = next(
-        (path / folder / file for folder in LISTS if (path / folder / file).exists()), None
-    )
-    if place is None:
+    places = _lists(path, file)
+    if not places:
         return None
     index = NameIndex(names)
     listed: dict[str, None] = {}
-    for entry in parse_test_text(read_text(place)):
+    for entry in parse_test_text(read_text(places[0])):
         found = index.find(entry.name)
         if len(found) > 1:
             raise SceneError(
-                f"{place}:{entry.line}",
+                f"{places[0]}:{entry.line}",
                 expected="a name that matches one image",
                 found=repr(entry.name),
                 todo="write the full name",

@@ -21,18 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from chronoscene.errors import SceneError
-from chronoscene.formats.shared.colmap_layout import (
-    find_model,
-    layout,
-    lost_labels,
-    lost_names,
-    lost_split,
-    make_scene,
-    new_names,
-    period_folders,
-    read_images,
-    write_renamed,
-)
+from chronoscene.formats.shared import colmap_layout
 from chronoscene.formats.shared.grouping import group_labels
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Camera, Scene
@@ -56,7 +45,9 @@ SCENES = (
 def matches(path: Path) -> bool:
     """Whether a folder has the name of a scene of WAT, and its layout."""
     name = path.resolve().name.lower().removesuffix("_resized")
-    return name in SCENES and find_model(path) is not None and layout(path / "images") == "folders"
+    if name not in SCENES or colmap_layout.find_model(path) is None:
+        return False
+    return colmap_layout.layout(path / "images") == "folders"
 
 
 def read(path: Path) -> Scene:
@@ -66,10 +57,10 @@ def read(path: Path) -> Scene:
         SceneError: If it is damaged, or images are not in folders.
     """
     path = Path(path)
-    model = read_images(path, path / "images")
+    model = colmap_layout.read_images(path, path / "images")
     tasks = {image.name: _task(path, image.name) for image in model.images}
     grouped = group_labels(tasks, list(dict.fromkeys(tasks[name] for name in sorted(tasks))))
-    return make_scene(
+    return colmap_layout.make_scene(
         path,
         path / "images",
         model,
@@ -105,7 +96,7 @@ def write(
         SceneError: If ``out`` is in use, an image is missing, or cameras differ.
     """
     camera = _one_camera(scene, out)
-    return write_renamed(
+    return colmap_layout.write_renamed(
         scene.with_frames([replace(frame, camera=camera) for frame in scene.frames]),
         Path(out),
         _names(scene),
@@ -137,8 +128,9 @@ def losses(scene: Scene) -> list[str]:
     names = _names(scene)
     old = {new: name for name, new in names.items()}
     taken = default_tests({names[f.name]: f.period for f in scene.frames})
-    lost = lost_labels(scene, _folders(scene)) + lost_names(names)
-    lost += lost_split(scene, {old[name] for name in taken}, "images 0, 8, 16, ... of each task")
+    lost = colmap_layout.lost_labels(scene, _folders(scene)) + colmap_layout.lost_names(names)
+    tests = {old[name] for name in taken}
+    lost += colmap_layout.lost_split(scene, tests, "images 0, 8, 16, ... of each task")
     if any(not frame.camera.is_pinhole for frame in scene.frames):
         lost.append("distortion, which its loader ignores: undistort first")
     files = [name.rpartition("/")[2] for name in old]
@@ -149,8 +141,8 @@ def losses(scene: Scene) -> list[str]:
 
 def _folders(scene: Scene) -> list[str]:
     """Folders of the tasks; the loader sorts full paths, so the slash takes part."""
-    return period_folders(scene.periods, order=lambda folder: f"{folder}/")
+    return colmap_layout.period_folders(scene.periods, order=lambda folder: f"{folder}/")
 
 
 def _names(scene: Scene) -> dict[str, str]:
-    return new_names(scene, _folders(scene), deep=False)
+    return colmap_layout.new_names(scene, _folders(scene), deep=False)

@@ -126,10 +126,7 @@ def intersect_rays(direction: Array, centre: Array, first: Ints) -> tuple[Array,
 
 
 def common_view(
-    xyz: Array,
-    owner: Ints,
-    views: Sequence[Sequence[tuple[Camera, Array]]],
-    reach: Array,
+    xyz: Array, owner: Ints, views: Sequence[Sequence[tuple[Camera, Array]]], reach: Array
 ) -> Array:
     """Share of the points of each group that the cameras of each group have in view.
 

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import colmap_folders, detect_format, read_scene
+from chronoscene.formats.shared.colmap_layout import period_folders
 from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.scene import Period
 
@@ -144,13 +145,13 @@ def test_tracks_follow_frames_that_change_places(make_scene_folder, tmp_path):
 )
 def test_folders_are_in_the_order_of_the_periods_and_safe(labels, folders):
     periods = tuple(Period(i, label) for i, label in enumerate(labels))
-    assert colmap_folders.period_folders(periods) == folders
+    assert period_folders(periods) == folders
 
 
 @given(st.lists(st.text(max_size=8), min_size=1, max_size=12))
 def test_any_labels_become_folders_in_order(labels):
     periods = tuple(Period(i, label) for i, label in enumerate(labels))
-    folders = colmap_folders.period_folders(periods)
+    folders = period_folders(periods)
     assert sorted(set(folders), key=natural_key) == folders
     for folder in folders:
         assert folder not in ("", ".", "..") and folder == folder.strip()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,15 +18,8 @@ import numpy as np
 from chronoscene.colmap.model import Model, read_model, write_model
 from chronoscene.colmap.raw_model import model_kind
 from chronoscene.errors import SceneError
-from chronoscene.formats.chronoscene import (
-    MODEL,
-    SPLIT,
-    TEST,
-    check_image,
-    check_writable_name,
-    make_frames,
-)
-from chronoscene.formats.shared.grouping import label_date, natural_key
+from chronoscene.formats import chronoscene as our_format
+from chronoscene.formats.shared.grouping import Grouped, label_date, natural_key
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Period, Scene, WorldFrame
@@ -38,7 +31,7 @@ MODELS = ("sparse/0", "sparse")
 
 def find_model(path: Path) -> Path | None:
     """Folder of the model of a scene that is not in the ChronoScene format."""
-    if (path / SPLIT).exists():
+    if (path / our_format.SPLIT).exists():
         return None
     return next((path / m for m in MODELS if model_kind(path / m) is not None), None)
 
@@ -89,7 +82,7 @@ def read_images(path: Path, images: Path) -> Model:
             folder, expected="registered images", found="none", todo="register the images"
         )
     for image in model.images:
-        check_image(folder, image)
+        our_format.check_image(folder, image)
     return model
 
 
@@ -107,7 +100,7 @@ def make_scene(
     path: Path,
     images: Path,
     model: Model,
-    grouped: tuple[Mapping[str, int], Sequence[Period]],
+    grouped: Grouped,
     tests: set[str],
     *,
     rule: str,
@@ -119,9 +112,9 @@ def make_scene(
         name=path.resolve().name,
         root=path,
         images_root=images,
-        frames=make_frames(model, dict(periods), tests),
+        frames=our_format.make_frames(model, periods, tests),
         points=model.points,
-        periods=tuple(table),
+        periods=table,
         split_rule=rule,
         format=format,
     )
@@ -158,13 +151,13 @@ def write_renamed(
         )
     new = _renamed(scene, names)
     for frame in new.frames:
-        check_writable_name(out, frame)
+        our_format.check_writable_name(out, frame)
     with staged_folder(out) as staged:
-        (staged / MODEL).mkdir(parents=True)
-        write_model(staged / MODEL, new.frames, new.points)
+        (staged / our_format.MODEL).mkdir(parents=True)
+        write_model(staged / our_format.MODEL, new.frames, new.points)
         if test_list:
             tests = "".join(f"{f.name}\n" for f in new.frames if f.split == "test")
-            (staged / TEST).write_text(tests, encoding="utf-8", newline="\n")
+            (staged / our_format.TEST).write_text(tests, encoding="utf-8", newline="\n")
         (staged / "images").mkdir()
         place_images(
             scene, staged / "images", names=names, image_source=image_source, progress=progress
@@ -188,12 +181,7 @@ def _renamed(scene: Scene, names: Mapping[str, str]) -> Scene:
 def period_folders(
     periods: tuple[Period, ...], order: Callable[[str], Any] = natural_key
 ) -> list[str]:
-    """A folder for each period, such that sorted folders are in the order of the periods.
-
-    Args:
-        periods: Of the scene.
-        order: Key by which a reader sorts the folders.
-    """
+    """A folder for each period, such that those sorted by ``order`` are in the periods' order."""
     labels = [period.label for period in periods]
     plain = all(re.fullmatch(r"\w[\w.+ -]*(?<! )", label) for label in labels)
     if plain and labels == sorted(set(labels), key=order):
@@ -205,10 +193,7 @@ def period_folders(
 def new_names(scene: Scene, folders: list[str], *, deep: bool) -> dict[str, str]:
     """Name of each image in the folder of its period; unchanged if all are there already.
 
-    Args:
-        scene: Any scene.
-        folders: Of its periods.
-        deep: Whether the folder of a period may have subfolders.
+    With ``deep``, the folder of a period may have subfolders.
     """
     old = {f.name: folders[f.period] for f in scene.frames}
     fits = all(
@@ -241,13 +226,7 @@ def lost_names(names: Mapping[str, str]) -> list[str]:
 
 
 def lost_split(scene: Scene, tests: set[str], rule: str) -> list[str]:
-    """Losses of a format whose loader chooses the test images itself.
-
-    Args:
-        scene: Any scene.
-        tests: Names, in the scene, of the images that it chooses.
-        rule: Its rule, in words.
-    """
+    """Losses of a format whose loader chooses the test images itself, by a rule in words."""
     if {f.name for f in scene.select(split="test")} == tests:
         return []
     return [f"the split, because its loader takes {rule}"]

@@ -22,7 +22,6 @@ from chronoscene.errors import SceneError
 from chronoscene.scene import Points
 
 MAX_HEADER_BYTES = 100_000
-
 COLOURS = ("red", "green", "blue")
 
 UNKNOWN_COLOUR = 128
@@ -96,8 +95,8 @@ def _read_vertices(path: Path, file: BinaryIO) -> NDArray[np.void]:
     is_text, count, dtype = _read_header(path, file)
     names = dtype.names or ()
     left = path.stat().st_size - file.tell()
-    least = 2 * len(names) if is_text else dtype.itemsize
-    if left + is_text < count * least:  # the last line of a text may have no end
+    min_size = 2 * len(names) if is_text else dtype.itemsize
+    if left + is_text < count * min_size:  # the last line of a text may have no end
         raise _error(path, f"{count} vertices", f"{left} bytes after the header")
     if not is_text:
         return np.frombuffer(file.read(count * dtype.itemsize), dtype, count)

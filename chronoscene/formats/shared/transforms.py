@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.formats.chronoscene import MAX_COORDINATE
+from chronoscene.formats.shared.grouping import Grouped
 from chronoscene.formats.shared.json_values import json_error, number
 from chronoscene.images.store import image_size
-from chronoscene.scene import Camera, Frame, Period, Points, Scene
+from chronoscene.scene import Camera, Frame, Points, Scene
 from chronoscene.scene.cameras import CAMERA_MODELS, MAX_SIDE
 from chronoscene.scene.splits import IMAGE_SUFFIXES, split_of
 
@@ -177,7 +178,7 @@ def opengl_from_pose(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]
 def make_scene(
     path: Path,
     shots: Sequence[Shot],
-    grouped: tuple[Mapping[str, int], Sequence[Period]],
+    grouped: Grouped,
     tests: set[str],
     *,
     points: Points,
@@ -192,13 +193,14 @@ def make_scene(
     ids = [shot.image_id for shot in shots]
     known = min(ids) > 0 and max(ids) < 2**31 and len(set(ids)) == len(ids)
     ordered = sorted(shots, key=lambda shot: shot.name)
+    period_of, periods = grouped
     frames = tuple(
         Frame(
             name=shot.name.removeprefix(prefix),
             image_id=shot.image_id if known else i,
             camera=shot.camera,
             cam_from_world=shot.cam_from_world,
-            period=grouped[0][shot.name],
+            period=period_of[shot.name],
             split=split_of(shot.name, tests),
         )
         for i, shot in enumerate(ordered, start=1)
@@ -209,7 +211,7 @@ def make_scene(
         images_root=path / prefix if prefix else path,
         frames=frames,
         points=points,
-        periods=tuple(grouped[1]),
+        periods=periods,
         split_rule=rule,
         format=format,
     )
