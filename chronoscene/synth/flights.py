@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.errors import ConfigError
-from chronoscene.scene import Camera, Split
+from chronoscene.scene import Camera, Frame, Split
 from chronoscene.scene.geometry import pose_from_rotation_translation
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.noise import rng_for
@@ -23,22 +22,12 @@ UNEQUAL = (1.09, 0.91, 1.0, 1.15, 0.85)
 """Views per period relative to the mean, repeated over the periods."""
 TEST_SHARE = 0.15
 """Share of held-out views."""
-TRIES = 60
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
-    """One planned photo."""
-
-    name: str
-    period: int
-    split: Split
-    cam_from_world: Array
-    """[4, 4]"""
+SPLITS: tuple[Split, Split] = ("train", "test")
+MAX_TRIES = 60
 
 
 def make_camera(settings: SynthSettings) -> Camera:
-    """The pinhole camera that all views share."""
+    """The pinhole camera that all frames share."""
     w, h = settings.width, settings.height
     focal = (0.82 if settings.kind == "aerial" else 0.68) * w
     if not settings.off_centre:
@@ -48,24 +37,23 @@ def make_camera(settings: SynthSettings) -> Camera:
     return Camera(1, "PINHOLE", w, h, (focal, 1.008 * focal, cx, cy))
 
 
-def plan_views(
-    settings: SynthSettings, world: World, renderers: Sequence[PeriodRenderer], camera: Camera
-) -> list[View]:
-    """All views of all periods, in the order of their names."""
-    views = []
+def plan_frames(
+    settings: SynthSettings, world: World, renderers: Sequence[PeriodRenderer]
+) -> tuple[Frame, ...]:
+    """All frames, period by period."""
+    camera = make_camera(settings)
+    route = _flight if settings.kind == "aerial" else _walk
+    frames: list[Frame] = []
     for period in range(settings.periods):
         count = max(4, round(settings.views * UNEQUAL[period % len(UNEQUAL)]))
         rng = rng_for(settings.seed, "flight", settings.kind, period)
-        if settings.kind == "aerial":
-            wishes = _flight(world, count, rng)
-        else:
-            wishes = _walk(world, count, rng)
+        wishes = route(world, count, rng)
         tests = _held_out(count, rng)
         for i, (eye, target) in enumerate(wishes):
             pose = _free_pose(eye, target, settings.kind, renderers, camera, rng)
-            split: Split = "test" if i in tests else "train"
-            views.append(View(f"p{period}_{i:04d}.jpg", period, split, pose))
-    return views
+            name, split = f"p{period}_{i:04d}.jpg", SPLITS[i in tests]
+            frames.append(Frame(name, len(frames) + 1, camera, pose, period, split))
+    return tuple(frames)
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
@@ -183,7 +171,7 @@ def _free_pose(
     All periods count, since test cameras are rendered at every one of them.
     """
     apart = 6.0 if kind == "aerial" else 2.0
-    for attempt in range(TRIES):
+    for attempt in range(MAX_TRIES):
         shift = np.zeros(3)
         if attempt and kind == "aerial":
             shift = np.array([*rng.normal(0, 1.0 + 0.1 * attempt, 2), 0.9 * attempt])
@@ -192,20 +180,15 @@ def _free_pose(
         place = eye + shift
         aim = target + (shift if kind == "street" else 0)
         pose = look_at(place, aim, float(rng.normal(0, 0.015)))
-        if all(_is_free(r, camera, pose, place, apart) for r in renderers):
+        if all(
+            r.clearance(place[None])[0] >= apart * 0.6
+            and r.coarse_depth(camera, pose).min() >= apart
+            for r in renderers
+        ):
             return pose
     raise ConfigError(
         "--seed",
         expected="a city with room for the cameras",
-        found=f"no free place near {np.round(eye, 1).tolist()} after {TRIES} tries",
+        found=f"no free place near {np.round(eye, 1).tolist()} after {MAX_TRIES} attempts",
         todo="choose another seed",
     )
-
-
-def _is_free(
-    renderer: PeriodRenderer, camera: Camera, pose: Array, place: Array, apart: float
-) -> bool:
-    """Whether nothing is around the camera, and nothing close stands in its view."""
-    if renderer.clearance(place[None])[0] < apart * 0.6:
-        return False
-    return bool(renderer.coarse_depth(camera, pose).min() >= apart)

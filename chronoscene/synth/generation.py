@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -11,14 +12,14 @@ import numpy as np
 
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.io.staging import staged_folder
-from chronoscene.scene import Camera, Frame, Period, Points, Scene, WorldFrame
+from chronoscene.scene import Period, Points, Scene, WorldFrame
 from chronoscene.synth.city.plan import make_world
 from chronoscene.synth.city.world import World
-from chronoscene.synth.flights import View, make_camera, plan_views
+from chronoscene.synth.flights import plan_frames
 from chronoscene.synth.render.renderer import PeriodRenderer, load_open3d
 from chronoscene.synth.settings import SynthSettings
 from chronoscene.synth.sparse_points import make_points
-from chronoscene.synth.truth import save_jpeg, write_truth
+from chronoscene.synth.truth import save_image, write_truth
 
 Progress = Callable[[int, int, str], None]
 
@@ -42,10 +43,19 @@ def _make(raw: Path, settings: SynthSettings, progress: Progress, name: str) -> 
     """Write photos and ground truth below ``raw`` and return the scene."""
     world = make_world(settings)
     renderers = make_renderers(settings, world)
-    camera = make_camera(settings)
-    views = plan_views(settings, world, renderers, camera)
-    tests = sum(v.split == "test" for v in views)
-    total = len(views) + tests * (settings.periods - 1) + 2
+    scene = Scene(
+        name=name,
+        root=raw,
+        images_root=raw / "images",
+        frames=plan_frames(settings, world, renderers),
+        points=Points.empty(),
+        periods=make_periods(world),
+        split_rule=scene_format.TEST,
+        format=scene_format.NAME,
+        world=WorldFrame(unit="metre"),
+    )
+    tests = len(scene.select(split="test"))
+    total = len(scene.frames) + tests * (settings.periods - 1) + 2
     done = 0
 
     def advance(what: str) -> None:
@@ -54,35 +64,30 @@ def _make(raw: Path, settings: SynthSettings, progress: Progress, name: str) -> 
         progress(done, total, what)
 
     advance("city")
-    for view in views:
-        image = renderers[view.period].image(camera, view.cam_from_world)
-        save_jpeg(raw / "images" / view.name, image)
+    for frame in scene.frames:
+        image = renderers[frame.period].image(frame.camera, frame.cam_from_world)
+        save_image(scene.image_path(frame), image)
         advance("photos")
-    points = make_points(settings, renderers, camera, views, raw / "images")
+    points = make_points(settings, scene, renderers)
     advance("points")
-    periods = make_periods(world)
-    write_truth(raw / "gt", world, renderers, camera, views, periods, raw / "images", advance)
-    return _scene(name, raw, camera, views, points, periods)
+    write_truth(raw / "gt", scene, world, renderers, advance)
+    return replace(scene, points=points)
 
 
 def make_renderers(settings: SynthSettings, world: World) -> list[PeriodRenderer]:
     """One renderer per period."""
     low, high = world.core
     box = np.array([[*(low - 16.0), 0.3], [*(high + 16.0), 33.0]])
-    renderers = []
-    for period, light in enumerate(world.lights):
-        part, ids = world.geometry(period)
-        renderers.append(
-            PeriodRenderer(
-                part,
-                ids,
-                light,
-                supersample=settings.supersample,
-                probe_box=box,
-                probe_spacing=settings.probe_spacing,
-            )
+    return [
+        PeriodRenderer(
+            *world.geometry(period),
+            light,
+            supersample=settings.supersample,
+            probe_box=box,
+            probe_spacing=settings.probe_spacing,
         )
-    return renderers
+        for period, light in enumerate(world.lights)
+    ]
 
 
 def make_periods(world: World) -> tuple[Period, ...]:
@@ -96,28 +101,3 @@ def make_periods(world: World) -> tuple[Period, ...]:
         periods.append(Period(i, f"{light.name} {day.year}", day.isoformat()))
         last = day
     return tuple(periods)
-
-
-def _scene(
-    name: str,
-    raw: Path,
-    camera: Camera,
-    views: Sequence[View],
-    points: Points,
-    periods: tuple[Period, ...],
-) -> Scene:
-    frames = tuple(
-        Frame(v.name, i + 1, camera, v.cam_from_world, v.period, v.split)
-        for i, v in enumerate(views)
-    )
-    return Scene(
-        name=name,
-        root=raw,
-        images_root=raw / "images",
-        frames=frames,
-        points=points,
-        periods=periods,
-        split_rule=scene_format.TEST,
-        format=scene_format.NAME,
-        world=WorldFrame(unit="metre"),
-    )

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.scene import Camera, Period
+from chronoscene.images.store import load_rgb
+from chronoscene.scene import Frame, Period, Scene
 from chronoscene.synth.city.world import World
-from chronoscene.synth.flights import View
 from chronoscene.synth.render.renderer import PeriodRenderer, PixelMaps
 
 UNCHANGED, APPEARANCE, GEOMETRY = 0, 127, 255
@@ -24,20 +24,19 @@ DEPTH_TOLERANCE = 1e-3
 ALBEDO_TOLERANCE = 0.02
 """Linear difference of albedo that counts as a change of appearance."""
 SHEET_COLUMNS = 6
+JPEG_FLAGS = (
+    cv2.IMWRITE_JPEG_QUALITY,
+    95,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+)
 
-Advance = Callable[[str], None]
 
-
-def save_jpeg(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write RGB at quality 95 without subsampling of the colours."""
-    flags = [
-        cv2.IMWRITE_JPEG_QUALITY,
-        95,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
-        cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
-    ]
+def save_image(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write RGB or grey; JPEG at quality 95 without subsampling of the colours."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), np.ascontiguousarray(image[..., ::-1]), flags)
+    image = np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
+    assert cv2.imwrite(str(path), image, JPEG_FLAGS if path.suffix == ".jpg" else [])
 
 
 def change_mask(here: PixelMaps, there: PixelMaps) -> NDArray[np.uint8]:
@@ -55,45 +54,42 @@ def change_mask(here: PixelMaps, there: PixelMaps) -> NDArray[np.uint8]:
 
 def write_truth(
     folder: Path,
+    scene: Scene,
     world: World,
     renderers: Sequence[PeriodRenderer],
-    camera: Camera,
-    views: Sequence[View],
-    periods: Sequence[Period],
-    images: Path,
-    advance: Advance,
+    advance: Callable[[str], None],
 ) -> None:
     """Write the folder ``gt``.
 
     Args:
         folder: The folder; it is made.
+        scene: Frames with their images, and periods.
         world: Lights, edits and objects.
         renderers: One per period.
-        camera: Shared camera.
-        views: All views.
-        periods: Labels and dates.
-        images: Folder of the photos, for the contact sheet.
         advance: Told the name of each finished unit of work.
     """
-    tests = [v for v in views if v.split == "test"]
-    for view in tests:
-        stem = view.name.removesuffix(".jpg")
-        here = renderers[view.period].maps(camera, view.cam_from_world)
-        _save_depth(folder / "depth" / f"{stem}.npz", here)
+    tests = scene.select(split="test")
+    for frame in tests:
+        view = frame.camera, frame.cam_from_world
+        here = renderers[frame.period].maps(*view)
+        _save_depth(folder / "depth" / f"{Path(frame.name).stem}.npz", here)
         for other, renderer in enumerate(renderers):
-            if other == view.period:
+            if other == frame.period:
                 continue
-            name = f"{stem}__p{other}"
-            there = renderer.maps(camera, view.cam_from_world)
+            name = _cross_name(frame, other)
+            there = renderer.maps(*view)
             _save_depth(folder / "cross_depth" / f"{name}.npz", there)
-            save_jpeg(
-                folder / "cross_rgb" / f"{name}.jpg", renderer.image(camera, view.cam_from_world)
-            )
-            _save_png(folder / "change" / f"{name}.png", change_mask(here, there))
+            save_image(folder / "cross_rgb" / f"{name}.jpg", renderer.image(*view))
+            save_image(folder / "change" / f"{name}.png", change_mask(here, there))
             advance("ground truth")
-    _save_png(folder / "contact_sheet.png", _contact_sheet(folder, images, tests, len(renderers)))
-    text = json.dumps(_story(world, periods), indent=1)
+    save_image(folder / "contact_sheet.png", _contact_sheet(folder, scene, tests))
+    text = json.dumps(_story(world, scene.periods), indent=1)
     (folder / "periods.json").write_text(text + "\n", encoding="utf-8", newline="\n")
+
+
+def _cross_name(frame: Frame, period: int) -> str:
+    """Stem of the files that show a frame's view at another period."""
+    return f"{Path(frame.name).stem}__p{period}"
 
 
 def _save_depth(path: Path, maps: PixelMaps) -> None:
@@ -101,24 +97,13 @@ def _save_depth(path: Path, maps: PixelMaps) -> None:
     np.savez_compressed(path, depth=maps.depth)
 
 
-def _save_png(path: Path, image: NDArray[np.uint8]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image)
-
-
 def _story(world: World, periods: Sequence[Period]) -> dict[str, Any]:
     """Light, edits, and every object with its states and the periods that show them."""
     objects: dict[str, Any] = {}
     for e in world.elements:
-        low, high = e.part.bounds
         entry = objects.setdefault(e.name, {"kind": e.kind, "states": []})
-        entry["states"].append(
-            {
-                "state": e.state,
-                "periods": e.periods,
-                "bounds": [np.round(low, 3).tolist(), np.round(high, 3).tolist()],
-            }
-        )
+        bounds = np.round(e.part.bounds, 3).tolist()
+        entry["states"].append({"state": e.state, "periods": e.periods, "bounds": bounds})
     return {
         "periods": [
             {"id": p.id, "label": p.label, "date": p.date, "light": asdict(light)}
@@ -129,33 +114,28 @@ def _story(world: World, periods: Sequence[Period]) -> dict[str, Any]:
     }
 
 
-def _contact_sheet(
-    folder: Path, images: Path, tests: Sequence[View], periods: int
-) -> NDArray[np.uint8]:
+def _contact_sheet(folder: Path, scene: Scene, tests: Sequence[Frame]) -> NDArray[np.uint8]:
     """One row per period, the same cameras in every row; green marks the real photo."""
     pick = np.unique(np.linspace(0, len(tests) - 1, min(SHEET_COLUMNS, len(tests))).astype(int))
     rows = []
-    for period in range(periods):
+    for period in range(scene.num_periods):
         row = []
-        for view in (tests[int(i)] for i in pick):
-            stem = view.name.removesuffix(".jpg")
-            own = view.period == period
-            path = images / view.name
-            image = cv2.imread(
-                str(path if own else folder / "cross_rgb" / f"{stem}__p{period}.jpg")
-            )
-            assert image is not None
-            small = _at_most(np.asarray(image[..., ::-1]), 320)
+        for frame in (tests[int(i)] for i in pick):
+            own = frame.period == period
+            cross = folder / "cross_rgb" / f"{_cross_name(frame, period)}.jpg"
+            small = _shrunk(load_rgb(scene.image_path(frame) if own else cross))
             if own:
-                cv2.rectangle(small, (0, 0), (small.shape[1] - 1, small.shape[0] - 1), (0, 220, 0),
-                              max(1, small.shape[1] // 100))  # fmt: skip
+                height, width = small.shape[:2]
+                end = (width - 1, height - 1)
+                cv2.rectangle(small, (0, 0), end, (0, 220, 0), max(1, width // 100))
             row.append(small)
         rows.append(np.concatenate(row, axis=1))
     return np.concatenate(rows)
 
 
-def _at_most(image: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
-    if image.shape[1] <= width:
-        return np.ascontiguousarray(image)
-    size = (width, max(1, round(image.shape[0] * width / image.shape[1])))
+def _shrunk(image: NDArray[np.uint8], max_width: int = 320) -> NDArray[np.uint8]:
+    height, width = image.shape[:2]
+    if width <= max_width:
+        return image
+    size = (max_width, max(1, round(height * max_width / width)))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))

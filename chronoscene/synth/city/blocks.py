@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -11,21 +11,8 @@ from numpy.typing import NDArray
 
 from chronoscene.synth.city import furniture as fur
 from chronoscene.synth.city.buildings import SLAB, Building, finished, foundation, frame, rubble
-from chronoscene.synth.city.placing import (
-    Rect,
-    floor,
-    lawn,
-    park_cars,
-    path,
-    paved_block,
-    plant,
-    plant_hedge,
-    put_bench,
-    put_house,
-    scatter_trees,
-)
-from chronoscene.synth.city.vegetation import tree
-from chronoscene.synth.city.world import World, renewal_stages, site_stages, visits
+from chronoscene.synth.city.placing import Block, Rect, floor
+from chronoscene.synth.city.world import renewal_stages, site_stages, visits
 from chronoscene.synth.render.mesh import Part
 from chronoscene.synth.render.noise import rng_for
 
@@ -33,12 +20,10 @@ Array = NDArray[np.float64]
 X = np.array([1.0, 0.0, 0.0])
 
 
-def square(world: World, name: str, rect: Rect) -> None:
+def square(block: Block) -> None:
     """Paved square: fountain, trees, benches, kiosks and, at times, a market."""
-    rng = rng_for(world.seed, name)
-    inner = paved_block(world, name, rect)
-    pattern = str(rng.choice(["rings", "bands"]))
-    world.always(f"{name}/paving", "ground", lambda: floor(name, inner, pattern))
+    world, name, inner, rng = block.world, block.name, block.inner, block.rng
+    block.pave("paving", inner, str(rng.choice(["rings", "bands"])))
     mid = inner.at(0.5, 0.5)
     radius = min(3.6, 0.13 * min(inner.size))
     if rng.random() < 0.6:
@@ -49,49 +34,53 @@ def square(world: World, name: str, rect: Rect) -> None:
         c = inner.at(fx, fy)
         w = 0.11 * min(inner.size)
         bed = Rect(c[0] - w, c[1] - w, c[0] + w, c[1] + w)
-        lawn(world, f"{name}/bed_{i}", bed, "mown", SLAB + 0.03)
+        block.lawn(bed, f"bed_{i}", "mown", SLAB + 0.03)
         for j in range(1 if w < 2.5 else 3):
             at = bed.at(*rng.uniform(0.2, 0.8, 2)) if w >= 2.5 else bed.at(0.5, 0.5)
-            plant(world, f"{name}/tree_{i}{j}", at, rng)
+            block.plant(f"tree_{i}{j}", at)
         side = np.sign(0.5 - fx)
-        put_bench(world, f"{name}/bench_{i}", c + side * (w + 0.8) * X, -side * np.pi / 2)
+        block.put(f"bench_{i}", "bench", fur.bench, c + side * (w + 0.8) * X, -side * np.pi / 2)
     for i in range(max(2, int(min(inner.size) // 7))):
         at = inner.at(*rng.uniform(0.3, 0.7, 2))
         if np.linalg.norm((at - mid)[:2]) < radius + 3.5:
-            at = mid + _unit2(at - mid) * (radius + 4.5)
+            at = mid + _flat_unit(at - mid) * (radius + 4.5)
         turn = float(rng.uniform(0, 6.28))
-        make = fur.stall if i % 2 else fur.kiosk
-        label = f"{name}/{'stall' if i % 2 else 'kiosk'}_{i}"
+        part, make = (f"stall_{i}", fur.stall) if i % 2 else (f"kiosk_{i}", fur.kiosk)
         here = visits(rng, world.periods, 0.5)
-        world.place(label, "kiosk", here, partial(make, label, at, turn, world.seed))
+        block.put(part, "kiosk", make, at, turn, world.seed, present=here)
 
 
-def park(world: World, name: str, rect: Rect) -> None:
+def _flat_unit(v: Array) -> Array:
+    """Horizontal direction of a vector; +x if it is vertical."""
+    flat = np.array([v[0], v[1], 0.0])
+    norm = np.linalg.norm(flat)
+    return flat / norm if norm > 1e-6 else X
+
+
+def park(block: Block) -> None:
     """Lawn with paths, trees, hedges and benches."""
-    rng = rng_for(world.seed, name)
-    inner = paved_block(world, name, rect)
-    lawn(world, name, inner)
+    inner, rng = block.inner, block.rng
+    block.lawn(inner)
     t = np.linspace(0, 1, 25)
     bend = rng.uniform(-0.16, 0.16, 2)
     first = np.stack([t, 0.2 + 0.6 * t + bend[0] * np.sin(np.pi * t)], axis=1)
     second = np.stack([0.75 - 0.5 * t + bend[1] * np.sin(2 * np.pi * t), t], axis=1)
     low, size = np.array([inner.x0, inner.y0]), np.array(inner.size)
-    for i, curve in enumerate((first, second)):
-        path(world, f"{name}/path_{i}", low + curve * size, 2.2)
     curves = low + np.concatenate([first, second]) * size
-    scatter_trees(world, name, inner, rng, int(np.prod(size) / 70), curves)
+    for i, curve in enumerate((curves[:25], curves[25:])):
+        block.gravel_path(f"path_{i}", curve, 2.2)
+    block.scatter_trees(inner, int(np.prod(size) / 70), curves)
     for i in range(4):
         k = int(rng.integers(4, 20)) + 25 * (i % 2)
         at = np.array([*(curves[k] + [1.6, 1.0]), SLAB])
-        put_bench(world, f"{name}/bench_{i}", at, float(rng.uniform(0, 6.28)))
-    plant_hedge(world, f"{name}/hedge_s", inner.at(0.05, 0.03), inner.at(0.6, 0.03))
-    plant_hedge(world, f"{name}/hedge_e", inner.at(0.97, 0.3), inner.at(0.97, 0.95))
+        block.put(f"bench_{i}", "bench", fur.bench, at, float(rng.uniform(0, 6.28)))
+    block.hedge("hedge_s", inner.at(0.05, 0.03), inner.at(0.6, 0.03))
+    block.hedge("hedge_e", inner.at(0.97, 0.3), inner.at(0.97, 0.95))
 
 
-def houses(world: World, name: str, rect: Rect) -> None:
+def houses(block: Block) -> None:
     """Rows of attached houses along two sides with a courtyard between them."""
-    rng = rng_for(world.seed, name)
-    inner = paved_block(world, name, rect)
+    inner, rng = block.inner, block.rng
     dx, dy = inner.size
     depth = min(11.0, 0.42 * dy) if dy > 20 else min(11.0, 0.75 * dy)
     rows = [(inner.y0, inner.y0 + depth, 0)]
@@ -105,7 +94,7 @@ def houses(world: World, name: str, rect: Rect) -> None:
         shops = bool(rng.random() < 0.6)
         for i in range(count):
             spec = Building(
-                f"{name}/house_{r}{i}", cuts[i], y0, cuts[i + 1], y1,
+                block.named(f"house_{r}{i}"), cuts[i], y0, cuts[i + 1], y1,
                 int(rng.integers(2, 6)), str(rng.choice(["gable", "gable", "hip", "flat"])),
                 str(rng.choice(["plaster", "plaster", "brick"])),
                 blank=(False, i < count - 1, False, i > 0),
@@ -113,18 +102,15 @@ def houses(world: World, name: str, rect: Rect) -> None:
                 balconies=bool(rng.random() < 0.3),
                 storey=float(rng.uniform(2.9, 3.3)), ground=float(rng.uniform(3.5, 4.2)),
             )  # fmt: skip
-            spec = _fit_roof(spec)
-            put_house(world, spec, chance=0.35)
+            block.house(_fit_roof(spec), chance=0.35)
     y0, y1 = inner.y0 + depth, (rows[1][0] if len(rows) > 1 else inner.y1)
     yard = Rect(inner.x0, y0, inner.x1, y1)
-    lawn(world, name, yard)
-    back = Rect(inner.x0, inner.y0, inner.x1, y0)
-    world.always(f"{name}/floor_0", "ground", lambda: floor(name, back, "slabs"))
+    block.lawn(yard)
+    block.pave("floor_0", Rect(inner.x0, inner.y0, inner.x1, y0), "slabs")
     if len(rows) > 1:
-        front = Rect(inner.x0, y1, inner.x1, inner.y1)
-        world.always(f"{name}/floor_1", "ground", lambda: floor(name, front, "slabs"))
+        block.pave("floor_1", Rect(inner.x0, y1, inner.x1, inner.y1), "slabs")
     if y1 - y0 > 4:
-        scatter_trees(world, name, yard.inset(1.5), rng, max(1, int(dx * (y1 - y0) / 130)))
+        block.scatter_trees(yard.inset(1.5), max(1, int(dx * (y1 - y0) / 130)))
 
 
 def _fit_roof(spec: Building) -> Building:
@@ -136,71 +122,74 @@ def _fit_roof(spec: Building) -> Building:
     return spec
 
 
-def slabs(world: World, name: str, rect: Rect) -> None:
+def slabs(block: Block) -> None:
     """One or two long flat-roofed buildings on lawns, with a car park."""
-    rng = rng_for(world.seed, name)
-    inner = paved_block(world, name, rect)
-    dy = inner.size[1]
-    upper = Rect(inner.x0, inner.y0 + 0.55 * dy, inner.x1, inner.y1)
-    lower = Rect(inner.x0, inner.y0, inner.x1, inner.y0 + 0.55 * dy)
-    lawn(world, f"{name}/north", upper)
+    inner, rng = block.inner, block.rng
+    middle = inner.y0 + 0.55 * inner.size[1]
+    upper = Rect(inner.x0, middle, inner.x1, inner.y1)
+    lower = Rect(inner.x0, inner.y0, inner.x1, middle)
+    block.lawn(upper, "north")
     wall = str(rng.choice(["panel", "concrete", "brick", "panel"]))
     spec = Building(
-        f"{name}/slab", upper.x0 + 2, upper.y0 + 1.0, upper.x1 - 2,
+        block.named("slab"), upper.x0 + 2, upper.y0 + 1.0, upper.x1 - 2,
         upper.y0 + 1.0 + min(12.0, upper.size[1] - 3), int(rng.integers(4, 8)), "flat", wall,
         balconies=bool(rng.random() < 0.7),
     )  # fmt: skip
-    put_house(world, spec, chance=0.5)
+    block.house(spec, chance=0.5)
     lot = Rect(lower.x0, lower.y0, lower.x1, lower.y0 + min(17.0, lower.size[1]))
-    world.always(f"{name}/car_park", "ground", lambda: floor(name, lot, "car_park"))
+    block.pave("car_park", lot, "car_park")
     places = []
     for k in range(int((lot.size[0] - 1) // 2.6)):
         x = lot.x0 + 1.35 + 2.6 * k
         places += [(x, lot.y0 + 2.5, SLAB, np.pi / 2), (x, lot.y1 - 2.5, SLAB, np.pi / 2)]
-    park_cars(world, f"{name}/lot", places if lot.size[1] > 11 else places[::2], 0.4)
+    block.park_cars("lot", places if lot.size[1] > 11 else places[::2], 0.4)
     if lot.y1 < lower.y1 - 0.5:
         rest = Rect(lower.x0, lot.y1, lower.x1, lower.y1)
-        lawn(world, f"{name}/strip", rest, "mown")
+        block.lawn(rest, "strip", "mown")
         if rest.size[1] > 3:
-            scatter_trees(world, name, rest.inset(1.2), rng, int(rest.size[0] // 8))
+            block.scatter_trees(rest.inset(1.2), int(rest.size[0] // 8))
 
 
-def tower(world: World, name: str, rect: Rect) -> None:
+def tower(block: Block) -> None:
     """A high building with a low wing, on a paved and planted base."""
-    rng = rng_for(world.seed, name)
-    inner = paved_block(world, name, rect)
-    world.always(f"{name}/paving", "ground", lambda: floor(name, inner, "bands"))
+    inner, rng = block.inner, block.rng
+    block.pave("paving", inner, "bands")
     w = min(16.0, 0.5 * min(inner.size))
     x0, y0 = inner.at(*rng.uniform(0.08, 0.3, 2))[:2]
     spec = Building(
-        f"{name}/tower", x0, y0, x0 + w, y0 + w, int(rng.integers(8, 11)), "flat",
-        str(rng.choice(["panel", "concrete"])), blank=(False, False, False, False),
+        block.named("tower"), x0, y0, x0 + w, y0 + w, int(rng.integers(8, 11)), "flat",
+        str(rng.choice(["panel", "concrete"])),
     )  # fmt: skip
-    put_house(world, spec, chance=0.6)
+    block.house(spec, chance=0.6)
     if inner.x1 - (x0 + w) > 7:
         wing = Building(
-            f"{name}/wing", x0 + w, y0 + 0.2 * w, inner.x1 - 1.5, y0 + 0.85 * w, 2, "flat",
+            block.named("wing"), x0 + w, y0 + 0.2 * w, inner.x1 - 1.5, y0 + 0.85 * w, 2, "flat",
             "panel", blank=(False, False, False, True), shops=(True, False, True, False),
         )  # fmt: skip
-        put_house(world, wing, chance=0.5)
+        block.house(wing, chance=0.5)
     free = Rect(inner.x0 + 1.5, y0 + w + 2.5, inner.x1 - 1.5, inner.y1 - 1.5)
     if free.size[1] > 3:
         bed = free.inset(0.5)
-        lawn(world, name, bed, "mown", SLAB + 0.04)
-        scatter_trees(world, name, bed.inset(0.8), rng, int(bed.size[0] * bed.size[1] / 45))
+        block.lawn(bed, kind="mown", z=SLAB + 0.04)
+        block.scatter_trees(bed.inset(0.8), int(bed.size[0] * bed.size[1] / 45))
 
 
-def site(world: World, name: str, rect: Rect) -> None:
+def site(block: Block) -> None:
     """A building site: empty lot, foundation, frame with crane, finished building."""
-    rng = rng_for(world.seed, name)
-    inner = paved_block(world, name, rect)
+    world, inner, rng = block.world, block.inner, block.rng
     steps = site_stages(world.periods)
-    spec = _site_building(name, inner, rng)
-    done = {p for p, s in enumerate(steps) if s == "finished"}
-    surfaces: list[str | None] = [
-        f"mown {light.season}" if p in done else "soil" for p, light in enumerate(world.lights)
+    low, (dx, dy) = inner.at(0.12, 0.16), inner.size
+    spec = Building(
+        block.named("hall"), low[0], low[1], low[0] + 0.7 * dx, low[1] + 0.62 * dy,
+        int(rng.integers(4, 7)), "flat", str(rng.choice(["panel", "brick", "plaster"])),
+        shops=(True, False, False, False), storey=3.3,
+    )  # fmt: skip
+    surfaces = [
+        f"mown {season}" if step == "finished" else "soil"
+        for step, season in zip(steps, world.seasons, strict=True)
     ]
-    world.add(f"{name}/floor", "ground", surfaces, lambda s: floor(name, inner, s))
+    ground = block.named("floor")
+    world.add(ground, "ground", surfaces, lambda s: floor(block.name, inner, s))
 
     def make(stage: str) -> Part:
         if stage == "foundation":
@@ -211,56 +200,39 @@ def site(world: World, name: str, rect: Rect) -> None:
         return finished(spec, world.seed)
 
     world.add(spec.name, "building", [None if s == "lot" else s for s in steps], make)
-    _site_gear(world, name, inner, steps, spec)
+    _site_gear(block, steps, spec)
+    young = [round(3.2 + 0.6 * p, 2) if s == "finished" else None for p, s in enumerate(steps)]
     for i in range(4):
-        young = [
-            (round(3.2 + 0.6 * p, 2), season) if p in done else None
-            for p, season in enumerate(world.seasons)
-        ]
-        at, label = inner.at(0.12 + 0.25 * i, 0.93), f"{name}/young_{i}"
-        world.add(label, "tree", young, partial(tree, label, at, world.seed, 2, True))
+        block.tree(f"young_{i}", inner.at(0.12 + 0.25 * i, 0.93), young, 2, broad=True)
 
 
-def _site_building(name: str, inner: Rect, rng: np.random.Generator) -> Building:
-    dx, dy = inner.size
-    low = inner.at(0.12, 0.16)
-    return Building(
-        f"{name}/hall", low[0], low[1], low[0] + 0.7 * dx, low[1] + 0.62 * dy,
-        int(rng.integers(4, 7)), "flat", str(rng.choice(["panel", "brick", "plaster"])),
-        shops=(True, False, False, False), storey=3.3,
-    )  # fmt: skip
-
-
-def _site_gear(world: World, name: str, inner: Rect, steps: list[str], spec: Building) -> None:
+def _site_gear(block: Block, steps: Sequence[str], spec: Building) -> None:
     """Fence, containers, crane and diggers while the work goes on."""
+    inner, seed = block.inner, block.world.seed
     busy = [s != "finished" for s in steps]
-    high = [s.startswith("f") and s != "finished" for s in steps]
+    high = [s in ("foundation", "frame_low", "frame_high") for s in steps]
     early = [s in ("lot", "foundation") for s in steps]
     r = inner.inset(0.4)
     corners = [(r.x0, r.y0), (r.x1, r.y0), (r.x1, r.y1), (r.x0, r.y1), (r.x0, r.y0)]
-    world.place(f"{name}/fence", "fence", busy,
-                partial(fur.fence, f"{name}/fence", corners, SLAB))  # fmt: skip
+    block.put("fence", "fence", fur.fence, corners, SLAB, present=busy)
     for i in range(2):
-        label, at = f"{name}/container_{i}", inner.at(0.25 + 0.4 * i, 0.9)
-        world.place(label, "container", busy, partial(fur.container, label, at, 0.0, world.seed))
+        at = inner.at(0.25 + 0.4 * i, 0.9)
+        block.put(f"container_{i}", "container", fur.container, at, 0.0, seed, present=busy)
     at = np.array([spec.x1 + 0.08 * inner.size[0], (spec.y0 + spec.y1) / 2, SLAB])
-    turn = float(rng_for(world.seed, name, "crane").uniform(2.0, 4.2))
-    label = f"{name}/crane"
-    world.place(label, "crane", high, partial(fur.crane, label, at, turn, spec.wall_height + 9.0))
-    label, at = f"{name}/digger", inner.at(0.86, 0.12)
-    world.place(label, "digger", early, partial(fur.digger, label, at, 2.3))
+    turn = float(rng_for(seed, block.name, "crane").uniform(2.0, 4.2))
+    block.put("crane", "crane", fur.crane, at, turn, spec.wall_height + 9.0, present=high)
+    block.put("digger", "digger", fur.digger, inner.at(0.86, 0.12), 2.3, present=early)
 
 
-def renewal(world: World, name: str, rect: Rect) -> None:
+def renewal(block: Block) -> None:
     """An old building that is pulled down; a car park takes its place. Houses stand beside it."""
-    rng = rng_for(world.seed, name)
-    inner = paved_block(world, name, rect)
+    world, inner, rng = block.world, block.inner, block.rng
     dx, dy = inner.size
     left = Rect(inner.x0, inner.y0, inner.x0 + 0.6 * dx, inner.y1)
     right = Rect(left.x1, inner.y0, inner.x1, inner.y1)
     steps = renewal_stages(world.periods)
     spec = Building(
-        f"{name}/old", left.x0 + 1.5, left.y0 + 0.1 * dy, left.x1 - 1.5, left.y0 + 0.72 * dy,
+        block.named("old"), left.x0 + 1.5, left.y0 + 0.1 * dy, left.x1 - 1.5, left.y0 + 0.72 * dy,
         int(rng.integers(3, 5)), "gable", "brick",
     )  # fmt: skip
 
@@ -268,30 +240,27 @@ def renewal(world: World, name: str, rect: Rect) -> None:
         return finished(spec, world.seed) if stage == "house" else rubble(spec, world.seed)
 
     world.add(spec.name, "building", [None if s == "park" else s for s in steps], make)
-    floors = {"house": "slabs", "rubble": "soil", "park": "car_park"}
-    world.add(f"{name}/floor", "ground", [floors[s] for s in steps],
-              lambda s: floor(name, left, s))  # fmt: skip
-    parked = [s == "park" for s in steps]
+    surfaces = [{"house": "slabs", "rubble": "soil", "park": "car_park"}[s] for s in steps]
+    ground = block.named("floor")
+    world.add(ground, "ground", surfaces, lambda s: floor(block.name, left, s))
     for k in range(int((left.size[0] - 1) // 2.6)):
-        here = [p and bool(rng.random() < 0.55) for p in parked]
+        here = [s == "park" and bool(rng.random() < 0.55) for s in steps]
         at = np.array([left.x0 + 1.35 + 2.6 * k, left.y0 + 2.5, SLAB])
-        label = f"{name}/visitor_{k}"
-        world.place(label, "car", here, partial(fur.car, label, at, np.pi / 2, world.seed))
-    lawn(world, name, right)
+        block.car(f"visitor_{k}", at, np.pi / 2, here)
+    block.lawn(right)
     beside = Building(
-        f"{name}/house", right.x0 + 1.0, right.y0 + 0.3 * dy, right.x1 - 0.5, right.y1 - 1.0,
+        block.named("house"), right.x0 + 1.0, right.y0 + 0.3 * dy, right.x1 - 0.5, right.y1 - 1.0,
         int(rng.integers(2, 5)), "hip", "plaster",
     )  # fmt: skip
-    put_house(world, beside, chance=0.7)
-    scatter_trees(world, name, Rect(right.x0 + 1, right.y0 + 1, right.x1 - 1,
-                                     right.y0 + 0.25 * dy), rng, 2)  # fmt: skip
+    block.house(beside, chance=0.7)
+    garden = Rect(right.x0 + 1, right.y0 + 1, right.x1 - 1, right.y0 + 0.25 * dy)
+    block.scatter_trees(garden, 2)
 
 
-def suburb(world: World, name: str, rect: Rect) -> None:
+def suburb(block: Block) -> None:
     """Detached houses in gardens, simpler than the core."""
-    rng = rng_for(world.seed, name)
-    inner = paved_block(world, name, rect, 2.0)
-    lawn(world, name, inner)
+    world, inner, rng = block.world, block.inner, block.rng
+    block.lawn(inner)
     dx, dy = inner.size
     cols, rows = max(1, int(dx // 18)), max(1, int(dy // 18))
     for i in range(cols):
@@ -301,26 +270,17 @@ def suburb(world: World, name: str, rect: Rect) -> None:
             w, d = rng.uniform(0.42, 0.62, 2) * plot.size
             x, y = plot.at(*rng.uniform(0.1, 0.3, 2))[:2]
             spec = Building(
-                f"{name}/villa_{i}{j}", x, y, x + w, y + d, int(rng.integers(1, 4)),
+                block.named(f"villa_{i}{j}"), x, y, x + w, y + d, int(rng.integers(1, 4)),
                 str(rng.choice(["gable", "hip"])), str(rng.choice(["plaster", "brick"])),
                 ground=3.0, simple=not world.near,
             )  # fmt: skip
             world.always(spec.name, "building", partial(finished, spec, world.seed))
-            at, label = plot.at(0.86, float(rng.uniform(0.2, 0.8))), f"{name}/tree_{i}{j}"
-            height = float(rng.uniform(5, 9))
-            world.add(
-                label, "tree", [(height, season) for season in world.seasons],
-                partial(tree, label, at, world.seed, 2 if world.near else 1, False),
-            )  # fmt: skip
+            at = plot.at(0.86, float(rng.uniform(0.2, 0.8)))
+            heights = [float(rng.uniform(5, 9))] * world.periods
+            block.tree(f"tree_{i}{j}", at, heights, 2 if world.near else 1, broad=False)
 
 
-def _unit2(v: Array) -> Array:
-    flat = np.array([v[0], v[1], 0.0])
-    norm = np.linalg.norm(flat)
-    return flat / norm if norm > 1e-6 else np.array([1.0, 0.0, 0.0])
-
-
-FILLERS: dict[str, Callable[[World, str, Rect], None]] = {
+FILLERS: dict[str, Callable[[Block], None]] = {
     "square": square,
     "park": park,
     "houses": houses,

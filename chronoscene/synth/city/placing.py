@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,6 @@ from numpy.typing import NDArray
 from chronoscene.synth.city import furniture as fur
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.buildings import SLAB, Building, finished
-from chronoscene.synth.city.ground import PARKING, pavement
 from chronoscene.synth.city.vegetation import hedge, tree
 from chronoscene.synth.city.world import World, looks, tree_heights
 from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
@@ -21,6 +22,8 @@ from chronoscene.synth.render.textures import PAVING
 
 Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
+PARKING = 2.0
+"""Width of the parking lane at each side of a road, metres."""
 RING = 3.0
 """Width of pavements, metres."""
 
@@ -49,12 +52,6 @@ class Rect:
         """Point at fractions of the extents. [3]"""
         dx, dy = self.size
         return np.array([self.x0 + fx * dx, self.y0 + fy * dy, z])
-
-
-def paved_block(world: World, name: str, rect: Rect, ring: float = RING) -> Rect:
-    low, high = np.array([rect.x0, rect.y0]), np.array([rect.x1, rect.y1])
-    world.always(f"{name}/pavement", "ground", lambda: pavement(name, low, high, ring, world.seed))
-    return rect.inset(ring)
 
 
 def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
@@ -89,83 +86,160 @@ def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
     return b.build()
 
 
-def lawn(world: World, name: str, rect: Rect, kind: str = "lawn", z: float = SLAB) -> None:
-    states = [f"{kind} {season}" for season in world.seasons]
-    world.add(f"{name}/lawn", "lawn", states, lambda s: floor(name, rect, s, z))
+def pavement(name: str, low: Array, high: Array, ring: float, seed: int) -> Part:
+    """Kerb and slabs around a block; the inside stays open."""
+    b = PartBuilder(key_number(name, "pavement"))
+    rng = rng_for(seed, name, "pavement")
+    grey = pal.tint(rng, srgb(158, 154, 146))
+    light = pal.tint(rng, srgb(182, 174, 160))
+    slabs = b.style(PAVING, grey, light, srgb(88, 84, 78), (0.6, 0.4, 0.5, 0.0, 1.0))
+    kerb = b.style(PAVING, srgb(170, 168, 162), None, srgb(90, 88, 84), (1.0, 0.3, 0.0, 0, 1))
+    dx, dy = high - low
+    edge = 0.18
+    up = SLAB * Z
+    o = np.array([low[0], low[1], 0.0])
+    for corner, along in ((o, dx * X), (o + dx * X, dy * Y), (o + dx * X + dy * Y, -dx * X),
+                          (o + dy * Y, -dy * Y)):  # fmt: skip
+        u = along / np.linalg.norm(along)
+        inwards = np.cross(Z, u)
+        b.quads(corner, along, up, kerb)
+        b.quads(corner + up + edge * u, along - 2 * edge * u, edge * inwards, kerb)
+        b.quads(corner + up, edge * u, edge * inwards, kerb)
+        inner = corner + up + edge * inwards + edge * u
+        b.quads(inner, along - (edge + ring) * u, (ring - edge) * inwards, slabs)
+    return b.build()
 
 
-def path(world: World, name: str, points: Array, width: float) -> None:
-    """Gravel path along a curve, a hand above the lawn's surface."""
-    way = np.gradient(points, axis=0)
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    side = np.column_stack([-way[:, 1], way[:, 0]]) * width / 2
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """A block of the city; puts objects into the world under names that start with its own."""
 
-    def make() -> Part:
-        b = PartBuilder(key_number(name))
-        style = pal.soil_style(b, 0.05, 0.0)
-        left = np.column_stack([points + side, np.full(len(points), SLAB + 0.02)])
-        right = np.column_stack([points - side, np.full(len(points), SLAB + 0.02)])
-        frame = (np.zeros(3), X, Y)
-        for i in range(len(points) - 1):
-            b.polygon([right[i], right[i + 1], left[i + 1], left[i]], style, frame=frame)
-        return b.build()
+    world: World
+    name: str
+    inner: Rect
+    """What is inside of the pavement."""
+    rng: np.random.Generator
 
-    world.always(name, "ground", make)
+    @classmethod
+    def paved(cls, world: World, name: str, rect: Rect, ring: float = RING) -> Block:
+        """A block with a pavement around it."""
+        low, high = np.array([rect.x0, rect.y0]), np.array([rect.x1, rect.y1])
+        make = partial(pavement, name, low, high, ring, world.seed)
+        world.always(f"{name}/pavement", "ground", make)
+        return cls(world, name, rect.inset(ring), rng_for(world.seed, name))
+
+    def named(self, part: str) -> str:
+        """Name of a part of the block."""
+        return f"{self.name}/{part}" if part else self.name
+
+    def put(
+        self, part: str, kind: str, make: Callable[..., Part], *args: Any,
+        present: Sequence[bool] | None = None,
+    ) -> None:  # fmt: skip
+        """Add an object, always or in some periods; ``make`` gets its name and the arguments."""
+        name, every = self.named(part), [True] * self.world.periods
+        self.world.place(name, kind, present or every, partial(make, name, *args))
+
+    def pave(self, part: str, rect: Rect, surface: str) -> None:
+        """A floor that never changes; see `floor`."""
+        self.world.always(self.named(part), "ground", partial(floor, self.name, rect, surface))
+
+    def lawn(self, rect: Rect, part: str = "", kind: str = "lawn", z: float = SLAB) -> None:
+        """Grass that changes with the seasons."""
+        name = self.named(part)
+        states = [f"{kind} {season}" for season in self.world.seasons]
+        self.world.add(f"{name}/lawn", "lawn", states, lambda s: floor(name, rect, s, z))
+
+    def plant(self, part: str, at: Array, size: float = 6.5, broad: bool = False) -> None:
+        """A tree that grows and changes with the seasons."""
+        world = self.world
+        height = float(self.rng.uniform(0.75, 1.25) * size)
+        heights = tree_heights(self.rng, world.periods, height)
+        self.tree(part, at, heights, 2, broad)
+
+    def tree(
+        self, part: str, at: Array, heights: Sequence[float | None], detail: int, broad: bool
+    ) -> None:
+        """A tree by its height in each period."""
+        states = [
+            None if height is None else (height, season)
+            for height, season in zip(heights, self.world.seasons, strict=True)
+        ]
+        name = self.named(part)
+        make = partial(tree, name, at, self.world.seed, detail, broad)
+        self.world.add(name, "tree", states, make)
+
+    def scatter_trees(self, rect: Rect, count: int, avoid: Sequence[Array] = ()) -> None:
+        """Trees at random places that keep apart from each other and from given points."""
+        taken = list(avoid)
+        for i in range(count):
+            for _ in range(20):
+                at = rect.at(*self.rng.random(2))
+                if all(np.hypot(at[0] - q[0], at[1] - q[1]) > 2.6 for q in taken):
+                    taken.append(at)
+                    self.plant(f"tree_{i}", at)
+                    break
+
+    def hedge(self, part: str, low: Array, high: Array) -> None:
+        """A hedge between two points."""
+        name = self.named(part)
+        make = partial(hedge, name, low, high, self.world.seed)
+        self.world.add(name, "tree", self.world.seasons, make)
+
+    def gravel_path(self, part: str, points: Array, width: float) -> None:
+        """Gravel path along a curve, slightly above the lawn's surface."""
+        way = np.gradient(points, axis=0)
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        side = np.column_stack([-way[:, 1], way[:, 0]]) * width / 2
+        height = np.full(len(points), SLAB + 0.02)
+
+        def make(name: str) -> Part:
+            b = PartBuilder(key_number(name))
+            style = pal.soil_style(b, 0.05, 0.0)
+            left = np.column_stack([points + side, height])
+            right = np.column_stack([points - side, height])
+            frame = (np.zeros(3), X, Y)
+            for i in range(len(points) - 1):
+                b.polygon([right[i], right[i + 1], left[i + 1], left[i]], style, frame=frame)
+            return b.build()
+
+        self.put(part, "ground", make)
+
+    def house(self, spec: Building, chance: float) -> None:
+        """A finished building, which may get another facade."""
+        world = self.world
+        rng = rng_for(world.seed, spec.name, "reclad")
+        states = looks(rng, world.periods, chance)
+        walls = (spec.wall, str(rng.choice(["plaster", "panel", "brick"])))
+        world.add(
+            spec.name,
+            "facade",
+            [(walls[s], s) for s in states],
+            lambda s: finished(replace(spec, wall=s[0], look=s[1]), world.seed),
+        )
+
+    def park_cars(
+        self, part: str, places: list[tuple[float, float, float, float]], chance: float
+    ) -> None:
+        """Parked cars: each place (x, y, z, heading) holds one car, another or none per period."""
+        periods = range(self.world.periods)
+        rng = rng_for(self.world.seed, self.named(part), "cars")
+        for i, (x, y, z, turn) in enumerate(places):
+            stay = rng.random() < 0.2
+            here = rng.random(len(periods)) < chance
+            heading = turn + rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
+            groups = [list(periods)] if stay else [[p] for p in periods]
+            for k, group in enumerate(groups):
+                present = [p in group and bool(here[group[0]]) for p in periods]
+                self.car(f"{part}/car_{i}_{k}".lstrip("/"), np.array([x, y, z]), heading, present)
+
+    def car(self, part: str, at: Array, heading: float, present: Sequence[bool]) -> None:
+        self.put(part, "car", fur.car, at, heading, self.world.seed, present=present)
 
 
-def plant(
-    world: World,
-    name: str,
-    at: Array,
-    rng: np.random.Generator,
-    size: float = 6.5,
-    broad: bool = False,
-) -> None:
-    """A tree that grows and changes with the seasons."""
-    heights = tree_heights(rng, world.periods, float(rng.uniform(0.75, 1.25) * size))
-    states = [
-        None if h is None else (h, season) for h, season in zip(heights, world.seasons, strict=True)
-    ]
-    world.add(name, "tree", states, partial(tree, name, at, world.seed, 2, broad))
-
-
-def plant_hedge(world: World, name: str, low: Array, high: Array) -> None:
-    world.add(name, "tree", world.seasons, partial(hedge, name, low, high, world.seed))
-
-
-def park_cars(
-    world: World, name: str, places: list[tuple[float, float, float, float]], chance: float
-) -> None:
-    """Parked cars: each place (x, y, z, heading) holds one car, another or none per period."""
-    rng = rng_for(world.seed, name, "cars")
-    for i, (x, y, z, turn) in enumerate(places):
-        stay = rng.random() < 0.2
-        here = rng.random(world.periods) < chance
-        heading = turn + rng.normal(0, 0.03) + (np.pi if rng.random() < 0.3 else 0)
-        base = np.array([x, y, z])
-        every = range(world.periods)
-        groups = [list(every)] if stay else [[p] for p in every]
-        for k, group in enumerate(groups):
-            label = f"{name}/car_{i}_{k}"
-            present = [p in group and bool(here[group[0]]) for p in every]
-            world.place(label, "car", present, partial(fur.car, label, base, heading, world.seed))
-
-
-def _lamps(world: World, name: str, rect: Rect) -> None:
-    """Lamps along the kerb, arms over the road."""
-    r = rect.inset(0.8)
-    dx, dy = r.size
-    spots = [(f, 0.0, -np.pi / 2) for f in np.linspace(0.2, 0.8, max(1, int(dx // 18)))]
-    spots += [(f, 1.0, np.pi / 2) for f in np.linspace(0.2, 0.8, max(1, int(dx // 18)))]
-    spots += [(0.0, f, np.pi) for f in np.linspace(0.3, 0.7, max(1, int(dy // 22)))]
-    spots += [(1.0, f, 0.0) for f in np.linspace(0.3, 0.7, max(1, int(dy // 22)))]
-    for i, (fx, fy, turn) in enumerate(spots):
-        label, at = f"{name}/lamp_{i}", r.at(fx, fy)
-        world.always(label, "lamp", partial(fur.lamp, label, at, turn))
-
-
-def curb_side(world: World, name: str, rect: Rect, road: float) -> None:
-    """Cars in the parking lanes around a block, and lamps."""
+def curb_side(world: World, name: str, rect: Rect) -> None:
+    """Cars in the parking lanes around a block, lamps, and street trees."""
+    block = Block(world, name, rect, rng_for(world.seed, name, "avenue"))
     places = []
     off = PARKING / 2
     step = 5.5
@@ -175,15 +249,26 @@ def curb_side(world: World, name: str, rect: Rect, road: float) -> None:
     for k in range(int((rect.size[1] - 10) // step)):
         y = rect.y0 + 8.0 + k * step
         places += [(rect.x0 - off, y, 0.0, np.pi / 2), (rect.x1 + off, y, 0.0, -np.pi / 2)]
-    park_cars(world, name, places, 0.3 if world.near else 0.42)
-    _lamps(world, name, rect)
-    _avenue(world, name, rect)
+    block.park_cars("", places, 0.3 if world.near else 0.42)
+    _lamps(block)
+    _avenue(block)
 
 
-def _avenue(world: World, name: str, rect: Rect) -> None:
+def _lamps(block: Block) -> None:
+    """Lamps along the kerb, arms over the road."""
+    r = block.inner.inset(0.8)
+    dx, dy = r.size
+    along = np.linspace(0.2, 0.8, max(1, int(dx // 18)))
+    across = np.linspace(0.3, 0.7, max(1, int(dy // 22)))
+    spots = [(f, 0.0, -np.pi / 2) for f in along] + [(f, 1.0, np.pi / 2) for f in along]
+    spots += [(0.0, f, np.pi) for f in across] + [(1.0, f, 0.0) for f in across]
+    for i, (fx, fy, turn) in enumerate(spots):
+        block.put(f"lamp_{i}", "lamp", fur.lamp, r.at(fx, fy), turn)
+
+
+def _avenue(block: Block) -> None:
     """Street trees in pits along some sides of a block."""
-    rng = rng_for(world.seed, name, "avenue")
-    r = rect.inset(1.0)
+    rng, r = block.rng, block.inner.inset(1.0)
     ends = [r.at(0, 0), r.at(1, 0), r.at(1, 1), r.at(0, 1), r.at(0, 0)]
     for side, (a, b) in enumerate(pairwise(ends)):
         if rng.random() < 0.45:
@@ -191,47 +276,8 @@ def _avenue(world: World, name: str, rect: Rect) -> None:
         length = float(np.linalg.norm(b - a))
         for i in range(int((length - 10) // 9.5)):
             at = a + (8.0 + 9.5 * i + rng.uniform(-0.5, 0.5)) / length * (b - a)
-            label = f"{name}/avenue_{side}{i}"
+            part = f"avenue_{side}{i}"
             pit = Rect(at[0] - 0.6, at[1] - 0.6, at[0] + 0.6, at[1] + 0.6)
-            world.always(f"{label}/pit", "ground",
-                         partial(floor, label, pit, "soil", SLAB + 0.015))  # fmt: skip
-            plant(world, label, at, rng, 5.6, broad=True)
-
-
-def put_house(
-    world: World, spec: Building, *, chance: float = 0.3, also: tuple[str, ...] = ()
-) -> None:
-    """A finished building, which may get another facade."""
-    rng = rng_for(world.seed, spec.name, "reclad")
-    states = looks(rng, world.periods, chance)
-    walls = (spec.wall, str(rng.choice(["plaster", "panel", "brick"])))
-    world.add(
-        spec.name,
-        "facade",
-        [(walls[s], s) for s in states],
-        lambda s: finished(replace(spec, wall=s[0], look=s[1]), world.seed),
-    )
-
-
-def scatter_trees(
-    world: World,
-    name: str,
-    rect: Rect,
-    rng: np.random.Generator,
-    count: int,
-    avoid: Array | None = None,
-) -> None:
-    """Trees at random places that keep apart from each other and from given points."""
-    taken: list[Array] = []
-    for i in range(count):
-        for _ in range(20):
-            at = rect.at(*rng.random(2))
-            near = [*taken, *([] if avoid is None else avoid)]
-            if all(np.hypot(at[0] - q[0], at[1] - q[1]) > 2.6 for q in near):
-                taken.append(at)
-                plant(world, f"{name}/tree_{i}", at, rng)
-                break
-
-
-def put_bench(world: World, name: str, at: Array, turn: float) -> None:
-    world.always(name, "bench", partial(fur.bench, name, at, turn))
+            make = partial(floor, block.named(part), pit, "soil", SLAB + 0.015)
+            block.world.always(block.named(f"{part}/pit"), "ground", make)
+            block.plant(part, at, 5.6, broad=True)

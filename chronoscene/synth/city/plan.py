@@ -1,23 +1,34 @@
-"""The plan of a city: blocks, roads, what stands on them and how that changes."""
+"""The plan of a city: blocks and what stands on them, roads between, countryside around."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.synth.city import blocks as fill
-from chronoscene.synth.city.ground import road_network, surroundings
-from chronoscene.synth.city.placing import Rect, curb_side
+from chronoscene.synth.city import palettes as pal
+from chronoscene.synth.city.blocks import FILLERS
+from chronoscene.synth.city.buildings import Building, finished
+from chronoscene.synth.city.placing import PARKING, RING, Block, Rect, curb_side
+from chronoscene.synth.city.vegetation import tree
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.light import make_lights
-from chronoscene.synth.render.noise import rng_for
+from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.render.noise import key_number, rng_for
+from chronoscene.synth.render.textures import FIELDS
 from chronoscene.synth.settings import SynthSettings
 
 Array = NDArray[np.float64]
+X, Y, Z = np.eye(3)
 ROAD = 9.6
 """Width of roads with parked cars on both sides, metres."""
+FAR = 900.0
+"""Half the extent of the countryside, metres."""
+REBUILT = ("houses", "slabs", "tower", "park")
+"""What may stand on a block after all of it was torn down."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,10 +59,6 @@ def make_plan(settings: SynthSettings) -> Plan:
     return Plan(*edges)
 
 
-REBUILT = ("houses", "slabs", "tower", "park")
-"""What may stand on a block after all of it was torn down."""
-
-
 def make_world(settings: SynthSettings) -> World:
     """Build all objects of all periods."""
     plan = make_plan(settings)
@@ -59,7 +66,7 @@ def make_world(settings: SynthSettings) -> World:
     core = np.array([[plan.x[1, 0], plan.y[1, 0]], [plan.x[n, 1], plan.y[n, 1]]])
     world = World(settings.seed, make_lights(settings.seed, settings.periods), core)
     world.near = settings.kind == "street"
-    road_network(world, plan.x, plan.y, ROAD)
+    _add_roads(world, plan)
     for (column, row), role in _roles(settings).items():
         name = f"block_{column}{row}"
         rect = plan.rect(column, row)
@@ -67,31 +74,34 @@ def make_world(settings: SynthSettings) -> World:
         if role != "suburb":
             x, y = rect.center
             world.focus.append(np.array([x, y, 3.0]))
-            curb_side(world, name, rect, ROAD)
-    surroundings(world, plan.x, plan.y)
+            curb_side(world, name, rect)
+    _add_surroundings(world, plan)
     return world
 
 
 def _fill(world: World, settings: SynthSettings, name: str, rect: Rect, role: str) -> None:
     """Build on a block; at one date it may be torn down, and something else be built."""
-    build = fill.FILLERS[role]
+
+    def build(role: str, name: str) -> None:
+        FILLERS[role](Block.paved(world, name, rect, 2.0 if role == "suburb" else RING))
+
     rng = rng_for(settings.seed, name, "rebuilt")
     if world.periods == 1 or rng.random() >= settings.rebuilt:
-        build(world, name, rect)
+        build(role, name)
         return
     date = int(rng.integers(1, world.periods))
     with world.during(range(date)):
-        build(world, name, rect)
+        build(role, name)
     other = role if role == "suburb" else str(rng.choice(sorted({*REBUILT} - {role})))
     with world.during(range(date, world.periods)):
-        fill.FILLERS[other](world, f"{name}_rebuilt", rect)
+        build(other, f"{name}_rebuilt")
 
 
 def _roles(settings: SynthSettings) -> dict[tuple[int, int], str]:
     """What each block is: one square, one building site, one renewal, parks, houses, slabs."""
     rng = rng_for(settings.seed, "roles")
     n = settings.blocks
-    cells = [(i, j) for i in range(1, n + 1) for j in range(1, n + 1)]
+    cells = list(product(range(1, n + 1), range(1, n + 1)))
     middle = (n + 1) / 2
     rng.shuffle(cells)
     cells.sort(key=lambda c: max(abs(c[0] - middle), abs(c[1] - middle)))
@@ -101,7 +111,120 @@ def _roles(settings: SynthSettings) -> dict[tuple[int, int], str]:
     tail = wanted[1:] + rest
     rng.shuffle(tail)
     roles = dict(zip(cells, ["square", *tail], strict=True))
-    for i in range(n + 2):
-        for j in range(n + 2):
-            roles.setdefault((i, j), "suburb")
+    for cell in product(range(n + 2), range(n + 2)):
+        roles.setdefault(cell, "suburb")
     return roles
+
+
+def _add_roads(world: World, plan: Plan) -> None:
+    """Roads between the columns and rows of blocks, junctions and zebra crossings."""
+    b = PartBuilder(key_number("roads"))
+    lanes, bare = pal.asphalt_style(b, 1, PARKING), pal.asphalt_style(b, 0)
+    zebra = pal.asphalt_style(b, 2)
+
+    def add(axis: int, ends: Array, side: float, far: float, seed: int, core: bool) -> None:
+        """A road beside one block, along x (axis 0) or y (1); only the core has crossings."""
+
+        def at(s: float, t: float, z: float = 0.0) -> Array:
+            return np.array([t, s, z] if axis else [s, t, z])
+
+        low, high = ends
+        along, across = (Y, (far - side) * X) if axis else (X, (far - side) * Y)
+        b.quads(at(low, side), (high - low) * along, across, lanes, seed=seed)
+        if core:
+            for s in (low + 1.0, high - 4.0):
+                b.quads(at(s, side, 0.012), 3.0 * along, across, zebra)
+            middle = (side + far) / 2
+            world.roads.append((at(low, middle)[:2], at(high, middle)[:2]))
+
+    columns, rows = plan.x, plan.y
+    between_columns = np.column_stack([columns[:-1, 1], columns[1:, 0]])
+    between_rows = np.column_stack([rows[:-1, 1], rows[1:, 0]])
+    for i, (x0, x1) in enumerate(between_columns):
+        for j, ends in enumerate(rows):
+            add(1, ends, x1, x0, i, 0 < j < len(rows) - 1)
+        for j, (y0, y1) in enumerate(between_rows):
+            b.quads([x0, y0, 0], (x1 - x0) * X, (y1 - y0) * Y, bare, seed=j)
+    for j, (y0, y1) in enumerate(between_rows):
+        for i, ends in enumerate(columns):
+            add(0, ends, y0, y1, j + 40, 0 < i < len(columns) - 1)
+    world.always("roads", "ground", b.build)
+
+
+def _add_surroundings(world: World, plan: Plan) -> None:
+    """Hills with fields, and scattered farms and trees."""
+    low, high = np.array([plan.x[0, 0], plan.y[0, 0]]), np.array([plan.x[-1, 1], plan.y[-1, 1]])
+    rng = rng_for(world.seed, "surroundings")
+    hills = _Hills(rng, low, high)
+    world.always("country", "ground", lambda: _terrain(hills))
+    count, half = 220, (high - low) / 2
+    reach = half.max()
+    for i in range(count):
+        turn, r = rng.uniform(0, 2 * np.pi), reach * (1.5 + 2.6 * rng.random() ** 1.5)
+        at = (low + high) / 2 + r * np.array([np.cos(turn), np.sin(turn)])
+        if np.all(np.abs(at - (low + high) / 2) < half + 8):
+            continue
+        z = float(hills.height(at[None])[0])
+        if rng.random() < 0.24:
+            _farm(world, f"farm_{i}", at, z, rng)
+        else:
+            base = np.array([*at, z - 0.3])
+            height = float(rng.uniform(7, 15))
+            states = [(height, season) for season in world.seasons]
+            label = f"far_tree_{i}"
+            world.add(label, "tree", states, partial(tree, label, base, world.seed, 0, False))
+
+
+def _farm(world: World, name: str, at: Array, z: float, rng: np.random.Generator) -> None:
+    w, d = rng.uniform(8, 16, 2)
+    spec = Building(
+        name, at[0] - w / 2, at[1] - d / 2, at[0] + w / 2, at[1] + d / 2, int(rng.integers(1, 4)),
+        str(rng.choice(["gable", "hip"])), str(rng.choice(["plaster", "brick"])), simple=True,
+    )  # fmt: skip
+    part = finished(spec, world.seed)
+    part.vertices[..., 2] += np.float32(z - 0.8)
+    part.patches[:, 2] += z - 0.8
+    world.always(name, "building", lambda: part)
+
+
+class _Hills:
+    """Height of the countryside: flat at the city, hills farther out."""
+
+    def __init__(self, rng: np.random.Generator, low: Array, high: Array) -> None:
+        self._waves = rng.normal(0, 1, (7, 2)) / np.array([230, 180, 140, 110, 90, 70, 55])[:, None]
+        self._phase = rng.uniform(0, 6.28, 7)
+        self._middle, self._half = (low + high) / 2, (high - low) / 2
+
+    def height(self, xy: Array) -> Array:
+        """Metres above the city's ground. [N]"""
+        outside = np.maximum(np.abs(xy - self._middle) - self._half, 0)
+        distance = np.hypot(outside[:, 0], outside[:, 1])
+        sizes = np.array([9, 8, 6, 4, 3, 2, 1.5])
+        bumps = (np.sin(xy @ self._waves.T + self._phase) * sizes).sum(axis=1)
+        far = np.clip((distance - 25) / 320, 0, 1)
+        rise = 34 * np.clip((distance - 120) / 700, 0, 1) ** 1.3
+        height: Array = -0.35 + far * (10 + bumps) + rise
+        return height
+
+
+def _terrain(hills: _Hills) -> Part:
+    """Grid with smooth normals, finer near the city."""
+    b = PartBuilder(key_number("country"))
+    fields = b.style(FIELDS, srgb(104, 120, 62), srgb(164, 152, 96), srgb(128, 104, 76))
+    t = np.linspace(-1, 1, 121)
+    line = FAR * (0.45 * t + 0.55 * t**3)
+    xy = np.stack(np.meshgrid(line, line, indexing="ij"), -1)
+    flat = xy.reshape(-1, 2)
+    z = hills.height(flat)
+    e = 2.0
+    east, north = np.array([e, 0]), np.array([0, e])
+    sx = (hills.height(flat + east) - hills.height(flat - east)) / (2 * e)
+    sy = (hills.height(flat + north) - hills.height(flat - north)) / (2 * e)
+    normals = np.stack([-sx, -sy, np.ones_like(sx)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = np.column_stack([flat, z])
+    n = len(line)
+    i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([np.stack([i, i + n, i + n + 1], 1), np.stack([i, i + n + 1, i + 1], 1)])
+    b.triangles(points[faces], normals[faces], fields, origin=np.zeros(3))
+    return b.build()

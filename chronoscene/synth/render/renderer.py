@@ -122,13 +122,8 @@ class PeriodRenderer:
         hits = self.cast(rays)
         depth = np.where(hits.tri == MISS, np.float32(0), hits.t)
         color = self.albedo(rays, hits, depth / camera.K[0, 0])
-        return PixelMaps(
-            depth.reshape(shape), self.elements(hits).reshape(shape), color.reshape(*shape, 3)
-        )
-
-    def elements(self, hits: Hits) -> NDArray[np.int32]:
-        """Identity of the object that each ray hit, -1 for a miss. [n]"""
-        return self.elements_of(hits.tri)
+        element = self.elements_of(hits.tri).reshape(shape)
+        return PixelMaps(depth.reshape(shape), element, color.reshape(*shape, 3))
 
     def surface_near(self, points: Array) -> NDArray[np.uint32]:
         """Triangles that pass through points, `MISS` where none is within a millimetre. [n]"""

@@ -102,13 +102,13 @@ def test_cameras_keep_their_distance(made, renderers) -> None:  # type: ignore[n
 
 def test_street_views_walk_between_the_houses() -> None:
     from chronoscene.synth.city.plan import make_world
-    from chronoscene.synth.flights import make_camera, plan_views
+    from chronoscene.synth.flights import plan_frames
     from chronoscene.synth.generation import make_renderers
 
     wanted = preset("tiny", kind="street", views=6)
     world = make_world(wanted)
     renderers = make_renderers(wanted, world)
-    views = plan_views(wanted, world, renderers, make_camera(wanted))
+    views = plan_frames(wanted, world, renderers)
     eyes = np.array([np.linalg.inv(v.cam_from_world)[:3, 3] for v in views])
     assert (eyes[:, 2] > 1.2).all() and (eyes[:, 2] < 4.5).all()
     forward = np.array([v.cam_from_world[2, :3] for v in views])
