@@ -2,7 +2,7 @@
 
 A rule is a small function in `chronoscene.validation.rules` with a decorator for its severity. Its
 parameters name the attributes of `RawScene` that it looks at (``scene`` is the scene itself); it is
-skipped if one of them is None, and yields a `Hit` for each problem::
+skipped if one of them is None, or what it is read from, and yields a `Hit` for each problem::
 
     @rule.warning("CS122", bad="quaternion `2 0 0 0`", remedy="normalise the quaternion")
     def quaternion_not_unit(scene: RawScene, images: RawImages) -> Iterator[Hit]:
@@ -98,6 +98,10 @@ class Rule:
         return self.check(*(scene if p == "scene" else getattr(scene, p) for p in self.parameters))
 
 
+SOURCES = dict.fromkeys(("names", "headers", "readable", "centres"), "images")
+SOURCES["usable_cameras"] = "cameras"
+"""Attributes that are empty, not None, without the part that they are read from."""
+
 RULES: dict[str, Rule] = {}
 """Rules by code. Complete when `chronoscene.validation.rules` has been imported."""
 
@@ -125,7 +129,7 @@ def _register(
         name = check.__name__.replace("_", "-")
         assert name not in {r.name for r in RULES.values()}, name
         parameters = tuple(inspect.signature(check).parameters)
-        needed = (*(p for p in parameters if p != "scene"), *needs)
+        needed = (*(SOURCES.get(p, p) for p in parameters if p != "scene"), *needs)
         text = what or " ".join((check.__doc__ or "").split())
         RULES[code] = Rule(code, name, severity, text, remedy, bad, parameters, needed, last, check)
         return check

@@ -327,9 +327,9 @@ class RawScene:
         return read_headers(self.root / "images", self.present)
 
     @cached_property
-    def readable(self) -> list[str]:
-        """Present images with a good header."""
-        return [name for name, header in self.headers.items() if header.problem is None]
+    def readable(self) -> dict[str, Header]:
+        """Headers of the present images with a good one."""
+        return {name: header for name, header in self.headers.items() if header.problem is None}
 
     @cached_property
     def digests(self) -> dict[str, bytes]:
@@ -341,7 +341,7 @@ class RawScene:
         """Digests and thumbnails of the readable images, if they may be decoded."""
         if not self.decode:
             return None
-        return read_pixels(self.root / "images", self.readable, self.track)
+        return read_pixels(self.root / "images", list(self.readable), self.track)
 
 
 def derived(compute: Callable[[RawScene], T]) -> Callable[[RawScene], T]:

@@ -97,12 +97,11 @@ def zero_distortion(scene: RawScene) -> Iterator[Hit]:
     "CS135",
     bad="f = 35 (millimetres) with a width of 4000 pixels",
     remedy="check that the focal lengths are in pixels and belong to images of this size",
-    needs=("cameras",),
 )
-def implausible_focal(scene: RawScene) -> Iterator[Hit]:
+def implausible_focal(scene: RawScene, usable_cameras: dict[int, Camera]) -> Iterator[Hit]:
     """The focal lengths imply a field of view or an aspect ratio of pixels that no ordinary camera
     has."""
-    for camera in scene.usable_cameras.values():
+    for camera in usable_cameras.values():
         fx, fy = camera.K[0, 0], camera.K[1, 1]
         angle = np.degrees(2 * np.arctan(camera.width / (2 * fx)))
         if not MIN_ANGLE <= angle <= MAX_ANGLE:
@@ -118,11 +117,10 @@ def implausible_focal(scene: RawScene) -> Iterator[Hit]:
     "CS136",
     bad="cx = 2000 with a width of 1600",
     remedy="check that the camera belongs to images of this size (not to a crop or a scaled copy)",
-    needs=("cameras",),
 )
-def principal_point_outside(scene: RawScene) -> Iterator[Hit]:
+def principal_point_outside(scene: RawScene, usable_cameras: dict[int, Camera]) -> Iterator[Hit]:
     """The principal point is outside the image."""
-    for camera in scene.usable_cameras.values():
+    for camera in usable_cameras.values():
         cx, cy = camera.K[0, 2], camera.K[1, 2]
         if not (0 <= cx <= camera.width and 0 <= cy <= camera.height):
             expected = f"a principal point within {camera.width} x {camera.height}"

@@ -168,13 +168,12 @@ def name_not_text(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     "CS113",
     bad="`IMG_1.jpg` and `img_1.JPG`; `é` as one character and as two",
     remedy="rename one of the files, in images/ and in the model",
-    needs=("images",),
 )
-def name_case_collision(scene: RawScene) -> Iterator[Hit]:
+def name_case_collision(scene: RawScene, names: list[str]) -> Iterator[Hit]:
     """Image names differ only by case or by Unicode normalisation: they are the same file on
     Windows and macOS, so that copying or checking out the scene loses an image."""
     groups: dict[str, list[str]] = {}
-    for name in scene.names:
+    for name in names:
         groups.setdefault(spelling(name), []).append(name)
     for group in groups.values():
         if len(group) > 1:
@@ -186,12 +185,10 @@ def name_case_collision(scene: RawScene) -> Iterator[Hit]:
     "CS114",
     bad="`2016-05-03T12:00:00.jpg`; `aux.png`",
     remedy="nothing to do here; to share the scene, rename the files in images/ and in the model",
-    needs=("images",),
 )
-def name_not_portable(scene: RawScene) -> Iterator[Hit]:
+def name_not_portable(names: list[str]) -> Iterator[Hit]:
     """Other systems cannot store some image names: they have characters that Windows rejects, end
     in a space or a dot, are names of devices, or are longer than 255 bytes."""
-    names = [name for name in scene.names if not is_portable(name)]
-    if names:
-        found = f"{counted(len(names), 'name')} that some cannot store: {shown(names)}"
-        yield Hit("images", "names that all systems can store", found, count=len(names))
+    if odd := [name for name in names if not is_portable(name)]:
+        found = f"{counted(len(odd), 'name')} that some cannot store: {shown(odd)}"
+        yield Hit("images", "names that all systems can store", found, count=len(odd))

@@ -77,11 +77,10 @@ def quaternion_not_unit(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     "CS123",
     bad="a model in UTM coordinates, 4,427,000 m north",
     remedy="subtract an offset from the model and record it in sparse/world.json",
-    needs=("images",),
 )
-def far_from_origin(scene: RawScene) -> Iterator[Hit]:
+def far_from_origin(scene: RawScene, centres: Array) -> Iterator[Hit]:
     """The scene is too far from the origin to be resolved in single precision."""
-    centres = scene.centres[scene.is_posed]
+    centres = centres[scene.is_posed]
     if len(centres) < 2:
         return
     middle = np.median(centres, axis=0)

@@ -13,7 +13,7 @@ from chronoscene.io.wording import quote
 from chronoscene.scene import Camera
 from chronoscene.validation import rule
 from chronoscene.validation.checks.names import Spellings
-from chronoscene.validation.checks.pixels import Pixels
+from chronoscene.validation.checks.pixels import Header, Pixels
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
@@ -36,14 +36,13 @@ BLANK = 2.0
     "CS201",
     bad="`images.bin` has `a.jpg`, but there is only `images/a.JPG`",
     remedy="copy the image there, or remove it from the model",
-    needs=("images",),
 )
-def image_missing(scene: RawScene) -> Iterator[Hit]:
+def image_missing(scene: RawScene, names: list[str]) -> Iterator[Hit]:
     """The file of a registered image is missing."""
     if not (scene.root / "images").is_dir():
         return  # has its own rule
     present, others = set(scene.present), Spellings(_unregistered(scene))
-    for name in scene.names:
+    for name in names:
         if name not in present:
             near = others.find(name)
             found = _instead(scene, name) + (f"; there is {quote(near)}" if near else "")
@@ -85,11 +84,10 @@ def image_unregistered(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     "CS203",
     bad="a file of zero bytes; a text file named `a.jpg`",
     remedy="copy the file again, or convert it to JPEG or PNG",
-    needs=("images",),
 )
-def image_unreadable(scene: RawScene) -> Iterator[Hit]:
+def image_unreadable(headers: dict[str, Header]) -> Iterator[Hit]:
     """An image file is empty, or is not an image."""
-    for name, header in scene.headers.items():
+    for name, header in headers.items():
         if header.problem is not None:
             yield Hit(f"images/{name}", "an image", header.problem)
         elif header.mode == "F":
@@ -155,16 +153,13 @@ def _expected(camera: Camera) -> str:
 
 
 @rule.error(
-    "CS206",
-    bad="a JPEG truncated during transfer",
-    remedy="copy the file again from its source",
-    needs=("images",),
+    "CS206", bad="a JPEG truncated during transfer", remedy="copy the file again from its source"
 )
-def image_damaged(scene: RawScene, pixels: dict[str, Pixels]) -> Iterator[Hit]:
+def image_damaged(pixels: dict[str, Pixels], headers: dict[str, Header]) -> Iterator[Hit]:
     """An image file is damaged: its header is valid, but its pixels cannot be decoded (needs
     `--decode`)."""
     for name, decoded in pixels.items():
-        if decoded.problem is not None and scene.headers[name].mode != "F":
+        if decoded.problem is not None and headers[name].mode != "F":
             yield Hit(f"images/{name}", "an image that can be decoded", decoded.problem)
 
 
@@ -173,29 +168,25 @@ def image_damaged(scene: RawScene, pixels: dict[str, Pixels]) -> Iterator[Hit]:
     bad="a phone photo in portrait with EXIF orientation 6",
     remedy="remove the tag, but leave the pixels as they are: the poses refer to them "
     "(chronoscene validate --fix does so for JPEG files)",
-    needs=("images",),
 )
-def orientation_tag(scene: RawScene) -> Iterator[Hit]:
+def orientation_tag(scene: RawScene, readable: dict[str, Header]) -> Iterator[Hit]:
     """An image has an orientation tag. ChronoScene and COLMAP ignore it, but viewers rotate the
     image."""
     rotated = images_of_other_shape(scene) if scene.cameras is not None else set()
-    for name in scene.readable:
-        orientation = scene.headers[name].orientation
-        if name not in rotated and orientation in range(2, 9):  # else an error names the tag
-            yield Hit(f"images/{name}", "no orientation tag", f"orientation {orientation}")
+    for name, header in readable.items():
+        if name not in rotated and header.orientation in range(2, 9):  # else an error names the tag
+            yield Hit(f"images/{name}", "no orientation tag", f"orientation {header.orientation}")
 
 
 @rule.error(
     "CS208",
     bad="a JPEG of which only the first half was uploaded",
     remedy="copy the file again from its source",
-    needs=("images",),
 )
-def image_cut_off(scene: RawScene) -> Iterator[Hit]:
+def image_cut_off(scene: RawScene, readable: dict[str, Header]) -> Iterator[Hit]:
     """An image file is truncated. With `--decode`, CS206 reports such files."""
     pixels = scene.pixels or {}
-    for name in scene.readable:
-        header = scene.headers[name]
+    for name, header in readable.items():
         if header.truncated and (name not in pixels or pixels[name].problem is None):
             yield Hit(f"images/{name}", f"a complete {header.kind} file", "one without its end")
 
@@ -204,28 +195,23 @@ def image_cut_off(scene: RawScene) -> Iterator[Hit]:
     "CS211",
     bad="a PNG with 16 bits per channel",
     remedy="nothing to do here; save it with 8 bits per channel for other readers",
-    needs=("images",),
 )
-def image_deep(scene: RawScene) -> Iterator[Hit]:
+def image_deep(readable: dict[str, Header]) -> Iterator[Hit]:
     """An image has more than 8 bits per channel. Only 8 are used; the released code may not be able
     to read it."""
-    for name in scene.readable:
-        header = scene.headers[name]
+    for name, header in readable.items():
         if header.deep and header.mode != "F":
             yield Hit(f"images/{name}", "8 bits per channel", f"more ({header.kind})")
 
 
 @rule.warning(
-    "CS212",
-    bad="a JPEG in CMYK",
-    remedy="convert the image to RGB using its colour profile",
-    needs=("images",),
+    "CS212", bad="a JPEG in CMYK", remedy="convert the image to RGB using its colour profile"
 )
-def image_cmyk(scene: RawScene) -> Iterator[Hit]:
+def image_cmyk(readable: dict[str, Header]) -> Iterator[Hit]:
     """An image is in CMYK, the colours of printing: it is converted to RGB without its colour
     profile, so its colours differ from those of the other images."""
-    for name in scene.readable:
-        if scene.headers[name].mode == "CMYK":
+    for name, header in readable.items():
+        if header.mode == "CMYK":
             yield Hit(f"images/{name}", "pixels in RGB", "pixels in CMYK")
 
 
@@ -233,27 +219,21 @@ def image_cmyk(scene: RawScene) -> Iterator[Hit]:
     "CS213",
     bad="a PNG with an alpha channel",
     remedy="nothing to do if this is intended; otherwise save the image without transparency",
-    needs=("images",),
 )
-def image_transparent(scene: RawScene) -> Iterator[Hit]:
+def image_transparent(readable: dict[str, Header]) -> Iterator[Hit]:
     """An image may have transparent pixels, which are filled with the background colour in training
     and in testing."""
-    for name in scene.readable:
-        header = scene.headers[name]
+    for name, header in readable.items():
         if header.transparent:
             yield Hit(f"images/{name}", "opaque pixels", f"pixels of mode {header.mode}")
 
 
 @rule.warning(
-    "CS214",
-    bad="an animated WebP",
-    remedy="save the frame that is meant as a file of its own",
-    needs=("images",),
+    "CS214", bad="an animated WebP", remedy="save the frame that is meant as a file of its own"
 )
-def image_animated(scene: RawScene) -> Iterator[Hit]:
+def image_animated(readable: dict[str, Header]) -> Iterator[Hit]:
     """An image has several frames, of which only the first is used."""
-    for name in scene.readable:
-        header = scene.headers[name]
+    for name, header in readable.items():
         if header.animated:
             yield Hit(f"images/{name}", "a single frame", f"several frames ({header.kind})")
 
@@ -262,15 +242,14 @@ def image_animated(scene: RawScene) -> Iterator[Hit]:
     "CS215",
     bad="a PNG named `a.jpg`",
     remedy="rename the file, in images/ and in the model, or convert it",
-    needs=("images",),
 )
-def image_misnamed(scene: RawScene) -> Iterator[Hit]:
+def image_misnamed(readable: dict[str, Header]) -> Iterator[Hit]:
     """The extension of an image does not match its file format; programs that go by the extension
     fail."""
-    for name in scene.readable:
-        kind, known = scene.headers[name].kind, KINDS.get(PurePosixPath(name).suffix.lower())
-        if known is not None and kind not in known:
-            yield Hit(f"images/{name}", f"a {known[0]} file", f"a {kind} file")
+    for name, header in readable.items():
+        known = KINDS.get(PurePosixPath(name).suffix.lower())
+        if known is not None and header.kind not in known:
+            yield Hit(f"images/{name}", f"a {known[0]} file", f"a {header.kind} file")
 
 
 @rule.warning(

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from chronoscene.colmap.raw_model import RawPoints
 from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted, quote, shown
+from chronoscene.scene import Camera
 from chronoscene.scene.splits import TEST_EVERY
 from chronoscene.validation import rule
+from chronoscene.validation.checks.pixels import Header
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs3_split import test_elsewhere
 from chronoscene.validation.scene_folder import RawScene, TextFile
@@ -82,18 +84,17 @@ def official_failure(line: str) -> str | None:
     "CS702",
     bad="`x/0001.png` and `y/0001.png`; `a.1.png` and `a.2.png`; `0001.jpg` and `0001.png`",
     remedy="give all images different file names up to the first dot",
-    needs=("images",),
 )
-def official_name_collision(scene: RawScene) -> Iterator[Hit]:
+def official_name_collision(scene: RawScene, names: list[str]) -> Iterator[Hit]:
     """Two images are the same to the official loader, which identifies them by their file name up
     to the first dot; the later line of `split.txt` overwrites the earlier one."""
     groups: dict[str, list[str]] = {}
-    for name in scene.names:
+    for name in names:
         groups.setdefault(_cut(name), []).append(name)
-    for key, names in groups.items():
-        if len(names) > 1:
-            found = f"{shown(names)}, all known to it as {quote(key)}"
-            files = {PurePosixPath(name).name for name in names}
+    for key, group in groups.items():
+        if len(group) > 1:
+            found = f"{shown(group)}, all known to it as {quote(key)}"
+            files = {PurePosixPath(name).name for name in group}
             if len(files) == 1:
                 found += f", and all read from images/{files.pop()}"
             place = scene.model_file("images")
@@ -104,29 +105,21 @@ def official_name_collision(scene: RawScene) -> Iterator[Hit]:
     "CS703",
     bad="`images/2016/a.jpg`",
     remedy="nothing to do here; flatten the folders to use the scene with the official code, too",
-    needs=("images",),
 )
-def official_folders(scene: RawScene) -> Iterator[Hit]:
+def official_folders(names: list[str]) -> Iterator[Hit]:
     """Images are in folders below `images/`; the official loader looks for all of them directly in
     `images/`, and fails on names with folders in `split.txt`."""
-    inside = [name for name in scene.names if "/" in name]
-    if inside:
+    if inside := [name for name in names if "/" in name]:
         found = f"{counted(len(inside), 'image')} in folders: {shown(inside)}"
         yield Hit("images", "no folders", found, count=len(inside))
 
 
-@rule.warning(
-    "CS704",
-    bad="an 8 bit greyscale PNG",
-    remedy="save the image with three channels",
-    needs=("images",),
-)
-def official_grey(scene: RawScene) -> Iterator[Hit]:
+@rule.warning("CS704", bad="an 8 bit greyscale PNG", remedy="save the image with three channels")
+def official_grey(readable: dict[str, Header]) -> Iterator[Hit]:
     """The official loader would fail on a greyscale image."""
-    for name in scene.readable:
-        mode = scene.headers[name].mode
-        if mode in GREY_MODES:
-            yield Hit(f"images/{name}", "an image with colours", f"pixels of mode {mode}")
+    for name, header in readable.items():
+        if header.mode in GREY_MODES:
+            yield Hit(f"images/{name}", "an image with colours", f"pixels of mode {header.mode}")
 
 
 @rule.info(
@@ -134,12 +127,11 @@ def official_grey(scene: RawScene) -> Iterator[Hit]:
     bad="cx = 140.8 with a width of 320",
     remedy="nothing to do here; expect worse results from the official code, or crop the images "
     "with chronoscene undistort --center",
-    needs=("cameras",),
 )
-def official_principal_point(scene: RawScene) -> Iterator[Hit]:
+def official_principal_point(scene: RawScene, usable_cameras: dict[int, Camera]) -> Iterator[Hit]:
     """The principal point is not in the centre of the image; ChronoScene uses it, the official code
     ignores it."""
-    for camera in scene.usable_cameras.values():
+    for camera in usable_cameras.values():
         dx, dy = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
         if max(abs(dx), abs(dy)) > OFF_CENTRE:
             found = f"an offset of ({dx:+.4g}, {dy:+.4g}) px"
