@@ -15,8 +15,7 @@ from chronoscene.stats.counts import CountRule, SceneCount, count_scene
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-CELLS = 50
-"""Cubes along the longest edge of a scene for its coverage."""
+CELLS = 50  # cubes along the longest edge of a scene for its coverage
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,12 +234,9 @@ CORE = (10.0, 90.0)
 REACH = 0.8
 """Of the longest edge of the core, on every side: farther points are outliers. One reach for
 all axes: the towers of a flat place are not outliers."""
-ENDS = (2.0, 98.0)
-"""Percentiles of what is left that are the ends of the scene, and `BEYOND` that."""
-BEYOND = 0.08
-"""Of the distance between the two ends: an even spread of points is inside as a whole."""
-MAX_SAMPLE = 50_000
-"""Points that are looked at: an even choice of a larger cloud is enough."""
+ENDS = (2.0, 98.0)  # percentiles of what is left that are the ends of the scene, and `BEYOND` that
+BEYOND = 0.08  # of the distance between the two ends: an even spread of points is inside as a whole
+MAX_SAMPLE = 50_000  # points that are looked at: an even choice of a larger cloud is enough
 
 
 def robust_range(xyz: Array) -> Array:

@@ -16,8 +16,7 @@ from chronoscene.scene.tracks import track_owners
 
 Array = NDArray[np.float64]
 
-MAX_TABLE = 1_000_000
-"""Ids within a range of about this many numbers are looked up in a table."""
+MAX_TABLE = 1_000_000  # ids within a range of about this many numbers are looked up in a table
 
 
 @dataclass(frozen=True, slots=True, eq=False)
