@@ -16,51 +16,21 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.colmap import raw_model
 from chronoscene.colmap.model import read_raw_model
-from chronoscene.colmap.raw_model import (
-    FORMS,
-    MODEL_FILES,
-    RawImages,
-    RawModel,
-    RawPoints,
-    numbered_models,
-)
+from chronoscene.colmap.raw_model import FORMS, MODEL_FILES, RawImages, RawModel, RawPoints
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST
-from chronoscene.scene import Camera
+from chronoscene.scene import Camera, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
-from chronoscene.scene.splits import (
-    IMAGE_SUFFIXES,
-    NameEntry,
-    Problem,
-    SplitEntry,
-    assign_periods,
-    assign_tests,
-    decode_text,
-    default_tests,
-    parse_split_text,
-    parse_test_text,
-)
+from chronoscene.scene.splits import NameEntry, Problem, SplitEntry
 from chronoscene.scene.tracks import seen_by_period
+from chronoscene.validation.checks import observations, pixels
 from chronoscene.validation.checks.names import is_safe
-from chronoscene.validation.checks.observations import (
-    Observations,
-    Reprojection,
-    good_poses,
-    observe,
-    reproject,
-)
-from chronoscene.validation.checks.pixels import (
-    Header,
-    Pixels,
-    hash_files,
-    read_headers,
-    read_pixels,
-)
+from chronoscene.validation.checks.observations import Observations, Reprojection
+from chronoscene.validation.checks.pixels import Header, Pixels, Track
 
 T = TypeVar("T")
-Track = Callable[[Sequence[T], str], Iterable[T]]
-"""Passes items on and shows the progress under a description."""
 
 MODEL_PLACES = (MODEL, "sparse", "colmap/sparse/0", "dense/sparse", "dense/0/sparse", "")
 """Where a model is looked for; only the first place is right."""
@@ -139,7 +109,7 @@ class RawScene:
         for place in MODEL_PLACES:
             if any((self.root / place / f"{s}{e}").is_file() for s in MODEL_FILES for e in FORMS):
                 return place
-        numbered = numbered_models(self.root)  # the first one may have been deleted
+        numbered = raw_model.numbered_models(self.root)  # the first one may have been deleted
         return f"sparse/{numbered[0].name}" if numbered else None
 
     @cached_property
@@ -182,7 +152,7 @@ class RawScene:
     def observations(self) -> Observations | None:
         if self.images is None or self.points is None:
             return None
-        return observe(self.images, self.points)
+        return observations.observe(self.images, self.points)
 
     @cached_property
     def centres(self) -> NDArray[np.float64]:
@@ -192,7 +162,7 @@ class RawScene:
         with np.errstate(all="ignore"):  # absurd translations become infinite
             rotations = rotation_from_quaternion(self.images.quaternions)
             centres = -np.einsum("nji,nj->ni", rotations, self.images.translations)
-        centres[~(good_poses(self.images) & np.isfinite(centres).all(axis=1))] = np.nan
+        centres[~(observations.good_poses(self.images) & np.isfinite(centres).all(axis=1))] = np.nan
         return centres
 
     @cached_property
@@ -206,7 +176,7 @@ class RawScene:
         images, points, seen = self.images, self.points, self.observations
         if self.cameras is None or images is None or points is None or seen is None:
             return None
-        return list(reproject(self.usable_cameras, images, points, seen))
+        return list(observations.reproject(self.usable_cameras, images, points, seen))
 
     # Periods and split.
 
@@ -216,7 +186,7 @@ class RawScene:
 
     @cached_property
     def _parsed_split(self) -> tuple[list[SplitEntry], list[Problem]]:
-        return parse_split_text(self.split_text.text) if self.split_text else ([], [])
+        return splits.parse_split_text(self.split_text.text) if self.split_text else ([], [])
 
     @property
     def split(self) -> list[SplitEntry] | None:
@@ -230,7 +200,7 @@ class RawScene:
 
     @cached_property
     def _assigned(self) -> tuple[dict[str, int], list[Problem]]:
-        return assign_periods(self.names, self.split or [])
+        return splits.assign_periods(self.names, self.split or [])
 
     @property
     def split_problems(self) -> list[Problem]:
@@ -252,11 +222,11 @@ class RawScene:
     @cached_property
     def test(self) -> list[NameEntry] | None:
         """Lines of ``test.txt``."""
-        return parse_test_text(self.test_text.text) if self.test_text else None
+        return splits.parse_test_text(self.test_text.text) if self.test_text else None
 
     @cached_property
     def _tested(self) -> tuple[set[str], list[Problem]]:
-        return assign_tests(self.names, self.test or [])
+        return splits.assign_tests(self.names, self.test or [])
 
     @property
     def test_problems(self) -> list[Problem]:
@@ -269,7 +239,7 @@ class RawScene:
             return None
         if self.test is not None:
             return self._tested[0]
-        return None if os.path.lexists(self.root / TEST) else default_tests(self.periods)
+        return None if os.path.lexists(self.root / TEST) else splits.default_tests(self.periods)
 
     @cached_property
     def image_periods(self) -> NDArray[np.int64]:
@@ -309,7 +279,7 @@ class RawScene:
             found += [
                 (below / file).as_posix()
                 for file in files
-                if file.lower().endswith(IMAGE_SUFFIXES) and not file.startswith("._")
+                if file.lower().endswith(splits.IMAGE_SUFFIXES) and not file.startswith("._")
             ]
         return sorted(found)
 
@@ -324,7 +294,7 @@ class RawScene:
     @cached_property
     def headers(self) -> dict[str, Header]:
         """Headers of the present images."""
-        return read_headers(self.root / "images", self.present)
+        return pixels.read_headers(self.root / "images", self.present)
 
     @cached_property
     def readable(self) -> dict[str, Header]:
@@ -334,14 +304,14 @@ class RawScene:
     @cached_property
     def digests(self) -> dict[str, bytes]:
         """SHA-256 of the present files that have the same size as another; the rest are unique."""
-        return hash_files(self.root / "images", self.present, self.track)
+        return pixels.hash_files(self.root / "images", self.present, self.track)
 
     @cached_property
     def pixels(self) -> dict[str, Pixels] | None:
         """Digests and thumbnails of the readable images, if they may be decoded."""
         if not self.decode:
             return None
-        return read_pixels(self.root / "images", list(self.readable), self.track)
+        return pixels.read_pixels(self.root / "images", list(self.readable), self.track)
 
 
 def derived(compute: Callable[[RawScene], T]) -> Callable[[RawScene], T]:
@@ -362,7 +332,7 @@ def read_text_file(path: Path) -> TextFile | None:
         if not path.is_file():  # a pipe would block
             return None
         data = path.read_bytes()
-        text = decode_text(data)
+        text = splits.decode_text(data)
         return None if "\0" in text else TextFile(data, text)  # UTF-16 without its mark
     except (OSError, UnicodeDecodeError):
         return None

@@ -14,6 +14,7 @@ from chronoscene.formats.chronoscene import read_periods
 from chronoscene.geodesy import Georeference, median_longitude
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import SIGMA, Similarity, fit_robustly
+from chronoscene.validation.checks import grouped
 from chronoscene.validation.scene_folder import RawScene, derived
 
 MIN_DATES = 3  # photos with a date from which the median date of a period is meaningful
@@ -37,14 +38,10 @@ def dates_of(scene: RawScene) -> dict[str, datetime]:
 @derived
 def median_dates(scene: RawScene) -> dict[int, datetime]:
     """Median dates of the periods with enough dates."""
-    by_period: dict[int, list[datetime]] = {}
-    for name, taken in dates_of(scene).items():
-        by_period.setdefault((scene.periods or {})[name], []).append(taken)
-    return {
-        period: sorted(dates)[len(dates) // 2]
-        for period, dates in by_period.items()
-        if len(dates) >= MIN_DATES
-    }
+    periods = scene.periods or {}
+    by_period = grouped((periods[name], taken) for name, taken in dates_of(scene).items())
+    enough = {period: sorted(d) for period, d in by_period.items() if len(d) >= MIN_DATES}
+    return {period: dates[len(dates) // 2] for period, dates in enough.items()}
 
 
 @derived

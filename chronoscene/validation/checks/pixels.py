@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,11 @@ from PIL import Image
 from chronoscene.errors import ImageError
 from chronoscene.images.exif import ExifData, exif_of
 from chronoscene.images.store import load_rgb
+from chronoscene.validation.checks import grouped
+
+T = TypeVar("T")
+Track = Callable[[Sequence[T], str], Iterable[T]]
+"""Passes items on and shows the progress under a description."""
 
 THUMBNAIL = 32  # pixels along each side of a thumbnail
 GREY_SIDE = 160  # pixels along the longer side of a small grey image: 20 kB for each image
@@ -110,14 +115,11 @@ def read_header(path: Path) -> Header:
 
 
 def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
-    exif = exif_of(image)
-    width, height = image.size
-    kind = image.format or ""
-    if kind == "TIFF" and exif.orientation >= 5:  # Pillow gives the size after rotation
-        width, height = height, width
+    exif, kind = exif_of(image), image.format or ""
+    turned = kind == "TIFF" and exif.orientation >= 5  # Pillow gives the size after rotation
     return Header(
         problem=None,
-        size=(width, height),
+        size=image.size[::-1] if turned else image.size,
         mode=image.mode,
         orientation=exif.orientation,
         kind=kind,
@@ -244,21 +246,15 @@ def _tiff_end(image: Image.Image) -> int:
     return max(ends)
 
 
-def hash_files(
-    folder: Path, names: Sequence[str], track: Callable[[Sequence[str], str], Iterable[str]]
-) -> dict[str, bytes]:
+def hash_files(folder: Path, names: Sequence[str], track: Track) -> dict[str, bytes]:
     """SHA-256 of the files that have the same size as another one."""
-    by_size: dict[int, list[str]] = {}
-    for name in names:
-        by_size.setdefault(_size(folder / name), []).append(name)
+    by_size = grouped((_size(folder / name), name) for name in names)
     same = [name for group in by_size.values() if len(group) > 1 for name in group]
     digests = {name: _digest(folder / name) for name in track(same, "equal files")}
     return {name: digest for name, digest in digests.items() if digest is not None}
 
 
-def read_pixels(
-    folder: Path, names: Sequence[str], track: Callable[[Sequence[str], str], Iterable[str]]
-) -> dict[str, Pixels]:
+def read_pixels(folder: Path, names: Sequence[str], track: Track) -> dict[str, Pixels]:
     """Decode images in several threads, a few at a time.
 
     Pillow decodes without Python's lock: 484 photos of 0.5 to 0.7 megapixels took 2.2 s in two
@@ -283,7 +279,7 @@ def read_pixels_of(path: Path) -> Pixels:
     try:
         rgb = load_rgb(path)
     except ImageError as error:
-        return Pixels(_without_path(error.found, path))
+        return Pixels(error.found.replace(f" {str(path)!r}", ""))  # the place names the file
     except Exception as error:  # damaged files make Pillow raise almost anything
         return Pixels(_problem(error))
     if (damage := jpeg_damage(path.read_bytes())) is not None:
@@ -300,11 +296,6 @@ def read_pixels_of(path: Path) -> Pixels:
 def _problem(error: Exception) -> str:
     known = error.strerror if isinstance(error, OSError) else None
     return known or re.sub(r" ?<_io\.[^>]*>", "", str(error)) or type(error).__name__
-
-
-def _without_path(text: str, path: Path) -> str:
-    """Pillow's message without the path, which is in the place of the finding."""
-    return text.replace(f" {str(path)!r}", "")
 
 
 def _size(path: Path) -> int:

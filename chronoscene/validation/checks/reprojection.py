@@ -17,6 +17,7 @@ from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import Similarity, fit_robustly
 from chronoscene.scene.tracks import MIN_PARALLAX, intersect_rays
+from chronoscene.validation.checks import grouped
 from chronoscene.validation.scene_folder import RawScene, derived
 
 Array = NDArray[np.float64]
@@ -103,12 +104,12 @@ def period_errors(scene: RawScene) -> dict[int, float]:
 @derived
 def _depths(scene: RawScene) -> dict[int, NDArray[np.float64]]:
     """Samples of the depths in front of the cameras by index of the period, -1 for none."""
-    by_period: dict[int, list[NDArray[np.float64]]] = {}
-    for seen in scene.reprojections or ():
-        depth = seen.depth[:: len(seen.depth) // MAX_DEPTHS + 1]
-        front = depth[(depth > 0) & np.isfinite(depth)]
-        if len(front):
-            by_period.setdefault(int(scene.image_periods[seen.image]), []).append(front)
+    samples = (
+        (int(scene.image_periods[seen.image]), seen.depth[:: len(seen.depth) // MAX_DEPTHS + 1])
+        for seen in scene.reprojections or ()
+    )
+    front = ((period, depth[(depth > 0) & np.isfinite(depth)]) for period, depth in samples)
+    by_period = grouped((period, depth) for period, depth in front if len(depth))
     return {period: np.concatenate(depths) for period, depths in by_period.items()}
 
 
@@ -152,9 +153,7 @@ def own_frames(scene: RawScene) -> dict[int, str]:
 def _limit_of_wrong(scene: RawScene, mine: NDArray[np.int64]) -> float | None:
     """Error in pixels that most images of a period exceed, or None.
 
-    Args:
-        scene: The scene.
-        mine: Indices of the images of the period that can be judged.
+    ``mine``: indices of the images of the period that can be judged.
     """
     if not len(mine):
         return None
@@ -177,12 +176,7 @@ class Rays:
     """Observations of points by the images of one period (M observations)."""
 
     def __init__(self, scene: RawScene, period: int) -> None:
-        """Take the observations with a usable camera and a valid pose.
-
-        Args:
-            scene: The scene, with its model.
-            period: Index of the period.
-        """
+        """Take the observations with a usable camera and a valid pose; ``period``: its index."""
         images, points, seen = scene.images, scene.points, scene.observations
         table = scene.point_periods
         assert images is not None and points is not None
@@ -283,19 +277,18 @@ def explain(scene: RawScene, period: int, limit: float) -> str | None:
     assert scene.points is not None
     index, own = rays.place_points()
     target = scene.points.xyz[index]
-    if len(index) < MIN_POINTS:
+    found = fit_robustly(own, target, mirror=True) if len(index) >= MIN_POINTS else None
+    if found is None:
         return None
-    found = fit_robustly(own, target, mirror=True)
-    extent = float(np.median(np.linalg.norm(target - np.median(target, axis=0), axis=1)))
-    if found is None or not np.median(found[1]) <= FITS * extent:
-        return None
-    before = float(np.median(np.linalg.norm(own - target, axis=1)))
-    if not np.median(found[1]) <= BETTER * before:
+    similarity, left = found[0], np.median(found[1])
+    extent = np.median(np.linalg.norm(target - np.median(target, axis=0), axis=1))
+    before = np.median(np.linalg.norm(own - target, axis=1))
+    if not (left <= FITS * extent and left <= BETTER * before):
         return None
     _, focal_error = rays.focal_factor()
-    if focal_error <= WELL * min(limit, rays.error_in(found[0])):
+    if focal_error <= WELL * min(limit, rays.error_in(similarity)):
         return None  # the camera is wrong, not the frame
-    return _moved(found[0], own, target)
+    return _moved(similarity, own, target)
 
 
 def focal_factor(rays: Rays, limit: float) -> float | None:

@@ -17,6 +17,7 @@ from chronoscene.images.exif import set_upright
 from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
+from chronoscene.validation.checks import grouped
 from chronoscene.validation.checks.names import spelling
 from chronoscene.validation.repair.contents import (
     Repair,
@@ -171,9 +172,7 @@ class _Fix:
     def _misspelt_images(self) -> None:
         """Rename files whose name differs from that in the model only by case or Unicode form."""
         registered, present = set(self._scene.names), set(self._scene.present)
-        by_spelling: dict[str, list[str]] = {}
-        for file in self._scene.files:
-            by_spelling.setdefault(spelling(file), []).append(file)
+        by_spelling = grouped((spelling(file), file) for file in self._scene.files)
         renamed = []
         for name in sorted(registered - present):
             files = by_spelling.get(spelling(name), [])

@@ -11,6 +11,7 @@ from itertools import groupby
 import click
 
 from chronoscene.io.wording import counted
+from chronoscene.validation.checks import grouped
 from chronoscene.validation.report.rule_list import COLOURS
 from chronoscene.validation.rule import (
     NOTHING,
@@ -86,9 +87,7 @@ def _rule(code: str, findings: list[Finding]) -> list[str]:
 
 def _fold(findings: Iterable[Finding]) -> list[str]:
     """One line for all findings that differ only in their place."""
-    places: dict[str, list[str]] = {}
-    for f in findings:
-        places.setdefault(f"expected {f.expected}, found {f.found}", []).append(f.place)
+    places = grouped((f"expected {f.expected}, found {f.found}", f.place) for f in findings)
     lines = []
     for text, where in places.items():
         rest = f" and {len(where) - MAX_PLACES} more" if len(where) > MAX_PLACES else ""

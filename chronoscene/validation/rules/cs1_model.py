@@ -12,6 +12,7 @@ from chronoscene.formats.chronoscene import MODEL
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
 from chronoscene.validation import rule
+from chronoscene.validation.checks import grouped
 from chronoscene.validation.checks.names import is_portable, is_safe, spelling
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
@@ -171,10 +172,7 @@ def name_not_text(scene: RawScene, images: RawImages) -> Iterator[Hit]:
 def name_case_collision(scene: RawScene, names: list[str]) -> Iterator[Hit]:
     """Image names differ only by case or by Unicode normalisation: they are the same file on
     Windows and macOS, so that copying or checking out the scene loses an image."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(spelling(name), []).append(name)
-    for group in groups.values():
+    for group in grouped((spelling(name), name) for name in names).values():
         if len(group) > 1:
             place = scene.model_file("images")
             yield Hit(place, "names that differ by more than case", shown(sorted(group)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
-from datetime import date, datetime, time, timedelta
+from datetime import date, time, timedelta
 from itertools import pairwise
 
 import numpy as np
@@ -14,16 +14,8 @@ from chronoscene.colmap.raw_model import RawImages
 from chronoscene.formats.chronoscene import PERIODS, SPLIT
 from chronoscene.io.wording import counted, shown
 from chronoscene.validation import rule
-from chronoscene.validation.checks.photo_metadata import (
-    DAY,
-    GpsFit,
-    dates_of,
-    fit_gps,
-    is_upside_down,
-    median_dates,
-    of_other_period,
-    stated_dates,
-)
+from chronoscene.validation.checks import grouped, photo_metadata
+from chronoscene.validation.checks.photo_metadata import GpsFit, dates_of, of_other_period
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
@@ -69,19 +61,18 @@ _BEGIN = re.compile(
 )
 def exif_period_order(scene: RawScene) -> Iterator[Hit]:
     """The dates of the photos contradict the order of the periods, or `sparse/periods.json`."""
-    medians = median_dates(scene)
+    medians = photo_metadata.median_dates(scene)
     for earlier, later in pairwise(sorted(medians)):
-        if medians[earlier] - medians[later] >= DAY:
-            expected = (
-                f"photos later than {medians[earlier]:%Y-%m-%d}, the date of period {earlier}"
-            )
-            yield Hit(f"period {later}", expected, f"{medians[later]:%Y-%m-%d} (median)")
-    for period, stated in stated_dates(scene).items():
+        if medians[earlier] - medians[later] >= photo_metadata.DAY:
+            before = f"{medians[earlier]:%Y-%m-%d}, the date of period {earlier}"
+            found = f"{medians[later]:%Y-%m-%d} (median)"
+            yield Hit(f"period {later}", f"photos later than {before}", found)
+    for period, stated in photo_metadata.stated_dates(scene).items():
         if period not in medians:
             continue
-        first = date.fromisoformat(stated + "-01" * (2 - stated.count("-"))).toordinal()
-        last_day = DAYS[stated.count("-")]
-        if not -SLACK <= medians[period].toordinal() - first <= last_day + SLACK:
+        hyphens = stated.count("-")
+        first = date.fromisoformat(stated + "-01" * (2 - hyphens)).toordinal()
+        if not -SLACK <= medians[period].toordinal() - first <= DAYS[hyphens] + SLACK:
             expected = f"the date of the photos of period {period}, {medians[period]:%Y-%m-%d}"
             yield Hit(PERIODS, expected, stated)
 
@@ -109,14 +100,14 @@ def exif_other_period(scene: RawScene) -> Iterator[Hit]:
 def exif_position(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     """The GPS position of a photo is far from its camera in the model, after aligning the model
     with the positions of all photos."""
-    fit = fit_gps(scene)
+    fit = photo_metadata.fit_gps(scene)
     if fit is None:
         return
     if fit.sigma > max(GPS_LOOSE * fit.spread, GPS_FAR):
         found = f"a distance of {np.median(fit.distance):.3g} m (median)"
         yield Hit(scene.model_file("images"), "cameras at the GPS positions of the photos", found)
         return
-    if is_upside_down(scene, fit):
+    if photo_metadata.is_upside_down(scene, fit):
         found = "positions that fit only a mirrored or overturned model, whose cameras look up"
         todo = "check the signs of longitudes (east, west), and whether the model is mirrored"
         yield Hit(scene.model_file("images"), "cameras the right way up over GPS", found, todo)
@@ -138,9 +129,8 @@ def _mostly_far(scene: RawScene, fit: GpsFit, far: np.ndarray) -> dict[int, Hit]
         total, number = int(np.count_nonzero(mine)), int(np.count_nonzero(far & mine))
         if number > max(1, 0.5 * total):
             found = f"{number} of {total} cameras {np.median(fit.distance[far & mine]):.3g} m away"
-            hits[index] = Hit(
-                f"period {period}", "cameras at their GPS positions", found, count=number
-            )
+            expected = "cameras at their GPS positions"
+            hits[index] = Hit(f"period {period}", expected, found, count=number)
     return hits
 
 
@@ -153,17 +143,17 @@ def _mostly_far(scene: RawScene, fit: GpsFit, far: np.ndarray) -> dict[int, Hit]
 )
 def exif_focal(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     """The focal length of a camera contradicts the photos taken with it."""
-    stated: dict[int, list[float]] = {}
-    for name, camera_id in zip(images.names, images.camera_ids.tolist(), strict=True):
-        focal = scene.headers[name].exif.focal_35mm if name in scene.headers else None
-        if focal is not None and camera_id in scene.usable_cameras:
-            stated.setdefault(camera_id, []).append(focal)
-    for camera_id, focals in stated.items():
-        camera, film = scene.usable_cameras[camera_id], float(np.median(focals))
-        long = max(camera.width, camera.height)
-        low, high = sorted(
-            [film * np.hypot(camera.width, camera.height) / FILM_DIAGONAL, film * long / FILM_WIDTH]
-        )
+    focals = (
+        (camera_id, scene.headers[name].exif.focal_35mm)
+        for name, camera_id in zip(images.names, images.camera_ids.tolist(), strict=True)
+        if name in scene.headers and camera_id in scene.usable_cameras
+    )
+    stated = grouped((camera_id, focal) for camera_id, focal in focals if focal is not None)
+    for camera_id, given in stated.items():
+        camera, film = scene.usable_cameras[camera_id], float(np.median(given))
+        by_diagonal = np.hypot(camera.width, camera.height) / FILM_DIAGONAL
+        by_width = max(camera.width, camera.height) / FILM_WIDTH
+        low, high = sorted([film * by_diagonal, film * by_width])
         focal = float(camera.K[0, 0])
         if not low / FOCAL_RATIO <= focal <= high * FOCAL_RATIO:
             expected = f"a focal length around {low:.4g} px ({film:.3g} mm on 36 mm film)"
@@ -179,11 +169,9 @@ def exif_focal(scene: RawScene, images: RawImages) -> Iterator[Hit]:
 def exif_date_alone(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
     """The date of a photo is half a year or more from the other dates of its period, and is not
     that of any other period."""
-    by_period: dict[int, dict[str, datetime]] = {}
-    for name, taken in dates_of(scene).items():
-        by_period.setdefault(periods[name], {})[name] = taken
+    by_period = grouped((periods[name], (name, taken)) for name, taken in dates_of(scene).items())
     elsewhere = of_other_period(scene)
-    for dates in by_period.values():
+    for dates in map(dict, by_period.values()):
         if len(dates) < MIN_PERIOD_DATES:
             continue
         middle = sorted(dates.values())[len(dates) // 2]
@@ -209,10 +197,11 @@ def one_visit_in_two_periods(scene: RawScene, periods: dict[str, int]) -> Iterat
         for name, moment in dates_of(scene).items()
         if moment.time() != time() and name not in misfiled  # midnight: the time is unknown
     )
-    found: dict[tuple[int, ...], list[tuple[str, str]]] = {}
-    for (early, a), (late, b) in pairwise(taken):
-        if periods[a] != periods[b] and late - early <= ONE_VISIT:
-            found.setdefault(tuple(sorted((periods[a], periods[b]))), []).append((a, b))
+    found = grouped(
+        (tuple(sorted((periods[a], periods[b]))), (a, b))
+        for (early, a), (late, b) in pairwise(taken)
+        if periods[a] != periods[b] and late - early <= ONE_VISIT
+    )
     for (one, other), pairs in found.items():
         text = f"{counted(len(pairs), 'pair')} within five minutes: {shown(pairs[0])}"
         expected = f"photos of periods {one} and {other} at different times"
@@ -228,8 +217,8 @@ def one_visit_in_two_periods(scene: RawScene, periods: dict[str, int]) -> Iterat
 def names_period_order(scene: RawScene) -> Iterator[Hit]:
     """The years in the image names, or the dates in `sparse/periods.json`, contradict the order of
     the periods."""
-    known = median_dates(scene)  # of these periods, CS221 has compared the stated dates
-    stated = {period: date for period, date in stated_dates(scene).items() if period not in known}
+    known = photo_metadata.median_dates(scene)  # their stated dates are compared by CS221
+    stated = {p: d for p, d in photo_metadata.stated_dates(scene).items() if p not in known}
     for earlier, later in pairwise(sorted(stated)):
         digits = min(len(stated[earlier]), len(stated[later]))  # dates of different precision
         if stated[earlier][:digits] > stated[later][:digits]:
@@ -244,9 +233,7 @@ def names_period_order(scene: RawScene) -> Iterator[Hit]:
 
 def _years(scene: RawScene) -> dict[int, int]:
     """The year that nearly all names of a period contain, by period."""
-    names: dict[int, list[str]] = {}
-    for name, period in (scene.periods or {}).items():
-        names.setdefault(period, []).append(name)
+    names = grouped((period, name) for name, period in (scene.periods or {}).items())
     years = {}
     for period, group in names.items():
         found = Counter(year for name in group for year in {_year(name)} if year is not None)
@@ -258,9 +245,8 @@ def _years(scene: RawScene) -> dict[int, int]:
 
 def _year(name: str) -> int | None:
     """The first year in a name, also at the beginning of a date without hyphens."""
-    found = re.search(
-        r"(?<!\d)((?:19[89]|20[0-4])\d)(?:(?!\d)|(?=(?:0\d|1[0-2])[0-3]\d(?!\d)))", name
-    )
+    year, month_and_day = r"(?<!\d)((?:19[89]|20[0-4])\d)", r"(?:0\d|1[0-2])[0-3]\d(?!\d)"
+    found = re.search(rf"{year}(?:(?!\d)|(?={month_and_day}))", name)
     return int(found[1]) if found else None
 
 
@@ -272,17 +258,11 @@ def _year(name: str) -> int | None:
 def names_other_period(periods: dict[str, int]) -> Iterator[Hit]:
     """The folders of the images, or the dates or period numbers that their names begin with, match
     the periods, except for a few images."""
-    groups: dict[str, list[str]] = {}
-    for name in periods:
-        folder, _, file = name.rpartition("/")
-        begin = _BEGIN.match(file)
-        key = f"{folder}/" if folder else begin[0] if begin else None
-        if key is not None:
-            groups.setdefault(key, []).append(name)
+    groups = grouped((_folder_or_begin(name), name) for name in periods)
     usual = {
         key: Counter(periods[name] for name in names).most_common(1)[0]
         for key, names in groups.items()
-        if len(names) >= MIN_GROUP
+        if key is not None and len(names) >= MIN_GROUP
     }
     total = sum(len(groups[key]) for key in usual)
     if len({period for period, _ in usual.values()}) < 2:
@@ -294,3 +274,10 @@ def names_other_period(periods: dict[str, int]) -> Iterator[Hit]:
             if periods[name] != period:
                 expected = f"period {period}, as for the other images with {key!r}"
                 yield Hit(f"{SPLIT} ({name})", expected, f"period {periods[name]}")
+
+
+def _folder_or_begin(name: str) -> str | None:
+    """What images of one period may have in common."""
+    folder, _, file = name.rpartition("/")
+    begin = _BEGIN.match(file)
+    return f"{folder}/" if folder else begin[0] if begin else None

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from chronoscene.io.wording import quote, shown
 from chronoscene.validation import rule
+from chronoscene.validation.checks import grouped
 from chronoscene.validation.checks.pixels import Pixels
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
@@ -72,21 +73,14 @@ def image_other_photo(scene: RawScene, pixels: dict[str, Pixels]) -> Iterator[Hi
     whole = _whole_periods(scene, list(fits), set(wrong))
     yield from whole.values()
     suspects = {name: greys[name] for name in wrong}
-    usual = _usual(scene, {name: value for name, (value, _) in fits.items()})
+    periods = scene.periods or {}
+    values = grouped((periods.get(name, -1), value) for name, (value, _) in fits.items())
     for name, sight in wrong.items():
-        period = (scene.periods or {}).get(name, -1)
-        if period not in whole and fits[name][0] < OF_USUAL * usual[period]:
+        period = periods.get(name, -1)
+        if period not in whole and fits[name][0] < OF_USUAL * np.nanmedian(values[period]):
             right, also = _what_fits(sight, name, suspects)
             found = f"colours that do not fit (correlation {fits[name][0]:.2f}{right})"
             yield Hit(f"images/{name}", "a photo of the points that it sees", found, also=also)
-
-
-def _usual(scene: RawScene, values: Mapping[str, float]) -> dict[int, float]:
-    """Median correlation of the images by period, -1 for none."""
-    by_period: dict[int, list[float]] = {}
-    for name, value in values.items():
-        by_period.setdefault((scene.periods or {}).get(name, -1), []).append(value)
-    return {period: float(np.nanmedian(group)) for period, group in by_period.items()}
 
 
 def _exchanged(fits: Mapping[str, tuple[float, Sight]], greys: Greys) -> Iterator[Hit]:
@@ -138,11 +132,7 @@ class Sight(NamedTuple):
     """Brightness of the points. [m]"""
 
     def correlation(self, grey: NDArray[np.uint8]) -> float:
-        """Correlation of the brightness of points and pixels; NaN if one is constant.
-
-        Args:
-            grey: The photo, of any size. [H, W]
-        """
+        """Correlation of the brightness of points and a photo [H, W]; NaN if one is constant."""
         size = np.array(grey.shape[::-1])
         x, y = np.clip((self.place * size).astype(np.int64), 0, size - 1).T
         pixels = grey[y, x].astype(np.float64)

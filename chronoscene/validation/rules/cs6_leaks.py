@@ -15,6 +15,7 @@ from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import shown
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation import rule
+from chronoscene.validation.checks import grouped
 from chronoscene.validation.checks.pixels import THUMBNAIL, Pixels
 from chronoscene.validation.checks.reprojection import typical_depth
 from chronoscene.validation.rule import Hit
@@ -179,14 +180,10 @@ def near_pairs(
             others = np.flatnonzero(near[i])
             nearest = others[np.argsort(squares[i, others])[:MAX_TRIED]]
             for a, b in ((first + i, first + j) for j in nearest.tolist()):
-                distance = _distance(full[a], full[b])
+                distance = float(np.sqrt(np.mean((full[a] - full[b]) ** 2)))
                 if distance < MAX_DIFFERENCE and pixels[names[a]].digest != pixels[names[b]].digest:
                     yield names[a], names[b], distance
                     break
-
-
-def _distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    return float(np.sqrt(np.mean((a - b) ** 2)))
 
 
 def relit_pairs(
@@ -258,7 +255,5 @@ def _equal(scene: RawScene) -> list[tuple[str, list[str]]]:
 
 def _groups(items: Iterable[tuple[str, bytes]]) -> Iterator[list[str]]:
     """Sorted names that share a digest; groups of two or more."""
-    found: dict[bytes, list[str]] = {}
-    for name, digest in items:
-        found.setdefault(digest, []).append(name)
-    yield from (sorted(group) for group in found.values() if len(group) > 1)
+    groups = grouped((digest, name) for name, digest in items)
+    return (sorted(group) for group in groups.values() if len(group) > 1)

@@ -18,6 +18,7 @@ from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
 from chronoscene.scene.splits import TEST_EVERY
 from chronoscene.validation import rule
+from chronoscene.validation.checks import grouped
 from chronoscene.validation.checks.pixels import Header
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs3_split import test_elsewhere
@@ -84,10 +85,7 @@ def official_failure(line: str) -> str | None:
 def official_name_collision(scene: RawScene, names: list[str]) -> Iterator[Hit]:
     """Two images are the same to the official loader, which identifies them by their file name up
     to the first dot; the later line of `split.txt` overwrites the earlier one."""
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(_cut(name), []).append(name)
-    for key, group in groups.items():
+    for key, group in grouped((_cut(name), name) for name in names).items():
         if len(group) > 1:
             found = f"{shown(group)}, all known to it as {quote(key)}"
             files = {PurePosixPath(name).name for name in group}
