@@ -12,20 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
+from chronoscene.images import undistortion
 from chronoscene.images.store import ImageSource, Progress, load_rgb, place_image
-from chronoscene.images.undistortion import (
-    CameraChange,
-    move_observations,
-    plan_cameras,
-    sampling_map,
-    warp,
-)
 from chronoscene.io.staging import staged_folder
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.scene import Scene
@@ -33,8 +25,6 @@ from chronoscene.scene import Scene
 JPEG_QUALITY = 95
 
 WRITABLE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-
-_METADATA_FORMATS = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 MAX_EXIF_BYTES = 65533
 """What a JPEG file can store. Some cameras write two blocks, which Pillow reads as a longer one."""
@@ -52,7 +42,7 @@ class Undistortion:
 
     scene: Scene
     """The new scene."""
-    changes: tuple[CameraChange, ...]
+    changes: tuple[undistortion.CameraChange, ...]
     observations_lost: int
     """Observations outside the new images."""
     points_lost: int
@@ -86,9 +76,16 @@ def undistort(
     """
     for frame in scene.frames:
         our_format.check_writable_name(out, frame)
-        _check_extension(scene.image_path(frame))
-    changes = plan_cameras(scene, center=center)
-    new, observations_lost, points_lost = move_observations(scene, changes)
+        path = scene.image_path(frame)
+        if path.suffix.lower() not in WRITABLE:
+            raise SceneError(
+                path,
+                expected=f"an image file that can be written: {', '.join(WRITABLE)}",
+                found=repr(path.suffix),
+                todo="convert the images first",
+            )
+    changes = undistortion.plan_cameras(scene, center=center)
+    new, observations_lost, points_lost = undistortion.move_observations(scene, changes)
     with staged_folder(out) as staged:
         our_format.write_texts(new, staged)
         _write_images(scene, staged / "images", changes, image_source, threads, progress)
@@ -97,25 +94,10 @@ def undistort(
     return Undistortion(done, distinct, observations_lost, points_lost)
 
 
-def _check_extension(path: Path) -> None:
-    if path.suffix.lower() not in WRITABLE:
-        raise SceneError(
-            path,
-            expected=f"an image file that can be written: {', '.join(WRITABLE)}",
-            found=repr(path.suffix),
-            todo="convert the images first",
-        )
-
-
-def undistort_pixels(rgb: NDArray[np.uint8], change: CameraChange) -> NDArray[np.uint8]:
-    """Resample an image to the new camera. [H, W, 3] -> [H', W', 3]"""
-    return warp(rgb, *sampling_map(change))
-
-
 def _write_images(
     scene: Scene,
     root: Path,
-    changes: list[CameraChange],
+    changes: list[undistortion.CameraChange],
     image_source: ImageSource,
     threads: int | None,
     progress: Progress | None,
@@ -137,11 +119,11 @@ def _write_images(
                 progress(done, len(order))
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-        sampling_map.cache_clear()
+        undistortion.sampling_map.cache_clear()
 
 
-def _resample(source: Path, target: Path, change: CameraChange) -> None:
-    pixels = undistort_pixels(load_rgb(source), change)
+def _resample(source: Path, target: Path, change: undistortion.CameraChange) -> None:
+    pixels = undistortion.warp(load_rgb(source), *undistortion.sampling_map(change))
     target.parent.mkdir(parents=True, exist_ok=True)
     options: dict[str, Any] = {}
     suffix = target.suffix.lower()
@@ -149,7 +131,7 @@ def _resample(source: Path, target: Path, change: CameraChange) -> None:
         options = {"quality": JPEG_QUALITY, "subsampling": 0}
     elif suffix == ".webp":
         options = {"lossless": True}
-    if suffix in _METADATA_FORMATS:
+    if suffix != ".bmp":
         options |= _metadata(source)
     Image.fromarray(pixels).save(target, **options)
 
@@ -157,15 +139,14 @@ def _resample(source: Path, target: Path, change: CameraChange) -> None:
 def _metadata(path: Path) -> dict[str, Any]:
     """EXIF, which has the capture date, and the colour profile if it is an RGB profile."""
     with Image.open(path) as image:
-        kept: dict[str, Any] = {"exif": image.info.get("exif")}
-        if image.format == "TIFF":
-            kept["exif"] = _tiff_metadata(image)
+        exif = _tiff_metadata(image) if image.format == "TIFF" else image.info.get("exif")
         profile = image.info.get("icc_profile")
+    kept: dict[str, Any] = {}
+    if exif and not (isinstance(exif, bytes) and len(exif) > MAX_EXIF_BYTES):
+        kept["exif"] = exif
     if isinstance(profile, bytes) and profile[16:20] == b"RGB ":
         kept["icc_profile"] = profile
-    if isinstance(kept["exif"], bytes) and len(kept["exif"]) > MAX_EXIF_BYTES:
-        del kept["exif"]
-    return {key: block for key, block in kept.items() if block}
+    return kept
 
 
 def _tiff_metadata(image: Image.Image) -> Image.Exif:

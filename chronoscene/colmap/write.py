@@ -128,12 +128,10 @@ def _points(points: RawPoints) -> bytes:
     heads["error"], heads["length"] = points.error, lengths
     pairs = np.empty((len(points.track_image), 2), _PAIR)
     pairs[:, 0], pairs[:, 1] = points.track_image, points.track_keypoint
-    is_head = np.ones(2 * len(points), bool)
-    is_head[1::2] = False
-    sizes = np.empty(2 * len(points), np.int64)
-    sizes[0::2], sizes[1::2] = POINT_HEAD.itemsize, lengths * 2 * _PAIR.itemsize
+    head_sizes = np.full_like(lengths, POINT_HEAD.itemsize)
+    sizes = np.column_stack([head_sizes, lengths * 2 * _PAIR.itemsize]).ravel()
     data = np.empty(int(sizes.sum()), np.uint8)
-    mask = np.repeat(is_head, sizes)
+    mask = np.repeat(np.tile([True, False], len(points)), sizes)
     data[mask] = heads.view(np.uint8).ravel()
     data[~mask] = pairs.view(np.uint8).ravel()
     return _COUNT.pack(len(points)) + data.tobytes()

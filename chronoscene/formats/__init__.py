@@ -130,17 +130,15 @@ def read_scene(
     path = Path(path)
     name = format if format is not None else detect_format(path)
     module = load_format(name)
-    if period_by is None:
-        scene: Scene = module.read(path)
-        return scene
-    if not hasattr(module, "PERIOD_BY"):
+    if period_by is not None and not hasattr(module, "PERIOD_BY"):
         raise ConfigError(
             "--period-by",
             expected=f"no such option for {name}, which defines its own periods",
             found=repr(period_by),
             todo="leave it out",
         )
-    scene = module.read(path, period_by=period_by)
+    options = {} if period_by is None else {"period_by": period_by}
+    scene: Scene = module.read(path, **options)
     return scene
 
 

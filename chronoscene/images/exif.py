@@ -19,12 +19,8 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
-
-_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_MAKE, _MODEL, _ORIENTATION = 0x010F, 0x0110, 0x0112
-_TAKEN, _DIGITISED = 0x9003, 0x9004
-_FOCAL, _FOCAL_35, _WIDTH, _HEIGHT = 0x920A, 0xA405, 0xA002, 0xA003
+from PIL import ExifTags, Image
+from PIL.ExifTags import GPS, Base
 
 _EXIF, _APP1, _START_OF_SCAN = b"Exif\0\0", 0xE1, 0xDA
 _SHORT, _LONG = 3, 4
@@ -97,9 +93,7 @@ def exif_of(image: Image.Image) -> ExifData:
         tags = Image.Image.getexif(image)  # the one of PNG files would decode the pixels
         if not tags and "xmp" not in image.info:
             return ExifData()
-        main: Mapping[int, Any] = dict(tags)
-        exif, gps = (_ifd(tags, key) for key in (_EXIF_IFD, _GPS_IFD))
-        return _parse(main, exif, gps, _drone(image.info.get("xmp")))
+        return _parse(tags, _drone(image.info.get("xmp")))
     except Exception:  # damaged metadata raises almost anything, and says nothing about the pixels
         return ExifData()
 
@@ -111,30 +105,30 @@ def _ifd(tags: Image.Exif, key: int) -> Mapping[int, Any]:
         return {}
 
 
-def _parse(
-    main: Mapping[int, Any],
-    exif: Mapping[int, Any],
-    gps: Mapping[int, Any],
-    drone: DroneData | None,
-) -> ExifData:
-    latitude = _degrees(gps.get(2), gps.get(1), "S", 90.0)
-    longitude = _degrees(gps.get(4), gps.get(3), "W", 180.0)
+def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
+    main: Mapping[int, Any] = dict(tags)
+    exif, gps = _ifd(tags, ExifTags.IFD.Exif), _ifd(tags, ExifTags.IFD.GPSInfo)
+    latitude = _degrees(gps.get(GPS.GPSLatitude), gps.get(GPS.GPSLatitudeRef), "S", 90.0)
+    longitude = _degrees(gps.get(GPS.GPSLongitude), gps.get(GPS.GPSLongitudeRef), "W", 180.0)
     if latitude is None or longitude is None or (latitude == 0 and longitude == 0):
         latitude = longitude = None  # without a fix, some cameras write zeros
-    altitude, below = _number(gps.get(6)), _integer(gps.get(5)) in (1, 3)
-    orientation = _integer(main.get(_ORIENTATION)) or 1
+    altitude = _number(gps.get(GPS.GPSAltitude))
+    if altitude is not None and _integer(gps.get(GPS.GPSAltitudeRef)) in (1, 3):
+        altitude = -altitude  # below the reference
+    date = _date(exif.get(Base.DateTimeOriginal)) or _date(exif.get(Base.DateTimeDigitized))
+    orientation = _integer(main.get(Base.Orientation)) or 1
     return ExifData(
-        date=_date(exif.get(_TAKEN)) or _date(exif.get(_DIGITISED)) or _gps_date(gps),
+        date=date or _gps_date(gps),
         latitude=latitude,
         longitude=longitude,
-        altitude=altitude if altitude is None or not below else -altitude,
-        focal_mm=_positive(exif.get(_FOCAL)),
-        focal_35mm=_positive(exif.get(_FOCAL_35)),
-        make=_text(main.get(_MAKE)),
-        model=_text(main.get(_MODEL)),
+        altitude=altitude,
+        focal_mm=_positive(exif.get(Base.FocalLength)),
+        focal_35mm=_positive(exif.get(Base.FocalLengthIn35mmFilm)),
+        make=_text(main.get(Base.Make)),
+        model=_text(main.get(Base.Model)),
         orientation=orientation if 1 <= orientation <= 8 else 1,
-        width=_size(exif.get(_WIDTH)),
-        height=_size(exif.get(_HEIGHT)),
+        width=_size(exif.get(Base.ExifImageWidth)),
+        height=_size(exif.get(Base.ExifImageHeight)),
         drone=drone,
     )
 
@@ -179,7 +173,7 @@ def _date(value: Any) -> datetime | None:
 
 def _gps_date(gps: Mapping[int, Any]) -> datetime | None:
     """Date and time of a GPS fix, in UTC."""
-    date, time = _date(gps.get(29)), gps.get(7)
+    date, time = _date(gps.get(GPS.GPSDateStamp)), gps.get(GPS.GPSTimeStamp)
     if date is None or not isinstance(time, tuple | list) or len(time) != 3:
         return date
     hour, minute, second = (_number(part) for part in time)
@@ -260,7 +254,7 @@ def _orientation_values(data: bytes) -> Iterator[tuple[int, str]]:
             for i in range(count):
                 entry = directory + 2 + 12 * i
                 tag, kind, length, _ = struct.unpack_from(f"{order}HHII", tiff, entry)
-                if tag == _ORIENTATION and kind in (_SHORT, _LONG) and length == 1:
+                if tag == Base.Orientation and kind in (_SHORT, _LONG) and length == 1:
                     yield start + entry + (10 if kind == _LONG and order == ">" else 8), order
         except struct.error:
             pass  # a directory beyond the end of the segment

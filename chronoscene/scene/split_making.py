@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
-from datetime import date, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -287,21 +287,16 @@ def latest(scene: Scene, fraction: float) -> set[str]:
     for period in scene.periods:
         frames = scene.select(period=period.id)
         ordered = sorted(frames, key=lambda f: (times[f.name], f.name))
-        days = sorted({times[f.name].date() for f in ordered})
-        if len(days) > 1:
-            tests |= _last_days([(times[f.name].date(), f.name) for f in ordered], fraction)
+        days = [times[f.name].date() for f in ordered]
+        wanted = fraction * len(ordered)
+        # The held-out images begin with a day, except where there is only one.
+        starts = [i for i in range(1, len(days)) if days[i] != days[i - 1]]
+        if starts:
+            start = min(starts, key=lambda i: (abs(len(days) - i - wanted), -i))
         else:
-            held_out = max(1, round(fraction * len(ordered)))
-            tests |= {f.name for f in ordered[len(ordered) - held_out :]}
+            start = len(days) - max(1, round(wanted))
+        tests |= {f.name for f in ordered[start:]}
     return tests
-
-
-def _last_days(dated: Sequence[tuple[date, str]], fraction: float) -> set[str]:
-    """Images of the last days, at least one: as many days as come closest to the fraction."""
-    days = sorted({day for day, _ in dated})
-    after = [sum(day >= first for day, _ in dated) for first in days[1:]]
-    nearest = min(range(len(after)), key=lambda i: (abs(after[i] - fraction * len(dated)), -i))
-    return {name for day, name in dated if day >= days[1 + nearest]}
 
 
 def capture_times(scene: Scene) -> dict[str, datetime]:
