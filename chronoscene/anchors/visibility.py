@@ -28,7 +28,6 @@ def visible_anchors(
     *,
     by: str = "radius",
     near_plane: float,
-    far_plane: float = FAR_PLANE,
 ) -> NDArray[np.int64]:
     """Indices of the anchors to decode, ascending. [M]
 
@@ -39,24 +38,20 @@ def visible_anchors(
         by: ``radius``: the projected footprint touches the image; ``frustum``: the centre
             projects into it.
         near_plane: Anchors nearer than this are invisible.
-        far_plane: So are those farther away than this.
     """
     mask = np.empty(len(anchors), np.bool_)
     pose = np.ascontiguousarray(view.cam_from_world, dtype=np.float64)
     intrinsics = np.array([view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]])
     extent = _EXTENT if by == "radius" else 0.0
-    _mark(
-        anchors, log_scales, pose, intrinsics, float(view.width), float(view.height),
-        near_plane, far_plane, extent, mask,
-    )  # fmt: skip
+    size = (float(view.width), float(view.height))
+    _mark(anchors, log_scales, pose, intrinsics, size, near_plane, extent, mask)
     return np.flatnonzero(mask)
 
 
 @kernel(parallel=True, extras=[constants])
-def _mark(  # type: ignore[no-untyped-def]
-    anchors, log_scales, pose, intrinsics, width, height, near, far, extent, mask
-):
+def _mark(anchors, log_scales, pose, intrinsics, size, near, extent, mask):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = intrinsics
+    width, height = size
     # The slope of a ray is held near the image before the projection is linearised, as in 3DGS.
     low_x, high_x = -(cx + _SLACK * width) / fx, ((1.0 + _SLACK) * width - cx) / fx
     low_y, high_y = -(cy + _SLACK * height) / fy, ((1.0 + _SLACK) * height - cy) / fy
@@ -64,12 +59,12 @@ def _mark(  # type: ignore[no-untyped-def]
         px, py, pz = anchors[i, 0], anchors[i, 1], anchors[i, 2]
         z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
         mask[i] = False
-        if z < near or z > far:
+        if z < near or z > FAR_PLANE:
             continue
         x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
         y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
         u, v = fx * x / z + cx, fy * y / z + cy
-        # Diagonal of Sigma' = J W Sigma W^T J^T (3DGS, equation 5), plus the blur.
+        # Diagonal of Sigma' = J W Sigma W^T J^T, as in 3DGS, plus the blur.
         slope_x = min(max(x / z, low_x), high_x)
         slope_y = min(max(y / z, low_y), high_y)
         variance_u, variance_v = EPS2D, EPS2D

@@ -3,7 +3,7 @@
 Nothing here changes a tensor in place: a round says which rows stay and which are appended. Groups
 of parameters that a method adds to those of `model.SHAPES` are copied along.
 
-Source: Kerbl et al. 2023 (3D Gaussian Splatting), section 5, with the values of the released code.
+Source: Kerbl et al. 2023 (3D Gaussian Splatting), with the values of the released code.
 """
 
 from __future__ import annotations
@@ -35,13 +35,12 @@ class GradientStatistics:
 
         Args:
             info: Of a call with one camera.
-            width: Of the image in pixels; gradients count in half image sizes, so that they do
-                not depend on the resolution.
+            width: Of the image in pixels.
             height: The same.
         """
         assert info.means2d.grad is not None
         gradient = info.means2d.grad[0]
-        # Norm of d loss / d (u, v), with u and v in normalised device coordinates.
+        # Norm of d loss / d (u, v), with u and v in half image sizes: no matter the resolution.
         x, y = gradient[:, 0] * (0.5 * width), gradient[:, 1] * (0.5 * height)
         seen = (info.radii[0] > 0).all(-1)
         self._sums += torch.where(seen, (x * x + y * y).sqrt(), 0.0)
@@ -65,17 +64,13 @@ class Round:
 def choose_growth(
     gradient: Tensor, max_scale: Tensor, extent: float, config: GaussianConfig
 ) -> tuple[Tensor, Tensor]:
-    """Rows to clone and rows to split.
+    """Rows to clone and rows to split. bool [N], bool [N]
 
     Args:
         gradient: `GradientStatistics.mean`. [N]
         max_scale: Largest of the three scales. [N]
         extent: `TrainingSet.camera_extent`.
         config: Thresholds and limit of the number.
-
-    Returns:
-        clone: bool [N]
-        split: bool [N]
     """
     grow = gradient >= config.gradient_threshold
     # Cloned or split, a row adds one Gaussian.
@@ -104,7 +99,6 @@ def densify(
         gradient: Mean gradient. [N]
         extent: `TrainingSet.camera_extent`.
         prune_large: Whether Gaussians may be too large.
-        config: Thresholds.
         generator: Draws the centres of the parts.
     """
     largest = scales_of(parameters["log_scales"]).amax(-1)
@@ -119,7 +113,7 @@ def densify(
 def _split(
     parents: dict[str, Tensor], config: GaussianConfig, generator: np.random.Generator
 ) -> dict[str, Tensor]:
-    """Two smaller Gaussians for each, centred on samples of N(mean, R S S^T R^T), equation 6."""
+    """Two smaller Gaussians for each, centred on samples of N(mean, R S S^T R^T)."""
     parts = {name: rows.repeat(PARTS, *(1,) * (rows.dim() - 1)) for name, rows in parents.items()}
     quats = parts["quats"].cpu().double().numpy()
     quats[np.linalg.norm(quats, axis=-1) == 0] = (1, 0, 0, 0)

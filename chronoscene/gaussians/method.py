@@ -65,13 +65,8 @@ class GaussianMethod(SplattingMethod):
         )
 
     def draw(self, view: View, period: float) -> Rasterization:
-        return draw(
-            self.model.splats(view, period),
-            view,
-            self.background,
-            near_plane=self.config.near_plane,
-            render_depth=True,
-        )
+        splats, near_plane = self.model.splats(view, period), self.config.near_plane
+        return draw(splats, view, self.background, near_plane=near_plane, render_depth=True)
 
     def stored_tensors(self) -> dict[str, Tensor]:
         return self.model.tensors()

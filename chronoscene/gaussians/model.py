@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,26 +29,18 @@ MIN_SPACING = math.sqrt(1e-7)
 """Points nearer to each other than this, in training units, start no smaller than it."""
 
 
+@dataclass(eq=False)
 class GaussianModel:
-    """Gaussians and what a method trains beside them.
+    """Gaussians and what a method trains beside them."""
 
-    Args:
-        parameters: Groups with a row per Gaussian; density control adds and removes rows. A method
-            may have more groups than `SHAPES`. [N, ...]
-        shared: Trained tensors without a row per Gaussian, such as those of a deformation field.
-        sh_degree: Degree of the spherical harmonics in use.
-    """
-
-    def __init__(
-        self,
-        parameters: dict[str, Tensor],
-        shared: Mapping[str, Tensor] | None = None,
-        *,
-        sh_degree: int = 0,
-    ) -> None:
-        self.parameters = parameters
-        self.shared = dict(shared or {})
-        self.sh_degree = sh_degree
+    parameters: dict[str, Tensor]
+    """Groups with a row per Gaussian; density control adds and removes rows. A method may have
+    more groups than `SHAPES`. [N, ...]"""
+    shared: dict[str, Tensor] = field(default_factory=dict)
+    """Trained tensors without a row per Gaussian, such as those of a deformation field."""
+    _: KW_ONLY
+    sh_degree: int = 0
+    """Degree of the spherical harmonics in use."""
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
@@ -88,7 +81,7 @@ def initialise(train: TrainingSet, *, opacity: float) -> dict[str, Tensor]:
     Raises:
         SceneError: If the scene has no sparse points.
 
-    Source: Kerbl et al. 2023, section 5.1, and the released code.
+    Source: Kerbl et al. 2023, and the released code.
     """
     rows = finite_rows(train.points)
     points, colors = train.points[rows], train.colors[rows]
@@ -152,11 +145,9 @@ def _exp(x: Tensor) -> Tensor:
 
 def scales_of(log_scales: Tensor) -> Tensor:
     """Standard deviations in units of the training frame. [N, 3]"""
-    result: Tensor = _Exp.apply(log_scales)
-    return result
+    return _Exp.apply(log_scales)
 
 
 def opacities_of(logit_opacities: Tensor) -> Tensor:
     """Opacities 0..1. [N]"""
-    result: Tensor = _Sigmoid.apply(logit_opacities)
-    return result
+    return _Sigmoid.apply(logit_opacities)

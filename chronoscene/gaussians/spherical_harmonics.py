@@ -7,8 +7,8 @@ order (0, 0), (1, -1), (1, 0), (1, 1), (2, -2), ...: that of the 3DGS file forma
 `evaluate` runs a fused kernel on the CPU, forward and backward; `evaluate_reference` is the
 definition, in plain torch, and what a GPU runs.
 
-Source: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", section
-4; the polynomials are the textbook ones (Sloan 2008, "Stupid Spherical Harmonics Tricks").
+Source: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering"; the
+polynomials are the textbook ones (Sloan 2008, "Stupid Spherical Harmonics Tricks").
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from numba import prange
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.kernels.compilation import inner, kernel
@@ -96,8 +97,7 @@ def evaluate(
     """
     if means.is_cuda:
         return evaluate_reference(sh_dc, sh_rest, means, camera_centre, degree)
-    colors: Tensor = _Evaluate.apply(sh_dc, sh_rest, means, camera_centre, degree)
-    return colors
+    return _Evaluate.apply(sh_dc, sh_rest, means, camera_centre, degree)
 
 
 class _Evaluate(torch.autograd.Function):
@@ -105,32 +105,23 @@ class _Evaluate(torch.autograd.Function):
     def forward(
         ctx: Any, sh_dc: Tensor, sh_rest: Tensor, means: Tensor, centre: Tensor, degree: int
     ) -> Tensor:
-        dc, rest, xyz, eye = (
-            t.detach().contiguous().numpy() for t in (sh_dc, sh_rest, means, centre)
-        )
-        colors = np.empty((len(means), 3), np.float32)
-        _forward(dc, rest, xyz, eye, degree, colors)
-        result = torch.from_numpy(colors)
+        result = torch.empty(len(means), 3)
+        inputs = (_array(tensor) for tensor in (sh_dc, sh_rest, means, centre))
+        _forward(*inputs, degree, result.numpy())
         ctx.save_for_backward(sh_dc, sh_rest, means, centre, result)
         ctx.degree = degree
         return result
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        sh_dc, sh_rest, means, centre, colors = (t.detach().contiguous() for t in ctx.saved_tensors)
-        grad_dc, grad_rest, grad_means = (torch.empty_like(t) for t in (sh_dc, sh_rest, means))
-        _backward(
-            sh_rest.numpy(),
-            means.numpy(),
-            centre.numpy(),
-            ctx.degree,
-            colors.numpy(),
-            grads[0].detach().contiguous().numpy(),
-            grad_dc.numpy(),
-            grad_rest.numpy(),
-            grad_means.numpy(),
-        )
-        return grad_dc, grad_rest, grad_means, None, None
+        dc, rest, means, centre, colors = (_array(tensor) for tensor in ctx.saved_tensors)
+        results = [np.empty_like(array) for array in (dc, rest, means)]
+        _backward(rest, means, centre, ctx.degree, colors, _array(grads[0]), *results)
+        return *(torch.from_numpy(result) for result in results), None, None
+
+
+def _array(tensor: Tensor) -> NDArray[np.float32]:
+    return tensor.detach().contiguous().numpy()
 
 
 @inner(inline="always")
@@ -172,6 +163,14 @@ def _direction_gradient(x, y, z, degree, s):  # type: ignore[no-untyped-def]
     return gx, gy, gz
 
 
+@inner(inline="always")
+def _direction(means, n, centre):  # type: ignore[no-untyped-def]
+    """Unit vector from the camera to a Gaussian, and 1 over their distance."""
+    x, y, z = means[n, 0] - centre[0], means[n, 1] - centre[1], means[n, 2] - centre[2]
+    inverse = np.float32(1.0) / np.sqrt(max(x * x + y * y + z * z, np.float32(1e-24)))
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
 @kernel(parallel=True)
 def _forward(sh_dc, sh_rest, means, centre, degree, colors):  # type: ignore[no-untyped-def]
     count, active = len(means), (degree + 1) ** 2 - 1
@@ -182,13 +181,8 @@ def _forward(sh_dc, sh_rest, means, centre, degree, colors):  # type: ignore[no-
             g = np.float32(C0) * sh_dc[n, 1] + np.float32(0.5)
             b = np.float32(C0) * sh_dc[n, 2] + np.float32(0.5)
             if degree > 0:
-                x, y, z = (
-                    means[n, 0] - centre[0],
-                    means[n, 1] - centre[1],
-                    means[n, 2] - centre[2],
-                )
-                inverse = np.float32(1.0) / np.sqrt(max(x * x + y * y + z * z, np.float32(1e-24)))
-                _write_basis(x * inverse, y * inverse, z * inverse, degree, values)
+                x, y, z, _ = _direction(means, n, centre)
+                _write_basis(x, y, z, degree, values)
                 for k in range(active):
                     r += values[k] * sh_rest[n, k, 0]
                     g += values[k] * sh_rest[n, k, 1]
@@ -211,18 +205,14 @@ def _backward(  # type: ignore[no-untyped-def]
             r = grad_colors[n, 0] if colors[n, 0] > 0 else np.float32(0.0)
             g = grad_colors[n, 1] if colors[n, 1] > 0 else np.float32(0.0)
             b = grad_colors[n, 2] if colors[n, 2] > 0 else np.float32(0.0)
-            grad_dc[n, 0], grad_dc[n, 1], grad_dc[n, 2] = (
-                np.float32(C0) * r,
-                np.float32(C0) * g,
-                np.float32(C0) * b,
-            )
+            grad_dc[n, 0] = np.float32(C0) * r
+            grad_dc[n, 1] = np.float32(C0) * g
+            grad_dc[n, 2] = np.float32(C0) * b
             grad_means[n] = 0.0
             if degree == 0 or (r == 0.0 and g == 0.0 and b == 0.0):
                 grad_rest[n] = 0.0
                 continue
-            x, y, z = (means[n, 0] - centre[0], means[n, 1] - centre[1], means[n, 2] - centre[2])
-            inverse = np.float32(1.0) / np.sqrt(max(x * x + y * y + z * z, np.float32(1e-24)))
-            x, y, z = x * inverse, y * inverse, z * inverse
+            x, y, z, inverse = _direction(means, n, centre)
             _write_basis(x, y, z, degree, values)
             for k in range(active):
                 sums[k] = r * sh_rest[n, k, 0] + g * sh_rest[n, k, 1] + b * sh_rest[n, k, 2]

@@ -6,7 +6,7 @@ Source: Kerbl et al. 2023 (3D Gaussian Splatting), with the schedule of the rele
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 import torch
@@ -50,68 +50,48 @@ class Timeline:
         self._last_moment = 0
 
     def at(self, index: int, progress: float) -> Due:
-        """What is due at a step.
-
-        Args:
-            index: Steps done before.
-            progress: Share of the training done before, 0..1.
-        """
+        """What is due at a step; arguments as `chronoscene.methods.Method.step`."""
         config = self.config
         length = config.schedule_length if config.stretch else config.iterations
         moment = round(progress * length) + 1
         # A squeezed schedule jumps over moments, so what counts is that a multiple was passed.
         passed_reset = moment // config.reset_interval > self._last_moment // config.reset_interval
+        round_is_due = (index + 1) % config.densify_interval == 0
         growing = moment < config.densify_until
+        progress = moment / config.schedule_length
         self._last_moment = moment
         return Due(
             moment=moment,
             sh_degree=min(config.sh_degree, moment // config.sh_interval),
-            position_lr=log_linear(
-                moment / config.schedule_length,
-                config.position_lr_initial,
-                config.position_lr_final,
-            ),
+            position_lr=log_linear(progress, config.position_lr_initial, config.position_lr_final),
             collect=growing,
-            densify=growing
-            and moment > config.densify_from
-            and (index + 1) % config.densify_interval == 0,
+            densify=growing and moment > config.densify_from and round_is_due,
             prune_large=moment > config.prune_large_from,
             reset=growing and passed_reset,
         )
 
 
+@dataclass(eq=False)
 class GaussianTrainer:
-    """Trains a model on the views of a training set.
+    """Trains a model on the views of a training set."""
 
-    Args:
-        config: Options.
-        model: Trained in place.
-        train: Views and images.
-        seed: All random choices follow from it.
-        background: [3]
-        learning_rates: Gives the learning rate of each tensor of the model at a step.
-    """
+    config: GaussianConfig
+    model: GaussianModel
+    """Trained in place."""
+    train: TrainingSet
+    _: KW_ONLY
+    seed: int
+    """All random choices follow from it."""
+    background: Tensor
+    """[3]"""
+    learning_rates: Callable[[Due], Mapping[str, float]]
+    """Gives the learning rate of each tensor of the model at a step."""
 
-    def __init__(
-        self,
-        config: GaussianConfig,
-        model: GaussianModel,
-        train: TrainingSet,
-        *,
-        seed: int,
-        background: Tensor,
-        learning_rates: Callable[[Due], Mapping[str, float]],
-    ) -> None:
-        self.config = config
-        self.model = model
-        self.train = train
-        self.seed = seed
-        self.background = background
-        self.learning_rates = learning_rates
-        self.timeline = Timeline(config)
-        self.sampler = ViewSampler(len(train.views), seed)
-        self.optimizer = Adam({n: t.requires_grad_() for n, t in model.tensors().items()})
-        self.statistics = GradientStatistics(len(model), background.device)
+    def __post_init__(self) -> None:
+        self.timeline = Timeline(self.config)
+        self.sampler = ViewSampler(len(self.train.views), self.seed)
+        self.optimizer = Adam({n: t.requires_grad_() for n, t in self.model.tensors().items()})
+        self.statistics = GradientStatistics(len(self.model), self.background.device)
 
     def step(self, index: int, progress: float) -> StepReport:
         """Render one training view, learn from it, and change the set of Gaussians where due."""

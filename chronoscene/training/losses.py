@@ -15,8 +15,7 @@ from chronoscene.kernels.compilation import kernel
 from chronoscene.training.ssim_kernel import CHANNELS, RADIUS, SIGMA, l1_ssim
 
 _CHUNK = 4096
-"""Gaussians that are summed one after the other; fixed, so the sum does not depend on the
-threads."""
+"""Gaussians summed one after the other; fixed, so the sum does not depend on the threads."""
 
 
 def photometric_loss(image: Tensor, target: Tensor, *, ssim_weight: float = 0.2) -> Tensor:
@@ -40,7 +39,7 @@ def photometric_loss(image: Tensor, target: Tensor, *, ssim_weight: float = 0.2)
     Raises:
         ShapeError: If the images differ in size, or have other types.
 
-    Source: Kerbl et al. 2023 (3D Gaussian Splatting), equation 7; Wang et al. 2004 for SSIM.
+    Source: Kerbl et al. 2023 (3D Gaussian Splatting); Wang et al. 2004 for SSIM.
     """
     _check_images(image, target)
     if image.device.type != "cpu" or image.dtype != torch.float32:
@@ -53,7 +52,8 @@ def photometric_loss_reference(
 ) -> Tensor:
     """The definition of `photometric_loss` in plain torch, in the type of ``image``."""
     _check_images(image, target)
-    truth = _unit_range(target).to(image)
+    # In float32 as in the kernel, so that both agree on where the image equals the target.
+    truth = (target.float() / 255 if target.dtype == torch.uint8 else target).to(image)
     l1 = (image - truth).abs().mean()
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(image, truth).mean())
 
@@ -82,13 +82,10 @@ class _PhotometricLoss(torch.autograd.Function):
         count = image.numel()
         weights = ((1 - ssim_weight) / count, ssim_weight / count)
         gradient = torch.empty(image.shape if ctx.needs_input_grad[0] else (0, *image.shape[1:]))
-        difference, dissimilarity = l1_ssim(
-            _rows(image),
-            _rows(target if target.dtype == torch.uint8 else target.float()),
-            np.float32(255 if target.dtype == torch.uint8 else 1),
-            np.array(weights, dtype=np.float32),
-            _rows(gradient),
-        )
+        is_byte = target.dtype == torch.uint8
+        arrays = _rows(image), _rows(target if is_byte else target.float())
+        scales = np.float32(255 if is_byte else 1), np.array(weights, dtype=np.float32)
+        difference, dissimilarity = l1_ssim(*arrays, *scales, _rows(gradient))
         ctx.save_for_backward(gradient)
         return torch.tensor(weights[0] * difference + weights[1] * dissimilarity)
 
@@ -101,11 +98,6 @@ class _PhotometricLoss(torch.autograd.Function):
 def _rows(image: Tensor) -> np.ndarray[Any, Any]:
     width = image.shape[1] * CHANNELS
     return image.detach().contiguous().view(image.shape[0], width).numpy()
-
-
-def _unit_range(target: Tensor) -> Tensor:
-    # In float32 as in the kernel, so that both agree on where the image equals the target.
-    return target.float() / 255 if target.dtype == torch.uint8 else target
 
 
 def _check_images(image: Tensor, target: Tensor) -> None:
@@ -126,8 +118,7 @@ def _check_images(image: Tensor, target: Tensor) -> None:
 
 
 def mean_volume(scales: Tensor, opacities: Tensor) -> Tensor:
-    """Mean over the Gaussians with an opacity above 0 of the product of their scales: keeps them
-    small.
+    """Mean product of the scales of the Gaussians with an opacity above 0: keeps them small.
 
     Args:
         scales: [N, 3]
@@ -141,8 +132,7 @@ def mean_volume(scales: Tensor, opacities: Tensor) -> Tensor:
     if scales.is_cuda:
         volumes = scales.prod(dim=1)[opacities > 0]
         return volumes.mean() if len(volumes) else scales.sum() * 0.0
-    result: Tensor = _MeanVolume.apply(scales, opacities)
-    return result
+    return _MeanVolume.apply(scales, opacities)
 
 
 class _MeanVolume(torch.autograd.Function):

@@ -115,8 +115,13 @@ class RowAdam:
         self.steps += 1
         self._speeds.append(corrected / root)
         self._ways = self._new_ways()
-        if self.steps >= _HORIZON:
-            self._settle(self._ways[_HORIZON, 0])
+        if self.steps < _HORIZON:
+            return
+        # What has waited `_HORIZON` steps now has gone all its way.
+        stamp = self.steps - _HORIZON
+        if stamp == len(self._settled):  # twice the room
+            self._settled = np.concatenate([self._settled, np.empty_like(self._settled)])
+        self._settled[stamp] = self._ways[_HORIZON, 0]
 
     def flush(self) -> Tensor:
         self.value.copy_(self.snapshot())
@@ -150,13 +155,6 @@ class RowAdam:
         self.value, self._mean, self._square = (table[mask] for table in tables)
         self._mark_all()
         return self.value
-
-    def _settle(self, way: np.float32) -> None:
-        """Keep the way of what has waited `_HORIZON` steps now; twice the room where it is full."""
-        stamp = self.steps - _HORIZON
-        if stamp == len(self._settled):
-            self._settled = np.concatenate([self._settled, np.empty_like(self._settled)])
-        self._settled[stamp] = way
 
     def _mark_all(self) -> None:
         self._stamps = np.full((len(self.value), len(self._widths)), self.steps, np.int64)

@@ -137,8 +137,6 @@ def decode_opacities(layout, weights, source, above, out, work, work_size, tasks
     """First pass: opacities of all offsets, and the starts of the anchors.
 
     Args:
-        layout: `Layout`.
-        weights: `Weights`.
         source: `Anchors`.
         above: Gaussians are active unless their opacity is this or less. float32
         out: `Outputs`, alphas and starts written.

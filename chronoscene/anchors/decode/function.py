@@ -46,13 +46,13 @@ class Decode(torch.autograd.Function):
         starts = torch.empty(count + 1, dtype=torch.int64)
         alphas = torch.empty(count * job.layout.offsets)
         places = Outputs(alphas.data_ptr(), starts.data_ptr(), *([0] * 7))
-        decode_opacities(job.layout, job.weights, job.source, above, places, *job.work)
+        arguments = (job.layout, job.weights, job.source, above)
+        decode_opacities(*arguments, places, *job.work)
         active = int(starts[-1])
         index = torch.empty(active, dtype=torch.int64)
         shapes = ((active, 3), (active, 4), (active, 3), (active,), (active, 3), (active,))
         outputs = (starts, index, *(torch.empty(shape) for shape in shapes))
-        places = _outputs(alphas, *outputs)
-        decode_forward(job.layout, job.weights, job.source, above, places, *job.work)
+        decode_forward(*arguments, _outputs(alphas, *outputs), *job.work)
         ctx.save_for_backward(*fixed, *tensors, *outputs)
         ctx.job = job
         ctx.mark_non_differentiable(index)
@@ -70,17 +70,11 @@ class Decode(torch.autograd.Function):
         chunks = max(1, -(-job.source.num_visible // CHUNK))
         partials = torch.empty(chunks, sum(sizes))
         partial = Gradients(*place(sizes, partials.data_ptr()))
-        decode_backward(
-            job.layout,
-            job.weights,
-            job.source,
-            _outputs(torch.empty(0), *outputs),
-            OutputGradients(*(grad.data_ptr() for grad in grads)),
-            AnchorGradients(*(tensor.data_ptr() for tensor in out[:3])),
-            partial,
-            sum(sizes),
-            *job.work,
-        )
+        arguments = (job.layout, job.weights, job.source, _outputs(torch.empty(0), *outputs))
+        output_gradients = OutputGradients(*(grad.data_ptr() for grad in grads))
+        anchor_gradients = AnchorGradients(*(tensor.data_ptr() for tensor in out[:3]))
+        gradients = (output_gradients, anchor_gradients, partial, sum(sizes))
+        decode_backward(*arguments, *gradients, *job.work)
         shared = torch.zeros_like(job.shared)
         ends = (job.shared.data_ptr(), _heads(out[4:]), shared.data_ptr())
         unpack_gradients(job.layout, partial, job.heads, *ends)
@@ -133,10 +127,8 @@ class _Job:
         memory = torch.zeros(tasks * sum(sizes))
         self.work = (Work(*place(sizes, memory.data_ptr())), sum(sizes), tasks)
         # The kernels know addresses only, so this object keeps alive what is there.
-        self._alive = (
-            *(anchors, weights, centre, visible, offsets, features, log_scales, periods),
-            *(*heads, packed, memory),
-        )
+        plain = (anchors, weights, centre, visible, offsets, features, log_scales, periods)
+        self._alive = (*plain, *heads, packed, memory)
 
 
 def _plain(tensor: Tensor) -> Tensor:
@@ -170,13 +162,9 @@ def _num_outputs(layout, head):  # type: ignore[no-untyped-def]
 
 @kernel
 def pack_weights(layout, heads, shared, out):  # type: ignore[no-untyped-def]
-    """Join three heads, as `Layout` says.
+    """Join three `Head` into ``out``, `Weights` that are zeros at first.
 
-    Args:
-        layout: `Layout`.
-        heads: Three `Head`.
-        shared: Address of the mixed global feature. [G]
-        out: `Weights`, zeros at first.
+    ``shared`` is the address of the mixed global feature. [G]
     """
     width = layout.inputs + layout.shared
     for head in range(3):
@@ -203,13 +191,10 @@ def pack_weights(layout, heads, shared, out):  # type: ignore[no-untyped-def]
 
 @kernel
 def unpack_gradients(layout, grads, heads, shared, out, shared_out):  # type: ignore[no-untyped-def]
-    """Spread the gradients of the joined weights over the heads and what they share.
+    """Spread the `Gradients` of the joined weights over the heads and what they share.
 
     Args:
-        layout: `Layout`.
-        grads: `Gradients`.
-        heads: Three `Head`.
-        shared: Address of the mixed global feature. [G]
+        heads: As in `pack_weights`, like ``shared``.
         out: Three `Head`, written.
         shared_out: Address of zeros, to which the gradient of ``shared`` is added. [G]
     """
