@@ -182,11 +182,12 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
     except OSError as error:
         return Unreadable(str(path), f"{error.filename or path}: {error.strerror or error}")
     if request.figures is not None:
-        from chronoscene.figures.projections import draw_projections
+        from chronoscene.figures.cloud import cloud_of
+        from chronoscene.figures.projections import draw_cloud
 
         target = request.figures / f"{name}_points.{request.figure_format}"
         with writing_to("--figures", target):
-            draw_projections(scene, target, cameras=request.cameras)
+            draw_cloud(cloud_of(scene), target, cameras=request.cameras)
     if request.pages is not None:
         from chronoscene.figures.viewer import write_page
 

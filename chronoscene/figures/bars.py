@@ -7,16 +7,7 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
-from chronoscene.figures.canvas import (
-    GREY,
-    GRID,
-    add_legend,
-    new_figure,
-    period_colors,
-    plain,
-    quiet_axes,
-    save,
-)
+from chronoscene.figures import canvas
 from chronoscene.io.wording import printable
 from chronoscene.stats.counts import PeriodCount, SceneCount, period_title
 
@@ -35,11 +26,11 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
     from rich.cells import cell_len
 
     periods = max(len(c.periods) for c in counts)
-    colors = period_colors(periods)
+    colors = canvas.period_colors(periods)
     longest = max(cell_len(_name(c)) for c in counts)
     left, top, bottom = 0.25 + 0.075 * longest, 0.42, 0.5
     height = top + bottom + BAR * (len(counts) + 0.4)
-    figure = new_figure(WIDTH, height)
+    figure = canvas.new_figure(WIDTH, height)
     gap = 0.35
     width = (WIDTH - left - gap - 0.2) / 2
     seen = any(c.count == "seen" for c in counts)
@@ -52,10 +43,12 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
         axes = figure.add_axes((box[0] / WIDTH, box[1] / height, box[2] / WIDTH, box[3] / height))
         values = [[of(p) for p in c.periods] for c in counts]
         _draw_panel(axes, what, values, colors)
-        axes.set_yticks(range(len(counts)), [plain(_name(c)) for c in counts] if i == 0 else [])
+        axes.set_yticks(
+            range(len(counts)), [canvas.plain(_name(c)) for c in counts] if i == 0 else []
+        )
         axes.tick_params(axis="y", length=0, labelsize=9)
     _legend(figure, _period_names(counts, periods), colors, 1 - 0.1 / height)
-    save(figure, path)
+    canvas.save(figure, path)
 
 
 def _name(count: SceneCount) -> str:
@@ -67,10 +60,10 @@ def _draw_panel(
     axes: Any, what: str, values: Sequence[Sequence[int]], colors: Sequence[str]
 ) -> None:
     """One bar per scene, its periods side by side, and their sum at the end."""
-    quiet_axes(axes)
+    canvas.quiet_axes(axes)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
-    axes.grid(axis="x", color=GRID, linewidth=0.6)
+    axes.grid(axis="x", color=canvas.GRID, linewidth=0.6)
     sums = [sum(row) for row in values]
     for p, color in enumerate(colors):
         rows = [y for y, row in enumerate(values) if p < len(row)]
@@ -86,7 +79,7 @@ def _draw_panel(
     largest = max(sums, default=0) or 1
     for y, total in enumerate(sums):
         text = axes.text(total + 0.012 * largest, y, f"{total:,}", va="center", fontsize=8)
-        text.set(color=GREY, bbox={"color": "white", "pad": 0.8})
+        text.set(color=canvas.GREY, bbox={"color": "white", "pad": 0.8})
     axes.set_xlim(0, 1.17 * largest)
     axes.set_ylim(len(values) - 0.45, -0.55)
     axes.locator_params(axis="x", nbins=6, integer=True)
@@ -120,4 +113,6 @@ def _legend(figure: Any, names: Sequence[str], colors: Sequence[str], top: float
     step = -(-len(colors) // min(MAX_LEGEND_ENTRIES, max(fitting, 1)))
     shown = range(0, len(colors), step)
     entries = [(names[i], colors[i]) for i in shown]
-    add_legend(figure, entries, loc="upper center", bbox_to_anchor=(0.5, top), ncol=len(shown))
+    canvas.add_legend(
+        figure, entries, loc="upper center", bbox_to_anchor=(0.5, top), ncol=len(shown)
+    )

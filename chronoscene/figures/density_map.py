@@ -117,6 +117,5 @@ def shade(counts: Counts, colors: Sequence[str], *, seed: int = 0) -> NDArray[np
 def opacity(counts: Counts) -> Counts:
     """From `MIN_OPACITY` for one point to 1 for as many as the densest pixels have. [n]"""
     dark = max(float(np.quantile(counts, DARK_QUANTILE)), 2.0)
-    return np.clip(
-        MIN_OPACITY + (1 - MIN_OPACITY) * np.log(counts) / np.log(dark), MIN_OPACITY, 1.0
-    )
+    grown = MIN_OPACITY + (1 - MIN_OPACITY) * np.log(counts) / np.log(dark)
+    return np.clip(grown, MIN_OPACITY, 1.0)

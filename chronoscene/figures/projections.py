@@ -15,20 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.figures.canvas import (
-    DPI,
-    GREY,
-    GRID,
-    add_legend,
-    new_figure,
-    period_colors,
-    plain,
-    quiet_axes,
-    save,
-)
-from chronoscene.figures.cloud import Box, Cloud, cloud_of, shown_box
+from chronoscene.figures import canvas
+from chronoscene.figures.canvas import DPI
+from chronoscene.figures.cloud import Box, Cloud, shown_box
 from chronoscene.figures.density_map import Window, count_points, dot_radius, grow_dots, shade
-from chronoscene.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -48,19 +38,14 @@ FAR = 20.0
 AXES = "xyz"
 
 
-def draw_projections(scene: Scene, path: Path, *, cameras: bool = False) -> None:
+def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
     """Draw the three projections of a scene.
 
     Args:
-        scene: The scene.
+        cloud: Points and cameras of the scene.
         path: File to write; the suffix says the format.
         cameras: Whether to draw the cameras, too, with their viewing directions.
     """
-    draw_cloud(cloud_of(scene), path, cameras=cameras)
-
-
-def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
-    """Draw points and cameras; see `draw_projections`."""
     cloud, box, axis_names = readable(cloud, shown_box(cloud, cameras=cameras))
     dx, dy, dz = box.edges
     scale = min((DRAWING[0] - GAP) / (dx + dz), (DRAWING[1] - GAP) / (dy + dz))
@@ -69,15 +54,14 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
     columns = max(1, int((width - LEFT) / (0.42 + 0.075 * max(map(len, names)))))
     top = TITLE + LINE * -(-len(names) // columns)
     height = BOTTOM + (dz + dy) * scale + GAP + top
-    figure = new_figure(width, height)
-    colors = period_colors(len(names))
+    figure = canvas.new_figure(width, height)
+    colors = canvas.period_colors(len(names))
     x_right, y_top = LEFT + dx * scale + GAP, BOTTOM + dz * scale + GAP
     places = {(0, 1): (LEFT, y_top), (0, 2): (LEFT, BOTTOM), (2, 1): (x_right, y_top)}
     dots = _dot_radius(cloud, box, scale, places)
     for plane, (x, y) in places.items():
         size = (box.edges[plane[0]] * scale, box.edges[plane[1]] * scale)
-        place = (x / width, y / height, size[0] / width, size[1] / height)
-        axes = figure.add_axes(place)
+        axes = figure.add_axes((x / width, y / height, size[0] / width, size[1] / height))
         image = _draw_points(axes, cloud, box, plane, size, colors, dots)
         if cameras:
             image.set_alpha(BEHIND)
@@ -85,7 +69,7 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
         _label_axes(axes, plane, axis_names, size)
     _write_texts(figure, cloud, box, (x_right / width, (y_top - GAP) / height))
     _draw_legend(figure, names, colors, columns, 1 - TITLE / height)
-    save(figure, path)
+    canvas.save(figure, path)
 
 
 def readable(cloud: Cloud, box: Box) -> tuple[Cloud, Box, tuple[str, ...]]:
@@ -102,28 +86,18 @@ def readable(cloud: Cloud, box: Box) -> tuple[Cloud, Box, tuple[str, ...]]:
     if cloud.unit == "metre":
         power = max(-3, min(3, power))
     factor = 10.0**power
-    moved = replace(
-        cloud, xyz=(cloud.xyz - offset) / factor, centres=(cloud.centres - offset) / factor
-    )
+    xyz, centres = (cloud.xyz - offset) / factor, (cloud.centres - offset) / factor
     box = Box((box.low - offset) / factor, (box.high - offset) / factor)
     units = {-3: " [mm]", 0: " [m]", 3: " [km]"}
     unit = units[power] if cloud.unit == "metre" else f" [$10^{{{power}}}$]" if power else ""
-    return (
-        moved,
-        box,
-        tuple(f"{axis}{_minus(shift)}{unit}" for axis, shift in zip(AXES, offset, strict=True)),
-    )
-
-
-def _minus(shift: float) -> str:
-    """What is taken from a coordinate."""
-    return f" {'-' if shift > 0 else '+'} {abs(shift):,.12g}" if shift else ""
+    taken = [f" {'-' if x > 0 else '+'} {abs(x):,.12g}" if x else "" for x in offset]
+    names = tuple(f"{axis}{shift}{unit}" for axis, shift in zip(AXES, taken, strict=True))
+    return replace(cloud, xyz=xyz, centres=centres), box, names
 
 
 def legend_names(labels: Sequence[str]) -> list[str]:
     """What the legend calls the periods."""
-    bare = all(label == str(i) for i, label in enumerate(labels))
-    if bare:
+    if all(label == str(i) for i, label in enumerate(labels)):
         return [f"Period {i}" if len(labels) <= 8 else str(i) for i in range(len(labels))]
     names = [label if label == str(i) else f"{i}: {label}" for i, label in enumerate(labels)]
     return [shorten(name, 28, placeholder="...") or name[:28] for name in names]
@@ -151,7 +125,7 @@ def _draw_points(
     dots: int,
 ) -> Any:
     """The density of the points, as an image. ``dots``: their radius in pixels."""
-    quiet_axes(axes)
+    canvas.quiet_axes(axes)
     dpi = DPI if dots else DPI / CELL
     pixels = [max(1, round(edge * dpi)) for edge in size]
     low, high = box.low[list(plane)], box.high[list(plane)]
@@ -159,7 +133,7 @@ def _draw_points(
     counts = count_points(cloud.xyz[:, plane], cloud.period, len(colors), window)
     image = shade(grow_dots(counts, dots), colors)
     extent = (low[0], high[0], low[1], high[1])
-    axes.grid(color=GRID, linewidth=0.5, zorder=0)
+    axes.grid(color=canvas.GRID, linewidth=0.5, zorder=0)
     return axes.imshow(image, extent=extent, interpolation="nearest", aspect="auto", zorder=1)
 
 
@@ -203,7 +177,7 @@ def _label_axes(
         axes.set_ylabel(names[plane[1]], fontsize=9, labelpad=2)
     title = "".join(sorted(AXES[i] for i in plane)).upper()
     box = {"color": "white", "alpha": 0.8, "pad": 1.5, "linewidth": 0}
-    style = {"fontsize": 8, "weight": "bold", "color": GREY, "bbox": box, "zorder": 4}
+    style = {"fontsize": 8, "weight": "bold", "color": canvas.GREY, "bbox": box, "zorder": 4}
     at = {"xy": (0, 1), "xycoords": "axes fraction", "textcoords": "offset points"}
     axes.annotate(title, xytext=(4, -4), va="top", **at, **style)
 
@@ -218,14 +192,14 @@ def _write_texts(figure: Any, cloud: Cloud, box: Box, corner: tuple[float, float
     left, top = LEFT / width, 1 - 0.1 / height
     longest = int((width - LEFT) / 0.095)
     name = shorten(cloud.name, longest, placeholder="...") or cloud.name[:longest]
-    figure.text(left, top, plain(name), fontsize=11, va="top")
+    figure.text(left, top, canvas.plain(name), fontsize=11, va="top")
     counted = cloud.period >= 0
     outside = int((counted & ~box.holds(cloud.xyz)).sum())
     lines = [f"{int(counted.sum()):,} points", f"{len(cloud.centres):,} cameras"]
     if outside:
         lines.insert(1, f"{outside:,} outside")
     at = corner[0], corner[1] - 0.42 / height
-    figure.text(*at, "\n".join(lines), fontsize=8, va="top", color=GREY, linespacing=1.4)
+    figure.text(*at, "\n".join(lines), fontsize=8, va="top", color=canvas.GREY, linespacing=1.4)
 
 
 def _draw_legend(
@@ -236,4 +210,6 @@ def _draw_legend(
     order = [i for column in range(columns) for i in range(column, len(names), columns)]
     entries = [(names[i], colors[i]) for i in order]
     corner = (LEFT / figure.get_size_inches()[0], top)
-    add_legend(figure, entries, loc="upper left", bbox_to_anchor=corner, ncol=columns, borderpad=0)
+    canvas.add_legend(
+        figure, entries, loc="upper left", bbox_to_anchor=corner, ncol=columns, borderpad=0
+    )

@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from chronoscene.figures.canvas import period_colors
+from chronoscene.figures import canvas
 from chronoscene.figures.cloud import Cloud, cloud_of, shown_box
 from chronoscene.io.pages import render_page
 from chronoscene.io.staging import write_text_atomic
@@ -46,13 +46,16 @@ def page_of(cloud: Cloud, rgb: NDArray[np.uint8], *, max_points: int = MAX_POINT
 
 def _page_data(cloud: Cloud, rgb: NDArray[np.uint8], max_points: int) -> dict[str, Any]:
     """What the script draws. Coordinates are relative to the middle of the scene."""
-    periods = len(cloud.labels)
     good = np.flatnonzero((cloud.period >= 0) & np.isfinite(cloud.xyz).all(axis=1))
     shown = np.random.default_rng(0).permutation(good)[:max_points]
     # By period, in random order within: any first part of a period stands for all of it.
     shown = shown[np.argsort(cloud.period[shown], kind="stable")]
     box = shown_box(cloud, cameras=False)
     middle = (box.low + box.high) / 2
+    colors = canvas.period_colors(len(cloud.labels))
+    groups = cloud.period[good], cloud.period[shown], cloud.camera_period
+    numbers = np.transpose([np.bincount(group, minlength=len(colors)) for group in groups])
+    periods = zip(cloud.labels, colors, numbers.tolist(), strict=True)
     return {
         "name": cloud.name,
         "unit": "m" if cloud.unit == "metre" else "",
@@ -60,14 +63,7 @@ def _page_data(cloud: Cloud, rgb: NDArray[np.uint8], max_points: int) -> dict[st
         "home": home_view(cloud, middle).tolist(),
         "periods": [
             {"label": label, "color": color, "points": points, "shown": part, "cameras": cameras}
-            for label, color, points, part, cameras in zip(
-                cloud.labels,
-                period_colors(periods),
-                np.bincount(cloud.period[good], minlength=periods).tolist(),
-                np.bincount(cloud.period[shown], minlength=periods).tolist(),
-                np.bincount(cloud.camera_period, minlength=periods).tolist(),
-                strict=True,
-            )
+            for label, color, (points, part, cameras) in periods
         ],
         "points": len(good),
         "left_out": len(cloud.xyz) - len(good),

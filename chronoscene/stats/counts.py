@@ -162,9 +162,7 @@ def count_table(counts: Sequence[SceneCount]) -> list[list[int | str | None]]:
     rows: list[list[int | str | None]] = []
     sums = [0] * (2 * periods + 2)
     for scene in counts:
-        cells: list[int | None] = []
-        for period in scene.periods:
-            cells += [period.images, period.points]
+        cells: list[int | None] = [n for p in scene.periods for n in (p.images, p.points)]
         cells += [None] * (2 * periods - len(cells)) + [scene.images, scene.points]
         sums = [total + (cell or 0) for total, cell in zip(sums, cells, strict=True)]
         rows.append([scene.name, *cells])
@@ -179,16 +177,13 @@ def _period_names(counts: Sequence[SceneCount]) -> list[str]:
 
 def _table(counts: Sequence[SceneCount], images: str = "images", points: str = "points") -> Table:
     """The table as it is read."""
-
-    def text(cell: int | str | None) -> str:
-        if cell is None:
-            return "-"
-        return cell if isinstance(cell, str) else f"{cell:,}"
-
     heads = [("Scene", "")]
     for name in _period_names(counts):
         heads += [(name, images), ("", points)]
-    rows = [list(map(text, row)) for row in count_table(counts)]
+    rows = [
+        [str(name), *("-" if number is None else f"{number:,}" for number in numbers)]
+        for name, *numbers in count_table(counts)
+    ]
     return Table(heads, rows, breaks={len(counts) - 1})
 
 

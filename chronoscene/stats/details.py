@@ -9,7 +9,7 @@ from typing import Any
 from chronoscene.io import tables
 from chronoscene.io.tables import Head, Table
 from chronoscene.stats.counts import Unreadable, compared, document, period_title
-from chronoscene.stats.measures import Measures, SceneStatistics
+from chronoscene.stats.measures import SceneStatistics
 
 MAX_SHOWN = 8
 """Periods up to which the overlaps fit into a table for reading; CSV and JSON have them all."""
@@ -53,8 +53,8 @@ class Row:
     """None for the whole scene."""
     label: str
     date: str | None
-    values: dict[str, float | None]
-    """By the names of `COLUMNS`."""
+    values: dict[str, Any]
+    """By the names of `COLUMNS`, and more."""
     overlap: tuple[float | None, ...]
     """With each period; empty for the whole scene."""
     in_view: tuple[float | None, ...]
@@ -68,19 +68,14 @@ class Row:
 def rows_of(statistics: SceneStatistics) -> list[Row]:
     """A row for each period and one for the scene."""
     counts = statistics.counts
-    rows = []
-    for count, measures, overlap, in_view in zip(
-        counts.periods, statistics.periods, statistics.overlap, statistics.in_view, strict=True
-    ):
-        values = _values(count.images, count.test, count.points, measures)
-        rows.append(Row(counts.name, count.id, count.label, count.date, values, overlap, in_view))
+    shares = zip(statistics.overlap, statistics.in_view, strict=True)
+    rows = [
+        Row(counts.name, count.id, count.label, count.date, asdict(count) | asdict(own), *known)
+        for count, own, known in zip(counts.periods, statistics.periods, shares, strict=True)
+    ]
     tests = sum(count.test for count in counts.periods)
-    values = _values(counts.images, tests, counts.points, statistics.whole)
-    return [*rows, Row(counts.name, None, "all", None, values, (), ())]
-
-
-def _values(images: int, test: int, points: int, measures: Measures) -> dict[str, float | None]:
-    return {"images": images, "test": test, "points": points, **asdict(measures)}
+    whole = {"images": counts.images, "test": tests, "points": counts.points}
+    return [*rows, Row(counts.name, None, "all", None, whole | asdict(statistics.whole), (), ())]
 
 
 def _max_periods(statistics: Sequence[SceneStatistics]) -> int:

@@ -214,6 +214,11 @@ class SceneReport:
         return sum(f.severity == severity for f in self.findings)
 
 
+def explain(finding: Finding) -> str:
+    """What is wrong in general: what the rule says, if there is one of this code."""
+    return RULES[finding.code].what if finding.code in RULES else finding.expected
+
+
 def counts(reports: Iterable[SceneReport]) -> dict[Severity, int]:
     """Number of findings by severity over several scenes."""
     found = tuple(reports)

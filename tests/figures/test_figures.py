@@ -164,7 +164,7 @@ def test_cameras_are_inside_of_the_panels(cloud):
 def panels(cloud: Cloud, path: Path, monkeypatch: pytest.MonkeyPatch, **options: bool) -> list:
     """Pixels per world unit of both axes of the panels, and the limits."""
     kept = []
-    monkeypatch.setattr(projections, "save", lambda figure, path: kept.append(figure))
+    monkeypatch.setattr(projections.canvas, "save", lambda figure, path: kept.append(figure))
     draw_cloud(cloud, path, **options)
     found = []
     for axes in kept[0].axes:
@@ -183,7 +183,7 @@ def test_all_panels_have_one_scale_and_share_their_axes(cloud, tmp_path, monkeyp
 
 def test_texts_of_the_figure_stay_inside_and_do_not_overlap(cloud, tmp_path, monkeypatch):
     kept = []
-    monkeypatch.setattr(projections, "save", lambda figure, path: kept.append(figure))
+    monkeypatch.setattr(projections.canvas, "save", lambda figure, path: kept.append(figure))
     labels = tuple(f"survey of the year {2010 + i}" for i in range(9))
     period = np.arange(3000) % 9
     many = replace(cloud_with(cloud.xyz, period, 9), labels=labels, name="a place")
@@ -247,7 +247,7 @@ def test_numbers_beside_the_axes_are_short(cloud, scale, place, unit, names):
 
 def test_names_with_marks_of_formulas_are_only_text(cloud, tmp_path, monkeypatch):
     kept = []
-    monkeypatch.setattr(projections, "save", lambda figure, path: kept.append(figure))
+    monkeypatch.setattr(projections.canvas, "save", lambda figure, path: kept.append(figure))
     odd = replace(cloud, name=r"$\no $x_1$", labels=("$a$", r"\$^$", "2"))
     draw_cloud(odd, tmp_path / "a.svg", cameras=True)
     (figure,) = kept
@@ -257,7 +257,7 @@ def test_names_with_marks_of_formulas_are_only_text(cloud, tmp_path, monkeypatch
 
 def test_the_legend_is_read_line_by_line(cloud, tmp_path, monkeypatch):
     kept = []
-    monkeypatch.setattr(projections, "save", lambda figure, path: kept.append(figure))
+    monkeypatch.setattr(projections.canvas, "save", lambda figure, path: kept.append(figure))
     labels = tuple(f"survey of {2000 + i}" for i in range(11))
     many = replace(cloud_with(cloud.xyz, np.arange(3000) % 11, 11), labels=labels)
     draw_cloud(many, tmp_path / "a.png")
@@ -302,7 +302,7 @@ def test_bars_of_the_paper(tmp_path, suffix):
 
 def test_bars_are_as_long_as_the_counts(tmp_path, monkeypatch):
     kept = []
-    monkeypatch.setattr("chronoscene.figures.bars.save", lambda figure, path: kept.append(figure))
+    monkeypatch.setattr("chronoscene.figures.canvas.save", lambda figure, path: kept.append(figure))
     draw_bars([counted("a", [(3, 50), (2, 10)]), counted("b", [(7, 20)])], tmp_path / "x.png")
     images, points = kept[0].axes
     bars = sorted(

@@ -17,17 +17,9 @@ from PIL import Image
 
 from chronoscene import __version__
 from chronoscene.io.pages import render_page
+from chronoscene.validation import rule
 from chronoscene.validation.checks.names import is_safe
-from chronoscene.validation.rule import (
-    NOTHING,
-    RULES,
-    SEVERITIES,
-    Finding,
-    SceneReport,
-    Severity,
-    counts,
-    is_valid,
-)
+from chronoscene.validation.rule import SEVERITIES, Finding, SceneReport, Severity, is_valid
 
 MAX_PICTURES = 24  # pictures of one scene
 MAX_SIDE_BY_SIDE = 3  # pictures of one finding
@@ -43,7 +35,7 @@ def write_html(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
     return render_page(
         "validation",
         scenes=[(report, _sections(report), _skipped(report)) for report in reports],
-        total=counts(reports),
+        total=rule.counts(reports),
         valid=is_valid(reports, strict=strict),
         is_valid=lambda report: is_valid([report], strict=strict),
         severities=SEVERITIES,
@@ -69,10 +61,10 @@ def _block(findings: list[Finding], pictures: Pictures) -> dict[str, Any]:
     first = findings[0]
     return {
         "first": first,
-        "what": RULES[first.code].what if first.code in RULES else first.expected,
+        "what": rule.explain(first),
         "rows": [(f, pictures.of(f.place, f.also)) for f in findings[:MAX_ROWS]],
         "total": len(findings),
-        "remedies": list(dict.fromkeys(f.remedy for f in findings if f.remedy != NOTHING))[:5],
+        "remedies": list(dict.fromkeys(f.remedy for f in findings if f.remedy != rule.NOTHING))[:5],
     }
 
 

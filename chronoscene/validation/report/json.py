@@ -10,7 +10,6 @@ import posixpath
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -83,19 +82,13 @@ def _sarif_run(report: SceneReport, rules: Sequence[Rule], strict: bool) -> dict
         "semanticVersion": __version__,
         "rules": [_sarif_rule(rule) for rule in rules],
     }
-    failed = [f for f in report.findings if f.code == RULE_FAILED]
+    failed = [str(f) for f in report.findings if f.code == RULE_FAILED]
+    notes = [{"level": "error", "message": {"text": text}} for text in failed]
     return {
         "tool": {"driver": driver},
         "automationDetails": {"id": f"chronoscene/{report.name}/"},
-        "originalUriBaseIds": {"SCENE": {"uri": _folder_uri(report.path)}},
-        "invocations": [
-            {
-                "executionSuccessful": not failed,
-                "toolExecutionNotifications": [
-                    {"level": "error", "message": {"text": str(f)}} for f in failed
-                ],
-            }
-        ],
+        "originalUriBaseIds": {"SCENE": {"uri": report.path.resolve().as_uri().rstrip("/") + "/"}},
+        "invocations": [{"executionSuccessful": not failed, "toolExecutionNotifications": notes}],
         "results": [_sarif_result(f, index, strict) for f in report.findings if f.code in index],
     }
 
@@ -154,7 +147,3 @@ def split_place(place: str) -> tuple[str, int | None, str | None]:
     assert parts is not None  # the first group takes any text
     line = int(parts["line"]) if parts["line"] else None
     return posixpath.normpath(parts["file"]), line, parts["what"]
-
-
-def _folder_uri(path: Path) -> str:
-    return path.resolve().as_uri().rstrip("/") + "/"

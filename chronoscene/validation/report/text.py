@@ -11,18 +11,10 @@ from itertools import groupby
 import click
 
 from chronoscene.io.wording import counted
+from chronoscene.validation import rule
 from chronoscene.validation.checks import grouped
 from chronoscene.validation.report.rule_list import COLOURS
-from chronoscene.validation.rule import (
-    NOTHING,
-    RULES,
-    SEVERITIES,
-    Finding,
-    SceneReport,
-    Summary,
-    counts,
-    is_valid,
-)
+from chronoscene.validation.rule import SEVERITIES, Finding, SceneReport, Summary, is_valid
 
 MAX_PLACES = 3  # places listed of findings that differ only in their place
 MAX_CODES = 8  # rules listed of those that were skipped for one reason
@@ -36,13 +28,9 @@ def write_text(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
     if len(reports) > 1:
         bad = sum(not is_valid([r], strict=strict) for r in reports)
         blocks.append([f"{counted(len(reports), 'scene')}, {bad} not valid: {_total(reports)}"])
-    width = _width()
+    # Without a terminal, other programs get unwrapped lines.
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     return "\n\n".join("\n".join(_fit(line, width) for line in block) for block in blocks) + "\n"
-
-
-def _width() -> int | None:
-    """Columns of the terminal; None without one: other programs get unwrapped lines."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def _fit(line: str, width: int | None) -> str:
@@ -50,12 +38,9 @@ def _fit(line: str, width: int | None) -> str:
     if width is None or len(click.unstyle(line)) <= width:
         return line
     indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
+    wide = max(width, MIN_WIDTH)
     return textwrap.fill(
-        line,
-        max(width, MIN_WIDTH),
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
+        line, wide, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
     )
 
 
@@ -74,14 +59,14 @@ def _rule(code: str, findings: list[Finding]) -> list[str]:
     """Lines of all findings of one rule in one scene."""
     first = findings[0]
     head = click.style(f"{first.severity} {code}", fg=COLOURS[first.severity])
-    what = RULES[code].what if code in RULES else first.expected
+    what = rule.explain(first)
     times = f" ({len(findings)} findings)" if len(findings) > 1 else ""
     lines = [f"  {head} {first.name}: {what}{times}"]
     folded = _fold(findings)
     lines += [f"    {line}" for line in folded[:MAX_LINES]]
     if len(folded) > MAX_LINES:
         lines.append(f"    and {len(folded) - MAX_LINES} more (--format json lists all)")
-    remedies = dict.fromkeys(f.remedy for f in findings if f.remedy != NOTHING)
+    remedies = dict.fromkeys(f.remedy for f in findings if f.remedy != rule.NOTHING)
     return lines + [f"    to do: {remedy}" for remedy in list(remedies)[:MAX_LINES]]
 
 
@@ -96,11 +81,8 @@ def _fold(findings: Iterable[Finding]) -> list[str]:
 
 
 def _summary(summary: Summary) -> str:
-    parts = [
-        _amount(summary.images, "image"),
-        _amount(summary.cameras, "camera"),
-        _amount(summary.points, "point"),
-    ]
+    numbers = {"image": summary.images, "camera": summary.cameras, "point": summary.points}
+    parts = [f"{w}s unknown" if n is None else counted(n, w) for w, n in numbers.items()]
     if summary.periods:
         each = ", ".join(
             f"{p.id}: {p.images}" if p.test is None else f"{p.id}: {p.train} + {p.test} test"
@@ -110,11 +92,7 @@ def _summary(summary: Summary) -> str:
     return ", ".join(parts)
 
 
-def _amount(number: int | None, noun: str) -> str:
-    return f"{noun}s unknown" if number is None else counted(number, noun)
-
-
 def _total(reports: Sequence[SceneReport]) -> str:
-    total = counts(reports)
+    total = rule.counts(reports)
     nouns = {"error": "error", "warning": "warning", "info": "remark"}
     return ", ".join(counted(total[severity], nouns[severity]) for severity in SEVERITIES)

@@ -45,10 +45,9 @@ def choose_rules(
         ConfigError: If one matches no rule.
     """
     rules = all_rules()
-    wanted = [_matching(place, text, rules) for text in select]
+    wanted = [_matching(place, text, rules) for text in select] or [{r.code for r in rules}]
     unwanted = [_matching("--ignore", text, rules) for text in ignore]
-    codes = set().union(*wanted) if wanted else {r.code for r in rules}
-    codes -= set().union(*unwanted)
+    codes = set().union(*wanted).difference(*unwanted)
     return tuple(r for r in rules if r.code in codes)
 
 
