@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 MAX_LENGTH = 1000
 """Characters of ``expected`` and ``found``: text from a damaged file may have millions."""
 
@@ -26,6 +29,15 @@ class ChronoSceneError(Exception):
         self.found = found
         self.todo = todo
         super().__init__(f"{place}: expected {expected}, found {found}; {todo}")
+
+    @property
+    def fields(self) -> dict[str, str]:
+        """The arguments by name."""
+        return {key: getattr(self, key) for key in ("place", "expected", "found", "todo")}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # By default, exceptions are unpickled without keyword arguments.
+        return partial(type(self), **self.fields), ()
 
 
 def _shortened(text: str) -> str:

@@ -1,5 +1,7 @@
 """Messages have one form, and checks name what is known."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,13 @@ from chronoscene.errors import MAX_LENGTH, ChronoSceneError, ConfigError, SceneE
 def test_message_has_place_expectation_finding_and_remedy():
     error = ChronoSceneError("a.txt:3", expected="two fields", found="one", todo="see DATASET.md")
     assert str(error) == "a.txt:3: expected two fields, found one; see DATASET.md"
+
+
+def test_errors_travel_between_processes():
+    error = SceneError("a.txt:3", expected="two fields", found="one", todo="see DATASET.md")
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is SceneError
+    assert again.fields == error.fields and str(again) == str(error)
 
 
 def test_long_quotations_are_shortened():

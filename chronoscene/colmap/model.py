@@ -36,9 +36,6 @@ from chronoscene.scene import Camera, Frame, Points
 from chronoscene.scene.cameras import from_pycolmap
 from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
 
-UNIT = 1e-9
-"""Quaternions whose length differs from 1 by less are unit quaternions up to rounding."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedImage:
@@ -220,11 +217,7 @@ def copy_poses(source: Path, folder: Path) -> int:
 def _checked_points(
     folder: Path, images: Sequence[PosedImage], raw: RawImages, points: RawPoints
 ) -> Points:
-    """Points whose tracks refer to the posed images.
-
-    Raises:
-        SceneError: If a track refers to an image or a keypoint that does not exist.
-    """
+    """Points whose tracks refer to the posed images; all images and keypoints must exist."""
     order = np.argsort(raw.ids)
     known = raw.ids[order]
     image, keypoint = points.track_image, points.track_keypoint
@@ -283,7 +276,7 @@ def _pose(rigid: pycolmap.Rigid3d) -> NDArray[np.float64]:
     x, y, z, w = rigid.rotation.quat
     with np.errstate(all="ignore"):
         length = np.linalg.norm([w, x, y, z])
-        if abs(length - 1) <= UNIT:
+        if abs(length - 1) <= 1e-9:  # unit up to rounding
             matrix = rigid.matrix()[:, :3]
         elif 0 < length < np.inf:
             matrix = rotation_from_quaternion([w, x, y, z])

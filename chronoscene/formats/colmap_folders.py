@@ -26,9 +26,10 @@ PERIOD_BY = ("folder", "table:FILE")
 
 def matches(path: Path) -> bool:
     """Whether a folder has images in folders and a model, and is not clearly of WAT."""
-    if colmap_layout.find_model(path) is None or colmap_layout.layout(path / "images") != "folders":
+    images = path / "images"
+    if colmap_layout.find_model(path) is None or not colmap_layout.is_in_folders(images):
         return False
-    folders, _ = colmap_layout.scan(path / "images")
+    folders, _ = colmap_layout.scan(images)
     # Where both formats put the folders in the same order, WAT wins; else one must be named.
     return not (wat.matches(path) and folders == sorted(folders, key=grouping.natural_key))
 

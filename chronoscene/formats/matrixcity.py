@@ -50,9 +50,6 @@ ROTATION_SCALE = 100.0
 PREPARED_UNIT = 100.0
 """Metres."""
 
-SAME_POSE = 0.01
-"""Metres, or entries of a rotation, by which two files may differ: prepared ones are rounded."""
-
 PARTS_OF_A_CITY = ("train", "test", "train_dense", "pose", "aerial", "street")
 """Folders that say what images are for, or how they were flown: neither blocks nor periods."""
 
@@ -123,7 +120,8 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
 
 def _check_same(path: Path, first: Shot, second: Shot) -> None:
     """Refuse two poses of an image: files may repeat it, as merged ones do, but must agree."""
-    if np.abs(first.cam_from_world - second.cam_from_world).max() > SAME_POSE:
+    # Metres, or entries of a rotation: prepared files are rounded.
+    if np.abs(first.cam_from_world - second.cam_from_world).max() > 0.01:
         raise SceneError(
             path / first.name,
             expected="the same pose in all pose files",
@@ -167,15 +165,10 @@ def _walk(path: Path) -> Iterator[tuple[list[PoseFile], str | None]]:
 
 
 def _pose_files(path: Path) -> list[PoseFile]:
-    """The files to read: raw ones if there are any; no ``train_dense`` beside ``train``.
-
-    Raises:
-        SceneError: If there are none, or a raw file is missing.
-    """
-    found, orphans = [], []
-    for files, orphan in _walk(path):
-        found += files
-        orphans += [orphan] if orphan is not None else []
+    """The files to read: raw ones if there are any; no ``train_dense`` beside ``train``."""
+    walked = list(_walk(path))
+    found = [file for files, _ in walked for file in files]
+    orphans = [orphan for _, orphan in walked if orphan is not None]
     raw = [file for file in found if file.name == RAW]
     if not found or (orphans and len(raw) == len(found)):
         raise SceneError(

@@ -148,11 +148,7 @@ def _by_name(path: Path, frames: list[dict[str, Any]]) -> dict[str, tuple[str, d
 def _read_shots(
     path: Path, data: Mapping[str, Any], named: Mapping[str, tuple[str, dict[str, Any]]]
 ) -> list[Shot]:
-    """The frames whose image is there.
-
-    Raises:
-        SceneError: If none is, or one is damaged.
-    """
+    """The frames whose image is there, of which there must be one."""
     cameras, shots = CameraTable(), []
     shared = {key: value for key, value in data.items() if key != "frames"}
     for name, (place, frame) in named.items():

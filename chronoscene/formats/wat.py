@@ -47,7 +47,7 @@ def matches(path: Path) -> bool:
     name = path.resolve().name.lower().removesuffix("_resized")
     if name not in SCENES or colmap_layout.find_model(path) is None:
         return False
-    return colmap_layout.layout(path / "images") == "folders"
+    return colmap_layout.is_in_folders(path / "images")
 
 
 def read(path: Path) -> Scene:

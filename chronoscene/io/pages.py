@@ -23,10 +23,8 @@ def render_page(name: str, **values: Any) -> str:
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
-    environment.globals["asset"] = lambda file: Markup(_asset(file))
+    # The last line end goes: the template has one after the call.
+    environment.globals["asset"] = lambda file: Markup(
+        (TEMPLATES / file).read_text(encoding="utf-8").removesuffix("\n")
+    )
     return environment.get_template(f"{name}.html.j2").render(**values)
-
-
-def _asset(file: str) -> str:
-    """Text of a file without its last line end: the template has one after the call."""
-    return (TEMPLATES / file).read_text(encoding="utf-8").removesuffix("\n")

@@ -172,25 +172,12 @@ def main() -> None:
     try:
         send({"result": getattr(importlib.import_module(module), name)(job, report)})
     except ChronoSceneError as error:
-        send({"error": error_fields(error)})
+        send({"error": error.fields})
     except KeyboardInterrupt:  # the parent has it, too
         sys.exit(130)
 
 
-def error_fields(error: ChronoSceneError) -> dict[str, str]:
-    """The keyword arguments, and the place, of an error: exceptions with these cannot travel."""
-    return {key: getattr(error, key) for key in ("place", "expected", "found", "todo")}
-
-
 # A pool, many items
-
-
-@dataclass(frozen=True, slots=True)
-class _Failure:
-    """An error on its way between processes."""
-
-    kind: type[ChronoSceneError]
-    fields: dict[str, str]
 
 
 def map_parallel(
@@ -231,7 +218,13 @@ def map_parallel(
                 yield from _pooled(function, [item], 1)
             except BrokenProcessPool as error:
                 if lost is None:
-                    raise _died(item) from error
+                    raise ChronoSceneError(
+                        item,
+                        expected="the process to finish",
+                        found="a process that died",
+                        todo="it may have run out of memory: close other programs, or pass fewer "
+                        "at a time",
+                    ) from error
                 yield lost(item)
 
 
@@ -243,29 +236,14 @@ def _pooled(
 
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         try:
-            for outcome in pool.map(partial(_attempt, function), items):
-                if isinstance(outcome, _Failure):
-                    raise outcome.kind(**outcome.fields)
-                yield outcome
+            yield from pool.map(partial(_stoppably, function), items)
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _attempt(function: Callable[[Item], Result], item: Item) -> Result | _Failure:
-    try:
-        with stoppable():  # temporary files go when the process is asked to end
-            return function(item)
-    except ChronoSceneError as error:
-        return _Failure(type(error), error_fields(error))
-
-
-def _died(item: object) -> ChronoSceneError:
-    return ChronoSceneError(
-        item,
-        expected="the process to finish",
-        found="a process that died",
-        todo="it may have run out of memory: close other programs, or pass fewer at a time",
-    )
+def _stoppably(function: Callable[[Item], Result], item: Item) -> Result:
+    with stoppable():  # temporary files go when the process is asked to end
+        return function(item)
 
 
 if __name__ == "__main__":

@@ -203,11 +203,7 @@ def whole_periods(scene: Scene, periods: tuple[int, ...]) -> set[str]:
 
 
 def blocked(scene: Scene, fraction: float, blocks: int | None, seed: int) -> set[str]:
-    """The images of whole blocks of camera positions.
-
-    Raises:
-        ConfigError: If there are more blocks than images.
-    """
+    """The images of whole blocks of camera positions; no ``blocks``: two for testing."""
     centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
     count = blocks or max(2, round(2 / fraction))
     if count > len(centres):
@@ -277,11 +273,7 @@ def choose_blocks(
 
 
 def latest(scene: Scene, fraction: float) -> set[str]:
-    """The last images of each period, as close to the fraction as whole days allow.
-
-    Raises:
-        SceneError: If an image has no date.
-    """
+    """The last images of each period, as close to the fraction as whole days allow."""
     times = capture_times(scene)
     tests = set()
     for period in scene.periods:
@@ -300,11 +292,7 @@ def latest(scene: Scene, fraction: float) -> set[str]:
 
 
 def capture_times(scene: Scene) -> dict[str, datetime]:
-    """When each image was taken, by its EXIF block or else the beginning of its file name.
-
-    Raises:
-        SceneError: If an image has neither.
-    """
+    """When each image was taken, by its EXIF block or else the beginning of its file name."""
     times = {f.name: _capture_time(scene.image_path(f)) for f in scene.frames}
     if lost := [name for name, time in times.items() if time is None]:
         raise SceneError(
@@ -328,11 +316,7 @@ def _capture_time(path: Path) -> datetime | None:
             return datetime.strptime(str(exif.get(tag, "")).strip("\0 "), "%Y:%m:%d %H:%M:%S")
         except ValueError:
             continue
-    return _time_in_name(path.name)
-
-
-def _time_in_name(name: str) -> datetime | None:
-    match = re.match("((?:19|20)[0-9]{2})-?([0-9]{2})-?([0-9]{2})(?![0-9])", name)
+    match = re.match("((?:19|20)[0-9]{2})-?([0-9]{2})-?([0-9]{2})(?![0-9])", path.name)
     try:
         return datetime(*map(int, match.groups())) if match else None  # type: ignore[arg-type]
     except ValueError:

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -54,12 +54,10 @@ def scan(folder: Path) -> tuple[list[str], list[str]]:
     return sorted(folders), sorted(images)
 
 
-def layout(images: Path) -> Literal["folders", "flat", "none"]:
-    """Whether images are in folders, or at least one directly in ``images``."""
+def is_in_folders(images: Path) -> bool:
+    """Whether there are folders of images, and no image beside them."""
     folders, files = scan(images)
-    if files:
-        return "flat"
-    return "folders" if folders else "none"
+    return bool(folders) and not files
 
 
 def read_images(path: Path, images: Path) -> Model:

@@ -24,12 +24,6 @@ from chronoscene.scene import Points
 MAX_HEADER_BYTES = 100_000
 COLOURS = ("red", "green", "blue")
 
-UNKNOWN_COLOUR = 128
-"""Grey for points without a colour, in each channel."""
-
-UNKNOWN_ERROR = -1.0
-"""What COLMAP stores where no reprojection error was computed."""
-
 
 def read_points(path: Path) -> Points:
     """Points of a PLY file, with ids 1, 2, ... and without observations.
@@ -140,7 +134,7 @@ def _to_points(path: Path, vertices: NDArray[np.void]) -> Points:
         xyz = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=-1)
     if not np.isfinite(xyz).all():
         raise _error(path, "finite positions", "NaN or infinity")
-    rgb = np.full((len(xyz), 3), UNKNOWN_COLOUR, np.uint8)
+    rgb = np.full((len(xyz), 3), 128, np.uint8)  # grey for points without a colour
     if set(COLOURS) <= set(vertices.dtype.names or ()):
         colours = [vertices[c] for c in COLOURS]
         if any(c.dtype != np.uint8 for c in colours):
@@ -151,7 +145,7 @@ def _to_points(path: Path, vertices: NDArray[np.void]) -> Points:
         ids=np.arange(1, len(xyz) + 1),
         xyz=xyz,
         rgb=rgb,
-        error=np.full(len(xyz), UNKNOWN_ERROR),
+        error=np.full(len(xyz), -1.0),  # what COLMAP stores where no error was computed
         track_start=np.zeros(len(xyz) + 1, np.int64),
     )
 

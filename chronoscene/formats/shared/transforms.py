@@ -32,7 +32,6 @@ EXTENSIONS = (".png", *(s for s in IMAGE_SUFFIXES if s != ".png"), *map(str.uppe
 _NOT_RIGID = 1e-3
 """Deviation from a rotation beyond which a matrix is refused; below, the nearest is taken."""
 
-
 MODEL_KEYS = {
     name: CAMERA_MODELS[name].distortion
     for name in (
@@ -66,13 +65,13 @@ def read_frames(place: Path, data: Mapping[str, Any]) -> list[dict[str, Any]]:
     return frames
 
 
-def head_has(path: Path, text: str, *, length: int = 65536) -> bool:
+def head_has(path: Path, text: str) -> bool:
     """Whether the first bytes of a file have a text."""
     try:
         if not path.is_file():  # a pipe would never end
             return False
         with path.open("rb") as file:
-            return text.encode() in file.read(length)
+            return text.encode() in file.read(65536)
     except OSError:
         return False
 
@@ -100,16 +99,9 @@ def file_name(place: object, folder: str, file_path: object) -> str:
 
 
 def image_name(place: object, root: Path, folder: str, file_path: object) -> str:
-    """Path of an image below the scene folder; a missing extension is found.
+    """Path of an image below the scene folder; arguments and errors as for `file_name`.
 
-    Args:
-        place: For the message.
-        root: The scene folder.
-        folder: As for `file_name`.
-        file_path: As for `file_name`. ``a.1`` may mean ``a.1.png``.
-
-    Raises:
-        SceneError: As `file_name`.
+    A missing extension is found, so ``a.1`` may mean ``a.1.png``.
     """
     name = file_name(place, folder, file_path)
     suffix = PurePosixPath(name).suffix
