@@ -33,7 +33,7 @@ def track_owners(track_start: Ints) -> Ints:
 
 
 def select_tracks(track_start: Ints, keep: Mask) -> tuple[Ints, Mask]:
-    """Where the tracks of some points [P] begin [kept + 1], and which observations they have [M]."""
+    """Where the tracks of the kept points [P] begin [kept + 1], and their observations. [M]"""
     lengths = np.diff(track_start)
     return np.concatenate([[0], np.cumsum(lengths[keep])]), np.repeat(keep, lengths)
 
