@@ -43,9 +43,8 @@ def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
         axes = figure.add_axes((box[0] / WIDTH, box[1] / height, box[2] / WIDTH, box[3] / height))
         values = [[of(p) for p in c.periods] for c in counts]
         _draw_panel(axes, what, values, colors)
-        axes.set_yticks(
-            range(len(counts)), [canvas.plain(_name(c)) for c in counts] if i == 0 else []
-        )
+        names = [canvas.plain(_name(c)) for c in counts] if i == 0 else []
+        axes.set_yticks(range(len(counts)), names)
         axes.tick_params(axis="y", length=0, labelsize=9)
     _legend(figure, _period_names(counts, periods), colors, 1 - 0.1 / height)
     canvas.save(figure, path)

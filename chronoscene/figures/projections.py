@@ -21,6 +21,10 @@ from chronoscene.figures.cloud import Box, Cloud, shown_box
 from chronoscene.figures.density_map import Window, count_points, dot_radius, grow_dots, shade
 
 Array = NDArray[np.float64]
+Plane = tuple[int, int]
+"""Axes of the world along width and height of a panel."""
+Size = tuple[float, float]
+"""Width and height in inches."""
 
 CELL = 2
 """Pixels along each side of a cell of the density where dots are not larger than a cell: the colour
@@ -103,7 +107,7 @@ def legend_names(labels: Sequence[str]) -> list[str]:
     return [shorten(name, 28, placeholder="...") or name[:28] for name in names]
 
 
-def _dot_radius(cloud: Cloud, box: Box, scale: float, planes: Iterable[tuple[int, int]]) -> int:
+def _dot_radius(cloud: Cloud, box: Box, scale: float, planes: Iterable[Plane]) -> int:
     """Radius of the dots in pixels, by the room for them in the middle one of the panels."""
     shown = cloud.xyz[cloud.period >= 0]
     shown = shown[box.holds(shown)]
@@ -116,13 +120,7 @@ def _dot_radius(cloud: Cloud, box: Box, scale: float, planes: Iterable[tuple[int
 
 
 def _draw_points(
-    axes: Any,
-    cloud: Cloud,
-    box: Box,
-    plane: tuple[int, int],
-    size: tuple[float, float],
-    colors: Sequence[str],
-    dots: int,
+    axes: Any, cloud: Cloud, box: Box, plane: Plane, size: Size, colors: Sequence[str], dots: int
 ) -> Any:
     """The density of the points, as an image. ``dots``: their radius in pixels."""
     canvas.quiet_axes(axes)
@@ -137,9 +135,7 @@ def _draw_points(
     return axes.imshow(image, extent=extent, interpolation="nearest", aspect="auto", zorder=1)
 
 
-def _draw_cameras(
-    axes: Any, cloud: Cloud, box: Box, plane: tuple[int, int], colors: Sequence[str]
-) -> None:
+def _draw_cameras(axes: Any, cloud: Cloud, box: Box, plane: Plane, colors: Sequence[str]) -> None:
     """A dot with a line in the viewing direction for each camera, on white."""
     from matplotlib.collections import LineCollection
 
@@ -157,12 +153,10 @@ def _draw_cameras(
     axes.scatter(*centres.T, s=size, c=own, edgecolors="#333333", linewidths=0.3, zorder=3)
 
 
-def _label_axes(
-    axes: Any, plane: tuple[int, int], names: Sequence[str], size: tuple[float, float]
-) -> None:
+def _label_axes(axes: Any, plane: Plane, names: Sequence[str], size: Size) -> None:
     """Ticks and names on the outer sides; panels that share an axis name it once.
 
-    ``size``: width and height in inches, for which there are as many ticks as fit.
+    There are as many ticks as fit.
     """
     from matplotlib.ticker import FuncFormatter, MaxNLocator
 

@@ -136,14 +136,10 @@ def _register(
     return register
 
 
+# Decorators of the rules of each severity; see `_register`.
 error = partial(_register, "error")
-"""Decorator of a rule of severity error; see `_register`."""
-
 warning = partial(_register, "warning")
-"""Decorator of a rule of severity warning; see `_register`."""
-
 info = partial(_register, "info")
-"""Decorator of a rule of severity info; see `_register`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -130,10 +130,9 @@ def validate_scene(
         decode: Whether to decode all images: slower, finds damaged pixels and copied images.
         track: Shows the progress of slow parts.
     """
-    chosen = all_rules() if rules is None else rules
     with quiet_numbers(), in_our_format(Path(path)) as (root, origin):
         scene = RawScene(root, decode=decode, track=track, origin=origin)
-        report = _validate(scene, chosen)
+        report = _validate(scene, all_rules() if rules is None else rules)
     if origin is None:
         return report
     return replace(report, name=printable(Path(path).resolve().name), path=Path(path))

@@ -120,8 +120,9 @@ def reproject(
         place = xyz.take(seen.point.take(rows), axis=1)
         u, v = uv.take(seen.keypoint.take(rows), axis=1)
         with np.errstate(all="ignore"):  # infinite for absurd poses
-            depth, x, y = project(rotations[image], images.translations[image], camera, *place)
-            error = np.sqrt((x - u) ** 2 + (y - v) ** 2)
+            local = _transform(rotations[image], images.translations[image], *place)
+            x, y = project_points(camera, local.T).T  # NaN behind the camera
+            depth, error = local[2], np.sqrt((x - u) ** 2 + (y - v) ** 2)
         # Points and keypoints that are not finite have their own rules.
         known = np.isfinite(place).all(axis=0) & np.isfinite(u) & np.isfinite(v)
         inside = (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
@@ -131,14 +132,9 @@ def reproject(
         yield Reprojection(image, rows, depth, error, outside)
 
 
-def project(
-    rotation: Array, translation: Array, camera: Camera, x: Array, y: Array, z: Array
-) -> tuple[Array, Array, Array]:
-    """Depth, and pixel position in x and y, of points at ``x, y, z`` in the world. [m] each
-
-    Positions behind the camera are NaN.
-    """
+def _transform(rotation: Array, translation: Array, x: Array, y: Array, z: Array) -> Array:
+    """Points at ``x, y, z`` [m] in the world in the frame of a camera. [3, m]"""
     local = np.empty((3, len(x)))
     for i, (row, shift) in enumerate(zip(rotation.tolist(), translation.tolist(), strict=True)):
         local[i] = row[0] * x + row[1] * y + row[2] * z + shift
-    return local[2], *project_points(camera, local.T).T
+    return local

@@ -31,8 +31,8 @@ MAX_UP = 0.9  # share of the cameras that look up if the model was turned over
 @derived
 def dates_of(scene: RawScene) -> dict[str, datetime]:
     """When the images that have a period were taken."""
-    headers = {n: scene.headers[n] for n in scene.periods or () if n in scene.headers}
-    return {n: h.exif.date for n, h in headers.items() if h.exif.date is not None}
+    dates = {n: scene.headers[n].exif.date for n in scene.periods or () if n in scene.headers}
+    return {name: taken for name, taken in dates.items() if taken is not None}
 
 
 @derived

@@ -6,9 +6,9 @@ import hashlib
 import os
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -95,7 +95,7 @@ class Pixels:
 def read_headers(folder: Path, names: Sequence[str]) -> dict[str, Header]:
     """Headers of some images below a folder, in several threads: a disk may be slow."""
     paths = [folder / name for name in names]
-    with _quiet():
+    with warnings.catch_warnings(action="ignore"):  # on large images and odd metadata
         if len(paths) < _MIN_THREADED:
             return dict(zip(names, map(read_header, paths), strict=True))
         with ThreadPoolExecutor(_HEADER_THREADS) as pool:
@@ -262,7 +262,7 @@ def read_pixels(folder: Path, names: Sequence[str], track: Track) -> dict[str, P
     """
     threads = os.cpu_count() or 2
     found: dict[str, Pixels] = {}
-    with _quiet(), ThreadPoolExecutor(threads) as pool:
+    with warnings.catch_warnings(action="ignore"), ThreadPoolExecutor(threads) as pool:
         # Only a few are submitted at a time, so that an interruption does not wait for all of them.
         waiting: list[tuple[str, Any]] = []
         for name in track(names, "decode images"):
@@ -299,23 +299,12 @@ def _problem(error: Exception) -> str:
 
 
 def _size(path: Path) -> int:
-    try:
+    with suppress(OSError):
         return os.path.getsize(path)
-    except OSError:
-        return -1
+    return -1
 
 
 def _digest(path: Path) -> bytes | None:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").digest()
-    except OSError:
-        return None
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without Pillow's warnings on large images and odd metadata."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+    with suppress(OSError), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
+    return None

@@ -151,10 +151,7 @@ def own_frames(scene: RawScene) -> dict[int, str]:
 
 
 def _limit_of_wrong(scene: RawScene, mine: NDArray[np.int64]) -> float | None:
-    """Error in pixels that most images of a period exceed, or None.
-
-    ``mine``: indices of the images of the period that can be judged.
-    """
+    """Error in pixels that most of some images of a period exceed, or None; ``mine``: indices."""
     if not len(mine):
         return None
     usual = period_limit(scene) if len(period_errors(scene)) > 1 else np.inf
@@ -260,10 +257,7 @@ class Rays:
 def explain(scene: RawScene, period: int, limit: float) -> str | None:
     """Description of what transforms a period that disagrees with the others into their frame.
 
-    Args:
-        scene: The scene, with its model.
-        period: Index of the period.
-        limit: Largest reprojection error in pixels that a right explanation leaves.
+    A right explanation leaves a reprojection error of up to ``limit`` pixels.
     """
     rays = Rays(scene, period)
     if len(rays.point) < MIN_POINTS:

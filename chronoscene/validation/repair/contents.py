@@ -33,6 +33,12 @@ class Repair(NamedTuple):
     text: str
 
 
+def _note(repairs: list[Repair], code: str, number: int, noun: str, what: str) -> None:
+    """Add what was done to a number of things, if there were any."""
+    if number:
+        repairs.append(Repair(code, f"{counted(number, noun)} {what}"))
+
+
 def repair_model(images: RawImages, points: RawPoints) -> tuple[RawImages, RawPoints, list[Repair]]:
     """A corrected model, and what was done."""
     repairs: list[Repair] = []
@@ -40,14 +46,13 @@ def repair_model(images: RawImages, points: RawPoints) -> tuple[RawImages, RawPo
     images = _unit_quaternions(images, repairs)
     points = _without_broken_observations(images, points, repairs)
     keep = np.asarray(np.isfinite(points.xyz).all(axis=1))
-    if not keep.all():
-        gone = counted(int(np.count_nonzero(~keep)), "point")
-        repairs.append(Repair("CS502", f"{gone} without finite coordinates removed"))
+    if gone := int(np.count_nonzero(~keep)):
+        _note(repairs, "CS502", gone, "point", "without finite coordinates removed")
         points = points.select(keep)
     long = np.diff(points.track_start) >= 2
     if not long.all() and np.count_nonzero(long) >= MIN_KEPT * len(points):
-        gone = counted(int(np.count_nonzero(~long)), "point")
-        repairs.append(Repair("CS503", f"{gone} with fewer than two observations removed"))
+        gone = int(np.count_nonzero(~long))
+        _note(repairs, "CS503", gone, "point", "with fewer than two observations removed")
         points = points.select(long)
     return _without_points(images, before, points), points, repairs
 
@@ -75,8 +80,7 @@ def _without_broken_observations(
         ("CS504", ~exists, "of images or keypoints that do not exist"),
         ("CS510", exists & ~sound, "at positions that are not finite"),
     ):
-        if number := int(np.count_nonzero(bad)):
-            repairs.append(Repair(code, f"{counted(number, 'observation')} {what} removed"))
+        _note(repairs, code, int(np.count_nonzero(bad)), "observation", f"{what} removed")
     if sound.all():
         return points
     lengths = np.bincount(seen.point[sound], minlength=len(points))
@@ -126,15 +130,11 @@ def repair_split(
     lines, unknown, twice, misspelt = _split_lines(text, names, entries, new_ids, others)
     index = NameIndex(names)
     known = set(names)
-    if short := sum(len(index.find(e.name)) == 1 and e.name not in known for e in entries):
-        repairs.append(Repair("", f"{counted(short, 'name')} written in full"))
-    if misspelt:
-        repairs.append(Repair("CS305", f"{counted(misspelt, 'name')} corrected as in the model"))
-    if unknown:
-        gone = counted(unknown, "line")
-        repairs.append(Repair("CS309", f"{gone} on images that are not in the model removed"))
-    if twice:
-        repairs.append(Repair("CS308", f"{counted(twice, 'repeated line')} removed"))
+    short = sum(len(index.find(e.name)) == 1 and e.name not in known for e in entries)
+    _note(repairs, "", short, "name", "written in full")
+    _note(repairs, "CS305", misspelt, "name", "corrected as in the model")
+    _note(repairs, "CS309", unknown, "line", "on images that are not in the model removed")
+    _note(repairs, "CS308", twice, "repeated line", "removed")
     return "".join(f"{line}\n" for line in lines if line), new_ids, repairs
 
 
@@ -230,14 +230,10 @@ def repair_test(
             unknown += 1
     if not lines:
         return [entry.name for entry in entries], []
-    repairs = []
-    if renamed:
-        repairs.append(Repair("CS324", f"{counted(renamed, 'name')} corrected as in the model"))
-    if unknown:
-        gone = counted(unknown, "line")
-        repairs.append(Repair("CS324", f"{gone} on images that are not in the model removed"))
-    if twice := len(entries) - unknown - len(lines):
-        repairs.append(Repair("CS326", f"{counted(twice, 'repeated line')} removed"))
+    repairs: list[Repair] = []
+    _note(repairs, "CS324", renamed, "name", "corrected as in the model")
+    _note(repairs, "CS324", unknown, "line", "on images that are not in the model removed")
+    _note(repairs, "CS326", len(entries) - unknown - len(lines), "repeated line", "removed")
     return list(lines), repairs
 
 

@@ -19,13 +19,8 @@ from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
 from chronoscene.validation.checks import grouped
 from chronoscene.validation.checks.names import spelling
-from chronoscene.validation.repair.contents import (
-    Repair,
-    plain_table,
-    repair_model,
-    repair_split,
-    repair_test,
-)
+from chronoscene.validation.repair import contents
+from chronoscene.validation.repair.contents import Repair
 from chronoscene.validation.rules.cs2_image_files import images_of_other_shape
 from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE, TEST_ELSEWHERE
 from chronoscene.validation.run import other_format, quiet_numbers
@@ -47,12 +42,6 @@ def fix_scene(root: Path, out: Path) -> list[Repair]:
         SceneError: If ``out`` is in use or cannot be written.
     """
     check_outside(out, [root], option="--fix")
-    _check_format(root)
-    with staged_folder(out) as staged, quiet_numbers():
-        return _Fix(RawScene(root), staged).run()
-
-
-def _check_format(root: Path) -> None:
     name = other_format(root)
     if name is not None:
         raise ConfigError(
@@ -61,6 +50,8 @@ def _check_format(root: Path) -> None:
             found=f"one in {name}",
             todo="convert it with chronoscene convert, then correct the result",
         )
+    with staged_folder(out) as staged, quiet_numbers():
+        return _Fix(RawScene(root), staged).run()
 
 
 class _Fix:
@@ -86,13 +77,11 @@ class _Fix:
     def _model(self) -> None:
         """Write the model into ``sparse/0/`` if anything in it is corrected."""
         model, place = self._scene.model, self._scene.model_place
-        if model is None or place is None:
+        if model is None or place is None or model.damages:
             return
-        complete = model.cameras is not None and model.images is not None
-        if not complete or model.points is None or model.damages:
+        if model.cameras is None or model.images is None or model.points is None:
             return
-        assert model.cameras is not None and model.images is not None
-        images, points, repairs = repair_model(model.images, model.points)
+        images, points, repairs = contents.repair_model(model.images, model.points)
         repairs += _form_repairs(model, place)
         if not repairs:
             return
@@ -125,11 +114,11 @@ class _Fix:
         text = self._find_text(SPLIT, SPLIT_ELSEWHERE, "CS301")
         if text is None or names is None:
             return
-        plain, repairs = plain_table(text.text, names)
+        plain, repairs = contents.plain_table(text.text, names)
         entries, _ = parse_split_text(plain)
         assert self._scene.images is not None
         others = sorted(set(self._scene.images.names) - set(names))
-        better, new_ids, more = repair_split(text.data, plain, names, entries, others)
+        better, new_ids, more = contents.repair_split(text.data, plain, names, entries, others)
         repairs += more
         if not self._write(SPLIT, better):
             return
@@ -153,7 +142,7 @@ class _Fix:
         text = self._find_text(TEST, TEST_ELSEWHERE, "CS322")
         if text is None or names is None:
             return
-        lines, repairs = repair_test(names, parse_test_text(text.text))
+        lines, repairs = contents.repair_test(names, parse_test_text(text.text))
         if self._write(TEST, "".join(f"{line}\n" for line in lines)):
             self._repairs += repairs
 
@@ -192,13 +181,12 @@ class _Fix:
         for name in sorted(turned - images_of_other_shape(self._scene)) if turned else ():
             source = self._scene.image_path(name)
             upright = set_upright(source.read_bytes()) if self._inside(name) else None
-            if upright is None:
-                continue
-            target = self._out / "images" / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(upright)
-            self._written.add(f"images/{name}")
-            done.append(name)
+            if upright is not None:
+                target = self._out / "images" / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(upright)
+                self._written.add(f"images/{name}")
+                done.append(name)
         if done:
             what = f"orientation tag of {counted(len(done), 'image')} set to upright: {shown(done)}"
             self._repairs.append(Repair("CS207", what))

@@ -53,11 +53,8 @@ def model_misplaced(scene: RawScene) -> Iterator[Hit]:
 def several_models(scene: RawScene) -> Iterator[Hit]:
     """COLMAP built several models that it could not merge; only `sparse/0/` is read."""
     place = scene.model_place
-    others = [
-        f"sparse/{folder.name}"
-        for folder in numbered_models(scene.root)
-        if f"sparse/{folder.name}" not in (place, our_format.MODEL)
-    ]
+    numbered = (f"sparse/{folder.name}" for folder in numbered_models(scene.root))
+    others = [name for name in numbered if name not in (place, our_format.MODEL)]
     if others:
         yield Hit("sparse", f"a single model, {place}", f"also {shown(others)}", count=len(others))
 

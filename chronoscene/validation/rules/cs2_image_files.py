@@ -44,16 +44,11 @@ def image_missing(scene: RawScene, names: list[str]) -> Iterator[Hit]:
     for name in names:
         if name not in present:
             near = others.find(name)
-            found = _instead(scene, name) + (f"; there is {quote(near)}" if near else "")
+            path = scene.image_path(name)
+            folder, link = os.path.isdir(path), os.path.islink(path)
+            found = "a folder" if folder else "a broken link" if link else "nothing"
+            found += f"; there is {quote(near)}" if near else ""
             yield Hit(f"images/{name}", "an image", found)
-
-
-def _instead(scene: RawScene, name: str) -> str:
-    """What is in the place of an image file."""
-    path = scene.image_path(name)
-    if os.path.isdir(path):
-        return "a folder"
-    return "a broken link" if os.path.islink(path) else "nothing"
 
 
 def _unregistered(scene: RawScene) -> list[str]:

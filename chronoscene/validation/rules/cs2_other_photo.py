@@ -116,9 +116,9 @@ def _what_fits(sight: Sight, name: str, suspects: Greys) -> tuple[str, tuple[str
             return f"; it fits {words}", ()
     others = {n: sight.correlation(grey) for n, grey in suspects.items() if n != name}
     best = max(others, key=lambda n: others[n], default=None)
-    if best is None or not others[best] >= USUAL:
-        return "", ()
-    return f"; {quote(best)} fits", (best,)
+    if best is not None and others[best] >= USUAL:
+        return f"; {quote(best)} fits", (best,)
+    return "", ()
 
 
 class Sight(NamedTuple):

@@ -261,13 +261,7 @@ def test_duplicate(scene: RawScene, test: list[NameEntry]) -> Iterator[Hit]:
 
 
 def _meant(scene: RawScene, problems: Iterable[Problem], lines: dict[int, str]) -> dict[int, str]:
-    """By line, the image that an unknown name probably means.
-
-    Args:
-        scene: The scene.
-        problems: Problems of one file.
-        lines: The names in this file, by line.
-    """
+    """By line, the image that an unknown name in ``lines`` of a file probably means."""
     unknown = [p.line for p in problems if p.kind == "unknown" and p.line]
     if not unknown:
         return {}

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import WORLD, read_world
-from chronoscene.scene.geometry import pose_from_rotation_translation, rotation_from_quaternion
 from chronoscene.scene.tracks import common_view
 from chronoscene.validation import rule
 from chronoscene.validation.checks.photo_metadata import fit_gps
 from chronoscene.validation.checks.reprojection import depth_percentiles, own_frames
 from chronoscene.validation.rule import NOTHING, Hit
+from chronoscene.validation.rules.cs1_cameras import pose_matrices
 from chronoscene.validation.scene_folder import RawScene, derived
 
 Table = NDArray[np.bool_]
@@ -48,9 +48,8 @@ def period_without_points(scene: RawScene, point_periods: Table) -> Iterator[Hit
         return  # no tracks at all, or no points: CS501, CS514
     for column, period in enumerate(scene.period_ids):
         if not point_periods[:, column].any():
-            yield Hit(
-                f"period {period}", "points that its images see", f"0 of {len(point_periods)}"
-            )
+            found = f"0 of {len(point_periods)}"
+            yield Hit(f"period {period}", "points that its images see", found)
 
 
 @rule.info("CS507", bad="(for information only)", remedy=NOTHING)
@@ -210,19 +209,13 @@ def _views(scene: RawScene) -> NDArray[np.float64]:
     owners = [_sample(finite & seen[:, i], MAX_POINTS // count) for i in range(count)]
     xyz = points.xyz[np.concatenate([np.zeros(0, np.int64), *owners])]
     owner = np.repeat(np.arange(count), list(map(len, owners)))
-    known = np.isin(images.camera_ids, list(scene.usable_cameras))
-    known &= scene.is_posed
-    rotations = rotation_from_quaternion(images.quaternions)
-    views = [
-        [
-            (
-                scene.usable_cameras[int(images.camera_ids[i])],
-                pose_from_rotation_translation(rotations[i], images.translations[i]),
-            )
-            for i in _sample(known & (scene.image_periods == period), MAX_IMAGES // count).tolist()
-        ]
-        for period in range(count)
-    ]
+    known = np.isin(images.camera_ids, list(scene.usable_cameras)) & scene.is_posed
+    poses = pose_matrices(np.column_stack([images.quaternions, images.translations]))
+    views = []
+    for period in range(count):
+        mine = _sample(known & (scene.image_periods == period), MAX_IMAGES // count)
+        cameras = [scene.usable_cameras[i] for i in images.camera_ids[mine].tolist()]
+        views.append(list(zip(cameras, poses[mine], strict=True)))
     return common_view(xyz, owner, views, reach).T
 
 

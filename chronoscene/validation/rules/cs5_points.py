@@ -181,8 +181,9 @@ def no_training_points(
 def duplicate_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
     finite = np.isfinite(points.xyz).all(axis=1)
     xyz = _cells(points.xyz[finite])
-    if _repeated(_hash(xyz)) <= MAX_DUPLICATES * len(xyz):
-        return  # sorting one number per point is much faster than sorting points
+    ordered = np.sort(_hash(xyz))  # much faster than sorting points
+    if np.count_nonzero(ordered[1:] == ordered[:-1]) <= MAX_DUPLICATES * len(xyz):
+        return
     twice = len(xyz) - len(np.unique(xyz, axis=0))
     if twice > MAX_DUPLICATES * len(xyz):
         found = f"{twice} of {len(xyz)} that coincide with another one"
@@ -206,12 +207,6 @@ def _hash(xyz: NDArray[np.float64]) -> NDArray[np.uint64]:
         mixed = (mixed ^ bits ^ (bits >> np.uint64(32))) * np.uint64(0x9E3779B97F4A7C15)
         mixed ^= mixed >> np.uint64(29)
     return mixed
-
-
-def _repeated(values: NDArray[np.uint64]) -> int:
-    """How many values equal an earlier one."""
-    ordered = np.sort(values)
-    return int(np.count_nonzero(ordered[1:] == ordered[:-1]))
 
 
 @rule.warning(

@@ -100,10 +100,8 @@ def near_leak(
     `--decode`)."""
     role = {n: (period, n in tests) for n, period in periods.items()}
     pixels = {n: p for n, p in pixels.items() if n in role}
-    near = {
-        (a, b): f"{difference:.2g} grey levels from that"
-        for a, b, difference in near_pairs(pixels, role)
-    }
+    differences = near_pairs(pixels, role)
+    near = {(a, b): f"{number:.2g} grey levels from that" for a, b, number in differences}
     for a, b, alike in relit_pairs(pixels, role):
         if pixels[a].digest != pixels[b].digest:
             near.setdefault((a, b), f"that, up to brightness, agrees to {alike:.2%} with that")
@@ -219,12 +217,8 @@ def twins(
 ) -> Iterator[tuple[int, int]]:
     """Pairs of a test image and a training image of its period with the same pose.
 
-    Args:
-        places: Camera centres. [N, 3]
-        rotations: [N, 3, 3]
-        periods: Negative for none. [N]
-        test: Whether an image is a test image. [N]
-        near: Largest distance of two centres in one place.
+    ``places`` [N, 3] are camera centres, in one place up to a distance of ``near``; ``rotations``
+    are [N, 3, 3]; ``periods`` [N] are negative for none; ``test`` [N] is true for test images.
     """
     order = np.argsort(places[:, 0], kind="stable")
     x = places[order, 0]

@@ -55,7 +55,10 @@ def official_split_line(scene: RawScene, split_text: TextFile) -> Iterator[Hit]:
         return
     wrong = {p.line for p in scene.split_problems if p.kind in ("fields", "period")}
     flat = not any("/" in name for name in scene.names)
-    for number, line in enumerate(_lines(split_text.text), start=1):
+    lines = re.split("\r\n|\r|\n", split_text.text)
+    if lines[-1] == "":  # Python's iteration over a file ends before it
+        lines.pop()
+    for number, line in enumerate(lines, start=1):
         problem = official_failure(line)
         if problem is None and flat and "/" in line:  # otherwise CS703 reports it
             problem = "a name with folders"
@@ -187,9 +190,3 @@ def _is_small(xyz: NDArray[np.float64]) -> bool:
 def _cut(name: str) -> str:
     """The name by which the official loader identifies an image."""
     return PurePosixPath(name).name.split(".")[0]
-
-
-def _lines(text: str) -> list[str]:
-    """Lines as Python iterates over a file: no empty one after the last line break."""
-    lines = re.split("\r\n|\r|\n", text)
-    return lines[:-1] if lines[-1] == "" else lines
