@@ -14,17 +14,17 @@ __all__ = ["PRESETS", "SynthSettings", "generate", "preset"]
 
 
 def generate(out: Path | str, settings: SynthSettings, progress: Any = None) -> None:
-    """Make a scene folder with images, COLMAP model, split and ground truth.
+    """Generate a scene folder with images, COLMAP model, split and ground truth.
 
-    Equal settings give equal bytes, whatever the number of threads.
+    The same settings give the same bytes, whatever the number of threads.
 
     Args:
-        out: Folder to create; it must not exist, or be empty.
-        settings: What to make; see `preset`.
-        progress: Callable ``(done, total, what)`` that is told about finished units of work.
+        out: Folder to create; must not exist or must be empty.
+        settings: What to generate; see `preset`.
+        progress: Called as ``progress(done, total, what)`` after each unit of work.
 
     Raises:
-        ChronoSceneError: If ``out`` holds files already.
+        ChronoSceneError: If ``out`` already contains files.
     """
     from chronoscene.synth.generation import run
 

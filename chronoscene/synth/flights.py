@@ -1,4 +1,4 @@
-"""Where the cameras are: one independent flight or walk per period."""
+"""Camera poses: one independent flight or walk per period."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 UNEQUAL = (1.09, 0.91, 1.0, 1.15, 0.85)
 """Views per period relative to the mean, repeated over the periods."""
 TEST_SHARE = 0.15
-"""Share of held-out views."""
+"""Share of test frames."""
 SPLITS: tuple[Split, Split] = ("train", "test")
 MAX_TRIES = 60
 
@@ -32,7 +32,7 @@ def make_camera(settings: SynthSettings) -> Camera:
     focal = (0.82 if settings.kind == "aerial" else 0.68) * w
     if not settings.off_centre:
         return Camera(1, "PINHOLE", w, h, (focal, focal, w / 2, h / 2))
-    # Rounded to quarters of a pixel: exact in binary, and plainly no image centre.
+    # Rounded to quarters of a pixel: exact in binary, and clearly not the image centre.
     cx, cy = round(4 * 0.56 * w) / 4, round(4 * 0.46 * h) / 4
     return Camera(1, "PINHOLE", w, h, (focal, 1.008 * focal, cx, cy))
 
@@ -47,9 +47,9 @@ def plan_frames(
     for period in range(settings.periods):
         count = max(4, round(settings.views * UNEQUAL[period % len(UNEQUAL)]))
         rng = rng_for(settings.seed, "flight", settings.kind, period)
-        wishes = route(world, count, rng)
+        planned = route(world, count, rng)
         tests = _held_out(count, rng)
-        for i, (eye, target) in enumerate(wishes):
+        for i, (eye, target) in enumerate(planned):
             pose = _free_pose(eye, target, settings.kind, renderers, camera, rng)
             name, split = f"p{period}_{i:04d}.jpg", SPLITS[i in tests]
             frames.append(Frame(name, len(frames) + 1, camera, pose, period, split))
@@ -57,7 +57,7 @@ def plan_frames(
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
-    """Pose of a camera at ``eye`` that looks at ``target`` with z up. [4, 4]"""
+    """cam_from_world of a camera at ``eye`` that looks at ``target`` with z up. [4, 4]"""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -68,7 +68,7 @@ def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
 
 
 def _held_out(count: int, rng: np.random.Generator) -> set[int]:
-    """One random view in each of equal parts of a flight."""
+    """Indices of the test frames: one at random in each of several equal parts of a flight."""
     number = max(1, round(TEST_SHARE * count))
     cuts = np.linspace(0, count, number + 1)
     return {int(rng.integers(np.ceil(a), np.ceil(b))) for a, b in pairwise(cuts)}
@@ -80,18 +80,18 @@ def _flight(world: World, count: int, rng: np.random.Generator) -> list[tuple[Ar
     shares = [round(0.42 * count), round(0.24 * count)]
     high = rng.uniform(0.66, 0.84) * half
     low = rng.uniform(0.46, 0.58) * half
-    wishes = _orbit(world, shares[0], rng, rng.uniform(0.85, 1.02) * half, high)
-    wishes += _orbit(world, shares[1], rng, rng.uniform(0.5, 0.66) * half, low)
-    return wishes + _grid(world, count - sum(shares), rng, rng.uniform(0.6, 0.75) * half)
+    planned = _orbit(world, shares[0], rng, rng.uniform(0.85, 1.02) * half, high)
+    planned += _orbit(world, shares[1], rng, rng.uniform(0.5, 0.66) * half, low)
+    return planned + _grid(world, count - sum(shares), rng, rng.uniform(0.6, 0.75) * half)
 
 
 def _orbit(
     world: World, count: int, rng: np.random.Generator, radius: float, height: float
 ) -> list[tuple[Array, Array]]:
-    """A closed round; cameras look past the middle, so that the whole core is covered."""
+    """A closed orbit; cameras aim beside the centre, so that the whole core is covered."""
     middle = world.core.mean(axis=0) + rng.normal(0, 0.06 * radius, 2)
     start, way = rng.uniform(0, 2 * np.pi), rng.choice([-1, 1])
-    wishes = []
+    planned = []
     for i in range(count):
         turn = start + way * 2 * np.pi * (i + rng.uniform(-0.2, 0.2)) / count
         out = np.array([np.cos(turn), np.sin(turn)])
@@ -99,20 +99,20 @@ def _orbit(
         eye = np.array([*(middle + r * out), max(9.0, height * rng.uniform(0.9, 1.1))])
         side = np.array([-out[1], out[0]])
         aim = middle + radius * (rng.uniform(-0.25, 0.2) * out + rng.uniform(-0.25, 0.25) * side)
-        wishes.append((eye, np.array([*aim, 2.0])))
-    return wishes
+        planned.append((eye, np.array([*aim, 2.0])))
+    return planned
 
 
 def _grid(
     world: World, count: int, rng: np.random.Generator, height: float
 ) -> list[tuple[Array, Array]]:
-    """Parallel lines over the core, looking obliquely forward and aside."""
+    """Parallel lines over the core with oblique views forward and to the sides."""
     rows = max(2, round(np.sqrt(count)))
     columns = int(np.ceil(count / rows))
     low, high = world.core
     turn = rng.uniform(0, np.pi)
     axis = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    wishes = []
+    planned = []
     for k in range(count):
         row, column = divmod(k, columns)
         if row % 2:
@@ -121,18 +121,18 @@ def _grid(
         f = 0.92 * (axis @ f) + rng.normal(0, 0.02, 2)
         place = (low + high) / 2 + f * (high - low)
         heading = turn + (np.pi if row % 2 else 0) + rng.uniform(-0.5, 0.5)
-        # Away from the edge: what lies outside of the core is seen by few.
+        # Look away from the edge: few views see what lies outside the core.
         toward = -f * 1.1 + 0.25 * np.array([np.cos(heading), np.sin(heading)])
         toward = toward / max(float(np.linalg.norm(toward)), 1e-6)
         z = height * rng.uniform(0.92, 1.08)
         ahead = z * rng.uniform(0.45, 0.95)
         eye = np.array([*place, max(9.0, z)])
-        wishes.append((eye, np.array([*(place + ahead * toward), 1.0])))
-    return wishes
+        planned.append((eye, np.array([*(place + ahead * toward), 1.0])))
+    return planned
 
 
 def _walk(world: World, count: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
-    """Along the roads nearest to the middle of the core, looking ahead and to both sides."""
+    """Along the roads nearest to the centre of the core, looking ahead and to both sides."""
     middle = world.core.mean(axis=0)
     roads = sorted(
         world.roads, key=lambda r: round(float(np.linalg.norm((r[0] + r[1]) / 2 - middle)), 3)
@@ -143,7 +143,7 @@ def _walk(world: World, count: int, rng: np.random.Generator) -> list[tuple[Arra
     ends = np.cumsum(lengths)
     order = rng.permutation(len(roads))
     yaws = np.array([0.0, 0.75, -0.75, 0.35, 1.25, -0.35, -1.25])
-    wishes = []
+    planned = []
     for i, s in enumerate(at):
         k = int(np.searchsorted(ends, s, side="right").clip(0, len(roads) - 1))
         a, b = roads[order[k]] if k % 2 else roads[order[k]][::-1]
@@ -154,8 +154,8 @@ def _walk(world: World, count: int, rng: np.random.Generator) -> list[tuple[Arra
         yaw = yaws[i % len(yaws)] + rng.normal(0, 0.12)
         toward = np.cos(yaw) * way + np.sin(yaw) * side
         eye = np.array([*place, rng.uniform(1.6, 2.6)])
-        wishes.append((eye, np.array([*(place + 10 * toward), eye[2] + rng.uniform(-0.3, 2.2)])))
-    return wishes
+        planned.append((eye, np.array([*(place + 10 * toward), eye[2] + rng.uniform(-0.3, 2.2)])))
+    return planned
 
 
 def _free_pose(
@@ -166,9 +166,9 @@ def _free_pose(
     camera: Camera,
     rng: np.random.Generator,
 ) -> Array:
-    """The wished pose, moved until no period has anything near it.
+    """The planned pose, moved until it is clear of obstacles in all periods.
 
-    All periods count, since test cameras are rendered at every one of them.
+    All periods count because test views are rendered at every one of them.
     """
     apart = 6.0 if kind == "aerial" else 2.0
     for attempt in range(MAX_TRIES):
@@ -188,7 +188,7 @@ def _free_pose(
             return pose
     raise ConfigError(
         "--seed",
-        expected="a city with room for the cameras",
-        found=f"no free place near {np.round(eye, 1).tolist()} after {MAX_TRIES} attempts",
+        expected="a city with free space for the cameras",
+        found=f"no free position near {np.round(eye, 1).tolist()} after {MAX_TRIES} attempts",
         todo="choose another seed",
     )

@@ -28,10 +28,10 @@ FIRST_YEAR = 2016
 
 
 def run(out: Path, settings: SynthSettings, progress: Progress | None = None) -> None:
-    """Make a scene; see `chronoscene.synth.generate`. The folder appears complete or not at all."""
+    """Generate a scene; see `chronoscene.synth.generate`. Either all of it appears or nothing."""
     load_open3d()
     with warnings.catch_warnings(), staged_folder(out) as staged:
-        # open3d loads a TBB that Numba finds too old; Numba then takes another layer, and says so.
+        # open3d loads a TBB that is too old for Numba, which warns and uses another layer.
         warnings.filterwarnings("ignore", message="The TBB threading layer")
         raw = staged.parent / "raw"
         scene = _make(raw, settings, progress or (lambda done, total, what: None), out.name)
@@ -91,7 +91,7 @@ def make_renderers(settings: SynthSettings, world: World) -> list[PeriodRenderer
 
 
 def make_periods(world: World) -> tuple[Period, ...]:
-    """Labels and dates: at least half a year apart, in the season of the light."""
+    """Labels and dates, about half a year or more apart, in the season of each light."""
     periods = []
     last = date(FIRST_YEAR, 1, 1)
     for i, light in enumerate(world.lights):

@@ -12,7 +12,7 @@ KINDS = ("aerial", "street")
 
 
 def _within(low: float, high: float, default: float) -> Any:
-    """Field that must lie in a range."""
+    """A field whose value must lie in a range."""
     return field(default=default, metadata={"range": (low, high)})
 
 
@@ -21,7 +21,7 @@ class SynthSettings:
     """All inputs of a synthetic scene. Lengths are metres."""
 
     preset: str = "custom"
-    """Name of the preset that this came from; informative."""
+    """Name of the preset these settings came from; informative."""
     kind: str = "aerial"
     """``aerial``: oblique orbits and grids. ``street``: walks along the roads."""
     periods: int = _within(1, 50, 3)
@@ -35,20 +35,20 @@ class SynthSettings:
     points: int = _within(0, 5_000_000, 11_000)
     """Sparse points to aim for."""
     seed: int = _within(0, 2**31 - 1, 0)
-    """Another seed is another place."""
+    """Each seed gives another city."""
     off_centre: bool = False
     """Whether the principal point lies away from the image centre (and fx differs from fy)."""
     blocks: int = _within(2, 9, 3)
     """Blocks of the city core per axis."""
     block_size: float = _within(15.0, 120.0, 40.0)
-    """Mean edge of a block."""
+    """Mean edge length of a block."""
     supersample: int = _within(1, 8, 2)
-    """Rays per pixel and axis."""
+    """Samples per pixel along each axis."""
     rebuilt: float = _within(0.0, 1.0, 0.0)
-    """Share of the blocks that are torn down and rebuilt as something else at one date, beside the
-    changes that every scene has. With 1 little more than the streets stays."""
+    """Share of blocks that are torn down and rebuilt with another role at one period, in addition
+    to the changes of every scene. At 1, little more than the streets remains."""
     probe_spacing: float = _within(0.5, 50.0, 3.0)
-    """Grid step of the samples of indirect light."""
+    """Distance between the probes of indirect light."""
     noise: float = _within(0.0, 100.0, 0.0)
     """Standard deviation of the noise on observed point positions, in pixels."""
 
@@ -91,7 +91,7 @@ PRESETS: dict[str, SynthSettings] = {
         block_size=46.0,
     ),
 }
-"""Sizes for tests, for a demonstration on a laptop and for a real benchmark."""
+"""Settings for tests, for a demonstration on a laptop and for a real benchmark."""
 
 
 def preset(name: str, **changes: Any) -> SynthSettings:

@@ -1,6 +1,6 @@
-"""Sparse points with honest tracks: surface points, and the training views that see them.
+"""Sparse points: points on surfaces, with tracks over the training frames that see them.
 
-Tests re-cast every observation: a track never claims more than the ray caster confirms.
+Every observation is confirmed by the ray caster.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from chronoscene.synth.settings import SynthSettings
 
 Array = NDArray[np.float64]
 
-MIN_TRACK = 3
-MAX_TRACK = 14
-SPARE = 1.7
-"""Candidates per wanted point; many are seen by too few views."""
-SAME_ALBEDO = 0.003
-"""Largest difference of albedo between periods that share a point."""
+MIN_TRACK_LENGTH = 3
+MAX_TRACK_LENGTH = 14
+CANDIDATES_PER_POINT = 1.7
+"""Candidates per requested point; many are seen by too few frames."""
+MAX_ALBEDO_CHANGE = 0.003
+"""Maximum albedo difference between periods that share a point."""
 MAX_DEPTH = 450.0
-"""Metres; farther points have no use."""
+"""Metres; more distant points are not useful."""
 
 
 class Candidates(NamedTuple):
-    """Surface points and what they lie on (N points)."""
+    """Surface points and the objects they lie on (N points)."""
 
     xyz: Array
     """[N, 3]"""
@@ -51,7 +51,7 @@ def make_points(
 
     Args:
         settings: Number of points, seed, noise.
-        scene: Frames with their images, whose colours the points get; only training frames count.
+        scene: Frames and their images; only training frames contribute points and colours.
         renderers: One per period.
     """
     if settings.points == 0:
@@ -60,17 +60,17 @@ def make_points(
     train = [i for i, f in enumerate(scene.frames) if f.split == "train"]
     frames = [scene.frames[i] for i in train]
     images = [load_rgb(scene.image_path(f)) for f in frames]
-    count = int(np.ceil(SPARE * settings.points / len(frames)))
+    count = int(np.ceil(CANDIDATES_PER_POINT * settings.points / len(frames)))
     found = [
         _candidates(renderers[frame.period], frame, image, count, rng)
         for frame, image in zip(frames, images, strict=True)
     ]
-    some = Candidates(*map(np.concatenate, zip(*found, strict=True)))
-    seen, xy = _visibility(some, frames, renderers)
-    keep = np.flatnonzero(seen.sum(axis=1) >= MIN_TRACK)
+    candidates = Candidates(*map(np.concatenate, zip(*found, strict=True)))
+    seen, xy = _visibility(candidates, frames, renderers)
+    keep = np.flatnonzero(seen.sum(axis=1) >= MIN_TRACK_LENGTH)
     if len(keep) > settings.points:
         keep = np.sort(rng.choice(keep, settings.points, replace=False))
-    points = _assemble(some.xyz[keep], seen[keep], xy[keep], images, settings.noise, rng)
+    points = _assemble(candidates.xyz[keep], seen[keep], xy[keep], images, settings.noise, rng)
     return replace(points, track_frame=np.array(train, np.int32)[points.track_frame])
 
 
@@ -81,7 +81,7 @@ def _candidates(
     count: int,
     rng: np.random.Generator,
 ) -> Candidates:
-    """Random surface points in a frame, mostly where the image has texture."""
+    """Random surface points in a frame, preferably where the image has texture."""
     gray = image.astype(np.float64).mean(axis=2)
     slope = np.hypot(*np.gradient(gray))
     weight = (3.0 + np.minimum(slope, 40.0)).ravel()
@@ -107,15 +107,15 @@ def _rays(origin: NDArray[np.floating], directions: NDArray[np.floating]) -> NDA
 
 
 def _visibility(
-    some: Candidates, frames: Sequence[Frame], renderers: Sequence[PeriodRenderer]
+    candidates: Candidates, frames: Sequence[Frame], renderers: Sequence[PeriodRenderer]
 ) -> tuple[NDArray[np.bool_], Array]:
     """Which frames see which points, and where. [N, F], [N, F, 2]"""
-    seen = np.zeros((len(some.xyz), len(frames)), bool)
-    xy = np.zeros((len(some.xyz), len(frames), 2))
-    same = _unchanged(some, renderers)
+    seen = np.zeros((len(candidates.xyz), len(frames)), bool)
+    xy = np.zeros((len(candidates.xyz), len(frames), 2))
+    same = _unchanged(candidates, renderers)
     for column, frame in enumerate(frames):
         camera, k = frame.camera, frame.camera.K
-        local = some.xyz @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
+        local = candidates.xyz @ frame.cam_from_world[:3, :3].T + frame.cam_from_world[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             at = local[:, :2] / local[:, 2:] * [k[0, 0], k[1, 1]] + k[:2, 2]
         inside = (local[:, 2] > 0.1) & np.all((at >= 0) & (at < [camera.width, camera.height]), 1)
@@ -124,21 +124,21 @@ def _visibility(
         # A point is seen if the ray to it ends there, on the same object.
         renderer, depth = renderers[frame.period], local[rows, 2]
         centre = np.linalg.inv(frame.cam_from_world)[:3, 3]
-        hits = renderer.cast(_rays(centre, (some.xyz[rows] - centre) / depth[:, None]))
+        hits = renderer.cast(_rays(centre, (candidates.xyz[rows] - centre) / depth[:, None]))
         close = np.abs(hits.t - depth) < 1e-4 * depth + 1e-3
-        seen[rows, column] = close & (renderer.elements_of(hits.tri) == some.element[rows])
+        seen[rows, column] = close & (renderer.elements_of(hits.tri) == candidates.element[rows])
     return seen, xy
 
 
-def _unchanged(some: Candidates, renderers: Sequence[PeriodRenderer]) -> NDArray[np.bool_]:
-    """Whether a point's piece of surface looks the same in each period, but for light. [N, T]"""
-    same = np.zeros((len(some.xyz), len(renderers)), bool)
+def _unchanged(candidates: Candidates, renderers: Sequence[PeriodRenderer]) -> NDArray[np.bool_]:
+    """Whether the surface at a point is the same in each period, apart from the light. [N, T]"""
+    same = np.zeros((len(candidates.xyz), len(renderers)), bool)
     for period, renderer in enumerate(renderers):
-        found = renderer.surface_near(some.xyz)
-        albedo = renderer.albedo_on(some.xyz, found)
-        close = np.abs(albedo - some.albedo).max(axis=1) < SAME_ALBEDO
-        same[:, period] = close & (renderer.elements_of(found) == some.element)
-        same[some.period == period, period] = True
+        found = renderer.surface_near(candidates.xyz)
+        albedo = renderer.albedo_on(candidates.xyz, found)
+        close = np.abs(albedo - candidates.albedo).max(axis=1) < MAX_ALBEDO_CHANGE
+        same[:, period] = close & (renderer.elements_of(found) == candidates.element)
+        same[candidates.period == period, period] = True
     return same
 
 
@@ -150,17 +150,17 @@ def _assemble(
     noise: float,
     rng: np.random.Generator,
 ) -> Points:
-    """Choose a random subset of each track and average its colours; tracks count training frames.
+    """Choose a random subset of each track and average its colours.
 
     Args:
         xyz: Points that enough frames see. [N, 3]
         seen: Which frames see them. [N, F]
         xy: Where they do. [N, F, 2]
-        images: Of the frames. [H, W, 3] each
-        noise: Standard deviation of the shift of observations, in pixels.
-        rng: Draws the frames and the shifts.
+        images: Images of the F training frames. [H, W, 3] each
+        noise: Standard deviation of the noise on observations, in pixels.
+        rng: Draws the subsets and the noise.
     """
-    wanted = np.minimum(MIN_TRACK + rng.geometric(0.28, len(xyz)) - 1, MAX_TRACK)
+    wanted = np.minimum(MIN_TRACK_LENGTH + rng.geometric(0.28, len(xyz)) - 1, MAX_TRACK_LENGTH)
     # Random keys, unseen last: the first entries of the sorted row are a random subset.
     keys = np.where(seen, rng.random(seen.shape), 2.0)
     order = np.argsort(keys, axis=1)

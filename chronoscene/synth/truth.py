@@ -1,4 +1,4 @@
-"""Ground truth beside the scene: depth, changes, and the test views at every other period."""
+"""Ground truth: depth, change masks, and the test views rendered at every other period."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from chronoscene.synth.city.world import World
 from chronoscene.synth.render.renderer import PeriodRenderer, PixelMaps
 
 UNCHANGED, APPEARANCE, GEOMETRY = 0, 127, 255
-"""Values of change masks."""
+"""Pixel values of change masks."""
 DEPTH_TOLERANCE = 1e-3
 """Relative difference of depth that counts as a change of geometry."""
 ALBEDO_TOLERANCE = 0.02
@@ -33,16 +33,16 @@ JPEG_FLAGS = (
 
 
 def save_image(path: Path, image: NDArray[np.uint8]) -> None:
-    """Write RGB or grey; JPEG at quality 95 without subsampling of the colours."""
+    """Write an RGB or grey image; JPEG has quality 95 and no chroma subsampling."""
     path.parent.mkdir(parents=True, exist_ok=True)
     image = np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
     assert cv2.imwrite(str(path), image, JPEG_FLAGS if path.suffix == ".jpg" else [])
 
 
 def change_mask(here: PixelMaps, there: PixelMaps) -> NDArray[np.uint8]:
-    """What differs between two periods seen by one camera. [H, W]
+    """Pixels that differ between two periods seen by the same camera. [H, W]
 
-    Light does not count: the mask compares objects, depth and albedo at the pixel centres.
+    The mask compares objects, depth and albedo at the pixel centres; light does not count.
     """
     mask = np.full(here.depth.shape, UNCHANGED, np.uint8)
     paint = np.abs(here.albedo - there.albedo).max(axis=2) > ALBEDO_TOLERANCE
@@ -62,11 +62,11 @@ def write_truth(
     """Write the folder ``gt``.
 
     Args:
-        folder: The folder; it is made.
-        scene: Frames with their images, and periods.
+        folder: Folder to create.
+        scene: Frames, their images, and periods.
         world: Lights, edits and objects.
         renderers: One per period.
-        advance: Told the name of each finished unit of work.
+        advance: Called with the name of each finished unit of work.
     """
     tests = scene.select(split="test")
     for frame in tests:
@@ -88,7 +88,7 @@ def write_truth(
 
 
 def _cross_name(frame: Frame, period: int) -> str:
-    """Stem of the files that show a frame's view at another period."""
+    """Stem of the files of a test view at another period."""
     return f"{Path(frame.name).stem}__p{period}"
 
 
@@ -98,7 +98,7 @@ def _save_depth(path: Path, maps: PixelMaps) -> None:
 
 
 def _story(world: World, periods: Sequence[Period]) -> dict[str, Any]:
-    """Light, edits, and every object with its states and the periods that show them."""
+    """Periods with their light, edits, and all objects with their states."""
     objects: dict[str, Any] = {}
     for e in world.elements:
         entry = objects.setdefault(e.name, {"kind": e.kind, "states": []})
@@ -115,7 +115,7 @@ def _story(world: World, periods: Sequence[Period]) -> dict[str, Any]:
 
 
 def _contact_sheet(folder: Path, scene: Scene, tests: Sequence[Frame]) -> NDArray[np.uint8]:
-    """One row per period, the same cameras in every row; green marks the real photo."""
+    """One row per period, the same cameras in every row; green marks the photo itself."""
     pick = np.unique(np.linspace(0, len(tests) - 1, min(SHEET_COLUMNS, len(tests))).astype(int))
     rows = []
     for period in range(scene.num_periods):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from chronoscene.synth import preset
-from chronoscene.synth.sparse_points import SAME_ALBEDO
+from chronoscene.synth.sparse_points import MAX_ALBEDO_CHANGE
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_tracks_join_periods_only_where_nothing_changed(made, observations, rend
         spread = albedo[mine].max(axis=0) - albedo[mine].min(axis=0)
         # At an edge the nearest triangle may be the neighbour's in one of the periods.
         if len(set(element[mine])) == 1:
-            assert spread.max() <= SAME_ALBEDO + 1e-9
+            assert spread.max() <= MAX_ALBEDO_CHANGE + 1e-9
     assert joined > 0.2 * len(made.scene.points)
 
 

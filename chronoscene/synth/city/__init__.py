@@ -1,1 +1,4 @@
-"""What stands in a generated city, and how it changes from period to period."""
+"""The generated city: settings go in, a `World` comes out.
+
+`plan` lays out the blocks, `blocks` fills them, and the other modules build what stands there.
+"""

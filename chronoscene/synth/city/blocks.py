@@ -21,7 +21,7 @@ X = np.array([1.0, 0.0, 0.0])
 
 
 def square(block: Block) -> None:
-    """Paved square: fountain, trees, benches, kiosks and, at times, a market."""
+    """Paved square with a fountain or statue, trees, benches, kiosks and market stalls."""
     world, name, inner, rng = block.world, block.name, block.inner, block.rng
     block.pave("paving", inner, str(rng.choice(["rings", "bands"])))
     mid = inner.at(0.5, 0.5)
@@ -79,7 +79,7 @@ def park(block: Block) -> None:
 
 
 def houses(block: Block) -> None:
-    """Rows of attached houses along two sides with a courtyard between them."""
+    """Rows of terraced houses along one or two sides, with a courtyard behind them."""
     inner, rng = block.inner, block.rng
     dx, dy = inner.size
     depth = min(11.0, 0.42 * dy) if dy > 20 else min(11.0, 0.75 * dy)
@@ -114,7 +114,7 @@ def houses(block: Block) -> None:
 
 
 def _fit_roof(spec: Building) -> Building:
-    """Attached houses need their ridge along the street, so narrow ones get a flat roof."""
+    """Terraced houses need their ridge along the street, so narrow ones get a flat roof."""
     narrow = spec.x1 - spec.x0 <= spec.y1 - spec.y0
     attached = spec.blank[1] or spec.blank[3]
     if attached and (narrow or spec.roof == "hip"):
@@ -123,7 +123,7 @@ def _fit_roof(spec: Building) -> Building:
 
 
 def slabs(block: Block) -> None:
-    """One or two long flat-roofed buildings on lawns, with a car park."""
+    """A long flat-roofed building on a lawn, with a car park."""
     inner, rng = block.inner, block.rng
     middle = inner.y0 + 0.55 * inner.size[1]
     upper = Rect(inner.x0, middle, inner.x1, inner.y1)
@@ -151,7 +151,7 @@ def slabs(block: Block) -> None:
 
 
 def tower(block: Block) -> None:
-    """A high building with a low wing, on a paved and planted base."""
+    """A high-rise with a low wing, on paving with a planted bed."""
     inner, rng = block.inner, block.rng
     block.pave("paving", inner, "bands")
     w = min(16.0, 0.5 * min(inner.size))
@@ -207,7 +207,7 @@ def site(block: Block) -> None:
 
 
 def _site_gear(block: Block, steps: Sequence[str], spec: Building) -> None:
-    """Fence, containers, crane and diggers while the work goes on."""
+    """Fence, containers, crane and excavator during construction."""
     inner, seed = block.inner, block.world.seed
     busy = [s != "finished" for s in steps]
     high = [s in ("foundation", "frame_low", "frame_high") for s in steps]
@@ -225,7 +225,7 @@ def _site_gear(block: Block, steps: Sequence[str], spec: Building) -> None:
 
 
 def renewal(block: Block) -> None:
-    """An old building that is pulled down; a car park takes its place. Houses stand beside it."""
+    """An old building that is demolished and replaced by a car park, beside a house that stays."""
     world, inner, rng = block.world, block.inner, block.rng
     dx, dy = inner.size
     left = Rect(inner.x0, inner.y0, inner.x0 + 0.6 * dx, inner.y1)
@@ -258,7 +258,7 @@ def renewal(block: Block) -> None:
 
 
 def suburb(block: Block) -> None:
-    """Detached houses in gardens, simpler than the core."""
+    """Detached houses in gardens, with less detail than in the core."""
     world, inner, rng = block.world, block.inner, block.rng
     block.lawn(inner)
     dx, dy = inner.size
@@ -290,4 +290,4 @@ FILLERS: dict[str, Callable[[Block], None]] = {
     "renewal": renewal,
     "suburb": suburb,
 }
-"""Block roles by name."""
+"""Functions that fill a block, by role."""

@@ -15,14 +15,14 @@ from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 
 Array = NDArray[np.float64]
-Z = np.array([0.0, 0.0, 1.0])
+X, Y, Z = np.eye(3)
 SLAB = 0.15
 """Height of pavements above the road."""
 
 
 @dataclass(frozen=True, slots=True)
 class Building:
-    """A rectangular building. Metres; axes of the world."""
+    """A rectangular building aligned with the world axes. Lengths are metres."""
 
     name: str
     x0: float
@@ -44,7 +44,7 @@ class Building:
     look: int = 0
     """Changes colours and windows without changing the volume."""
     simple: bool = False
-    """Windows without relief, for the distance."""
+    """Windows without relief, for buildings seen from afar."""
 
     @property
     def wall_height(self) -> float:
@@ -52,14 +52,13 @@ class Building:
 
     @property
     def sides(self) -> list[tuple[Array, Array, float]]:
-        """Lower left corner seen from outside, direction along the wall, width."""
+        """Lower left corner seen from outside, direction along the wall, and width of each side."""
         a = np.array([self.x0, self.y0, SLAB])
         b = np.array([self.x1, self.y0, SLAB])
         c = np.array([self.x1, self.y1, SLAB])
         d = np.array([self.x0, self.y1, SLAB])
-        x, y = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
         dx, dy = self.x1 - self.x0, self.y1 - self.y0
-        return [(a, x, dx), (b, y, dy), (c, -x, dx), (d, -y, dy)]
+        return [(a, X, dx), (b, Y, dy), (c, -X, dx), (d, -Y, dy)]
 
 
 def finished(spec: Building, seed: int) -> Part:
@@ -83,7 +82,7 @@ def finished(spec: Building, seed: int) -> Part:
 
 
 def frame(spec: Building, storeys: int, seed: int) -> Part:
-    """Bare concrete frame of the first storeys: slabs, columns, core, a scaffold on one side."""
+    """Concrete frame of the first storeys: slabs, columns, core, and a scaffold on one side."""
     b = PartBuilder(key_number(spec.name, "frame"))
     rng = rng_for(seed, spec.name, "frame")
     concrete = pal.wall_style(b, "concrete", rng, spec.storey)
@@ -106,7 +105,7 @@ def frame(spec: Building, storeys: int, seed: int) -> Part:
 
 
 def _rods(b: PartBuilder, spec: Building, grid: Array, top: float) -> None:
-    """Steel that waits for the next storey, and pallets on the top slab."""
+    """Starter bars for the next storey, and pallets on the top slab."""
     steel = pal.plain_style(b, srgb(122, 78, 52))
     base = np.column_stack([grid + 0.1, np.full(len(grid), top)])
     b.boxes(base, [0.16, 0, 0], [0, 0.16, 0], 1.1 * Z, steel)
@@ -116,15 +115,8 @@ def _rods(b: PartBuilder, spec: Building, grid: Array, top: float) -> None:
     x = rng.uniform(spec.x0 + 1, spec.x1 - 3, n)
     y = rng.uniform(spec.y0 + 1, spec.y1 - 3, n)
     size = rng.uniform(0.7, 1.6, (n, 3))
-    zeros = np.zeros(n)
-    b.boxes(
-        np.column_stack([x, y, np.full(n, top)]),
-        np.column_stack([size[:, 0], zeros, zeros]),
-        np.column_stack([zeros, size[:, 1], zeros]),
-        np.column_stack([zeros, zeros, size[:, 2]]),
-        wood,
-        bottom=False,
-    )
+    base = np.column_stack([x, y, np.full(n, top)])
+    b.boxes(base, size[:, :1] * X, size[:, 1:2] * Y, size[:, 2:] * Z, wood, bottom=False)
 
 
 def _scaffold(b: PartBuilder, spec: Building, top: float) -> None:

@@ -1,4 +1,4 @@
-"""Walls with real openings: recessed windows, sills, cornices, shop fronts, balconies."""
+"""Walls with recessed windows, sills, cornices, shop fronts and balconies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class Front:
-    """Choices that all sides of one building share."""
+    """Styles and dimensions that all sides of a building share."""
 
     wall: int
     trim: int
@@ -44,7 +44,7 @@ class Front:
         storey: float,
         ground: float,
     ) -> Front:
-        """Draw colours from one generator and sizes from another: another look of the same
+        """Draw styles with ``rng`` and dimensions with ``shape``, so that another look of the same
         building keeps its geometry."""
         light = wall != "panel"
         frame = pal.pick(rng, (pal.WHITE, srgb(74, 54, 40), srgb(60, 64, 66), srgb(196, 190, 176)))
@@ -75,8 +75,8 @@ class Wall:
 
     Args:
         b: Receives the geometry.
-        front: Choices of the building.
-        corner: Lower left corner seen from outside. [3]
+        front: Styles and dimensions of the building.
+        corner: Lower left corner as seen from outside. [3]
         along: Unit vector along the wall. [3]
         width: Metres.
     """
@@ -90,7 +90,7 @@ class Wall:
         self.frame = (corner, along, Z)
 
     def at(self, x: Array | float, z: Array | float, depth: float = 0.0) -> Array:
-        """World points of wall coordinates. [N, 3]"""
+        """World points of wall coordinates; ``depth`` goes into the wall. [N, 3]"""
         x, z = np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(z))
         inside: Array = self.corner + x[:, None] * self.along + z[:, None] * Z
         return inside - depth * self.out
@@ -99,12 +99,12 @@ class Wall:
         self, x: Array | float, z: float, w: float, h: float, depth: float, style: int,
         gap: float = 0.0,
     ) -> None:  # fmt: skip
-        """Boxes in front of the wall, which end before it by a gap."""
+        """Boxes that project from the wall by ``depth`` and end a ``gap`` before it."""
         corner = self.at(x, z, -depth)
         self.b.boxes(corner, w * self.along, -(depth - gap) * self.out, h * Z, style)
 
     def strip(self, z0: float, z1: float, depth: float) -> None:
-        """A moulding along the whole wall; longer by its depth, so that corners close."""
+        """A moulding along the whole wall, extended by its depth so that the corners close."""
         width = self.width + 2 * depth
         self.box(-depth, z0, width, z1 - z0, depth, self.front.trim, gap=0.005)
 
@@ -117,10 +117,10 @@ class Wall:
         Args:
             storeys: Number of storeys.
             rng: Draws the door.
-            blank: A fire wall without openings.
+            blank: Whether this is a fire wall without openings.
             shop: Whether the ground floor has shop windows and signs.
             balconies: Whether upper storeys have balconies.
-            simple: Windows without recess, for buildings in the distance.
+            simple: Whether windows are flat, for buildings in the distance.
         """
         front, b = self.front, self.b
         height = front.ground + front.storey * (storeys - 1)
@@ -160,7 +160,7 @@ class Wall:
     def _row(
         self, z0: float, z1: float, xs: Array, w: float, sill: float, h: float, glass: int
     ) -> None:
-        """Wall between two heights around equal openings at ``xs``, and what fills them."""
+        """Wall between two heights around equal windows whose left edges are at ``xs``."""
         b, front, u, n, recess = self.b, self.front, self.along, self.out, 0.18
         low, high = z0 + sill, z0 + sill + h
         b.quads(self.at(0, z0), self.width * u, sill * Z, front.wall, frame=self.frame)

@@ -1,4 +1,4 @@
-"""Colours of materials, linear, chosen from names by random numbers."""
+"""Materials: linear colours and the styles that are drawn from them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ GRASSES = {
     "autumn": (srgb(122, 118, 58), srgb(140, 122, 66), 0.30),
     "winter": (srgb(120, 116, 84), srgb(134, 124, 92), 0.06),
 }
-"""Two greens and the share of litter."""
+"""Two grass colours and the share of litter (fallen leaves or flowers)."""
 CROWNS = {
     "summer": ((srgb(58, 92, 34), srgb(96, 124, 50), srgb(132, 150, 70)),
                (srgb(44, 84, 42), srgb(76, 112, 58), srgb(104, 136, 76))),
@@ -78,7 +78,7 @@ def pick(rng: np.random.Generator, options: Sequence[T]) -> T:
 
 
 def tint(rng: np.random.Generator, color: Color, amount: float = 0.08) -> Color:
-    """A colour varied a little in brightness and hue."""
+    """A random variation of a colour in brightness and hue."""
     f = np.exp(rng.normal(0, amount)) * np.exp(rng.normal(0, amount / 3, 3))
     red, green, blue = np.minimum(color * f, 0.85).tolist()
     return red, green, blue
@@ -108,7 +108,7 @@ def wall_style(b: PartBuilder, kind: str, rng: np.random.Generator, storey: floa
 
 
 def glass_style(b: PartBuilder, frame: Color, panes: tuple[int, int] = (2, 2)) -> int:
-    """Style of a window; each pane of glass gets its own curtains from its seed."""
+    """Style of a window; the seed of each window determines its curtains."""
     room, curtain = srgb(42, 50, 60), srgb(206, 196, 176)
     return b.style(tex.GLASS, frame, room, curtain, (0.07, *panes), reflect=0.12, sharp=0.9)
 
@@ -143,7 +143,7 @@ def grass_style(b: PartBuilder, season: str, wear: float, stripes: float = 0.0) 
 
 
 def leaf_style(b: PartBuilder, season: str, species: int, size: float) -> int:
-    """Style of a crown in a season; species 2 keeps its needles."""
+    """Style of foliage in a season; species 2 is evergreen."""
     c0, c1, c2 = EVERGREEN if species == 2 else CROWNS[season][species]
     return b.style(tex.LEAVES, c0, c1, c2, (size, 0.10), translucent=0.35)
 
@@ -161,7 +161,7 @@ def metal_style(b: PartBuilder, color: Color, stripe: float = 0.0, dust: float =
 
 
 def plain_style(b: PartBuilder, color: Color, strength: float = 0.25, size: float = 0.6) -> int:
-    """Style of anything without a pattern of its own."""
+    """Style of surfaces without a pattern."""
     dark = (0.8 * color[0], 0.8 * color[1], 0.8 * color[2])
     return b.style(tex.PLAIN, color, dark, None, (strength, size))
 

@@ -1,4 +1,4 @@
-"""What stands on a block: its ground, and cars, lamps, trees, benches and houses in place."""
+"""Placing objects on blocks and along kerbs: ground, cars, lamps, trees and houses."""
 
 from __future__ import annotations
 
@@ -49,13 +49,21 @@ class Rect:
         return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
 
     def at(self, fx: float, fy: float, z: float = SLAB) -> Array:
-        """Point at fractions of the extents. [3]"""
+        """Point at fractions of the width and depth. [3]"""
         dx, dy = self.size
         return np.array([self.x0 + fx * dx, self.y0 + fy * dy, z])
 
 
 def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
-    """One rectangle of ground: ``lawn SEASON``, ``soil``, ``car_park``, ``slabs``, ``rings``."""
+    """A rectangle of ground.
+
+    Args:
+        name: Name of the block or object, which determines the texture.
+        rect: The rectangle.
+        surface: ``lawn SEASON``, ``mown SEASON``, ``soil``, ``car_park``, ``rings``, ``bands`` or
+            ``slabs``.
+        z: Height in metres.
+    """
     b = PartBuilder(key_number(name, "floor"))
     kind, _, season = surface.partition(" ")
     dx, dy = rect.size
@@ -87,7 +95,7 @@ def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
 
 
 def pavement(name: str, low: Array, high: Array, ring: float, seed: int) -> Part:
-    """Kerb and slabs around a block; the inside stays open."""
+    """Kerb and paving slabs around a block, without its inside."""
     b = PartBuilder(key_number(name, "pavement"))
     rng = rng_for(seed, name, "pavement")
     grey = pal.tint(rng, srgb(158, 154, 146))
@@ -112,12 +120,12 @@ def pavement(name: str, low: Array, high: Array, ring: float, seed: int) -> Part
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """A block of the city; puts objects into the world under names that start with its own."""
+    """A block of the city; adds objects to the world under names that start with its own."""
 
     world: World
     name: str
     inner: Rect
-    """What is inside of the pavement."""
+    """The area inside the pavement."""
     rng: np.random.Generator
 
     @classmethod
@@ -136,22 +144,22 @@ class Block:
         self, part: str, kind: str, make: Callable[..., Part], *args: Any,
         present: Sequence[bool] | None = None,
     ) -> None:  # fmt: skip
-        """Add an object, always or in some periods; ``make`` gets its name and the arguments."""
+        """Add an object, in all periods by default; ``make`` receives its name and ``args``."""
         name, every = self.named(part), [True] * self.world.periods
         self.world.place(name, kind, present or every, partial(make, name, *args))
 
     def pave(self, part: str, rect: Rect, surface: str) -> None:
-        """A floor that never changes; see `floor`."""
+        """Add ground that never changes; see `floor`."""
         self.world.always(self.named(part), "ground", partial(floor, self.name, rect, surface))
 
     def lawn(self, rect: Rect, part: str = "", kind: str = "lawn", z: float = SLAB) -> None:
-        """Grass that changes with the seasons."""
+        """Add grass that changes with the seasons."""
         name = self.named(part)
         states = [f"{kind} {season}" for season in self.world.seasons]
         self.world.add(f"{name}/lawn", "lawn", states, lambda s: floor(name, rect, s, z))
 
     def plant(self, part: str, at: Array, size: float = 6.5, broad: bool = False) -> None:
-        """A tree that grows and changes with the seasons."""
+        """Add a tree that grows, and may be planted late or felled."""
         world = self.world
         height = float(self.rng.uniform(0.75, 1.25) * size)
         heights = tree_heights(self.rng, world.periods, height)
@@ -160,7 +168,7 @@ class Block:
     def tree(
         self, part: str, at: Array, heights: Sequence[float | None], detail: int, broad: bool
     ) -> None:
-        """A tree by its height in each period."""
+        """Add a tree with the given height in each period; None where it is absent."""
         states = [
             None if height is None else (height, season)
             for height, season in zip(heights, self.world.seasons, strict=True)
@@ -170,7 +178,7 @@ class Block:
         self.world.add(name, "tree", states, make)
 
     def scatter_trees(self, rect: Rect, count: int, avoid: Sequence[Array] = ()) -> None:
-        """Trees at random places that keep apart from each other and from given points."""
+        """Add trees at random places, away from each other and from the points in ``avoid``."""
         taken = list(avoid)
         for i in range(count):
             for _ in range(20):
@@ -181,13 +189,13 @@ class Block:
                     break
 
     def hedge(self, part: str, low: Array, high: Array) -> None:
-        """A hedge between two points."""
+        """Add a hedge between two points."""
         name = self.named(part)
         make = partial(hedge, name, low, high, self.world.seed)
         self.world.add(name, "tree", self.world.seasons, make)
 
     def gravel_path(self, part: str, points: Array, width: float) -> None:
-        """Gravel path along a curve, slightly above the lawn's surface."""
+        """Add a gravel path along a curve, slightly above the lawn."""
         way = np.gradient(points, axis=0)
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         side = np.column_stack([-way[:, 1], way[:, 0]]) * width / 2
@@ -206,7 +214,7 @@ class Block:
         self.put(part, "ground", make)
 
     def house(self, spec: Building, chance: float) -> None:
-        """A finished building, which may get another facade."""
+        """Add a finished building whose facade may be renewed once, with the given chance."""
         world = self.world
         rng = rng_for(world.seed, spec.name, "reclad")
         states = looks(rng, world.periods, chance)
@@ -221,7 +229,7 @@ class Block:
     def park_cars(
         self, part: str, places: list[tuple[float, float, float, float]], chance: float
     ) -> None:
-        """Parked cars: each place (x, y, z, heading) holds one car, another or none per period."""
+        """Add parked cars: a place (x, y, z, heading) is empty or taken in each period."""
         periods = range(self.world.periods)
         rng = rng_for(self.world.seed, self.named(part), "cars")
         for i, (x, y, z, turn) in enumerate(places):
@@ -238,7 +246,7 @@ class Block:
 
 
 def curb_side(world: World, name: str, rect: Rect) -> None:
-    """Cars in the parking lanes around a block, lamps, and street trees."""
+    """Add parked cars, lamps and street trees around a block."""
     block = Block(world, name, rect, rng_for(world.seed, name, "avenue"))
     places = []
     off = PARKING / 2
@@ -255,7 +263,7 @@ def curb_side(world: World, name: str, rect: Rect) -> None:
 
 
 def _lamps(block: Block) -> None:
-    """Lamps along the kerb, arms over the road."""
+    """Add lamps along the kerb, with their arms over the road."""
     r = block.inner.inset(0.8)
     dx, dy = r.size
     along = np.linspace(0.2, 0.8, max(1, int(dx // 18)))
@@ -267,7 +275,7 @@ def _lamps(block: Block) -> None:
 
 
 def _avenue(block: Block) -> None:
-    """Street trees in pits along some sides of a block."""
+    """Add street trees in pits along some sides of a block."""
     rng, r = block.rng, block.inner.inset(1.0)
     ends = [r.at(0, 0), r.at(1, 0), r.at(1, 1), r.at(0, 1), r.at(0, 0)]
     for side, (a, b) in enumerate(pairwise(ends)):

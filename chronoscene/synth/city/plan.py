@@ -1,4 +1,4 @@
-"""The plan of a city: blocks and what stands on them, roads between, countryside around."""
+"""Layout of the city: blocks and their roles, roads between them, surrounding countryside."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ ROAD = 9.6
 FAR = 900.0
 """Half the extent of the countryside, metres."""
 REBUILT = ("houses", "slabs", "tower", "park")
-"""What may stand on a block after all of it was torn down."""
+"""Roles of a block after it is torn down and rebuilt."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """Grid of blocks; the outermost ring is suburb."""
+    """Grid of blocks; the outermost ring is suburban."""
 
     x: Array
     """West and east edge of each column. [N, 2]"""
@@ -60,7 +60,7 @@ def make_plan(settings: SynthSettings) -> Plan:
 
 
 def make_world(settings: SynthSettings) -> World:
-    """Build all objects of all periods."""
+    """Build the objects of all periods."""
     plan = make_plan(settings)
     n = settings.blocks
     core = np.array([[plan.x[1, 0], plan.y[1, 0]], [plan.x[n, 1], plan.y[n, 1]]])
@@ -80,7 +80,7 @@ def make_world(settings: SynthSettings) -> World:
 
 
 def _fill(world: World, settings: SynthSettings, name: str, rect: Rect, role: str) -> None:
-    """Build on a block; at one date it may be torn down, and something else be built."""
+    """Fill a block, which may be torn down and rebuilt with another role at one period."""
 
     def build(role: str, name: str) -> None:
         FILLERS[role](Block.paved(world, name, rect, 2.0 if role == "suburb" else RING))
@@ -98,7 +98,7 @@ def _fill(world: World, settings: SynthSettings, name: str, rect: Rect, role: st
 
 
 def _roles(settings: SynthSettings) -> dict[tuple[int, int], str]:
-    """What each block is: one square, one building site, one renewal, parks, houses, slabs."""
+    """Role of each block; the core has one square, one building site and one renewal."""
     rng = rng_for(settings.seed, "roles")
     n = settings.blocks
     cells = list(product(range(1, n + 1), range(1, n + 1)))
@@ -117,13 +117,13 @@ def _roles(settings: SynthSettings) -> dict[tuple[int, int], str]:
 
 
 def _add_roads(world: World, plan: Plan) -> None:
-    """Roads between the columns and rows of blocks, junctions and zebra crossings."""
+    """Add the roads between blocks, with junctions and zebra crossings."""
     b = PartBuilder(key_number("roads"))
     lanes, bare = pal.asphalt_style(b, 1, PARKING), pal.asphalt_style(b, 0)
     zebra = pal.asphalt_style(b, 2)
 
     def add(axis: int, ends: Array, side: float, far: float, seed: int, core: bool) -> None:
-        """A road beside one block, along x (axis 0) or y (1); only the core has crossings."""
+        """Add the road beside a block, along x (axis 0) or y (1); only the core has crossings."""
 
         def at(s: float, t: float, z: float = 0.0) -> Array:
             return np.array([t, s, z] if axis else [s, t, z])
@@ -152,7 +152,7 @@ def _add_roads(world: World, plan: Plan) -> None:
 
 
 def _add_surroundings(world: World, plan: Plan) -> None:
-    """Hills with fields, and scattered farms and trees."""
+    """Add hills with fields, and scattered farms and trees."""
     low, high = np.array([plan.x[0, 0], plan.y[0, 0]]), np.array([plan.x[-1, 1], plan.y[-1, 1]])
     rng = rng_for(world.seed, "surroundings")
     hills = _Hills(rng, low, high)
@@ -208,7 +208,7 @@ class _Hills:
 
 
 def _terrain(hills: _Hills) -> Part:
-    """Grid with smooth normals, finer near the city."""
+    """Terrain grid with smooth normals, finer near the city."""
     b = PartBuilder(key_number("country"))
     fields = b.style(FIELDS, srgb(104, 120, 62), srgb(164, 152, 96), srgb(128, 104, 76))
     t = np.linspace(-1, 1, 121)

@@ -1,4 +1,4 @@
-"""Roofs with what stands on them."""
+"""Flat, gable and hip roofs, with dormers, chimneys and rooftop equipment."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def add_roof(
     b: PartBuilder, kind: str, corner: Array, size: tuple[float, float], wall: int,
     rng: np.random.Generator, *, plain: bool,
 ) -> None:  # fmt: skip
-    """Add a roof with what stands on it.
+    """Add a roof and the objects on it.
 
     Args:
         b: Receives the geometry.
@@ -31,8 +31,8 @@ def add_roof(
         corner: Lowest corner of the roof. [3]
         size: Extent along x and y.
         wall: Style of parapets and gables.
-        rng: Draws slopes and colours, boxes, chimneys and dormers.
-        plain: Leave the small things out.
+        rng: Draws slope, colours and objects.
+        plain: Whether to omit small objects.
     """
     if kind == "flat":
         _flat_roof(b, corner, size, wall, rng, plain)
@@ -59,7 +59,7 @@ def _flat_roof(
     b: PartBuilder, corner: Array, size: tuple[float, float], wall: int,
     rng: np.random.Generator, plain: bool,
 ) -> None:  # fmt: skip
-    """Parapet, surface, and boxes: stair heads, ventilation, solar panels."""
+    """Parapet, surface, and rooftop equipment."""
     dx, dy = size
     roof = pal.flat_roof_style(b, rng)
     coping = pal.plain_style(b, srgb(170, 164, 154))
@@ -81,7 +81,7 @@ def _flat_roof(
 def _roof_boxes(
     b: PartBuilder, corner: Array, dx: float, dy: float, rng: np.random.Generator
 ) -> None:
-    """Boxes in the cells of a grid, so that they never overlap."""
+    """Stair heads, ventilation and solar panels in the cells of a grid, so that none overlap."""
     metal = pal.metal_style(b, srgb(178, 180, 180), dust=0.3)
     house = pal.wall_style(b, "plaster", rng, 3.0)
     cover = pal.flat_roof_style(b, rng)
@@ -112,7 +112,7 @@ def _roof_boxes(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PitchedRoof:
-    """Roof in axes of its own: ``a`` along the ridge and ``c`` across it, from corner ``o``."""
+    """Pitched roof with corner ``o``, axis ``a`` along the ridge and axis ``c`` across it."""
 
     b: PartBuilder
     o: Array
@@ -121,7 +121,7 @@ class _PitchedRoof:
     length: float
     depth: float
     slope: float
-    """Rise per metre."""
+    """Rise per horizontal metre."""
     tiles: int
     fascia: int
     wall: int
@@ -158,7 +158,7 @@ class _PitchedRoof:
         b.polygon([west, o, o + ridge], self.wall, frame=(west, -c, Z))
 
     def add_hip(self) -> None:
-        """Four slopes; the ridge is shorter than the house by its depth."""
+        """Four slopes; the ridge is shorter than the house by the depth of the house."""
         b, o, a, c, length, depth = self.b, self.o, self.a, self.c, self.length, self.depth
         run = min(depth, length) / 2
         p = [
@@ -183,7 +183,7 @@ class _PitchedRoof:
         b.quads(p[0] - 0.16 * Z, p[3] - p[0], p[1] - p[0], self.fascia)
 
     def add_chimneys(self, rng: np.random.Generator) -> None:
-        """One or two, near the ridge."""
+        """One or two chimneys near the ridge."""
         brick = pal.wall_style(self.b, "brick", rng, 9.0)
         for f in rng.uniform(0.2, 0.8, int(rng.integers(1, 3))):
             side = float(rng.uniform(0.3, 0.42))
@@ -192,7 +192,7 @@ class _PitchedRoof:
             self.b.boxes(at, 0.7 * self.a, 0.5 * self.c, 2.1 * Z, brick, bottom=False)
 
     def add_dormers(self, rng: np.random.Generator) -> None:
-        """Small houses in the slopes, with a window each."""
+        """Dormers with a window each in both slopes."""
         b, length, depth = self.b, self.length, self.depth
         glass = pal.glass_style(b, pal.WHITE)
         far = self.o + length * self.a + depth * self.c

@@ -1,4 +1,4 @@
-"""Trees and hedges: crowns of lumpy balls fringed with loose leaves."""
+"""Trees and hedges: lumpy balls fringed with loose leaves."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def icosphere(level: int) -> tuple[Array, NDArray[np.int64]]:
 
 
 class Foliage(PartBuilder):
-    """Builder of a plant: lumpy balls and loose leaves.
+    """Builder of a plant from lumpy balls and loose leaves.
 
-    Their normals lean away from the ``heart`` of a crown: the crown is shaded as one volume.
+    Normals lean away from the ``heart`` of a crown, so that the crown is shaded as one volume.
 
     Args:
         name: Name of the plant.
-        rng: Draws its shape.
+        rng: Draws the shape.
     """
 
     def __init__(self, name: str, rng: np.random.Generator) -> None:
@@ -57,7 +57,7 @@ class Foliage(PartBuilder):
     ) -> None:
         """Lumpy ball of 20 * 4**level triangles."""
         v, f = icosphere(level)
-        # Equal directions at the seams get equal bumps: noise depends on the direction alone.
+        # Bumps depend on the direction alone, so faces that share a corner stay joined.
         waves = self.rng.normal(0, 2.6, (4, 3))
         phase = self.rng.uniform(0, 6.28, 4)
         bumps = 1 + rough * np.sin(v @ waves.T + phase).sum(axis=1) / 1.6
@@ -97,15 +97,15 @@ def _facets(low: Array, high: Array) -> Array:
 def tree(
     name: str, base: Array, seed: int, detail: int, broad: bool, state: tuple[float, str]
 ) -> Part:
-    """A tree; name and seed fix species and shape, height and season change with time.
+    """A tree; name and seed determine species and shape, the state its height and season.
 
     Args:
         name: Name of the tree.
         base: Foot of the stem. [3]
         seed: Seed of the scene.
-        detail: 0 far away, 1 middle, 2 near.
-        broad: No conifer; they would stand in the way along a street.
-        state: Height in metres, and season: the palette of the leaves.
+        detail: Level of detail: 0 far away, 1 at middle distance, 2 near.
+        broad: Whether to exclude conifers, which would block a street.
+        state: Height in metres, and season, which determines the colours.
     """
     height, season = state
     rng = rng_for(seed, name, "tree")
@@ -127,7 +127,7 @@ def tree(
 
 
 def _conifer(b: Foliage, base: Array, height: float, leaf: int, detail: int) -> None:
-    """Tiers that get smaller towards the top."""
+    """Tiers that narrow towards the top."""
     tiers = (3, 5, 6)[detail]
     heart = base + 0.4 * height * Z
     for i in range(tiers):
@@ -141,7 +141,7 @@ def _conifer(b: Foliage, base: Array, height: float, leaf: int, detail: int) -> 
 
 
 def _bare(b: Foliage, base: Array, top: Array, height: float, bark: int, leaf: int) -> None:
-    """Branches and twigs in two orders, with a few brown leaves that stayed."""
+    """Branches with twigs, and a few brown leaves left."""
     rng, stem = b.rng, top - base
     for _ in range(9):
         start = base + stem * rng.uniform(0.45, 1.0)
@@ -176,7 +176,7 @@ def _broadleaf(b: Foliage, base: Array, top: Array, height: float, leaf: int, de
 
 
 def hedge(name: str, low: Array, high: Array, seed: int, season: str) -> Part:
-    """A row of balls between two corners of a flat box."""
+    """A row of balls between two points."""
     b = Foliage(name, rng_for(seed, name, "hedge"))
     leaf = pal.leaf_style(b, season, 1, 0.2)
     count = max(1, int(float(np.linalg.norm((high - low)[:2])) / 0.9))

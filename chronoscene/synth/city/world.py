@@ -1,4 +1,4 @@
-"""The world over time: named elements with their states per period, and the edits."""
+"""The world over time: named elements with a state per period, and the edits between periods."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ CHANGE_VERBS = {
     "lawn": "season",
     "ground": "resurface",
 }
-"""What a change of state is called, by kind of element; ``change`` for the others."""
+"""Name of a change of state by kind of element; other kinds have ``change``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Element:
-    """One state of one object, with the periods in which it looks so."""
+    """One state of an object and the periods that show it."""
 
     name: str
-    """Identity: the states of one object share it."""
+    """Identity of the object, shared by its states."""
     kind: str
     state: str
     periods: tuple[int, ...]
@@ -50,7 +50,7 @@ class Edit:
     before: str | None
     after: str | None
     bounds: tuple[tuple[float, ...], tuple[float, ...]]
-    """Box around both states: lowest and highest corner in metres."""
+    """Bounding box of both states: minimum and maximum corner, in metres."""
 
 
 @dataclass(slots=True)
@@ -60,17 +60,17 @@ class World:
     seed: int
     lights: list[Light]
     core: Array
-    """Rectangle of the city core: lowest and highest corner. [2, 2]"""
+    """Rectangle of the city core: minimum and maximum corner. [2, 2]"""
     near: bool = False
     """Whether cameras come close to the suburbs, which then need more detail."""
     roads: list[tuple[Array, Array]] = field(default_factory=list)
-    """Centre lines of the core's roads, for walks. Each end [2]."""
+    """Start and end of the centre lines of the core's roads, for walks. [2] each"""
     focus: list[Array] = field(default_factory=list)
     """Places that cameras look at. [3] each"""
     elements: list[Element] = field(default_factory=list)
     edits: list[Edit] = field(default_factory=list)
     lifetime: frozenset[int] | None = None
-    """Periods in which what is being added exists; None for all. See `during`."""
+    """Periods in which objects now being added exist; None for all. See `during`."""
 
     @property
     def periods(self) -> int:
@@ -78,12 +78,12 @@ class World:
 
     @property
     def names(self) -> list[str]:
-        """Names of the objects in the order of their identity numbers."""
+        """Names of the objects; the position in this list is the identity number."""
         return list(dict.fromkeys(e.name for e in self.elements))
 
     @contextmanager
     def during(self, periods: Sequence[int]) -> Iterator[None]:
-        """Whatever is added in this block exists in these periods only."""
+        """Objects added inside the ``with`` block exist in these periods only."""
         self.lifetime = frozenset(periods)
         try:
             yield
@@ -91,18 +91,14 @@ class World:
             self.lifetime = None
 
     def add(
-        self,
-        name: str,
-        kind: str,
-        states: Sequence[Hashable | None],
-        make: Callable[[Any], Part],
+        self, name: str, kind: str, states: Sequence[Hashable], make: Callable[[Any], Part]
     ) -> None:
-        """Add an object by its state in each period; None where it does not exist.
+        """Add an object by its state in each period.
 
         Args:
-            name: Identity, unique.
-            kind: Sort of object, for the edit list.
-            states: One per period; equal states share geometry.
+            name: Unique name.
+            kind: Kind of object, for the edit list.
+            states: One per period, None where the object is absent; equal states share geometry.
             make: Builds the geometry of a state.
         """
         assert len(states) == self.periods
@@ -124,7 +120,7 @@ class World:
     def place(
         self, name: str, kind: str, present: Sequence[bool], make: Callable[[], Part]
     ) -> None:
-        """Add an object that looks the same in all periods in which it is there."""
+        """Add an object that looks the same in every period in which it is present."""
         if any(present):
             self.add(name, kind, ["there" if p else None for p in present], lambda _: make())
 
@@ -146,19 +142,14 @@ class World:
 
 
 def _label(state: Hashable) -> str:
-    """A state as text: its parts joined by blanks."""
+    """A state as text: its parts joined by spaces."""
     if isinstance(state, tuple):
         return " ".join(str(s) for s in state)
     return str(state)
 
 
 def _edit(
-    period: int,
-    name: str,
-    kind: str,
-    before: Hashable | None,
-    after: Hashable | None,
-    parts: list[Part],
+    period: int, name: str, kind: str, before: Hashable, after: Hashable, parts: list[Part]
 ) -> Edit:
     verb = "add" if before is None else "remove"
     if before is not None and after is not None:
@@ -180,7 +171,7 @@ SITE = ("lot", "foundation", "frame_low", "frame_high", "finished")
 
 
 def site_stages(periods: int) -> list[str]:
-    """Stages of a building site: always from the empty lot to the finished building.
+    """Stages of a building site per period, from the empty lot to the finished building.
 
     Three periods show lot, frame, finished; a single period shows the finished building.
     """
@@ -194,7 +185,7 @@ def site_stages(periods: int) -> list[str]:
 
 
 def renewal_stages(periods: int) -> list[str]:
-    """A house that stands, falls, and leaves room for a car park."""
+    """Stages per period of a house that is demolished and replaced by a car park."""
     if periods == 1:
         return ["house"]
     fall = 1 if periods < 4 else 2
@@ -203,7 +194,7 @@ def renewal_stages(periods: int) -> list[str]:
 
 
 def looks(rng: np.random.Generator, periods: int, chance: float) -> list[int]:
-    """Number of the look of a facade per period; with a chance of one change."""
+    """Index of a facade's look per period; it changes at most once, with the given chance."""
     states = [0] * periods
     if periods > 1 and rng.random() < chance:
         change = int(rng.integers(1, periods))
@@ -212,7 +203,7 @@ def looks(rng: np.random.Generator, periods: int, chance: float) -> list[int]:
 
 
 def tree_heights(rng: np.random.Generator, periods: int, start: float) -> list[float | None]:
-    """Height per period: 20 to 60 % more in the end; some are planted late, some are felled."""
+    """Height per period, growing by 20 to 60 % overall; some trees are planted late or felled."""
     growth = float(rng.uniform(1.2, 1.6)) ** (1 / max(periods - 1, 1))
     heights: list[float | None] = [round(start * growth**p, 2) for p in range(periods)]
     fate = rng.random()
@@ -226,5 +217,5 @@ def tree_heights(rng: np.random.Generator, periods: int, start: float) -> list[f
 
 
 def visits(rng: np.random.Generator, periods: int, chance: float) -> list[bool]:
-    """Whether something movable is there, per period."""
+    """Whether a movable object is present, per period."""
     return [bool(x) for x in rng.random(periods) < chance]

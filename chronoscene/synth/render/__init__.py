@@ -1,1 +1,4 @@
-"""Ray casting: textures, light and compiled shading."""
+"""Ray casting: geometry and light go in; images, depth and object maps come out.
+
+`renderer` is the way in; `textures`, `light` and `shade` hold what it compiles.
+"""

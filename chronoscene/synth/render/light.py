@@ -1,8 +1,8 @@
 """Light of a period: sun, sky, haze and exposure, the compiled sky, and indirect light.
 
-Indirect light is radiance of low order on a grid, from rays that the grid's points send out: a
-smooth function of position and direction, equal for all views, without the noise that rays per
-pixel would have.
+Indirect light is stored as low-order spherical harmonics on a grid of probes, each of which casts
+rays in all directions. It is smooth in position and direction, the same for all views, and free of
+the noise that indirect rays per pixel would have.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Light:
     white: Color
     """Factors of the camera's white balance."""
     sky_seed: int = 0
-    """Other clouds."""
+    """Determines the clouds."""
 
     @property
     def direction(self) -> Array:
@@ -81,18 +81,18 @@ MOODS: tuple[Light, ...] = (
         (0.52, 0.58, 0.64), 0.50, 1 / 1700, 0.76, (1.02, 1.0, 0.97),
     ),
 )  # fmt: skip
-"""Moods in the order that periods take them: neighbours differ in every respect."""
+"""Lights in the order in which periods use them; neighbours differ in every respect."""
 
 
 def make_lights(seed: int, periods: int) -> list[Light]:
-    """One light per period: the moods in order, each turned and varied a little."""
+    """One light per period: `MOODS` in order, each with the sun turned and varied slightly."""
     rng = rng_for(seed, "light")
     turn = float(rng.uniform(0, 360))
     lights = []
     for p in range(periods):
         mood = MOODS[p % len(MOODS)]
         azimuth = (mood.azimuth + turn + float(rng.uniform(-15, 15))) % 360
-        # Later rounds through the moods must not repeat the earlier ones.
+        # Later cycles through the moods must not repeat earlier ones.
         azimuth = (azimuth + 67.0 * (p // len(MOODS))) % 360
         light = replace(
             mood,
@@ -106,7 +106,7 @@ def make_lights(seed: int, periods: int) -> list[Light]:
 
 
 class SkyArgs(NamedTuple):
-    """What compiled code needs of a light."""
+    """The values of a light that compiled code uses."""
 
     direction: Array
     sun: Array
@@ -128,7 +128,7 @@ def sky_args(light: Light) -> SkyArgs:
 
 @inner
 def sky_radiance(dx, dy, dz, a, detail):  # type: ignore[no-untyped-def]
-    """Radiance of the sky in a unit direction; ``detail`` False leaves the clouds out."""
+    """Radiance of the sky in a unit direction; without ``detail``, clouds are an even veil."""
     up = max(dz, 0.0)
     t = 1.0 - math.exp(-4.5 * up)
     r = a.horizon[0] + (a.zenith[0] - a.horizon[0]) * t
@@ -140,7 +140,7 @@ def sky_radiance(dx, dy, dz, a, detail):  # type: ignore[no-untyped-def]
     wide, sharp = 0.10 * sharp, 0.30 * sharp**8
     glow = wide + sharp
     r, g, b = r + glow * a.sun[0], g + glow * a.sun[1], b + glow * a.sun[2]
-    # Below the clouds of a grey day little of the blue is left.
+    # Under an overcast sky little of the blue is left.
     cover, white = 0.6 * a.cloud * a.cloud, 0.62
     if detail and up > 0.01:
         px, py = dx / (up + 0.12), dy / (up + 0.12)
@@ -155,7 +155,7 @@ def sky_radiance(dx, dy, dz, a, detail):  # type: ignore[no-untyped-def]
 
 
 class Probes(NamedTuple):
-    """Indirect light on a grid: radiance of order 1 in spherical harmonics."""
+    """Indirect light on a grid: radiance in spherical harmonics up to order 1."""
 
     origin: Array
     step: Array
@@ -163,12 +163,12 @@ class Probes(NamedTuple):
     values: NDArray[np.float32]
     """Mean radiance and three slopes per colour. [X, Y, Z, 4, 3]"""
     valid: NDArray[np.float32]
-    """0 inside of objects. [X, Y, Z]"""
+    """0 inside objects, else 1. [X, Y, Z]"""
 
 
 @inner
 def probe_light(probes, x, y, z, dx, dy, dz, slope):  # type: ignore[no-untyped-def]
-    """Indirect radiance around a point for a direction; ``slope`` 2/3 gives diffuse light."""
+    """Indirect radiance at a point from a direction; ``slope`` 2/3 gives irradiance / pi."""
     nx, ny, nz = probes.valid.shape
     fx = min(max((x - probes.origin[0]) / probes.step[0], 0.0), nx - 1.001)
     fy = min(max((y - probes.origin[1]) / probes.step[1], 0.0), ny - 1.001)
@@ -194,9 +194,10 @@ def probe_light(probes, x, y, z, dx, dy, dz, slope):  # type: ignore[no-untyped-
 def probe_values(  # type: ignore[no-untyped-def]
     rays, t, tri, uv, lit, tables, mean_albedo, sky, count
 ):
-    """Radiance of order 1 around each probe from the rays that it sent.
+    """Radiance up to order 1 around each probe from the rays that it cast.
 
-    Hits get sun and a constant sky; a probe that mostly sees backs of surfaces is inside.
+    Hits receive sunlight and a constant sky. A probe is inside an object, and not valid, if more
+    than a quarter of its rays hit surfaces from behind.
 
     Returns:
         values: [P, 4, 3] float32

@@ -1,4 +1,4 @@
-"""Triangles with painted patches: what objects are made of.
+"""Geometry of objects: triangles with textured patches.
 
 A *patch* is a piece of surface with a texture frame (origin and two unit axes in metres, so that
 textures are written in metres) and a *style* (kind of texture, colours, numbers). Triangles refer
@@ -18,6 +18,8 @@ from chronoscene.kernels.compilation import inner
 
 Array = NDArray[np.float64]
 Color = tuple[float, float, float]
+TextureFrame = tuple[ArrayLike, ArrayLike, ArrayLike]
+"""Origin and two unit axes."""
 
 STYLE_WIDTH = 24
 """Style row: kind, three colours (1..9), numbers (10..19), reflectance at 0 degrees (20), sharpness
@@ -27,7 +29,7 @@ PATCH_WIDTH = 12
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross product along the last axis; numpy's own spends its time on general axes."""
+    """Cross product along the last axis; faster than numpy's, which supports any axes."""
     x = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     y = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
     z = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
@@ -42,7 +44,7 @@ def srgb(red: float, green: float, blue: float) -> Color:
 
 
 class Part(NamedTuple):
-    """Geometry with its own tables (T triangles, P patches, S styles); kernels read it as it is."""
+    """Geometry as tables of T triangles, P patches and S styles, which kernels read directly."""
 
     vertices: NDArray[np.float32]
     """World metres, counter-clockwise seen from outside. [T, 3, 3]"""
@@ -97,7 +99,7 @@ class PartBuilder:
         sharp: float = 0.0,
         translucent: float = 0.0,
     ) -> int:
-        """Index of a style, made once for equal arguments."""
+        """Index of a style; equal arguments share one."""
         row = np.zeros(STYLE_WIDTH)
         row[0] = kind
         row[1:10] = [*c0, *(c1 or c0), *(c2 or c0)]
@@ -116,7 +118,7 @@ class PartBuilder:
         edge_v: ArrayLike,
         style: int,
         *,
-        frame: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
+        frame: TextureFrame | None = None,
         seed: int = 0,
     ) -> None:
         """Add N parallelograms; the outside is where ``edge_u x edge_v`` points.
@@ -126,8 +128,8 @@ class PartBuilder:
             edge_u: First edges, or one for all. [N, 3] or [3]
             edge_v: Second edges, or one for all. [N, 3] or [3]
             style: Style index.
-            frame: Origin and two unit axes of one texture over all quads; each quad has its own
-                texture otherwise, starting at its corner.
+            frame: Frame of one texture over all quads; by default each quad has its own,
+                which starts at its corner.
             seed: Varies the texture.
         """
         o = np.atleast_2d(np.asarray(corner, np.float64))
@@ -169,7 +171,7 @@ class PartBuilder:
             style: Style of the sides and the bottom.
             top: Style of the face at ``+c``; ``style`` where absent.
             seed: Varies the texture.
-            bottom: Whether to add the face at ``-c``.
+            bottom: Whether to add the face at ``-c`` as well.
         """
         o, a, b, c = np.broadcast_arrays(np.atleast_2d(np.asarray(corner, np.float64)), a, b, c)
         self.quads(o, a, c, style, seed=seed)
@@ -181,12 +183,7 @@ class PartBuilder:
             self.quads(o + b, a, -b, style, seed=seed + 5)
 
     def polygon(
-        self,
-        points: ArrayLike,
-        style: int,
-        *,
-        frame: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
-        seed: int = 0,
+        self, points: ArrayLike, style: int, *, frame: TextureFrame | None = None, seed: int = 0
     ) -> None:
         """Add a convex polygon, counter-clockwise seen from outside. [K, 3]"""
         p = np.asarray(points, np.float64)
@@ -247,7 +244,7 @@ class PartBuilder:
         self._num_patches += len(rows)
 
 
-def _frame_row(frame: tuple[ArrayLike, ArrayLike, ArrayLike], points: Array) -> Array:
+def _frame_row(frame: TextureFrame, points: Array) -> Array:
     """Patch row of a texture frame; the extents reach the farthest of the points."""
     origin, u, v = (np.asarray(x, np.float64) for x in frame)
     local = points.reshape(-1, 3) - origin
@@ -255,18 +252,13 @@ def _frame_row(frame: tuple[ArrayLike, ArrayLike, ArrayLike], points: Array) -> 
 
 
 def merge(parts: Sequence[Part]) -> Part:
-    """One part of several, with shifted indices."""
+    """Several parts as one, with shifted indices."""
     patch_shift = np.cumsum([0, *(len(p.patches) for p in parts)])
     style_shift = np.cumsum([0, *(len(p.styles) for p in parts)])
-    pairs = list(zip(parts, patch_shift, style_shift, strict=False))
-    return Part(
-        vertices=np.concatenate([p.vertices for p in parts]),
-        normals=np.concatenate([p.normals for p in parts]),
-        tri_patch=np.concatenate([p.tri_patch + np.int32(a) for p, a, _ in pairs]),
-        patches=np.concatenate([p.patches for p in parts]),
-        patch_style=np.concatenate([p.patch_style + np.int32(b) for p, _, b in pairs]),
-        patch_seed=np.concatenate([p.patch_seed for p in parts]),
-        styles=np.concatenate([p.styles for p in parts]),
+    tri_patch = [p.tri_patch + np.int32(n) for p, n in zip(parts, patch_shift, strict=False)]
+    patch_style = [p.patch_style + np.int32(n) for p, n in zip(parts, style_shift, strict=False)]
+    return Part(*map(np.concatenate, zip(*parts, strict=True)))._replace(
+        tri_patch=np.concatenate(tri_patch), patch_style=np.concatenate(patch_style)
     )
 
 

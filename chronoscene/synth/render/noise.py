@@ -1,6 +1,6 @@
 """Random numbers: seeded generators for the layout, hashes and noise for textures.
 
-Generators are keyed by names, so that adding one object leaves the others as they were. The
+Generators are keyed by names, so that adding an object leaves the others unchanged. The
 compiled functions are pure. Those that draw detail take ``fw``, the width of a pixel on the
 surface in metres, and fade or average what is smaller, so that textures do not alias.
 """
@@ -18,19 +18,19 @@ MASK = 0xFFFFFFFF
 
 
 def rng_for(seed: int, *keys: object) -> np.random.Generator:
-    """Generator for a named purpose; equal seed and keys give equal numbers on any machine."""
+    """Generator for a named purpose; the same seed and keys give the same numbers anywhere."""
     words = [zlib.crc32(str(key).encode()) for key in keys]
     return np.random.default_rng(np.random.SeedSequence([seed, *words]))
 
 
 def key_number(*keys: object) -> int:
-    """Small positive integer of a name, for the hashes inside textures."""
+    """Small non-negative integer derived from a name, for the hashes in textures."""
     return zlib.crc32("/".join(map(str, keys)).encode()) % 65_521
 
 
 @inner
 def hash01(ix, iy, seed):  # type: ignore[no-untyped-def]
-    """Uniform number in 0..1 of two integers and a seed."""
+    """Pseudo-random number, uniform in 0..1, from two integers and a seed."""
     h = (ix * 0x9E3779B1 + iy * 0x85EBCA77 + seed * 0xC2B2AE3D) & MASK
     h ^= h >> 15
     h = (h * 0x2C1B3C6D) & MASK
@@ -64,7 +64,7 @@ def value_noise_3d(x, y, z, seed):  # type: ignore[no-untyped-def]
 
 @inner
 def fade(size, fw):  # type: ignore[no-untyped-def]
-    """Weight 0..1 of detail of a size seen with pixels of width ``fw``."""
+    """Weight 0..1 of detail of the given size, seen with pixels of width ``fw``."""
     return min(1.0, max(0.0, size / fw * 0.8 - 0.6))
 
 
@@ -77,7 +77,7 @@ def fbm(x, y, size, octaves, seed, fw):  # type: ignore[no-untyped-def]
         if weight <= 0.0:
             break
         total += amplitude * weight * value_noise(x / size, y / size, seed + 131 * octave)
-        # A turn between octaves hides the lattice of the noise.
+        # Rotating between octaves hides the lattice of the noise.
         x, y = 0.8 * x - 0.6 * y, 0.6 * x + 0.8 * y
         size *= 0.47
         amplitude *= 0.55
@@ -132,7 +132,7 @@ def colors(s):  # type: ignore[no-untyped-def]
 
 @inner
 def weather(color, u, v, seed, fw, strength):  # type: ignore[no-untyped-def]
-    """Blotches, streaks that run down, and grain: what keeps real walls from being flat."""
+    """Blotches and vertical streaks, which keep walls from looking flat."""
     blotch = fbm(u, v, 2.6, 5, seed + 11, fw)
     streak = fbm(u * 3.0, v * 0.35, 1.0, 3, seed + 12, 0.6 * fw)
     return scaled(color, max(0.25, 1.0 + strength * (0.75 * blotch + 0.45 * streak)))

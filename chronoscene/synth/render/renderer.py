@@ -17,10 +17,10 @@ from chronoscene.synth.render.shade import albedo_at, camera_rays, shade, shadow
 
 Array = NDArray[np.float64]
 MAX_SAMPLES = 1_500_000
-"""Rays that are in memory at once."""
+"""Maximum number of rays in memory at once."""
 PROBE_RAYS = 64
 SUN_SPREAD = 0.009
-"""Radius of the sun's disc in radians; about twice the real one, for softer edges."""
+"""Angular radius of the sun in radians; about twice the real one, for softer shadows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +96,7 @@ class PeriodRenderer:
         return np.asarray(self._scene.compute_distance(query).numpy(), np.float64)
 
     def coarse_depth(self, camera: Camera, cam_from_world: Array) -> NDArray[np.float32]:
-        """z-depth along a coarse grid of the view; infinite for the sky. [n]"""
+        """z-depth on a 24 x 18 grid over the view; infinite for the sky. [n]"""
         k = camera.K.copy()
         k[0] *= 24 / camera.width
         k[1] *= 18 / camera.height
@@ -126,10 +126,11 @@ class PeriodRenderer:
         return PixelMaps(depth.reshape(shape), element, color.reshape(*shape, 3))
 
     def surface_near(self, points: Array) -> NDArray[np.uint32]:
-        """Triangles that pass through points, `MISS` where none is within a millimetre. [n]"""
+        """Triangles that pass through points, `MISS` where the nearest is too far away. [n]"""
         query = _tensor(np.asarray(points, np.float32))
         found = self._scene.compute_closest_points(query)
         gap = np.linalg.norm(found["points"].numpy() - points, axis=1)
+        # A millimetre, and the rounding of single precision far from the origin.
         limit = 1e-3 + 2e-6 * np.abs(points).max(axis=1)
         return np.where(gap < limit, found["primitive_ids"].numpy(), np.uint32(MISS))
 
@@ -207,17 +208,17 @@ class PeriodRenderer:
 
 @cache
 def load_open3d() -> Any:
-    """Import open3d, which casts the rays and nothing else needs.
+    """Import open3d, which only this ray caster needs.
 
     Raises:
-        BackendError: If it is not installed, or lacks libraries of the system.
+        BackendError: If it is not installed or system libraries are missing.
     """
     try:
         import open3d
     except (ImportError, OSError) as error:
         raise BackendError(
             "open3d",
-            expected="the package that casts the rays of generated scenes",
+            expected="the package that casts rays for generated scenes",
             found=str(error).splitlines()[0],
             todo="pip install 'chronoscene[synth]', and on Debian or Ubuntu also apt-get install "
             "libusb-1.0-0 libgl1 libegl1 libgomp1 libx11-6",
@@ -231,7 +232,7 @@ def _tensor(array: Any) -> Any:
 
 
 def _sphere(count: int) -> NDArray[np.float32]:
-    """Evenly spread unit directions (a Fibonacci lattice). [count, 3]"""
+    """Evenly distributed unit directions (a Fibonacci lattice). [count, 3]"""
     i = np.arange(count) + 0.5
     z = 1 - 2 * i / count
     turn = np.pi * (1 + 5**0.5) * i
@@ -240,5 +241,5 @@ def _sphere(count: int) -> NDArray[np.float32]:
 
 
 def _mean_albedo(styles: Array) -> Array:
-    """Rough colour of each style for indirect light. [S, 3]"""
+    """Approximate mean albedo of each style, for indirect light. [S, 3]"""
     return 0.7 * styles[:, 1:4] + 0.3 * styles[:, 4:7]

@@ -1,7 +1,7 @@
 """Compiled shading: camera rays, hit points, light, tone curve.
 
-All loops run over pixels or samples that do not touch each other, so the result does not depend
-on the number of threads.
+All parallel loops run over independent pixels or samples, so the result does not depend on the
+number of threads.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def camera_rays(world_from_cam, k, width, row0, rows, ss):  # type: ignore[no-un
 
 @kernel(parallel=True)
 def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ignore[no-untyped-def]
-    """Rays to the sun for all samples; whether each is needed.
+    """Rays to the sun for all samples, and whether each is needed. [n, 6], [n]
 
     Sample i uses direction ``i % count`` of the sun's disc: the offsets are fixed in the world, so
-    views agree about the soft edges of shadows.
+    views agree on the soft edges of shadows.
     """
     n = len(t)
     out = np.zeros((n, 6), np.float32)
@@ -93,7 +93,7 @@ def surface_albedo(tables, tri, x, y, z, fw):  # type: ignore[no-untyped-def]
 
 @inner
 def _reflected(x, y, z, n, d, style, facing, lit, sky, probes):  # type: ignore[no-untyped-def]
-    """Mirror-like part of the light: sky or surroundings, and the sun's highlight."""
+    """Specular reflection of sky and surroundings, and the sun's highlight."""
     k = 2.0 * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
     mx, my, mz = d[0] - k * n[0], d[1] - k * n[1], d[2] - k * n[2]
     grazing = (1.0 - min(1.0, abs(0.5 * k))) ** 5
@@ -162,7 +162,7 @@ def _sky(ray, sky):  # type: ignore[no-untyped-def]
 
 @inner
 def _share(lit, first, count):  # type: ignore[no-untyped-def]
-    """Share of samples that the sun reaches."""
+    """Share of lit samples."""
     total = 0.0
     for i in range(first, first + count):
         total += 1.0 if lit[i] else 0.0
@@ -231,7 +231,7 @@ def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # ty
                     base = mix(old, base, 0.5)
                     sun = _share(lit, first, per_pixel)
                 c = _radiance(rays[i], float(t[i]), tri[i], u, v, sun, base, tables, sky, probes)
-            # A cap keeps one bright sample from whitening an edge.
+            # The cap keeps a single bright sample from whitening an edge.
             weight = per_pixel if uniform else 1
             r, g = r + weight * min(c[0], 6.0), g + weight * min(c[1], 6.0)
             b += weight * min(c[2], 6.0)

@@ -30,7 +30,7 @@ def plain(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 @inner
 def plaster(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
-    """Plaster with a dirty base and spots where it came off (c1). Numbers: wear, storey, rows."""
+    """Plaster with a dirty base (c2) and worn spots (c1). Numbers: wear, storey, rows."""
     c0, c1, c2 = colors(s)
     color = weather(c0, u, v, seed, fw, 0.22)
     worn = smooth(0.72 - 0.4 * s[10], 0.84 - 0.4 * s[10], fbm(u, v, 1.3, 5, seed + 21, fw) + 0.25)

@@ -2,7 +2,7 @@
 
 Each function gets the style row, texture coordinates in metres, the patch extents, a seed and the
 pixel width ``fw`` on the surface, and returns a linear RGB triple. The kinds are the constants
-below; `albedo` chooses among them.
+below; `albedo` dispatches on them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _leaves(s, x, y, z, seed, fw):  # type: ignore[no-untyped-def]
     c0, c1, c2 = colors(s)
     size = s[10]
     near, middle = fade(size, 0.8 * fw), fade(4.0 * size, fw)
-    # Cells lie askew and are shaken by noise, so that no rows of leaves show.
+    # Cells are rotated and distorted, so that the leaves do not form rows.
     wx = (0.8 * x - 0.6 * y) / size + 0.9 * math.sin(2.3 * z / size)
     wy = (0.6 * x + 0.8 * y) / size + 0.9 * math.sin(1.9 * z / size + 1.0)
     wz = z / size + 0.8 * math.sin(2.1 * (x + 0.4 * y) / size)
