@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 HeightKind = Literal["as stated", "relative", "none"]
 
 
@@ -38,22 +39,16 @@ class Georeference:
             f"+h_0={self.height!r}"
         )
 
-    def to_enu(
-        self,
-        latitude: NDArray[np.float64],
-        longitude: NDArray[np.float64],
-        height: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
+    def to_enu(self, latitude: Array, longitude: Array, height: Array) -> Array:
         """Metres east, north and up of the origin. [N] each -> [N, 3]"""
-        x, y, z = _pipeline(self.crs).transform(longitude, latitude, height)
-        return np.stack([np.asarray(a, np.float64) for a in (x, y, z)], axis=-1)
+        places = _pipeline(self.crs).transform(longitude, latitude, height)
+        return np.stack([np.asarray(a, np.float64) for a in places], axis=-1)
 
-    def to_geodetic(self, enu: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_geodetic(self, enu: Array) -> Array:
         """Latitude, longitude (degrees) and height (metres): inverse of `to_enu`. [N, 3]"""
         inverse: Any = "INVERSE"
-        lon, lat, height = _pipeline(self.crs).transform(
-            *np.moveaxis(enu, -1, 0), direction=inverse
-        )
+        east, north, up = np.moveaxis(enu, -1, 0)
+        lon, lat, height = _pipeline(self.crs).transform(east, north, up, direction=inverse)
         return np.stack([lat, lon, height], axis=-1)
 
 
@@ -68,7 +63,7 @@ def from_crs(crs: str | None) -> Georeference | None:
     return Georeference(latitude, longitude, height, "as stated")
 
 
-def median_longitude(degrees: NDArray[np.float64]) -> float:
+def median_longitude(degrees: Array) -> float:
     """Median of longitudes in degrees, correct across the antimeridian."""
     first = degrees[0]
     turned = (degrees - first + 180) % 360 - 180

@@ -17,19 +17,18 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from PIL import ExifTags, Image
 from PIL.ExifTags import GPS, Base
+
+Number = TypeVar("Number", int, float)
 
 _EXIF, _APP1, _START_OF_SCAN = b"Exif\0\0", 0xE1, 0xDA
 _SHORT, _LONG = 3, 4
 
 MAX_XMP_BYTES = 1_000_000
 MAX_NAME_LENGTH = 100
-
-MIN_YEAR = 1990
-"""Clocks that were never set say less."""
 
 _DATE = re.compile(
     r"(\d{4})[-:./](\d{1,2})[-:./](\d{1,2})(?!\d)(?:[ T]+(\d{1,2})\D(\d{1,2})(?:\D(\d{1,2}))?)?",
@@ -122,13 +121,13 @@ def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
         latitude=latitude,
         longitude=longitude,
         altitude=altitude,
-        focal_mm=_positive(exif.get(Base.FocalLength)),
-        focal_35mm=_positive(exif.get(Base.FocalLengthIn35mmFilm)),
+        focal_mm=_positive(_number(exif.get(Base.FocalLength))),
+        focal_35mm=_positive(_number(exif.get(Base.FocalLengthIn35mmFilm))),
         make=_text(main.get(Base.Make)),
         model=_text(main.get(Base.Model)),
         orientation=orientation if 1 <= orientation <= 8 else 1,
-        width=_size(exif.get(Base.ExifImageWidth)),
-        height=_size(exif.get(Base.ExifImageHeight)),
+        width=_positive(_integer(exif.get(Base.ExifImageWidth))),
+        height=_positive(_integer(exif.get(Base.ExifImageHeight))),
         drone=drone,
     )
 
@@ -167,7 +166,7 @@ def _date(value: Any) -> datetime | None:
             date = datetime(year, month, day, *clock)
         except ValueError:
             continue
-        return date if year >= MIN_YEAR else None
+        return date if year >= 1990 else None  # clocks that were never set say less
     return None
 
 
@@ -205,8 +204,7 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _positive(value: Any) -> float | None:
-    number = _number(value)
+def _positive(number: Number | None) -> Number | None:
     return number if number is not None and number > 0 else None
 
 
@@ -215,11 +213,6 @@ def _integer(value: Any) -> int | None:
         return value[0]
     number = _number(value)
     return int(number) if number is not None and number == int(number) else None
-
-
-def _size(value: Any) -> int | None:
-    number = _integer(value)
-    return number if number is not None and number > 0 else None
 
 
 def _text(value: Any) -> str | None:

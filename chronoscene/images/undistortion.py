@@ -133,23 +133,14 @@ def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.flo
     """Positions in the new image of pixels of the old one; NaN where none. [N, 2] -> [N, 2]"""
     if change.is_copy or not len(xy):
         return xy
+    rays = unproject_pixels(change.source, xy)
+    if not change.source.is_pinhole:
+        # COLMAP iterates, and returns a result even beyond the field of view of the model, where
+        # there is no such ray; the projection of that result is not the pixel.
+        again = project_points(change.source, np.column_stack([rays, np.ones(len(rays))]))
+        rays[~(np.abs(again - xy).max(axis=1) < MAX_ROUND_TRIP_ERROR)] = np.nan
     fx, fy, cx, cy = change.target.params
-    return _rays(change.source, xy) * [fx, fy] + [cx, cy]
-
-
-def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points at depth 1 that a camera sees at pixels. [N, 2] -> [N, 2]
-
-    COLMAP iterates, and returns a result even beyond the field of view of the model, where there is
-    no such ray. So rays are projected again, and become NaN where the projection disagrees.
-    """
-    rays = unproject_pixels(camera, xy)
-    if camera.is_pinhole:
-        return rays
-    again = project_points(camera, np.column_stack([rays, np.ones(len(rays))]))
-    wrong = ~(np.abs(again - xy).max(axis=1) < MAX_ROUND_TRIP_ERROR)
-    rays[wrong] = np.nan
-    return rays
+    return rays * [fx, fy] + [cx, cy]
 
 
 @lru_cache(maxsize=4)

@@ -42,9 +42,6 @@ Result = TypeVar("Result")
 Report = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and its total."""
 
-POLL_SECONDS = 0.5
-"""How often a worker checks that its parent is still there."""
-
 
 @contextmanager
 def stoppable() -> Iterator[None]:
@@ -147,7 +144,7 @@ def _end_with(parent: int) -> None:
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(POLL_SECONDS)
+            time.sleep(0.5)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

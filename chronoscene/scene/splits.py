@@ -52,7 +52,7 @@ class Problem:
     """Line number from 1; None for the whole file."""
     expected: str
     found: str
-    todo: str
+    todo: str = "see DATASET.md"
 
     def error(self, path: Path) -> SceneError:
         """The problem as an exception that names the file."""
@@ -110,10 +110,10 @@ def parse_split_text(text: str) -> tuple[list[SplitEntry], list[Problem]]:
         fields = line.rsplit(maxsplit=1)
         if len(fields) < 2:
             expected = '"<image name> <period id>"'
-            problems.append(_problem("fields", number, expected, f"one field: {line!r}"))
+            problems.append(Problem("fields", number, expected, f"one field: {line!r}"))
         elif not re.fullmatch("[0-9]{1,9}", fields[1]):
             expected = "a period id 0, 1, ... as the last field"
-            problems.append(_problem("period", number, expected, repr(line)))
+            problems.append(Problem("period", number, expected, repr(line)))
         else:
             entries.append(SplitEntry(number, fields[0].strip(), int(fields[1])))
     return entries, problems
@@ -134,10 +134,6 @@ def _lines(text: str) -> Iterable[tuple[int, str]]:
     for number, line in enumerate(re.split("\r\n|\r|\n", text), start=1):
         if stripped := line.strip():
             yield number, stripped
-
-
-def _problem(kind: ProblemKind, line: int | None, expected: str, found: str) -> Problem:
-    return Problem(kind, line, expected, found, "see DATASET.md")
 
 
 class NameIndex:
@@ -212,7 +208,7 @@ def assign_periods(
     placed = [_place(entry, index.find(entry.name), periods, lines) for entry in entries]
     problems = [problem for problem in placed if problem is not None]
     problems += [
-        _problem("missing", None, f"a period for every registered image, {name!r} too", "none")
+        Problem("missing", None, f"a period for every registered image, {name!r} too", "none")
         for name in names
         if name not in periods
     ]
@@ -234,13 +230,13 @@ def _place(
         found_period = f"period {entry.period}"
         todo = "keep one of the two lines"
         return Problem("contradiction", entry.line, expected, found_period, todo)
-    return _problem("duplicate", entry.line, "each image once", f"{name!r} as in {lines[name]}")
+    return Problem("duplicate", entry.line, "each image once", f"{name!r} as in {lines[name]}")
 
 
 def _not_one(entry: SplitEntry | NameEntry, found: list[str]) -> Problem:
     """The problem of a name that matches no image, or several."""
     if not found:
-        return _problem("unknown", entry.line, "the name of a registered image", repr(entry.name))
+        return Problem("unknown", entry.line, "the name of a registered image", repr(entry.name))
     several = f"{entry.name!r}, which matches {', '.join(map(repr, found[:3]))}"
     todo = "write the full names below images/"
     return Problem("ambiguous", entry.line, "a name that matches one image", several, todo)
@@ -250,7 +246,7 @@ def check_period_ids(entries: Iterable[SplitEntry], used: Iterable[int]) -> list
     """Check that the ids are 0..T-1 and that every period has a registered image."""
     ids, used = sorted({entry.period for entry in entries}), set(used)
     if not ids:
-        return [_problem("ids", None, "at least one line", "none")]
+        return [Problem("ids", None, "at least one line", "none")]
     if ids != list(range(len(ids))):
         shown = ", ".join(map(str, ids[:10])) + (", ..." if len(ids) > 10 else "")
         expected = f"period ids 0..{len(ids) - 1} for {len(ids)} periods"
