@@ -203,7 +203,7 @@ def whole_periods(scene: Scene, periods: tuple[int, ...]) -> set[str]:
 
 
 def blocked(scene: Scene, fraction: float, blocks: int | None, seed: int) -> set[str]:
-    """The images of whole blocks of camera positions; no ``blocks``: two for testing."""
+    """The images of whole blocks of camera positions; by default, two blocks are for testing."""
     centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
     count = blocks or max(2, round(2 / fraction))
     if count > len(centres):

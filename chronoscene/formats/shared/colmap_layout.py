@@ -129,13 +129,8 @@ def write_renamed(
 ) -> Path:
     """Write ``images/`` and ``sparse/0`` with other image names; complete or not at all.
 
-    Args:
-        scene: Any scene; its images are found by the old names.
-        out: Folder that does not exist yet, or is empty.
-        names: New name of each image.
-        test_list: Whether to write ``sparse/0/test.txt``.
-        image_source: What to do with the images; see `IMAGE_SOURCES`.
-        progress: Called after each image.
+    ``names`` has the new name of each image, which is found by its old one; ``test_list`` says
+    whether to write ``sparse/0/test.txt``. The rest is as for `chronoscene.formats.chronoscene`.
 
     Raises:
         SceneError: If ``out`` is in use, an image is missing, or two new names are equal.
