@@ -57,9 +57,9 @@ class Spellings:
                 table.setdefault(key, set()).add(name)
 
     def find(self, text: str) -> str | None:
-        """The name with the same full name, file name, or file name without extension.
+        """The name with the same full name, else file name, else file name without extension.
 
-        The first of these that matches any name decides; None if it matches several.
+        None if the first of these that matches any name matches several.
         """
         for table, key in zip(self._by_key, _keys(text.strip(PUNCTUATION)), strict=True):
             if found := table.get(key):

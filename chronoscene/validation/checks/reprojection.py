@@ -92,13 +92,12 @@ def pose_limit(scene: RawScene, image: int) -> float:
 @derived
 def period_errors(scene: RawScene) -> dict[int, float]:
     """Median over the images of a period of `image_errors`, for periods with enough of them."""
-    medians = {}
-    for index, period in enumerate(scene.period_ids):
-        errors = image_errors(scene)[scene.image_periods == index]
-        errors = errors[~np.isnan(errors)]
-        if len(errors) >= MIN_IMAGES:
-            medians[period] = float(np.median(errors))
-    return medians
+    judged = ~np.isnan(image_errors(scene))
+    errors = {
+        period: image_errors(scene)[judged & (scene.image_periods == index)]
+        for index, period in enumerate(scene.period_ids)
+    }
+    return {p: float(np.median(e)) for p, e in errors.items() if len(e) >= MIN_IMAGES}
 
 
 @derived

@@ -58,12 +58,10 @@ def repair_model(images: RawImages, points: RawPoints) -> tuple[RawImages, RawPo
 
 
 def _unit_quaternions(images: RawImages, repairs: list[Repair]) -> RawImages:
-    good = good_poses(images)
-    norm = np.where(good, np.linalg.norm(images.quaternions, axis=1), 1.0)
-    if number := int(np.count_nonzero(np.abs(norm - 1) > UNIT_TOLERANCE)):
-        repairs.append(Repair("CS122", f"{counted(number, 'quaternion')} normalised"))
-        return replace(images, quaternions=images.quaternions / norm[:, None])
-    return images
+    norm = np.where(good_poses(images), np.linalg.norm(images.quaternions, axis=1), 1.0)
+    number = int(np.count_nonzero(np.abs(norm - 1) > UNIT_TOLERANCE))
+    _note(repairs, "CS122", number, "quaternion", "normalised")
+    return replace(images, quaternions=images.quaternions / norm[:, None]) if number else images
 
 
 def _without_broken_observations(

@@ -214,12 +214,9 @@ class _Fix:
             self._repairs.append(Repair("", what))
 
     def _behind_links(self, top: Path) -> list[str]:
-        """Add parts of the scene that are still missing because they are behind links.
+        """Add parts of the scene that are still missing because they are behind links; lists them.
 
         Images elsewhere are linked again, so that only the model is copied from there.
-
-        Returns:
-            What was added.
         """
         names = [f"images/{name}" for name in self._scene.present]
         below = f"{self._scene.model_place}/" if self._scene.model_place else ""

@@ -125,11 +125,8 @@ def period_frame(scene: RawScene) -> Iterator[Hit]:
 
 @derived
 def _other_depths(scene: RawScene) -> dict[int, float]:
-    """Periods without shared points whose depths are of another order than those of the rest.
-
-    Returns:
-        Ratio of the median depths by the index of the period.
-    """
+    """Ratio of the median depths, by index, of periods without shared points to those of the rest,
+    where it is of another order."""
     ratios = {}
     seen = scene.point_periods
     assert seen is not None
