@@ -141,7 +141,6 @@ class Method(Protocol):
 
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
         """Build the initial model. Nothing else draws from the global random state."""
-        ...
 
     def step(self, index: int, progress: float) -> StepReport:
         """Do one training step.
@@ -152,19 +151,15 @@ class Method(Protocol):
                 densification) follows it, so that a run that ends by the clock goes through the
                 same phases as one that ends after a number of iterations.
         """
-        ...
 
     def render(self, view: View, period: float) -> Prediction:
         """Render a view as of a period; fractional only where the spec says ``continuous``."""
-        ...
 
     def save(self, folder: Path) -> None:
         """Write ``model.safetensors`` and ``model.json`` into an existing empty folder."""
-        ...
 
     def load(self, folder: Path, *, device: str) -> None:
         """Read what `save` wrote; `render` then gives the same pixels."""
-        ...
 
     def size(self) -> MethodSize: ...
 

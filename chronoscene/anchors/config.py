@@ -136,11 +136,11 @@ class AnchorConfig:
         for head in self.direction_heads:
             check_choice("direction_heads", head, HEADS)
         for name, low in _LOWER_BOUNDS.items():
-            if getattr(self, name) < low:
+            value = getattr(self, name)
+            if value < low:
                 raise ConfigError(
-                    name, expected=f"at least {low}", found=str(getattr(self, name)),
-                    todo="correct the value",
-                )  # fmt: skip
+                    name, expected=f"at least {low}", found=str(value), todo="correct the value"
+                )
 
 
 HEADS = ("opacity", "covariance", "color")

@@ -122,11 +122,8 @@ class DensityStatistics:
     """What training views said about each anchor and Gaussian since it was last judged."""
 
     def __init__(self, anchors: int, offsets: int) -> None:
-        self.opacity_sum = np.zeros(anchors, np.float32)
-        self.visits = np.zeros(anchors, np.float32)
-        self.motion = np.zeros(anchors, np.float32)
-        self.grad_sum = np.zeros((anchors, offsets), np.float32)
-        self.hits = np.zeros((anchors, offsets), np.float32)
+        self.opacity_sum, self.visits, self.motion = np.zeros((3, anchors), np.float32)
+        self.grad_sum, self.hits = np.zeros((2, anchors, offsets), np.float32)
 
     def update(
         self,

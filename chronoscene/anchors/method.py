@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.anchors.config import AnchorConfig
+from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.density import initial_anchors, resolve_voxel_size
-from chronoscene.anchors.model import AnchorLayout, AnchorModel
-from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer, learning_rates
+from chronoscene.anchors.model import LAYERS, AnchorLayout, AnchorModel
+from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
@@ -35,8 +35,16 @@ class AnchorMethod(SplattingMethod):
         return AnchorLayout.of(self.config, num_periods)
 
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
-        """Learning rates by tensor name."""
-        return learning_rates(self.config, camera_extent)
+        """Start and end of the learning rate of every tensor, by its name in the model."""
+        config, (start, end) = self.config, self.config.offset_lr
+        rates = {
+            "offsets": (start * camera_extent, end * camera_extent),
+            "features": config.feature_lr,
+            "log_scales": config.scaling_lr,
+        }
+        for head in HEADS:
+            rates |= {f"{head}.{layer}": getattr(config, f"{head}_lr") for layer in LAYERS}
+        return rates
 
     def weights(self, period: float) -> NDArray[np.float32]:
         """Weights of the features of the periods; here there is one for all. [T]"""
@@ -66,11 +74,9 @@ class AnchorMethod(SplattingMethod):
         config = self.config
         points = train.points[:: config.point_stride]
         points = points[finite_rows(points)].astype(np.float64)
+        scale = train.training_from_world.scale
         size = resolve_voxel_size(
-            points,
-            config.voxel_size,
-            config.voxel_unit,
-            training_from_world=train.training_from_world.scale,
+            points, config.voxel_size, config.voxel_unit, training_from_world=scale
         )
         anchors, size = initial_anchors(
             points, size, origin=config.voxel_origin, limit=config.max_initial_anchors

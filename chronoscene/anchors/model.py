@@ -185,24 +185,13 @@ class AnchorModel:
         return camera_centre_tensor(view, self.device), visible
 
     def decode(self, period_weights: Tensor, centre: Tensor, visible: Tensor) -> Splats:
-        """Gaussians of the visible anchors, in their order, k to each.
-
-        Args:
-            period_weights: Weights of the features of the periods, usually with the sum 1. [T]
-            centre: Camera centre that gives the viewing direction. [3]
-            visible: Ascending indices, int64. [M]
-        """
+        """Gaussians of the visible anchors; arguments as those of `DecodeInputs`, see `decode`."""
         return decode(self._decode_inputs(period_weights, centre, visible))
 
     def decode_active(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
     ) -> tuple[Splats, Tensor]:
-        """`decode` without the Gaussians that are switched off.
-
-        Returns:
-            splats: The L Gaussians with an opacity above 0.
-            positions: Their places in the output of `decode`, ascending. int64 [L]
-        """
+        """`decode` without the Gaussians that are switched off, and the places of the others."""
         return decode_active(self._decode_inputs(period_weights, centre, visible))
 
     def _decode_inputs(

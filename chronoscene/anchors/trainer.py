@@ -7,17 +7,17 @@ same bytes for any number of threads.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.anchors.config import HEADS, AnchorConfig
+from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
-from chronoscene.anchors.model import LAYERS, PER_ANCHOR, AnchorModel
+from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
 from chronoscene.methods import StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.adam import Adam, DenseTable
@@ -26,59 +26,36 @@ from chronoscene.training.row_adam import make_table
 from chronoscene.training.schedule import ViewSampler, downscale_image, downscale_view, log_linear
 from chronoscene.training.splatting import camera_centre_tensor, draw, finite_rows
 
-Rates = Mapping[str, tuple[float, float]]
 AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]
 
 _MARGIN = 1e-9
 """Shares of the training this close are equal: progress is a quotient of rounded numbers."""
 
 
-def learning_rates(config: AnchorConfig, camera_extent: float) -> dict[str, tuple[float, float]]:
-    """Start and end of the learning rate of every tensor, by its name in the model."""
-    start, end = config.offset_lr
-    rates = {
-        "offsets": (start * camera_extent, end * camera_extent),
-        "features": config.feature_lr,
-        "log_scales": config.scaling_lr,
-    }
-    for head in HEADS:
-        rates |= {f"{head}.{layer}": getattr(config, f"{head}_lr") for layer in LAYERS}
-    return rates
-
-
+@dataclass(eq=False)
 class AnchorTrainer:
-    """Trains a model on the views of a training set.
+    """Trains a model on the views of a training set."""
 
-    Args:
-        config: Options.
-        model: Trained in place; `snapshot` gives its present state.
-        train: Views, images, background.
-        voxel_size: Smallest growth cell in training units.
-        seed: All random choices follow from it.
-        rates: Learning rates by tensor name.
-        after_update: Called with the model and the learning rates after each step that changed
-            the features; every step then updates the features of all anchors.
-    """
+    config: AnchorConfig
+    model: AnchorModel
+    """Trained in place; `snapshot` gives its present state."""
+    train: TrainingSet
+    _: KW_ONLY
+    voxel_size: float
+    """Smallest growth cell in training units."""
+    seed: int
+    """All random choices follow from it."""
+    rates: Mapping[str, tuple[float, float]]
+    """Learning rates by tensor name."""
+    after_update: AfterUpdate | None = None
+    """Called with the model and the learning rates after each step that changed the features;
+    every step then updates the features of all anchors."""
 
-    def __init__(
-        self,
-        config: AnchorConfig,
-        model: AnchorModel,
-        train: TrainingSet,
-        *,
-        voxel_size: float,
-        seed: int,
-        rates: Rates,
-        after_update: AfterUpdate | None = None,
-    ) -> None:
-        self.config = config
-        self.after_update = after_update
-        self.model = model.requires_grad()
-        self.train = train
-        self.voxel_size = voxel_size
-        trained = {n: t for n, t in model.tensors().items() if n in rates and t.numel() > 0}
-        self.rates = {name: rates[name] for name in trained}
-        layout = model.layout
+    def __post_init__(self) -> None:
+        model, train, seed = self.model.requires_grad(), self.train, self.seed
+        layout, tensors = model.layout, model.tensors()
+        trained = {n: t for n, t in tensors.items() if n in self.rates and t.numel() > 0}
+        self.rates = {name: self.rates[name] for name in trained}
         blocks = [layout.base_dim, *[layout.period_dim] * layout.num_periods]
         self.tables = {
             "offsets": make_table(model.offsets),
@@ -87,7 +64,7 @@ class AnchorTrainer:
             "log_scales": DenseTable(model.log_scales),
         }
         self.optimizer = Adam({n: t for n, t in trained.items() if n not in PER_ANCHOR})
-        self._seen_layout = dataclasses.replace(layout, num_periods=1)
+        self._seen_layout = replace(layout, num_periods=1)
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed)

@@ -5,7 +5,7 @@ Defaults are those of the 2023 release of 3D Gaussian Splatting (Kerbl et al.).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
@@ -82,15 +82,11 @@ class GaussianConfig:
 
     def __post_init__(self) -> None:
         check_choice("sh_degree", str(self.sh_degree), ("0", "1", "2", "3"))
-        for field in fields(self):
-            value = getattr(self, field.name)
-            low = 1 if field.name in _AT_LEAST_ONE else 0
+        for name, value in asdict(self).items():
+            low = 1 if name in _AT_LEAST_ONE else 0
             if not value >= low:
                 raise ConfigError(
-                    field.name,
-                    expected=f"at least {low}",
-                    found=str(value),
-                    todo="correct the value",
+                    name, expected=f"at least {low}", found=str(value), todo="correct the value"
                 )
 
 

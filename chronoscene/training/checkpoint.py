@@ -6,7 +6,6 @@ The JSON file is written last and holds the digest of the tensor file, so a fold
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
@@ -19,31 +18,10 @@ from torch import Tensor
 
 from chronoscene.errors import CheckpointError
 from chronoscene.io.staging import replacing, write_text_atomic
-from chronoscene.scene.similarity import Sim3
 
 TENSOR_FILE = "model.safetensors"
 META_FILE = "model.json"
 FORMAT_VERSION = 1
-
-
-def build_meta(
-    method: str,
-    version: str,
-    config: Any,
-    *,
-    training_from_world: Sim3,
-    num_periods: int,
-    **extra: Any,
-) -> dict[str, Any]:
-    """What every model says about itself; ``extra`` is whatever else JSON can hold."""
-    return {
-        "method": method,
-        "version": version,
-        "config": dataclasses.asdict(config),
-        "training_from_world": training_from_world.to_matrix().tolist(),
-        "num_periods": num_periods,
-        **extra,
-    }
 
 
 def save_tensors(folder: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
@@ -51,7 +29,7 @@ def save_tensors(folder: Path, tensors: Mapping[str, Tensor], meta: Mapping[str,
 
     Args:
         tensors: Stored contiguous, in the order of their names, from any device.
-        meta: What `build_meta` returns, or any mapping that JSON can hold without NaN.
+        meta: Whatever JSON can hold without NaN.
     """
     # Copies, since views that share memory cannot be told apart in the file.
     stored = {k: tensors[k].detach().cpu().contiguous().clone() for k in sorted(tensors)}
@@ -78,51 +56,43 @@ def load_tensors(
     """
     meta = _read_meta(folder / META_FILE)
     if method is not None and meta.get("method") != method:
-        raise CheckpointError(
-            folder / META_FILE,
-            expected=f"a model of {method}",
-            found=f"one of {meta.get('method')}",
-            todo="name another folder or another method",
+        todo = "name another folder or another method"
+        raise _refusal(
+            folder / META_FILE, f"a model of {method}", f"one of {meta.get('method')}", todo
         )
     path = folder / TENSOR_FILE
     if not path.is_file():
-        raise CheckpointError(
-            path, expected="the tensors of the model", found="no such file", todo="train again"
-        )
+        raise _refusal(path, "the tensors of the model", "no such file", "train again")
     if _sha256(path) != meta["tensors_sha256"]:
-        raise _damaged(path, f"the digest given in {META_FILE}", "another one")
+        raise _refusal(path, f"the digest given in {META_FILE}", "another one")
     try:
         return load_file(path, device=device), meta
     except SafetensorError as error:
-        raise _damaged(path, "a safetensors file", str(error)) from error
+        raise _refusal(path, "a safetensors file", str(error)) from error
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise CheckpointError(
-            path,
-            expected="the description of a trained model",
-            found="no such file",
-            todo="name the folder that a finished training wrote",
-        ) from error
+        todo = "name the folder that a finished training wrote"
+        raise _refusal(path, "the description of a trained model", "no such file", todo) from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise _damaged(path, "JSON", str(error)) from error
+        raise _refusal(path, "JSON", str(error)) from error
     if not isinstance(meta, dict) or "tensors_sha256" not in meta:
-        raise _damaged(path, "an object with the key 'tensors_sha256'", "none")
-    if meta.get("format_version") != FORMAT_VERSION:
-        raise CheckpointError(
-            path,
-            expected=f"format_version {FORMAT_VERSION}",
-            found=repr(meta.get("format_version")),
-            todo="use the version of the software that wrote it, or train again",
-        )
+        raise _refusal(path, "an object with the key 'tensors_sha256'", "none")
+    if (version := meta.get("format_version")) != FORMAT_VERSION:
+        todo = "use the version of the software that wrote it, or train again"
+        raise _refusal(path, f"format_version {FORMAT_VERSION}", repr(version), todo)
     return meta
 
 
-def _damaged(path: Path, expected: str, found: str) -> CheckpointError:
-    todo = "the file is damaged or was edited: copy it again or train again"
+def _refusal(
+    path: Path,
+    expected: str,
+    found: str,
+    todo: str = "the file is damaged or was edited: copy it again or train again",
+) -> CheckpointError:
     return CheckpointError(path, expected=expected, found=found, todo=todo)
 
 

@@ -58,9 +58,7 @@ def downscale_view(view: TrainingView, factor: int) -> TrainingView:
 def downscale_image(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """Rounded mean over squares of pixels; the result has the size of `downscale_view`.
 
-    Args:
-        image: [H, W, 3]
-        factor: Edge of a square in pixels; squares are smaller where the image is.
+    ``factor`` is the edge of a square in pixels; squares are smaller where the image is.
     """
     height, width = (max(size // factor, 1) for size in image.shape[:2])
     tall, wide = (min(factor, size) for size in image.shape[:2])

@@ -8,6 +8,7 @@ trainer that changes its tensors.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -21,7 +22,7 @@ from chronoscene.errors import SceneError
 from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
 from chronoscene.rasterizer import Rasterization, rasterize
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.training.checkpoint import build_meta, load_tensors, save_tensors
+from chronoscene.training.checkpoint import load_tensors, save_tensors
 
 
 def finite_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -79,11 +80,9 @@ def draw(
     check_finite: bool = True,
 ) -> Rasterization:
     """Rasterize Gaussians in one view; arguments as `chronoscene.rasterizer.rasterize`."""
-    viewmats, Ks = camera_tensors(view, splats.means.device)
     return rasterize(
         *splats,
-        viewmats,
-        Ks,
+        *camera_tensors(view, splats.means.device),
         view.width,
         view.height,
         near_plane=near_plane,
@@ -160,27 +159,23 @@ class SplattingMethod(ABC):
         """Rebuild the model from `stored_tensors` and `meta`."""
 
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
-        """Build the initial model and its trainer."""
         background = np.array(train.background, np.float32)
         self.background = torch.from_numpy(background).to(device)
-        self.meta = build_meta(
-            self.name,
-            self.version,
-            self.config,
-            training_from_world=train.training_from_world,
-            num_periods=train.num_periods,
-            background=background.tolist(),
-        )
+        self.meta = {
+            "method": self.name,
+            "version": self.version,
+            "config": asdict(self.config),
+            "training_from_world": train.training_from_world.to_matrix().tolist(),
+            "num_periods": train.num_periods,
+            "background": background.tolist(),
+        }
         self.trainer = self.start(train, seed=seed, device=device)
 
     def step(self, index: int, progress: float) -> StepReport:
-        """Learn from one training view."""
         assert self.trainer is not None, "setup comes first"
-        report: StepReport = self.trainer.step(index, progress)
-        return report
+        return self.trainer.step(index, progress)
 
     def render(self, view: View, period: float) -> Prediction:
-        """Render a view as of a period."""
         with torch.no_grad():
             return prediction_of(self.draw(view, period))
 

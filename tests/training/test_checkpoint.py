@@ -1,7 +1,6 @@
 """Models on disk."""
 
 import json
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -12,16 +11,9 @@ from chronoscene.scene.similarity import Sim3
 from chronoscene.training.checkpoint import (
     META_FILE,
     TENSOR_FILE,
-    build_meta,
     load_tensors,
     save_tensors,
 )
-
-
-@dataclass(frozen=True)
-class Config:
-    iterations: int = 7
-    rate: float = 0.1
 
 
 def example():
@@ -29,7 +21,13 @@ def example():
     whole = torch.randn(6, 4, generator=generator)
     tensors = {"zeta": whole.T, "alpha": whole[1:3], "half": whole.half(), "index": torch.arange(5)}
     frame = Sim3(0.5, np.eye(3), np.array([1.0, 2.0, 3.0]))
-    meta = build_meta("toy", "1", Config(), training_from_world=frame, num_periods=3, note="a")
+    meta = {
+        "method": "toy",
+        "config": {"iterations": 7, "rate": 0.1},
+        "training_from_world": frame.to_matrix().tolist(),
+        "num_periods": 3,
+        "note": "a",
+    }
     return tensors, meta
 
 

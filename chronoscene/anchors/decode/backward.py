@@ -218,28 +218,17 @@ def _chunk_gradient(layout, weights, source, outputs, grads, begin, end, work, p
             count = 0
 
 
-@inner
-def _chunk_partial(partial, chunk, size):  # type: ignore[no-untyped-def]
-    """Gradients of the weights in a chunk, set to zero."""
-    move = 4 * chunk * size
-    _set_zero(partial.w1_t + move, 0, size)
-    return Gradients(partial.w1_t + move, partial.b1 + move, partial.w2 + move, partial.b2 + move)
-
-
 @kernel(parallel=True)
 def decode_backward(  # type: ignore[no-untyped-def]
     layout, weights, source, outputs, grads, out, partial, size, work, work_size, tasks
 ):
-    """Gradients of what `decode_forward` reads.
+    """Gradients of what `decode_forward` reads; arguments as there, and these.
 
     Args:
-        layout: As forward, like ``weights``, ``source``, ``work`` and ``work_size``.
-        outputs: `Outputs` of the forward pass.
         grads: `OutputGradients`.
         out: `AnchorGradients`, written.
         partial: `Gradients` of the first chunk, in the end of all; those of other chunks follow.
         size: Numbers in it.
-        tasks: As forward.
     """
     # One at least: where nothing is visible, it sets the gradients to zero.
     chunks = max(1, (source.num_visible + CHUNK - 1) // CHUNK)
@@ -248,7 +237,11 @@ def decode_backward(  # type: ignore[no-untyped-def]
         for chunk in range(task, chunks, tasks):
             begin = chunk * CHUNK
             end = min(begin + CHUNK, source.num_visible)
-            part = _chunk_partial(partial, chunk, size)
+            move = 4 * chunk * size
+            _set_zero(partial.w1_t + move, 0, size)
+            part = Gradients(
+                partial.w1_t + move, partial.b1 + move, partial.w2 + move, partial.b2 + move
+            )
             _chunk_gradient(layout, weights, source, outputs, grads, begin, end, own, part, out)
     for i in prange((size + SLICE - 1) // SLICE):
         for j in range(i * SLICE, min((i + 1) * SLICE, size), LANES):

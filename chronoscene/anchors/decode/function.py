@@ -31,6 +31,9 @@ from chronoscene.anchors.decode.layout import (
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.memory import read, write
 
+OUTPUTS = (1, 7, 3)
+"""Per offset, of the heads for opacity, covariance and colour."""
+
 
 class Decode(torch.autograd.Function):
     @staticmethod
@@ -155,11 +158,6 @@ def _output_column(layout, head, output):  # type: ignore[no-untyped-def]
     return layout.quats_at + 4 * offset + part - 3
 
 
-@inner
-def _num_outputs(layout, head):  # type: ignore[no-untyped-def]
-    return layout.offsets * (1 if head == 0 else 7 if head == 1 else 3)
-
-
 @kernel
 def pack_weights(layout, heads, shared, out):  # type: ignore[no-untyped-def]
     """Join three `Head` into ``out``, `Weights` that are zeros at first.
@@ -180,7 +178,7 @@ def pack_weights(layout, heads, shared, out):  # type: ignore[no-untyped-def]
                 write(out.w1_t, i * layout.hiddens + at, value)
                 if i < layout.features:
                     write(out.w1, at * layout.features_pad + i, value)
-        for o in range(_num_outputs(layout, head)):
+        for o in range(layout.offsets * OUTPUTS[head]):
             column = _output_column(layout, head, o)
             write(out.b2, column, read(source.b2, o))
             for h in range(layout.hidden):
@@ -214,7 +212,7 @@ def unpack_gradients(layout, grads, heads, shared, out, shared_out):  # type: ig
                 write(target.w1, column, bias * read(shared, g))
                 total = read(shared_out, g) + bias * read(source.w1, column)
                 write(shared_out, g, total)
-        for o in range(_num_outputs(layout, head)):
+        for o in range(layout.offsets * OUTPUTS[head]):
             column = _output_column(layout, head, o)
             write(target.b2, o, read(grads.b2, column))
             for h in range(layout.hidden):

@@ -7,6 +7,7 @@ of weights of an offset and their gradients stay in registers meanwhile.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -20,15 +21,10 @@ PARTS = ((0, 1), (1, 3), (1, 4), (2, 3))
 """Head and number of outputs per offset of opacity, scale, quaternion and colour."""
 
 
-class _Pointers:
-    """Addresses of float32 numbers while code is generated."""
-
-    def __init__(self, builder: Any, address: Any) -> None:
-        self.builder = builder
-        self.base = builder.inttoptr(address, FLOAT.as_pointer())
-
-    def at(self, index: Any) -> Any:
-        return self.builder.gep(self.base, [index])
+def _numbers(builder: Any, address: Any) -> Callable[[Any], Any]:
+    """Pointer to each of the float32 numbers at an address, while code is generated."""
+    base = builder.inttoptr(address, FLOAT.as_pointer())
+    return lambda index: builder.gep(base, [index])
 
 
 @intrinsic
@@ -54,15 +50,15 @@ def add_offset(
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         b = builder
         unpacked = [cgutils.unpack_tuple(b, args[i], n) for i, n in enumerate((4, 4, 4, 2))]
-        grads = [_Pointers(b, place) for place in unpacked[0]]
-        hidden, d_hidden, w, d_w = (_Pointers(b, place) for place in unpacked[1])
+        grads = [_numbers(b, place) for place in unpacked[0]]
+        hidden, d_hidden, w, d_w = (_numbers(b, place) for place in unpacked[1])
         hiddens, pad = unpacked[3]
         slots, count, unit = args[4:]
         index = count.type
         outputs = [(part, i) for part, (_, number) in enumerate(PARTS) for i in range(number)]
         cells = [b.add(b.mul(b.add(unpacked[2][part], index(i)), pad), unit) for part, i in outputs]
-        weights = [emit_load(b, w.at(cell)) for cell in cells]
-        sums = [cgutils.alloca_once_value(b, emit_load(b, d_w.at(cell))) for cell in cells]
+        weights = [emit_load(b, w(cell)) for cell in cells]
+        sums = [cgutils.alloca_once_value(b, emit_load(b, d_w(cell))) for cell in cells]
         slots = b.inttoptr(slots, ir.IntType(64).as_pointer())
         with cgutils.for_range(b, count) as loop:
             pair = b.mul(loop.index, index(2))
@@ -70,19 +66,19 @@ def add_offset(
             gaussian = b.load(b.gep(slots, [b.add(pair, index(1))]))
             start = b.add(b.mul(slot, hiddens), unit)
             units = [b.add(start, b.mul(pad, index(head))) for head in range(3)]
-            values = [emit_load(b, hidden.at(at)) for at in units]
-            totals = [emit_load(b, d_hidden.at(at)) for at in units]
+            values = [emit_load(b, hidden(at)) for at in units]
+            totals = [emit_load(b, d_hidden(at)) for at in units]
             for n, (part, i) in enumerate(outputs):
                 head, number = PARTS[part]
                 at = b.add(b.mul(gaussian, index(number)), index(i))
-                grad = emit_splat(b, b.load(grads[part].at(at)), LANES)
+                grad = emit_splat(b, b.load(grads[part](at)), LANES)
                 totals[head] = emit_multiply_add(b, grad, weights[n], totals[head])
                 new = emit_multiply_add(b, grad, values[head], b.load(sums[n]))
                 b.store(new, sums[n])
             for at, total in zip(units, totals, strict=True):
-                emit_store(b, total, d_hidden.at(at))
+                emit_store(b, total, d_hidden(at))
         for cell, total in zip(cells, sums, strict=True):
-            emit_store(b, b.load(total), d_w.at(cell))
+            emit_store(b, b.load(total), d_w(cell))
         return context.get_dummy_value()
 
     integers = (types.intp, types.intp, types.intp)
@@ -101,8 +97,8 @@ def add_biases(typing: Any, grads: Any, d_b: Any, rows: Any, slots: Any, count: 
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         b = builder
-        grads = [_Pointers(b, place) for place in cgutils.unpack_tuple(b, args[0], 4)]
-        biases, rows = _Pointers(b, args[1]), cgutils.unpack_tuple(b, args[2], 4)
+        grads = [_numbers(b, place) for place in cgutils.unpack_tuple(b, args[0], 4)]
+        biases, rows = _numbers(b, args[1]), cgutils.unpack_tuple(b, args[2], 4)
         count = args[4]
         index = count.type
         quad = ir.VectorType(FLOAT, 4)
@@ -112,14 +108,14 @@ def add_biases(typing: Any, grads: Any, d_b: Any, rows: Any, slots: Any, count: 
             pair = b.add(b.mul(loop.index, index(2)), index(1))
             gaussian = b.load(b.gep(slots, [pair]))
             for part, (_, number) in enumerate(PARTS):
-                pointer = grads[part].at(b.mul(gaussian, index(number)))
+                pointer = grads[part](b.mul(gaussian, index(number)))
                 value = b.load(b.bitcast(pointer, quad.as_pointer()), typ=quad)
                 value.align = 4
                 b.store(b.fadd(b.load(sums[part]), value), sums[part])
         for part, (_, number) in enumerate(PARTS):
             total = b.load(sums[part])
             for i in range(number):
-                place = biases.at(b.add(rows[part], index(i)))
+                place = biases(b.add(rows[part], index(i)))
                 lane = b.extract_element(total, ir.IntType(32)(i))
                 b.store(b.fadd(b.load(place), lane), place)
         return context.get_dummy_value()
