@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -114,24 +114,16 @@ class Row:
 
 
 RUN_COLUMNS = (
-    "scene",
-    "scene_hash",
-    "split_hash",
-    "method",
-    "method_version",
-    "strategy",
-    "preset",
-    "config_hash",
-    "seed",
-    "device",
+    *("scene", "scene_hash", "split_hash", "method", "method_version"),
+    *("strategy", "preset", "config_hash", "seed", "device"),
 )
-ROW_COLUMNS = ("view", "camera_period", "rendered_period", "region", "metric", "value")
+ROW_COLUMNS = tuple(field.name for field in fields(Row))
 
 
 def write_run(folder: Path, record: RunRecord, rows: Iterable[Row]) -> None:
     """Write ``rows.csv`` and then ``run.json``, whose presence says that the run is complete."""
     shared = [getattr(record, name) for name in RUN_COLUMNS]
-    table = [[*shared, *(getattr(row, name) for name in ROW_COLUMNS)] for row in rows]
+    table = [[*shared, *astuple(row)] for row in rows]
     write_text_atomic(folder / ROWS_FILE, csv_text((*RUN_COLUMNS, *ROW_COLUMNS), table))
     write_text_atomic(folder / RUN_FILE, record.model_dump_json(indent=1) + "\n")
 

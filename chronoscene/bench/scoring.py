@@ -55,7 +55,8 @@ def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Sco
         image, reference = load_image(predictions, entry), load_image(ground_truth, target)
         values, refused = score_pair(image, reference, scorers)
         skipped |= {name: f"{entry.view}: {reason}" for name, reason in refused.items()}
-        rows += [_row(entry, name, value) for name, value in values.items()]
+        periods = entry.camera_period, entry.rendered_period
+        rows += [Row(entry.view, *periods, "all", name, value) for name, value in values.items()]
     # A metric that fails on one view has no mean over the test set.
     return Scores(tuple(row for row in rows if row.metric not in skipped), skipped)
 
@@ -71,10 +72,6 @@ def score_pair(
         except ShapeError as error:
             refused[name] = str(error)
     return values, refused
-
-
-def _row(entry: ImageEntry, metric: str, value: float) -> Row:
-    return Row(entry.view, entry.camera_period, entry.rendered_period, "all", metric, value)
 
 
 def match_views(

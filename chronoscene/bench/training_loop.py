@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -63,12 +62,7 @@ class Stopwatch:
         self._started = time.perf_counter()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.seconds += time.perf_counter() - self._started
 
 
@@ -140,23 +134,19 @@ def train(
         with clock:
             report = method.step(iteration, progress)
         iteration += 1
-        _check_loss(part, iteration, report)
+        if not math.isfinite(report.loss):
+            raise TrainingError(
+                f"model {part.name}, iteration {iteration}",
+                expected="a finite loss",
+                found=str(report.loss),
+                todo="lower the learning rates, or report this with the scene",
+            )
         done = stop.progress(iteration, clock.seconds)
         if due and done >= due[0]:
             due = [share for share in due if share > done]
             curve.append(_probe(method, part, truth, clock.seconds, iteration))
         observer(iteration, clock.seconds, report, curve[-1].psnr if curve else None)
     return Trained(clock.seconds, setup_seconds, iteration, tuple(curve))
-
-
-def _check_loss(part: Part, iteration: int, report: StepReport) -> None:
-    if not math.isfinite(report.loss):
-        raise TrainingError(
-            f"model {part.name}, iteration {iteration}",
-            expected="a finite loss",
-            found=str(report.loss),
-            todo="lower the learning rates, or report this with the scene",
-        )
 
 
 def _probe(

@@ -101,7 +101,9 @@ def run_job(job: Job) -> None:
         scene_hash=job.scene_hash,
         details={"method": spec.name, "strategy": job.strategy, "seed": job.seed},
     )
-    _write_curve(staging, outcomes)
+    columns = [f.name for f in fields(CurvePoint)]
+    points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
+    write_text_atomic(staging / results.CURVE_FILE, csv_text(columns, points))
     scorers = make_scorers(lpips_weights=Path(job.lpips_weights) if job.lpips_weights else None)
     truth = ground_truth_folder(Path(job.runs), scene.name)
     scores = score_folder(staging / results.PREDICTIONS, truth, scorers)
@@ -145,7 +147,6 @@ def _run_part(
     display: ProgressDisplay,
 ) -> PartOutcome:
     """Train one model, save it, and render the test views that it answers for."""
-
     method: Method = import_object(spec.method)(job.method_config(spec))
     trained = train(
         method,
@@ -181,16 +182,6 @@ def _save(method: Method, checkpoint: Path, part: Part) -> None:
     os.replace(partial, target)
 
 
-def _write_curve(folder: Path, outcomes: list[PartOutcome]) -> None:
-    columns = [f.name for f in fields(CurvePoint)]
-    points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
-    write_text_atomic(folder / results.CURVE_FILE, csv_text(columns, points))
-
-
-def _folder_bytes(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
 def _peak_device_memory(device: str) -> int | None:
     if device != "cuda":
         return None
@@ -210,6 +201,7 @@ def _record(
 ) -> results.RunRecord:
     """The record of the run, without its scores."""
     tests = len(scene.select(split="test"))
+    saved = (Path(job.staging) / results.CHECKPOINT).rglob("*")
     return results.RunRecord(
         method=spec.name,
         strategy=job.strategy,
@@ -220,7 +212,7 @@ def _record(
         seconds=sum(o.trained.seconds for o in outcomes),
         iterations=sum(o.trained.iterations for o in outcomes),
         primitives=sum(o.size.primitives for o in outcomes),
-        checkpoint_bytes=_folder_bytes(Path(job.staging) / results.CHECKPOINT),
+        checkpoint_bytes=sum(path.stat().st_size for path in saved if path.is_file()),
         peak_memory_bytes=peaks[0],
         device=describe_device(machine.device, machine.threads),
         commit=job.commit,

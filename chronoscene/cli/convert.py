@@ -43,9 +43,7 @@ def _period_help() -> str:
 )
 @click.option("--period-by", metavar="RULE", help=_period_help())
 @click.option(
-    "--link",
-    type=click.Choice(["hard", "sym"]),
-    help="Link the images instead of copying them.",
+    "--link", type=click.Choice(["hard", "sym"]), help="Link the images instead of copying them."
 )
 def command(
     source: Path,

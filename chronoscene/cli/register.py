@@ -20,7 +20,6 @@ from chronoscene.registration.result import ROUTES, Registered
 
 DEFAULTS = Options()
 
-
 FAILED = 1
 """Exit status if the verdict is fail."""
 
@@ -60,7 +59,11 @@ FAILED = 1
     help="Pixels; larger photos are downscaled for feature extraction.",
 )
 @click.option(
-    "--max-features", type=click.IntRange(100), default=DEFAULTS.max_features, show_default=True
+    "--max-features",
+    type=click.IntRange(100),
+    default=DEFAULTS.max_features,
+    show_default=True,
+    help="Keep at most this many features of each photo.",
 )
 @click.option(
     "--exhaustive-limit",
@@ -81,6 +84,7 @@ FAILED = 1
     type=click.Choice(["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]),
     default=DEFAULTS.camera_model,
     show_default=True,
+    help="COLMAP's model of the cameras that are calibrated.",
 )
 @click.option(
     "--calibration",

@@ -16,13 +16,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import format_names, read_scene
 from chronoscene.io.staging import check_outside, write_text_atomic
-from chronoscene.scene.split_making import (
-    FRACTION,
-    STRATEGIES,
-    NewSplit,
-    SplitSettings,
-    make_split,
-)
+from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, SplitSettings, make_split
 
 
 @click.command("split")

@@ -157,7 +157,11 @@ def command(
             text = format_counts(counts, output_format, **extra)
         emit(text, out)
         if request.figures is not None:
-            _draw_bars(counts, request.figures / f"counts.{request.figure_format}")
+            from chronoscene.figures.bars import draw_bars
+
+            path = request.figures / f"counts.{request.figure_format}"
+            with writing_to("--figures", path):
+                draw_bars(counts, path)
     for remark in [*unseen(counts), *against_paper(counts)]:
         click.echo(printable(remark), err=True)
     for scene in unreadable:
@@ -218,13 +222,6 @@ def _lost(item: tuple[Path, str]) -> Unreadable:
 def _width(out: Path | None) -> int | None:
     """Of the terminal, if the table goes to one."""
     return get_terminal_size().columns if out is None and sys.stdout.isatty() else None
-
-
-def _draw_bars(counts: Sequence[SceneCount], path: Path) -> None:
-    from chronoscene.figures.bars import draw_bars
-
-    with writing_to("--figures", path):
-        draw_bars(counts, path)
 
 
 def _file_names(paths: Sequence[Path]) -> list[str]:

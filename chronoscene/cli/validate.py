@@ -132,12 +132,7 @@ def command(
 
 
 def _check(
-    select: list[str],
-    ignore: list[str],
-    decode: bool,
-    path: Path,
-    *,
-    track: Track = no_progress,
+    select: list[str], ignore: list[str], decode: bool, path: Path, *, track: Track = no_progress
 ) -> SceneReport:
     """One scene, perhaps in a process of its own, which is given names of rules, not rules."""
     keep_freed_memory()  # arrays as large as the model come and go

@@ -207,7 +207,9 @@ def test_a_scene_that_is_none(bench, tmp_path):
 
 
 def test_images_are_trained_and_scored_at_the_evaluation_size(bench):
-    (folder,) = bench("MEAN", max_width=12)[0].finished
+    outcome, _ = bench("MEAN", max_width=12)
+    assert outcome.failures == ()
+    (folder,) = outcome.finished
     assert {(e.width, e.height) for e in read_manifest(folder / "predictions").images} == {(12, 8)}
     assert "ssim_valid" in read_run(folder).skipped
 
