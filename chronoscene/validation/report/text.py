@@ -28,9 +28,13 @@ def write_text(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
     if len(reports) > 1:
         bad = sum(not is_valid([r], strict=strict) for r in reports)
         blocks.append([f"{counted(len(reports), 'scene')}, {bad} not valid: {_total(reports)}"])
-    # Without a terminal, other programs get unwrapped lines.
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    width = _width()
     return "\n\n".join("\n".join(_fit(line, width) for line in block) for block in blocks) + "\n"
+
+
+def _width() -> int | None:
+    """Columns of the terminal; None without one: other programs get unwrapped lines."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def _fit(line: str, width: int | None) -> str:
