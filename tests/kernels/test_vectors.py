@@ -15,7 +15,7 @@ from chronoscene.kernels import vectors
 from chronoscene.kernels.memory import load, store
 from chronoscene.kernels.vectors import LANES, select, splat
 
-A = np.linspace(-3, 4, LANES, dtype=np.float32)
+A = np.linspace(-3.1, 4, LANES, dtype=np.float32)
 B = np.where(np.arange(LANES) % 3 == 0, A, np.linspace(5, 1, LANES)).astype(np.float32)
 
 

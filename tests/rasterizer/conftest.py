@@ -14,7 +14,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 from rasterizer_cases.comparison import Comparison, compare, steady_pixels, thresholds
-from rasterizer_cases.scenes import SmallScene, crowd, random_scene, scenes, well_posed
+from rasterizer_cases.scenes import SmallScene, crowd, random_scene
 
 
 @pytest.fixture(scope="session")
@@ -26,12 +26,9 @@ def tolerances() -> ModuleType:
 def tools() -> SimpleNamespace:
     """What the test files share."""
     return SimpleNamespace(
-        SmallScene=SmallScene,
         compare=compare,
         random_scene=random_scene,
         crowd=crowd,
-        scenes=scenes,
-        well_posed=well_posed,
         steady_pixels=steady_pixels,
         thresholds=thresholds,
     )

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import gc
-import os
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -272,25 +268,3 @@ def test_lists_that_never_have_room_are_an_error(
     with torch.no_grad(), pytest.raises(AssertionError, match="no room for 270 pairs of 30 Gaus"):
         scene.render("cpu")
     passes.clear_workspaces()
-
-
-@pytest.mark.slow
-def test_narrow_vectors_agree_too(tmp_path: Path) -> None:
-    """The kernels compiled for a processor without AVX-512, in another process."""
-    features = "+avx,+avx2,+fma,+bmi,+bmi2,+popcnt,+lzcnt,+f16c,+movbe,+sse4.2"
-    if "avx2" not in Path("/proc/cpuinfo").read_text():
-        pytest.skip("needs a processor with AVX2")
-    environment = dict(
-        os.environ,
-        NUMBA_CPU_NAME="haswell",
-        NUMBA_CPU_FEATURES=features,
-        NUMBA_CACHE_DIR=str(tmp_path),
-    )
-    tests = [str(Path(__file__).with_name(f"test_{x}.py")) for x in ("agreement", "extremes")]
-    result = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests],
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 0, result.stdout[-3000:]

@@ -119,7 +119,7 @@ def run(
         weights = weights * (result.alphas.detach().cpu() > 0.1)
     units = {"depths": _largest_depth(scene)}
     for name, output in outputs.items():
-        draw = torch.randn(output.shape, generator=generator).to(dtype)
+        draw = _loss_weights(output.shape, generator).to(dtype)
         loss = loss + (output * (draw * weights / units.get(name, 1)).to(device)).sum()
     loss.backward()
     arrays = {name: (x.detach().cpu() * weights).double().numpy() for name, x in outputs.items()}
@@ -132,6 +132,18 @@ def run(
         assert x.grad is not None
         arrays["grad " + name] = x.grad.double().numpy()
     return arrays
+
+
+def _loss_weights(shape: torch.Size, generator: torch.Generator) -> torch.Tensor:
+    """Random weights of pixels whose sum does not happen to cancel.
+
+    Under a Gaussian that is equally opaque everywhere, the gradient of its depth is that sum: with
+    weights that cancel to 1e-4 of their sizes (as the first ones for depths of 4 by 29 pixels do)
+    float32 leaves it three digits, whatever the kernels do.
+    """
+    draw = torch.randn(shape, generator=generator)
+    size = draw.abs().sum()
+    return draw + 0.1 if draw.sum().abs() < 1e-3 * size else draw
 
 
 def _largest_depth(scene: SmallScene) -> float:

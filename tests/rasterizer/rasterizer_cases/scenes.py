@@ -165,7 +165,10 @@ def crowd(count: int, width: int, height: int, seed: int = 0) -> SmallScene:
 @st.composite
 def extreme_scenes(draw: st.DrawFn) -> SmallScene:
     """Scales of 1e-8 to 1e4, quaternions of any length, opacities at their ends, distances from the
-    near plane to 1e6, any focal length, principal points far outside."""
+    near plane to 1e6, any focal length, principal points far outside.
+
+    The first Gaussian is inside the image and can be seen, so that most scenes show something.
+    """
     n = draw(st.integers(1, 8))
     width, height = draw(st.integers(1, 33)), draw(st.integers(1, 33))
 
@@ -178,15 +181,22 @@ def extreme_scenes(draw: st.DrawFn) -> SmallScene:
     K[0, 2], K[1, 2] = array((2,), -1, 1) * np.minimum(1e3, 20 * K[[0, 1], [0, 1]])
     z = np.float32(10) ** array((n,), -1.9, 6)
     pixels = array((n, 2), -0.5, 1.5) * np.array([width, height], np.float32)
+    pixels[0] = np.clip(pixels[0], 0, [width, height])
     sideways = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * z[:, None]
+    seen = st.one_of(_floats(0.1, 1.0), st.sampled_from([1.0, 0.99, 0.999, 5.0]))
     opacities = st.one_of(
         _floats(0.005, 1.0), st.sampled_from([0.0, -0.0, 1.0, 1e-40, 0.99, 0.999, 5.0])
     )
+    directions = array((n, 4), -1, 1)
+    if not directions[0].any():
+        directions[0, 0] = 1
+    drawn = draw(hnp.arrays(np.float32, n, elements=opacities))
+    drawn[0] = draw(seen)
     return SmallScene(
         means=np.concatenate([sideways, z[:, None]], axis=1).astype(np.float32),
-        quats=array((n, 4), -1, 1) * np.float32(10) ** array((n, 1), -17, 17),
+        quats=directions * np.float32(10) ** array((n, 1), -17, 17),
         scales=np.float32(10) ** array((n, 3), -8, 4),
-        opacities=draw(hnp.arrays(np.float32, n, elements=opacities)),
+        opacities=drawn,
         colors=array((n, 3), 0, 1),
         viewmats=np.eye(4, dtype=np.float32)[None],
         Ks=K[None],
