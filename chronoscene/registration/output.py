@@ -21,7 +21,7 @@ from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, certify
 from chronoscene.registration.quality.certificate_json import to_json
 from chronoscene.registration.quality.verdict import Verdict, judge
-from chronoscene.registration.report.page import write_report
+from chronoscene.registration.report.page import render_report
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import with_tie_tracks
 from chronoscene.registration.ties.tie_alignment import TieAlignment
@@ -318,5 +318,6 @@ def inspect_registration(
     write_text_atomic(folder / CERTIFICATE, json.dumps(data, indent=1, allow_nan=False) + "\n")
     if page:
         title = title or f"Registration of {folder.resolve().name}"
-        write_report(folder / PAGE, model, certificate, verdict, ties=ties, title=title)
+        text = render_report(model, certificate, verdict, ties=ties, title=title)
+        write_text_atomic(folder / PAGE, text)
     return Inspection(certificate, verdict)

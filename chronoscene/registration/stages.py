@@ -68,7 +68,7 @@ class Stages:
         """
         key = fingerprint(VERSION, name, self.previous if chained else "", inputs)
         path = self.folder / f"stage-{name}.json"
-        record = _read(path)
+        record = read_record(path)
         if record is None or record.get("key") != key:
             path.unlink(missing_ok=True)
             started = time.monotonic()
@@ -95,7 +95,8 @@ class Stages:
         self.log.append(entry | {"from_an_earlier_run": False})
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def read_record(path: Path) -> dict[str, Any] | None:
+    """A dictionary from a JSON file; None if there is none that can be read."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -19,6 +19,7 @@ from typing import Any
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.photos.photo import sha256_of
+from chronoscene.registration.stages import read_record
 
 METHOD = 1
 """Version of extraction and matching; raise it when they change in a way no setting shows."""
@@ -200,8 +201,7 @@ def _worth(database: Path, wanted: Record) -> tuple[int, int]:
 
 
 def _journals(database: Path) -> list[Path]:
-    journals = [Path(f"{database}{suffix}") for suffix in ("-wal", "-shm")]
-    return [path for path in journals if path.exists()]
+    return [p for suffix in ("-wal", "-shm") if (p := Path(f"{database}{suffix}")).exists()]
 
 
 def _remove(database: Path) -> None:
@@ -216,8 +216,4 @@ def _record_path(database: Path) -> Path:
 
 
 def _read_record(database: Path) -> Record | None:
-    try:
-        record = json.loads(_record_path(database).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return record if isinstance(record, dict) else None
+    return read_record(_record_path(database))

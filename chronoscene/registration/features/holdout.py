@@ -187,8 +187,7 @@ def _copy_database(source: Path, target: Path) -> None:
     a.close()
     b.close()
     for suffix in ("-wal", "-shm"):
-        leftover = Path(f"{target}{suffix}")
-        leftover.unlink(missing_ok=True)
+        Path(f"{target}{suffix}").unlink(missing_ok=True)
 
 
 def _write_held_out(

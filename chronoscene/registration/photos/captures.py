@@ -165,12 +165,11 @@ def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Capt
         raise _nothing(root, "no image files")
     order = _ordered_labels(listed)
     images, refused = [], []
+    numbers = [order.index(item.label) for item in listed]
     with ThreadPoolExecutor(available_threads()) as pool:
-        opened = list(
-            pool.map(lambda item: open_photo(item.path, item.name, order.index(item.label)), listed)
-        )
-    for item, capture in zip(listed, opened, strict=True):
-        period = order.index(item.label)
+        paths, names = [item.path for item in listed], [item.name for item in listed]
+        opened = list(pool.map(open_photo, paths, names, numbers))
+    for item, period, capture in zip(listed, numbers, opened, strict=True):
         if isinstance(capture, str):
             refused.append((item.name, period, capture))
         else:
@@ -183,8 +182,9 @@ def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Capt
         for i, label in enumerate(order)
     )
     _check_names(root, images)
-    remarks = remarks + _date_remarks(periods)
-    return Captures(root, tuple(images), periods, tuple(refused), tuple(remarks))
+    shown = ", ".join(f"{i} = {p.label} ({p.date or 'no date'})" for i, p in enumerate(periods))
+    told = (*remarks, f"periods: {shown}")
+    return Captures(root, tuple(images), periods, tuple(refused), told)
 
 
 def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
@@ -213,11 +213,6 @@ def _period_date(label: str, captures: Sequence[Capture]) -> str | None:
     if (first.year, first.month) == (last.year, last.month):
         return first.isoformat()[:7]
     return str(first.year) if first.year == last.year else str(days[len(days) // 2].year)
-
-
-def _date_remarks(periods: Sequence[CapturePeriod]) -> list[str]:
-    shown = ", ".join(f"{i} = {p.label} ({p.date or 'no date'})" for i, p in enumerate(periods))
-    return [f"periods: {shown}"]
 
 
 def _check_names(root: Path, images: Sequence[Capture]) -> None:

@@ -38,8 +38,6 @@ class Prepared:
     """Captures without those that are copies of others."""
 
     captures: tuple[Capture, ...]
-    digests: dict[str, str]
-    """SHA-256 of each file by name."""
     refused: tuple[tuple[str, int, str], ...]
     remarks: tuple[str, ...]
 
@@ -100,14 +98,17 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
     stages = context.stages
     told = [f"{name}: {reason}" for name, _, reason in captures.refused]
     stages.remark("captures", *captures.remarks, *told)
-    unique = drop_copies(captures.images, content_digests(captures.images))
+    digests = content_digests(captures.images)
+    unique = drop_copies(captures.images, digests)
     _check_enough(captures, unique.captures, scene, context)
     label, date = _new_period(captures)
     source = unique.captures
     if scene is not None:
         source = _as_new_period(unique.captures, scene, label)
-    digests = [unique.digests[c.name] for c in unique.captures]
-    inputs = [[c.name, str(c.path.resolve()), d] for c, d in zip(source, digests, strict=True)]
+    inputs = [
+        [c.name, str(c.path.resolve()), digests[original.name]]
+        for c, original in zip(source, unique.captures, strict=True)
+    ]
     if scene is not None:
         inputs += [[f.name, str(scene.image_path(f))] for f in scene.frames]
     names = stages.run("photos", inputs, lambda: _place(source, scene, unique.remarks, context))
@@ -235,7 +236,7 @@ def drop_copies(captures: Sequence[Capture], digests: dict[str, str]) -> Prepare
     kept.sort(key=lambda c: c.name)
     across = sum("earlier period" in reason for *_, reason in refused)
     remarks = [f"{across} photos are copies of photos of an earlier period"] if across else []
-    return Prepared(tuple(kept), digests, tuple(refused), tuple(remarks))
+    return Prepared(tuple(kept), tuple(refused), tuple(remarks))
 
 
 def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], list[str]]:
@@ -250,12 +251,15 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
     for capture, name in zip(captures, plain, strict=True):
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        kind = _kind(capture.path)
-        if kind == "convert":
-            target = _convert(capture.path, target)
+        if not _is_plain(capture.path):
+            target = target.with_name(f"{target.name}.png")
+            with replacing(target) as partial:
+                Image.fromarray(load_rgb(capture.path)).save(partial, format="PNG")
             converted += 1
         elif capture.exif.orientation != 1 and capture.path.suffix.lower() in (".jpg", ".jpeg"):
-            _copy_upright(capture.path, target)
+            data = capture.path.read_bytes()
+            with replacing(target) as partial:
+                partial.write_bytes(set_upright(data) or data)
             turned += 1
         else:
             place_image(capture.path, target, "symlink")
@@ -291,21 +295,9 @@ def renamed(captures: Sequence[Capture], names: Sequence[str]) -> tuple[Capture,
     return tuple(sorted(changed, key=lambda c: c.name))
 
 
-def _kind(path: Path) -> str:
+def _is_plain(path: Path) -> bool:
+    """Whether COLMAP reads a file in colour, as it is stored."""
     with Image.open(path) as image:
         plain = image.mode in _PLAIN_MODES and getattr(image, "n_frames", 1) == 1
         turned_tiff = image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) != 1
-    return "keep" if plain and not turned_tiff else "convert"
-
-
-def _convert(source: Path, target: Path) -> Path:
-    target = target.with_name(f"{target.name}.png")
-    with replacing(target) as partial:
-        Image.fromarray(load_rgb(source)).save(partial, format="PNG")
-    return target
-
-
-def _copy_upright(source: Path, target: Path) -> None:
-    data = source.read_bytes()
-    with replacing(target) as partial:
-        partial.write_bytes(set_upright(data) or data)
+    return plain and not turned_tiff

@@ -19,7 +19,6 @@ from chronoscene.registration.quality.misalignment import (
     Misalignment,
     Transfers,
     measure,
-    sampson_errors,
     transfer_errors,
     transfers,
 )
@@ -33,6 +32,7 @@ from chronoscene.registration.quality.rays import (
     Rays,
     gather,
     project,
+    sampson_distance,
 )
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.result import Registered
@@ -259,12 +259,12 @@ def _held_out(
 
 def _epipolar(model: Registered, evidence: Evidence, periods: tuple[int, int]) -> Array:
     """Epipolar distances of all held-out matches between two periods, pixels."""
-    errors = [
-        sampson_errors(first.pose[0], second.pose[0], first, second)
-        for matches, (first, second) in zip(model.held_out, evidence.matches, strict=True)
-        if {int(model.periods[matches.image_a]), int(model.periods[matches.image_b])}
-        == set(periods)
-        and len(first)
-    ]
+    errors = []
+    for matches, (first, second) in zip(model.held_out, evidence.matches, strict=True):
+        between = model.periods[[matches.image_a, matches.image_b]].tolist()
+        if len(first) and set(between) == set(periods):
+            relative = second.pose[0] @ np.linalg.inv(first.pose[0])
+            focals = first.focal, second.focal
+            errors.append(sampson_distance(relative, first.uv, second.uv, *focals))
     found = np.concatenate([np.zeros(0), *errors])
     return np.asarray(found[np.isfinite(found)])

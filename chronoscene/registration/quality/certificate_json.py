@@ -200,7 +200,15 @@ def to_json(
                 }
                 for p in certificate.pairs
             ],
-            "tie_points": None if ties is None else _ties(ties),
+            "tie_points": None
+            if ties is None
+            else {
+                "replaced": ties.replaced,
+                "controlled": ties.controlled,
+                "outliers": ties.outliers,
+                "remarks": ties.remarks,
+                "points": [asdict(r) for r in ties.residuals],
+            },
             "thresholds": [asdict(t) for t in THRESHOLDS.values()],
         }
     )
@@ -215,16 +223,6 @@ def _similarity(pair: PairFigures) -> dict[str, Any] | None:
         "scale": found.similarity.scale,
         "rotation_degrees": rotation_angle(found.similarity.rotation),
         "matrix": found.similarity.to_matrix().tolist(),
-    }
-
-
-def _ties(ties: TieAlignment) -> dict[str, Any]:
-    return {
-        "replaced": ties.replaced,
-        "controlled": ties.controlled,
-        "outliers": list(ties.outliers),
-        "remarks": list(ties.remarks),
-        "points": [asdict(r) for r in ties.residuals],
     }
 
 

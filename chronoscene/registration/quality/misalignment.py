@@ -266,20 +266,12 @@ def _sandwich(track: Ints, residual: Array, jacobian: Array, weight: Array) -> A
     bread = np.linalg.inv(normal)
     # The noise of the pixels alone is a lower bound: few tracks can agree by chance.
     covariance = bread @ (sums.T @ sums) @ bread * groups / (groups - 7)
-    return np.asarray(_ratio(bread, covariance) * covariance)
-
-
-def _ratio(least: Array, covariance: Array) -> float:
-    """Factor, at least 1, that raises a covariance to that of the noise of the pixels alone."""
-    size = float(np.trace(covariance / np.maximum(np.diag(least), 1e-300)[:, None])) / 7
-    return 1.0 / size if 0 < size < 1 else 1.0
+    size = float(np.trace(covariance / np.maximum(np.diag(bread), 1e-300)[:, None])) / 7
+    return np.asarray((1.0 / size if 0 < size < 1 else 1.0) * covariance)
 
 
 def _interval(
-    size: Callable[[Sim3], float],
-    estimate: Sim3,
-    drawn: Sequence[Sim3],
-    noise: Sequence[Sim3],
+    size: Callable[[Sim3], float], estimate: Sim3, drawn: Sequence[Sim3], noise: Sequence[Sim3]
 ) -> Interval:
     """A size cannot be negative: the lower end is what noise alone does not explain."""
     value = size(estimate)
@@ -296,29 +288,3 @@ def rotation_angle(rotation: Array) -> float:
     """Angle of a rotation in degrees, exact for small ones too. [3, 3]"""
     axis = rotation[[2, 0, 1], [1, 2, 0]] - rotation[[1, 2, 0], [2, 0, 1]]
     return float(np.degrees(np.arctan2(np.linalg.norm(axis), np.trace(rotation) - 1)))
-
-
-def sampson_errors(pose_a: Array, pose_b: Array, ray_a: Rays, ray_b: Rays) -> Array:
-    """First-order distance of correspondences to the epipolar geometry, in pixels.
-
-    Args:
-        pose_a: [4, 4]
-        pose_b: [4, 4]
-        ray_a: [M]
-        ray_b: [M]
-
-    Returns:
-        NaN where the two cameras stand in one place. [M]
-    """
-    relative = pose_b @ np.linalg.inv(pose_a)
-    t = relative[:3, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    essential = cross @ relative[:3, :3]
-    one = np.ones((len(ray_a), 1))
-    a, b = np.hstack([ray_a.uv, one]), np.hstack([ray_b.uv, one])
-    line_b, line_a = a @ essential.T, b @ essential
-    # Gradient by pixels: divided by the focal lengths.
-    square = ((line_b[:, :2] / ray_b.focal) ** 2).sum(axis=1)
-    square += ((line_a[:, :2] / ray_a.focal) ** 2).sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.abs((b * line_b).sum(axis=1)) / np.sqrt(square))

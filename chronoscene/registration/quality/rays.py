@@ -159,6 +159,33 @@ def project(rays: Rays, xyz: Array) -> tuple[Array, Array, Array]:
     return (uv - rays.uv) * rays.focal, jacobian, depth
 
 
+def sampson_distance(
+    b_from_a: Array, uv_a: Array, uv_b: Array, focal_a: Array | float, focal_b: Array | float
+) -> Array:
+    """First-order distance of correspondences to the epipolar geometry of two cameras, in pixels.
+
+    Args:
+        b_from_a: Pose of the second camera in the frame of the first. [4, 4]
+        uv_a: At depth 1, without distortion. [M, 2]
+        uv_b: [M, 2]
+        focal_a: Pixels. [M, 2], or one number for all
+        focal_b: As ``focal_a``.
+
+    Returns:
+        NaN where the two cameras stand in one place. [M]
+    """
+    x, y, z = b_from_a[:3, 3]
+    essential = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ b_from_a[:3, :3]
+    one = np.ones((len(uv_a), 1))
+    a, b = np.hstack([uv_a, one]), np.hstack([uv_b, one])
+    line_b, line_a = a @ essential.T, b @ essential
+    # Gradient by pixels: divided by the focal lengths.
+    square = ((line_b[:, :2] / focal_b) ** 2).sum(axis=1)
+    square += ((line_a[:, :2] / focal_a) ** 2).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.abs((b * line_b).sum(axis=1)) / np.sqrt(square))
+
+
 def place(rays: Rays) -> Placed:
     """Points of tracks by their rays: those seen by two images or more, with parallax, that fit.
 

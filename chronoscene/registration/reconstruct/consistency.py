@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.quality.rays import sampson_distance
 from chronoscene.registration.reconstruct.models import image_pose
 
 AGREEING_PIXELS = 4.0
@@ -47,16 +48,19 @@ def pair_agreements(model: pycolmap.Reconstruction, matches: Matches) -> Agreeme
     for i, image in posed.items():
         camera = model.cameras[image.camera_id]
         xy = np.array([p.xy for p in image.points2D]).reshape(-1, 2)
-        rays[i] = np.column_stack([camera.cam_from_img(xy), np.ones(len(xy))])
+        rays[i] = camera.cam_from_img(xy)
         poses[i] = image_pose(image)
         focals[i] = float(camera.mean_focal_length())
     found = {}
     for (a, b), pairs in matches.items():
         if a in posed and b in posed:
             relative = poses[b] @ np.linalg.inv(poses[a])
-            errors = epipolar_distance(relative, rays[a][pairs[:, 0]], rays[b][pairs[:, 1]])
-            pixels = errors * (focals[a] + focals[b]) / 2
-            found[a, b] = (int((pixels < AGREEING_PIXELS).sum()), len(pairs))
+            focal = (focals[a] + focals[b]) / 2
+            uv = rays[a][pairs[:, 0]], rays[b][pairs[:, 1]]
+            pixels = sampson_distance(relative, *uv, focal, focal)
+            # Images from one place have no epipolar geometry that a match could contradict.
+            agreeing = pixels < AGREEING_PIXELS if relative[:3, 3].any() else np.isnan(pixels)
+            found[a, b] = (int(agreeing.sum()), len(pairs))
     return found
 
 
@@ -122,18 +126,6 @@ def _matrices(agreements: Agreements, ids: list[int]) -> tuple[NDArray[np.int64]
             i, j = position[a], position[b]
             counts[:, i, j] = counts[:, j, i] = found
     return counts[0], counts[1]
-
-
-def epipolar_distance(
-    b_from_a: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Sampson distances at depth 1 of rays x, y, 1 in two cameras. [N]"""
-    x, y, z = b_from_a[:3, 3]
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    essential = cross @ b_from_a[:3, :3]
-    lines_b, lines_a = a @ essential.T, b @ essential
-    norm = (lines_b[:, :2] ** 2).sum(axis=1) + (lines_a[:, :2] ** 2).sum(axis=1)
-    return np.asarray(np.abs((b * lines_b).sum(axis=1)) / np.sqrt(np.maximum(norm, 1e-30)))
 
 
 def deregister_misplaced(

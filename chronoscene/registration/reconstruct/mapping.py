@@ -247,9 +247,13 @@ def adjust(
         if not constant:
             config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
-    summary = adjuster.solve()
-    _drop_bad_observations(model)
-    return str(summary.termination_type.name)
+    solved = adjuster.solve()
+    # Drop observations with a large error, and points with a small triangulation angle.
+    manager = pycolmap.ObservationManager(model)
+    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, MIN_TRI_ANGLE)
+    manager.filter_observations_with_negative_depth()
+    model.update_point_3d_errors()
+    return str(solved.termination_type.name)
 
 
 def _with_priors(
@@ -273,11 +277,3 @@ def _with_priors(
         )
         listed.append(prior)
     return pycolmap.create_pose_prior_bundle_adjuster(options, settings, config, listed, model)
-
-
-def _drop_bad_observations(model: pycolmap.Reconstruction) -> None:
-    """Drop observations with a large error, and points with a small triangulation angle."""
-    manager = pycolmap.ObservationManager(model)
-    manager.filter_all_points3D(MAX_REPROJECTION_ERROR, MIN_TRI_ANGLE)
-    manager.filter_observations_with_negative_depth()
-    model.update_point_3d_errors()

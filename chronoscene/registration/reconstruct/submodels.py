@@ -245,14 +245,12 @@ def _place_by_gps(
     missing = [i for i in range(len(submodels)) if i not in placed]
     if not missing or not priors.enu:
         return
-    base = gps_alignment(submodels[root].model, priors)
-    if base is None or not _places_alone(base):
-        remarks.append(f"{submodels[root].label}: its GPS does not determine a frame")
+    base = _frame_by_gps(submodels[root], priors, remarks)
+    if base is None:
         return
     for i in missing:
-        found = gps_alignment(submodels[i].model, priors)
-        if found is None or not _places_alone(found):
-            remarks.append(f"{submodels[i].label}: its GPS does not determine a frame")
+        found = _frame_by_gps(submodels[i], priors, remarks)
+        if found is None:
             continue
         placed[i] = base.enu_from_model.inverse() @ found.enu_from_model
         remarks.append(
@@ -261,5 +259,9 @@ def _place_by_gps(
         )
 
 
-def _places_alone(found: GpsAlignment) -> bool:
-    return found.is_useful and int(found.inliers.sum()) >= MIN_POSITIONS
+def _frame_by_gps(submodel: Submodel, priors: Priors, remarks: list[str]) -> GpsAlignment | None:
+    found = gps_alignment(submodel.model, priors)
+    if found is None or not found.is_useful or found.inliers.sum() < MIN_POSITIONS:
+        remarks.append(f"{submodel.label}: its GPS does not determine a frame")
+        return None
+    return found

@@ -6,14 +6,12 @@ Styles and pictures are embedded; it loads nothing. Names are escaped by the tem
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from chronoscene import __version__
 from chronoscene.io.pages import render_page
-from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, PairFigures
-from chronoscene.registration.quality.certificate_json import Figure, pair_figures, period_figures
+from chronoscene.registration.quality.certificate_json import pair_figures, period_figures
 from chronoscene.registration.quality.rays import Array
 from chronoscene.registration.quality.verdict import THRESHOLDS, Level, Verdict
 from chronoscene.registration.report.pictures import PHOTO_WIDTH, Photos, camera_map
@@ -34,20 +32,6 @@ COLORS = (
     "#2f7ed8", "#d9622b", "#2a9d5c", "#a44bd1", "#b8860b", "#0f9aa7", "#d1477f", "#6b7280",
 )  # fmt: skip
 """Of the periods, in turn; each is legible on white and on near-black."""
-
-
-def write_report(
-    path: Path,
-    model: Registered,
-    certificate: Certificate,
-    verdict: Verdict,
-    *,
-    ties: TieAlignment | None = None,
-    title: str = "Registration",
-) -> None:
-    """Write the page; arguments as in `render_report`."""
-    page = render_report(model, certificate, verdict, ties=ties, title=title)
-    write_text_atomic(path, page)
 
 
 def render_report(
@@ -78,7 +62,10 @@ def render_report(
         colors=[COLORS[i % len(COLORS)] for i in range(len(certificate.labels))],
         map=camera_map(model) if model.names else None,
         periods=[(p, list(period_figures(certificate, p))) for p in certificate.periods],
-        pairs=[_pair_section(certificate, verdict, p) for p in certificate.pairs],
+        pairs=[
+            (_names(certificate, p), verdict.pairs.get((p.a, p.b)), pair_figures(certificate, p))
+            for p in certificate.pairs
+        ],
         drawn=_drawn(model, certificate, photos),
         photo_width=PHOTO_WIDTH,
         flickers=_flickers(model, certificate, photos),
@@ -89,11 +76,8 @@ def render_report(
     )
 
 
-def _pair_section(
-    certificate: Certificate, verdict: Verdict, pair: PairFigures
-) -> tuple[str, Level | None, list[Figure]]:
-    names = f"{certificate.labels[pair.a]} and {certificate.labels[pair.b]}"
-    return names, verdict.pairs.get((pair.a, pair.b)), list(pair_figures(certificate, pair))
+def _names(certificate: Certificate, pair: PairFigures) -> str:
+    return f"{certificate.labels[pair.a]} and {certificate.labels[pair.b]}"
 
 
 def _drawn(model: Registered, certificate: Certificate, photos: Photos) -> list[dict[str, Any]]:
@@ -170,8 +154,8 @@ def _clicks(
         if len(chosen) < CLICKS:
             chosen += spots(model, seen, pair, CLICKS - len(chosen), gaps=False, twice=True)
         if chosen:
-            names = f"{certificate.labels[pair.a]} and {certificate.labels[pair.b]}"
-            found.append((names, [_click(model, certificate, pair, s) for s in chosen]))
+            clicks = [_click(model, certificate, pair, s) for s in chosen]
+            found.append((_names(certificate, pair), clicks))
     return found
 
 

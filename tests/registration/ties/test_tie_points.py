@@ -7,22 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from generated_registrations import (
-    CAMERA,
-    CaseSettings,
-    Generated,
-    generate_case,
-    pose_errors,
-)
+from generated_registrations import CAMERA, CaseSettings, Generated, generate_case, pose_errors
 
 from chronoscene.errors import SceneError
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.verdict import judge
 from chronoscene.registration.ties.residuals import with_tie_tracks
-from chronoscene.registration.ties.tie_alignment import (
-    align_with_tie_points,
-    move_periods,
-)
+from chronoscene.registration.ties.tie_alignment import align_with_tie_points, move_periods
 from chronoscene.registration.ties.tie_points import TiePoints, match_images, read_tie_points
 from chronoscene.scene.similarity import Sim3
 
