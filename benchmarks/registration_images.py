@@ -28,7 +28,7 @@ from chronoscene.formats import read_scene
 from chronoscene.geodesy import Georeference
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
-from chronoscene.registration.pipeline import run, run_into
+from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
@@ -132,7 +132,7 @@ def _frozen(folder: Path, found: list[Inspection]) -> Registered:
     captures = read_captures(folder / "photos" / periods[-1])
     options = options_for(folder / "work-frozen", None)
     out = folder / "registered-frozen"
-    return run_into(read_scene(base), captures, out, options, inspected=found.append)
+    return run(captures, out, options, into=read_scene(base), inspected=found.append)
 
 
 def _photos(case: ImageCase, folder: Path) -> dict[str, NDArray[np.float64]]:

@@ -32,7 +32,7 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
-from chronoscene.registration.pipeline import run, run_into
+from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.splits import IMAGE_SUFFIXES
@@ -164,7 +164,7 @@ def _frozen(
             shutil.copyfile(source / "images" / name, new / name)
     options = options_for(folder / "work-frozen", None)
     scene = read_scene(folder / "old")
-    return run_into(scene, read_captures(new), folder / "frozen", options, inspected=found.append)
+    return run(read_captures(new), folder / "frozen", options, into=scene, inspected=found.append)
 
 
 if __name__ == "__main__":

@@ -26,11 +26,7 @@ def check_shape(name: str, array: Any, shape: Sequence[int | None]) -> None:
 
 
 def check_choice(
-    place: str,
-    value: str,
-    known: Iterable[str],
-    *,
-    error: type[ChronoSceneError] = ConfigError,
+    place: str, value: str, known: Iterable[str], *, error: type[ChronoSceneError] = ConfigError
 ) -> str:
     """Return ``value`` if it is one of ``known``, else raise naming the known ones."""
     names = sorted(known)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from chronoscene.arrays import Array
+
 HeightKind = Literal["as stated", "relative", "none"]
 
 

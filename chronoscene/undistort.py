@@ -32,8 +32,7 @@ MAX_EXIF_BYTES = 65533
 _KEPT_TAGS = (0x010F, 0x0110, 0x0112, 0x0132)
 """Make, model, orientation and time: the other tags of a TIFF describe its pixels."""
 
-_KEPT_BLOCKS = (0x8769, 0x8825)
-"""EXIF proper, and GPS."""
+_KEPT_BLOCKS = (0x8769, 0x8825)  # EXIF proper, and GPS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,7 +26,7 @@ LAYERS = (
     ("chronoscene.io", "chronoscene.geodesy"),
     ("chronoscene.kernels",),
     ("chronoscene.checks",),
-    ("chronoscene.errors",),
+    ("chronoscene.errors", "chronoscene.arrays"),
 )
 """From the top of the house down. A module imports from its own room and from lower layers."""
 

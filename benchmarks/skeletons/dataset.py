@@ -24,12 +24,7 @@ from chronoscene.scene import Camera, WorldFrame
 from chronoscene.scene.splits import TEST_EVERY, format_split_text
 from chronoscene.stats.counts import PAPER_COUNTS
 from chronoscene.synth.render.noise import rng_for
-from skeletons.geometry import (
-    flying_height,
-    make_camera,
-    make_houses,
-    make_poses,
-)
+from skeletons.geometry import flying_height, make_camera, make_houses, make_poses
 from skeletons.tracks import Flight, add_noise, make_tracks
 
 Progress = Callable[[int, int, str], None]
@@ -78,11 +73,7 @@ def write_dataset(
 
 
 def write_skeleton(
-    out: Path,
-    counts: Sequence[tuple[int, int]],
-    *,
-    seed: int = 0,
-    size: tuple[int, int] = (64, 48),
+    out: Path, counts: Sequence[tuple[int, int]], *, seed: int = 0, size: tuple[int, int] = (64, 48)
 ) -> None:
     """Write one scene.
 

@@ -64,10 +64,7 @@ class Tracks:
 
 
 def make_tracks(
-    houses: Houses,
-    flights: Sequence[Flight],
-    counts: Sequence[int],
-    rng: np.random.Generator,
+    houses: Houses, flights: Sequence[Flight], counts: Sequence[int], rng: np.random.Generator
 ) -> tuple[Surface, Tracks]:
     """Points that are counted in each period exactly so often, and their tracks.
 
@@ -170,11 +167,7 @@ def _project_nearest(flight: Flight, xyz: Array) -> tuple[Index, Array, NDArray[
 
 
 def _choose(
-    images: Index,
-    exact: Array,
-    visible: NDArray[np.bool_],
-    wanted: Index,
-    rng: np.random.Generator,
+    images: Index, exact: Array, visible: NDArray[np.bool_], wanted: Index, rng: np.random.Generator
 ) -> Tracks:
     """A random choice of at most so many visible cameras of each point."""
     keys = np.where(visible, rng.random(visible.shape), 2.0)

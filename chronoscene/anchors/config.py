@@ -143,8 +143,7 @@ class AnchorConfig:
                 )
 
 
-HEADS = ("opacity", "covariance", "color")
-"""The three MLPs."""
+HEADS = ("opacity", "covariance", "color")  # The three MLPs
 
 _CHOICES: dict[str, tuple[str, ...]] = {
     "voxel_unit": ("world", "training", "spacing"),

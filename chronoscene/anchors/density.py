@@ -164,8 +164,7 @@ class DensityStatistics:
             setattr(self, name, getattr(self, name)[mask])
 
 
-_CHUNK = 512
-"""Anchors whose Gaussians one task looks up together."""
+_CHUNK = 512  # Anchors whose Gaussians one task looks up together
 
 
 @kernel(parallel=True)

@@ -28,8 +28,7 @@ from chronoscene.methods import View
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.training.splatting import Splats, camera_centre_tensor
 
-PER_ANCHOR = ("offsets", "features", "log_scales")
-"""Trained tensors with one row per anchor."""
+PER_ANCHOR = ("offsets", "features", "log_scales")  # Trained tensors with one row per anchor
 
 LAYERS = HeadWeights._fields
 _OUTPUTS = {"opacity": 1, "covariance": 7, "color": 3}

@@ -22,8 +22,7 @@ from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord, read_run,
 from chronoscene.io.staging import replacing
 from chronoscene.metrics.psnr_ssim import psnr
 
-CELL_WIDTH = 2.6
-"""Inches per image."""
+CELL_WIDTH = 2.6  # Inches per image
 ERROR_RANGE = 0.25
 """Mean absolute error over channels that saturates the error map, as a share of full scale."""
 

@@ -10,10 +10,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from chronoscene.bench.job import StopRule
 from chronoscene.methods import StepReport
 
-REFRESH = 0.1
-"""Seconds between two updates of the bar."""
-SMOOTHING = 0.95
-"""Weight of the past in the loss that is shown."""
+REFRESH = 0.1  # Seconds between two updates of the bar
+SMOOTHING = 0.95  # Weight of the past in the loss that is shown
 
 
 class ProgressDisplay:

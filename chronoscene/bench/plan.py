@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -62,13 +63,12 @@ def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]
     notices: dict[str, None] = {}
     for scene in scenes:
         check_scene(scene)
-        template = _template(settings, scene, commit)
-        for job, spec in _scene_jobs(settings, template, specs):
+        for job, spec in _scene_jobs(settings, scene, commit, specs):
             check_job(job, spec)
             plan.setdefault(job.folder, (job, spec))
             notices.update(dict.fromkeys(job.notices))
         store = ImageStore(scene, max_width=settings.max_width)
-        freeze_ground_truth(settings.runs, scene, template.scene_hash, store, settings.max_width)
+        freeze_ground_truth(settings.runs, scene, job.scene_hash, store, settings.max_width)
     for notice in notices:
         say(f"note: {notice}")
     return list(plan.values())
@@ -110,51 +110,38 @@ def _check_names(scenes: list[Scene]) -> None:
             )
 
 
-def _template(settings: BenchSettings, scene: Scene, commit: str) -> Job:
-    """What all jobs of a scene have in common."""
-    return Job(
-        scene_root=str(scene.root.resolve()),
-        scene=scene.name,
-        scene_hash=scene_hash(scene),
-        split_hash=split_hash(scene),
-        method="",
-        method_name="",
-        strategy="",
-        preset=settings.preset,
-        overrides={},
-        iterations=settings.iterations,
-        budget_seconds=settings.budget_seconds,
-        separate_iterations=settings.separate_iterations,
-        seed=0,
-        max_width=settings.max_width,
-        threads=settings.threads,
-        device=settings.device,
-        runs=str(settings.runs.resolve()),
-        lpips_weights=str(settings.lpips_weights.resolve()) if settings.lpips_weights else None,
-        commit=commit,
-    )
-
-
 def _scene_jobs(
-    settings: BenchSettings, template: Job, specs: list[tuple[str, MethodSpec]]
+    settings: BenchSettings, scene: Scene, commit: str, specs: list[tuple[str, MethodSpec]]
 ) -> Iterator[tuple[Job, MethodSpec]]:
     """Every method, strategy and seed on one scene."""
     overrides = split_overrides(settings, [spec for _, spec in specs])
-    for reference, spec in specs:
-        for wanted in settings.strategies:
-            strategy, notice = effective_strategy(spec, wanted)
-            for seed in settings.seeds:
-                job = replace(
-                    template,
-                    method=reference,
-                    method_name=spec.name,
-                    strategy=strategy,
-                    overrides=overrides[spec.name],
-                    seed=seed,
-                    notices=[notice] if notice else [],
-                    plugin_path=str(Path.cwd()) if ":" in reference else None,
-                )
-                yield job, spec
+    digest, split = scene_hash(scene), split_hash(scene)
+    for (reference, spec), wanted, seed in product(specs, settings.strategies, settings.seeds):
+        strategy, notice = effective_strategy(spec, wanted)
+        job = Job(
+            scene_root=str(scene.root.resolve()),
+            scene=scene.name,
+            scene_hash=digest,
+            split_hash=split,
+            method=reference,
+            method_name=spec.name,
+            strategy=strategy,
+            preset=settings.preset,
+            overrides=overrides[spec.name],
+            iterations=settings.iterations,
+            budget_seconds=settings.budget_seconds,
+            separate_iterations=settings.separate_iterations,
+            seed=seed,
+            max_width=settings.max_width,
+            threads=settings.threads,
+            device=settings.device,
+            runs=str(settings.runs.resolve()),
+            lpips_weights=str(settings.lpips_weights.resolve()) if settings.lpips_weights else None,
+            commit=commit,
+            notices=[notice] if notice else [],
+            plugin_path=str(Path.cwd()) if ":" in reference else None,
+        )
+        yield job, spec
 
 
 def is_finished(job: Job, spec: MethodSpec, overwrite: bool = False) -> bool:

@@ -21,8 +21,7 @@ STRATEGIES = ("joint", "pooled", "separate")
 """``joint``: one model, told the period. ``pooled``: one model, the period hidden from it.
 ``separate``: one model per period, which sees the images and points of that period alone."""
 
-EXTENT_MARGIN = 1.1
-"""Factor of 3DGS between the farthest camera and the camera extent."""
+EXTENT_MARGIN = 1.1  # Factor of 3DGS between the farthest camera and the camera extent
 
 
 @dataclass(frozen=True, slots=True, eq=False)

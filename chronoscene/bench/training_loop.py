@@ -182,12 +182,9 @@ def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:
     return to_bytes(rgb)
 
 
-WARM_UP_SIZE = 32
-"""Pixels per axis of the made-up images."""
-WARM_UP_STEPS = 120
-"""Enough for the first rounds of densification of the methods here."""
-WARM_UP_SECONDS = 3.0
-"""Limit on the time for the steps after the first three."""
+WARM_UP_SIZE = 32  # Pixels per axis of the made-up images
+WARM_UP_STEPS = 120  # Enough for the first rounds of densification of the methods here
+WARM_UP_SECONDS = 3.0  # Limit on the time for the steps after the first three
 
 
 def warm_up(spec: MethodSpec, config: Any, *, num_periods: int, device: str) -> str | None:

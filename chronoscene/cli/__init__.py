@@ -26,8 +26,7 @@ COMMANDS = {
 }
 """Command name to ``module:attribute``."""
 
-USAGE_ERROR = 2
-"""Exit status for wrong usage and for input that cannot be read at all."""
+USAGE_ERROR = 2  # Exit status for wrong usage and for input that cannot be read at all
 
 
 class LazyGroup(click.Group):

@@ -18,8 +18,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.staging import check_outside
 
-SOME_FAILED = 1
-"""Exit status when a run failed; the others have their results."""
+SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
 EXISTING = click.Path(path_type=Path, exists=True)

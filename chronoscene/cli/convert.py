@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -24,15 +26,16 @@ def _period_help() -> str:
     return f"How images are grouped into periods, where the format leaves a choice. {rules}."
 
 
+def format_option(scene: str) -> Callable[[Any], Any]:
+    """The option ``--format`` of a command that reads one scene."""
+    help = f"Format of {scene}.  [default: detected]"
+    return click.option("--format", "scene_format", type=click.Choice(format_names()), help=help)
+
+
 @click.command("convert")
 @click.argument("source", type=click.Path(path_type=Path), metavar="SRC")
 @click.argument("out", type=click.Path(path_type=Path))
-@click.option(
-    "--format",
-    "source_format",
-    type=click.Choice(format_names()),
-    help="Format of SRC.  [default: detected]",
-)
+@format_option("SRC")
 @click.option(
     "--to",
     "target",
@@ -48,7 +51,7 @@ def _period_help() -> str:
 def command(
     source: Path,
     out: Path,
-    source_format: str | None,
+    scene_format: str | None,
     target: str,
     period_by: str | None,
     link: str | None,
@@ -62,7 +65,7 @@ def command(
         done = convert(
             source,
             out,
-            source_format=source_format,
+            source_format=scene_format,
             target=target,
             period_by=period_by,
             image_source=LINKS[link],

@@ -18,8 +18,7 @@ from chronoscene.io.processes import Report
 T = TypeVar("T")
 BAR_WIDTH = 20
 """Characters: with the names of our steps, the rest of a line of 80 is for the numbers."""
-MEMORY = 300.0
-"""Seconds over which the rate is a mean; a step may be a scene, which takes a minute."""
+MEMORY = 300.0  # Seconds over which the rate is a mean; a step may be a scene, which takes a minute
 
 
 @contextmanager

@@ -11,17 +11,16 @@ from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
-from chronoscene.registration.context import CALIBRATIONS
+from chronoscene.registration.context import CALIBRATIONS, Options
 from chronoscene.registration.features.matching import MIN_PHOTOS
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import read_captures
-from chronoscene.registration.pipeline import Options, run, run_into
+from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import ROUTES, Registered
 
 DEFAULTS = Options()
 
-FAILED = 1
-"""Exit status if the verdict is fail."""
+FAILED = 1  # Exit status if the verdict is fail
 
 
 @click.command("register")
@@ -146,14 +145,16 @@ def command(
     options = Options(**settings)
     inspections: list[Inspection] = []
     with progress_bar(log=True) as report:
-        if scene is None:
-            registered = run(found, out, options, report=report, inspected=inspections.append)
-        else:
+        if scene is not None:
             check_outside(out, [scene], option="OUT")
-            old = read_scene(scene)
-            registered = run_into(
-                old, found, out, options, report=report, inspected=inspections.append
-            )
+        registered = run(
+            found,
+            out,
+            options,
+            into=None if scene is None else read_scene(scene),
+            report=report,
+            inspected=inspections.append,
+        )
     emit(summary(registered, out) + "".join(i.summary for i in inspections), None)
     if any(i.verdict.level == "fail" for i in inspections):
         context.exit(FAILED)

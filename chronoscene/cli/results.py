@@ -15,8 +15,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.io.tables import FORMATS
 from chronoscene.metrics.registry import make_scorers, metric_info
 
-SOME_FAILED = 1
-"""Exit status when a run could not be scored."""
+SOME_FAILED = 1  # Exit status when a run could not be scored
 
 
 @click.command("score")

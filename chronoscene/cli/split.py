@@ -9,12 +9,12 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.convert import describe_period
+from chronoscene.cli.convert import describe_period, format_option
 from chronoscene.cli.output import check_place, emit, writing_to
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats import format_names, read_scene
+from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside, write_text_atomic
 from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, SplitSettings, make_split
 
@@ -64,12 +64,7 @@ from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, Split
     help="Also write the scene with the new split to this new folder. Images are hard-linked where "
     "the file system allows it.",
 )
-@click.option(
-    "--format",
-    "scene_format",
-    type=click.Choice(format_names()),
-    help="Format of SCENE.  [default: detected]",
-)
+@format_option("SCENE")
 def command(
     source: Path,
     out: Path | None,

@@ -37,8 +37,7 @@ from chronoscene.stats.measures import SceneStatistics, measure_scene
 Layout = Literal["full", "paper"]
 FIGURE_FORMATS = ("png", "pdf", "svg")
 
-SCENE_PARTS = ("sparse", "images")
-"""Folders that only scenes have."""
+SCENE_PARTS = ("sparse", "images")  # Folders that only scenes have
 
 SOME_FAILED, ALL_FAILED = 1, 2
 """Exit status when scenes cannot be read."""

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.convert import LINKS, describe
+from chronoscene.cli.convert import LINKS, describe, format_option
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
-from chronoscene.formats import format_names, read_scene
+from chronoscene.formats import read_scene
 from chronoscene.images.undistortion import CameraChange
 from chronoscene.io.staging import check_outside
 from chronoscene.scene.splits import split_hash
@@ -33,12 +33,7 @@ from chronoscene.undistort import Undistortion, undistort
     type=click.Choice(["hard", "sym"]),
     help="Link images that do not change instead of copying them.",
 )
-@click.option(
-    "--format",
-    "scene_format",
-    type=click.Choice(format_names()),
-    help="Format of SCENE.  [default: detected]",
-)
+@format_option("SCENE")
 def command(
     source: Path,
     out: Path,

@@ -26,8 +26,7 @@ from chronoscene.validation.scene_folder import Track, no_progress
 
 WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
 
-NOT_VALID = 1
-"""Exit status when there are errors."""
+NOT_VALID = 1  # Exit status when there are errors
 
 
 def _explain(context: click.Context, option: click.Parameter, value: str | None) -> None:

@@ -38,8 +38,7 @@ from chronoscene.colmap.raw_model import (
 from chronoscene.errors import SceneError
 from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES, Camera
 
-KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])
-"""A keypoint of an image."""
+KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])  # A keypoint of an image
 POINT_HEAD = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )

@@ -17,11 +17,8 @@ from numpy.typing import NDArray
 from chronoscene.scene import Camera
 from chronoscene.scene.scene import PointTable
 
-MODEL_FILES = ("cameras", "images", "points3D")
-"""Stems of the files that every model has."""
-
-FORMS = (".bin", ".txt")
-"""Suffixes of model files."""
+MODEL_FILES = ("cameras", "images", "points3D")  # Stems of the files that every model has
+FORMS = (".bin", ".txt")  # Suffixes of model files
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,8 +64,7 @@ IDENTITY: Pose = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 Sensor = tuple[int, int]
 """Type and id."""
 
-CAMERA = 0
-"""Type of the sensors that are cameras."""
+CAMERA = 0  # Type of the sensors that are cameras
 
 
 @dataclass(frozen=True, slots=True)

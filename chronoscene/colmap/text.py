@@ -32,11 +32,8 @@ from chronoscene.colmap.raw_model import (
 from chronoscene.io.wording import quote
 from chronoscene.scene.cameras import CAMERA_MODELS, Camera
 
-BLOCK = 20_000
-"""Lines that are split into fields at a time, to bound the memory."""
-
-MAX_DAMAGES = 100
-"""Damaged lines of one file that are listed."""
+BLOCK = 20_000  # Lines that are split into fields at a time, to bound the memory
+MAX_DAMAGES = 100  # Damaged lines of one file that are listed
 
 _IMAGE_LINE = '"<id> <qw> <qx> <qy> <qz> <tx> <ty> <tz> <camera id> <name>" separated by blanks'
 _KEYPOINT_LINE = '"<x> <y> <point id>" for each keypoint'

@@ -22,8 +22,7 @@ from chronoscene.scene.geometry import quaternion_from_rotation
 _COUNT = struct.Struct("<Q")
 _CAMERA, _IMAGE = struct.Struct("<IIQQ"), struct.Struct("<I7dI")
 _PAIR = np.dtype("<i4")
-_ID = 0xFFFFFFFF
-"""Ids have 32 bits; readers differ in whether they are signed."""
+_ID = 0xFFFFFFFF  # Ids have 32 bits; readers differ in whether they are signed
 
 
 def write_raw_model(

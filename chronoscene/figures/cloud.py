@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.io.wording import printable
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.stats.counts import assign_points, period_name
 from chronoscene.stats.measures import robust_range
-
-Array = NDArray[np.float64]
 
 MARGIN = 0.03  # of the longest edge, on every side
 MIN_EDGE = 0.18  # of the longest edge: a flat scene gets room above and below it

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.figures.canvas import rgb_of
 
-Array = NDArray[np.float64]
 Counts = NDArray[np.float32]
 
 MIN_OPACITY = 0.6  # opacity of a pixel with one point, where others have many

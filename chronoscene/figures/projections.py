@@ -13,14 +13,12 @@ from textwrap import shorten
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chronoscene.figures import canvas
 from chronoscene.figures.canvas import DPI
 from chronoscene.figures.cloud import Box, Cloud, shown_box
 from chronoscene.figures.density_map import Window, count_points, dot_radius, grow_dots, shade
 
-Array = NDArray[np.float64]
 Plane = tuple[int, int]
 """Axes of the world along width and height of a panel."""
 Size = tuple[float, float]

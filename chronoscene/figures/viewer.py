@@ -11,13 +11,12 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.figures import canvas
 from chronoscene.figures.cloud import Cloud, cloud_of, shown_box
 from chronoscene.io.pages import render_page
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.scene import Scene
-
-Array = NDArray[np.float64]
 
 MAX_POINTS = 300_000
 """In a page, so that it opens at once and turns smoothly. The page says how many there are."""

@@ -22,8 +22,7 @@ from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame, splits
 
 NAME = "chronoscene"
-MARKS = "sparse/split.txt"
-"""What `matches` looks for."""
+MARKS = "sparse/split.txt"  # What `matches` looks for
 
 SPLIT = "sparse/split.txt"
 TEST = "sparse/0/test.txt"
@@ -31,14 +30,12 @@ MODEL = "sparse/0"
 PERIODS = "sparse/periods.json"
 WORLD = "sparse/world.json"
 
-MAX_COORDINATE = 1e100
-"""Larger than any world; squares and sums of such numbers are still finite."""
+MAX_COORDINATE = 1e100  # Larger than any world; squares and sums of such numbers are still finite
 
 NOT_RIGID = 1e-6
 """Deviation from a rotation beyond which a pose is refused; COLMAP's are exact to rounding."""
 
-MAX_PERIODS = 100_000
-"""Far more than any real scene has: a mistaken id must not fill the memory."""
+MAX_PERIODS = 100_000  # Far more than any real scene has: a mistaken id must not fill the memory
 
 
 def matches(path: Path) -> bool:

@@ -17,8 +17,7 @@ from chronoscene.images.store import ImageSource, Progress
 from chronoscene.scene import Scene
 
 NAME = "colmap-folders"
-MARKS = "images/<period>/ and sparse/0/"
-"""What `matches` looks for."""
+MARKS = "images/<period>/ and sparse/0/"  # What `matches` looks for
 
 PERIOD_BY = ("folder", "table:FILE")
 """The first folder of the names (default), or a CSV file with the columns file and period."""

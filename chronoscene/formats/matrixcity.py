@@ -39,23 +39,20 @@ NAME = "matrixcity"
 MARKS = "transforms.json with rot_mat, or pose/<block>/transforms_train.json"
 """What `matches` looks for."""
 
-PERIOD_BY = ("one", "folder")
-"""All blocks in one period, or one period for each first folder."""
+PERIOD_BY = ("one", "folder")  # All blocks in one period, or one period for each first folder
 
 RAW = "transforms.json"
 PREPARED = ("transforms_train.json", "transforms_test.json")
 RAW_KEY = '"rot_mat"'
 
 ROTATION_SCALE = 100.0
-PREPARED_UNIT = 100.0
-"""Metres."""
+PREPARED_UNIT = 100.0  # Metres
 
 PARTS_OF_A_CITY = ("train", "test", "train_dense", "pose", "aerial", "street")
 """Folders that say what images are for, or how they were flown: neither blocks nor periods."""
 
 MAX_DEPTH = 4
-MAX_FOLDERS = 5000
-"""Folders that are searched, so that a wrong path does not take forever."""
+MAX_FOLDERS = 5000  # Folders that are searched, so that a wrong path does not take forever
 
 
 @dataclass(frozen=True, slots=True)

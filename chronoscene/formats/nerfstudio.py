@@ -49,11 +49,8 @@ from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "nerfstudio"
 FILE = "transforms.json"
-MARKS = FILE
-"""What `matches` looks for."""
-
-POINTS = "sparse_points.ply"
-"""Where points are written to."""
+MARKS = FILE  # What `matches` looks for
+POINTS = "sparse_points.ply"  # Where points are written to
 
 FISHEYE = "OPENCV_FISHEYE"
 

@@ -30,8 +30,7 @@ from chronoscene.scene import Scene
 from chronoscene.scene.splits import NameIndex, parse_test_text, read_text
 
 NAME = "neusc"
-MARKS = "dense/images/ and dense/sparse/"
-"""What `matches` looks for."""
+MARKS = "dense/images/ and dense/sparse/"  # What `matches` looks for
 
 PERIOD_BY = ("year", "month", "day", "gap:DAYS", "count:N")
 """How dates become periods; by year unless told otherwise."""

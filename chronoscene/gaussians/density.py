@@ -19,8 +19,7 @@ from chronoscene.gaussians.model import logit, opacities_of, scales_of
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.scene.geometry import rotation_from_quaternion
 
-PARTS = 2
-"""Gaussians that a split one becomes."""
+PARTS = 2  # Gaussians that a split one becomes
 
 
 class GradientStatistics:

@@ -39,8 +39,7 @@ _C3_1 = 0.25 * sqrt(21 / (2 * pi))
 _C3_0 = 0.25 * sqrt(7 / pi)
 _C3_22 = 0.25 * sqrt(105 / pi)
 
-BLOCK = 512
-"""Rows that one task handles. Fixed, so that the result does not depend on the threads."""
+BLOCK = 512  # Rows that one task handles. Fixed, so that the result does not depend on the threads.
 
 
 def dc_from_rgb(rgb: Tensor) -> Tensor:

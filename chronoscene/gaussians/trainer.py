@@ -22,8 +22,7 @@ from chronoscene.training.losses import photometric_loss
 from chronoscene.training.schedule import ViewSampler, log_linear
 from chronoscene.training.splatting import draw
 
-_SPLIT_STREAM = 1
-"""Keeps the samples of splits apart from other draws of the same seed."""
+_SPLIT_STREAM = 1  # Keeps the samples of splits apart from other draws of the same seed
 
 
 @dataclass(frozen=True, slots=True)

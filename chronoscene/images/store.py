@@ -30,8 +30,7 @@ from chronoscene.errors import ImageError, SceneError
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.cameras import CAMERA_MODELS
 
-MAX_WIDTH = 1600
-"""Pixels; the limit that the field's loaders use."""
+MAX_WIDTH = 1600  # Pixels; the limit that the field's loaders use
 
 ImageSource = Literal["copy", "link", "symlink", "none"]
 

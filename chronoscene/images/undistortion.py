@@ -26,11 +26,8 @@ from chronoscene.scene.cameras import (
 )
 from chronoscene.scene.tracks import by_image
 
-ROWS = 128
-"""Rows of a map that are computed at once, to bound the memory."""
-
-MAX_JPEG_SIDE = 65535
-"""Pixels; a camera that needs more than a JPEG file can hold is a mistake."""
+ROWS = 128  # Rows of a map that are computed at once, to bound the memory
+MAX_JPEG_SIDE = 65535  # Pixels; a camera that needs more than a JPEG file can hold is a mistake
 
 MAX_ROUND_TRIP_ERROR = 0.01
 """Pixels between an observation and the projection of its ray; beyond, the ray is wrong."""

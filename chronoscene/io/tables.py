@@ -21,10 +21,8 @@ FORMATS = ("table", "csv", "markdown", "latex", "json")
 
 Head = tuple[str, str]
 """Two lines; a column whose first line is empty shares that of the column before."""
-GAP = 2
-"""Blanks between columns."""
-MIN_NAME_WIDTH = 12
-"""Characters of a name that are shown even on narrow terminals."""
+GAP = 2  # Blanks between columns
+MIN_NAME_WIDTH = 12  # Characters of a name that are shown even on narrow terminals
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-MAX_NAME_LENGTH = 120
-"""Characters of a name from a file that a message repeats."""
+MAX_NAME_LENGTH = 120  # Characters of a name from a file that a message repeats
 
 
 def printable(text: str) -> str:

@@ -8,8 +8,7 @@ import sys
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _KEPT_BYTES = 256 << 20
-_MAX_MMAP_THRESHOLD = 32 << 20
-"""The largest that glibc accepts."""
+_MAX_MMAP_THRESHOLD = 32 << 20  # The largest that glibc accepts
 
 
 def available_threads() -> int:

@@ -10,9 +10,6 @@ finished jobs. Between phases a worker waits for jobs, not for workers: who come
 everything done and passes through.
 """
 
-# mypy: allow-untyped-defs
-# Numba infers the types of kernels.
-
 from __future__ import annotations
 
 import os

@@ -27,10 +27,8 @@ LN2_HIGH = float32(0.693359375)
 LN2_LOW = float32(math.log(2) - 0.693359375)
 ROUNDER = float32(1.5 * 2**23)
 """Adding it rounds to an integer, which then stands in the lowest bits."""
-EXP_MIN = float32(-86.5)
-"""Below, exp would leave the normal numbers; it stays at 2.7e-38."""
-EXP_MAX = float32(88.3)
-"""Above, exp is infinite."""
+EXP_MIN = float32(-86.5)  # Below, exp would leave the normal numbers; it stays at 2.7e-38
+EXP_MAX = float32(88.3)  # Above, exp is infinite
 INFINITY = float32(math.inf)
 # Taylor coefficients 1 / n! of exp; the rest at |x| <= ln(2) / 2 is 1e-8 of the value.
 EXP_TAYLOR = tuple(float32(1 / math.factorial(n)) for n in range(8))

@@ -40,8 +40,7 @@ def _register_lanes() -> int:
     return 16 if "+avx512f" in names else 8 if "+avx2" in names else 4
 
 
-LANES = _register_lanes()
-"""Numbers of 32 bits in the widest register of the processor."""
+LANES = _register_lanes()  # Numbers of 32 bits in the widest register of the processor
 MANY_REGISTERS = LANES == 16 or platform.machine() in ("aarch64", "arm64")
 """32 vector registers, else 16."""
 

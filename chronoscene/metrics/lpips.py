@@ -23,10 +23,8 @@ from chronoscene.metrics.psnr_ssim import unit_float
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 """Per RGB channel: the mean and deviation of ImageNet, moved to inputs in [-1, 1]."""
-EPSILON = 1e-10
-"""Added to the length of a feature vector before the division."""
-MIN_SIZE = 16
-"""Pixels per axis that survive the four poolings of VGG16."""
+EPSILON = 1e-10  # Added to the length of a feature vector before the division
+MIN_SIZE = 16  # Pixels per axis that survive the four poolings of VGG16
 
 
 class Lpips:

@@ -12,15 +12,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
 
-Array = NDArray[np.float64]
-
-WINDOW = 11
-"""Taps of the SSIM window per axis."""
-SIGMA = 1.5
-"""Standard deviation of the SSIM window in pixels."""
+WINDOW = 11  # Taps of the SSIM window per axis
+SIGMA = 1.5  # Standard deviation of the SSIM window in pixels
 C1, C2 = 0.01**2, 0.03**2
 """Stabilisers of SSIM for data range 1 (Wang et al. 2004)."""
 

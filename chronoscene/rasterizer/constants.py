@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-ALPHA_MIN = 1.0 / 255.0
-"""A Gaussian is skipped at a pixel where its alpha is below this."""
+ALPHA_MIN = 1.0 / 255.0  # A Gaussian is skipped at a pixel where its alpha is below this
 
 ALPHA_MAX = 0.9990000128746033
 """Alpha is capped here, so that light always passes and 1 - alpha can be divided by. It is 0.999 in
@@ -21,8 +20,7 @@ VALUE_MAX = 1e30
 """A Gaussian with a colour or an opacity of this size or more is culled: the squares and sums in
 the gradient must stay within float32."""
 
-EXTENT_MAX = 1e15
-"""So is one whose half extent on the screen is this many pixels or more."""
+EXTENT_MAX = 1e15  # So is one whose half extent on the screen is this many pixels or more
 
 DEPTH_MAX = 1e18
 """The far plane is at most here and the near plane at least at one over this: what is divided by
@@ -36,8 +34,7 @@ FOCAL_MIN = 1e-3
 """Smallest focal length in image widths (heights): rays 89.9 degrees off the axis. Beyond, the
 Jacobian of a large Gaussian is a difference of numbers that are equal in float32."""
 
-RADIUS_MAX = 2_000_000_000
-"""Larger radii are reported as this: they are int32."""
+RADIUS_MAX = 2_000_000_000  # Larger radii are reported as this: they are int32
 
 CLAMP_MARGIN = 0.3
 """The Jacobian of the projection is taken at a position at most this many half image widths
@@ -50,5 +47,4 @@ NEAR_PLANE = 0.01
 """Default near plane, in world units: Gaussians whose centres are nearer to the camera are culled.
 All methods use it unless they are told otherwise."""
 
-FAR_PLANE = 1e10
-"""Default far plane, likewise."""
+FAR_PLANE = 1e10  # Default far plane, likewise

@@ -16,8 +16,7 @@ Calibration = Literal["auto", "per-period", "shared"]
 
 CALIBRATIONS: tuple[Calibration, ...] = get_args(Calibration)
 
-EXHAUSTIVE_LIMIT = 60
-"""Images; at most 1,770 pairs."""
+EXHAUSTIVE_LIMIT = 60  # Images; at most 1,770 pairs
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from chronoscene.arrays import Ints
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.store import Progress
@@ -37,13 +38,10 @@ GEOREFERENCE = "georeference.json"
 CERTIFICATE = "registration.json"
 PAGE = "registration.html"
 
-SAME_PIXELS = 1.0
-"""Two observations in one image this near to each other are of one point..."""
+SAME_PIXELS = 1.0  # Two observations in one image this near to each other are of one point..
 
 SAME_ERROR = 4.0
 """...if the point projects into the new images this near to their observations, in pixels."""
-
-Ints = NDArray[np.int64]
 
 
 def as_scene(registered: Registered, name: str) -> Scene:

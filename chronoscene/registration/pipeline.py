@@ -22,13 +22,9 @@ from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
 from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
 from chronoscene.scene import Scene
 
-__all__ = ["Options", "run", "run_into"]
-
-SCHEMA_VERSION = 1
-"""Version of the log."""
+SCHEMA_VERSION = 1  # Version of the log
 
 Inspected = Callable[[Inspection], None]
-"""Called with the certificate and the verdict."""
 
 
 def run(
@@ -36,6 +32,7 @@ def run(
     out: Path,
     options: Options | None = None,
     *,
+    into: Scene | None = None,
     report: Report | None = None,
     inspected: Inspected | None = None,
 ) -> Registered:
@@ -45,53 +42,25 @@ def run(
         captures: From `chronoscene.registration.photos.captures.read_captures`.
         out: Folder that does not exist or is empty.
         options: Settings; None for the defaults.
+        into: Scene to which the captures are added as one new period; its poses do not change.
         report: Called with the progress.
         inspected: Called with the certificate and the verdict.
 
     Raises:
-        RegistrationError: If there is no model; what was computed is kept in the work folder.
-        SceneError: If ``out`` is in use, or tie points do not suffice.
-    """
-    return _run(captures, None, Path(out), options or Options(), report, inspected)
-
-
-def run_into(
-    scene: Scene,
-    captures: Captures,
-    out: Path,
-    options: Options | None = None,
-    *,
-    report: Report | None = None,
-    inspected: Inspected | None = None,
-) -> Registered:
-    """Add the captures to a scene as one new period and write a new scene; old poses do not change.
-
-    Args as in `run`.
-
-    Raises:
-        RegistrationError: If none of the photos can be placed.
-        SceneError: If ``out`` is in use, or the scene has distortion.
-        ConfigError: If tie points are given.
+        RegistrationError: If there is no model, or none of the photos can be placed; what was
+            computed is kept in the work folder.
+        SceneError: If ``out`` is in use, tie points do not suffice, or ``into`` has distortion.
+        ConfigError: If tie points are given together with ``into``.
     """
     options = options or Options()
-    if options.tie_points is not None:
+    out = Path(out)
+    if into is not None and options.tie_points is not None:
         raise ConfigError(
             "--tie-points",
             expected="a registration of all periods",
             found="--into, which does not move existing poses",
             todo="omit one of the two",
         )
-    return _run(captures, scene, Path(out), options, report, inspected)
-
-
-def _run(
-    captures: Captures,
-    scene: Scene | None,
-    out: Path,
-    options: Options,
-    report: Report | None,
-    inspected: Inspected | None,
-) -> Registered:
     output.check_free(out, overwrite=options.overwrite)
     work = (options.work or out.with_name(f"{out.name}.work")).resolve()
     points = None
@@ -99,7 +68,7 @@ def _run(
         points = read_tie_points(options.tie_points, scale=options.tie_scale)
     with work_folder(work) as lock:
         context = Context(work, Stages(work), options, report, lock)
-        inputs = gather(captures, scene, context)
+        inputs = gather(captures, into, context)
         matched = find_matches(inputs, context)
         registered, ties = _tie(estimate(inputs, matched, context), points, inputs, context)
         staged = _stage_scene(registered, inputs, out.resolve().name, context)

@@ -26,11 +26,8 @@ from chronoscene.errors import RegistrationError
 from chronoscene.io.processes import Report, run_worker
 from chronoscene.io.staging import write_text_atomic
 
-VERSION = 1
-"""Version of what stages store; other versions are not read."""
-
-PATIENCE = 5.0
-"""Seconds; a step ends within one second after its command was killed."""
+VERSION = 1  # Version of what stages store; other versions are not read
+PATIENCE = 5.0  # Seconds; a step ends within one second after its command was killed
 
 
 def fingerprint(*parts: Any) -> str:
@@ -155,8 +152,7 @@ STEPS = {
 """Name of a step to ``module:function``, which takes a dictionary and a `Report` and returns what
 JSON can hold."""
 
-LOG_LINES = 4
-"""Lines of the step's own output in a message."""
+LOG_LINES = 4  # Lines of the step's own output in a message
 
 
 def run_step(

@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 
 if TYPE_CHECKING:
     from chronoscene.io.pycolmap import pycolmap
-
-Array = NDArray[np.float64]
 
 
 class CameraModel(NamedTuple):
@@ -69,8 +67,7 @@ CAMERA_MODELS = {
 }
 """COLMAP's camera models in the order of their ids, 0 to 17."""
 
-MODEL_NAMES = tuple(CAMERA_MODELS)
-"""Name of a camera model by its id."""
+MODEL_NAMES = tuple(CAMERA_MODELS)  # Name of a camera model by its id
 
 PINHOLE_MODELS = tuple(name for name, m in CAMERA_MODELS.items() if m.kind == "pinhole")
 """Camera models without distortion."""
@@ -78,8 +75,7 @@ PINHOLE_MODELS = tuple(name for name, m in CAMERA_MODELS.items() if m.kind == "p
 POLYNOMIAL_MODELS = tuple(name for name, m in CAMERA_MODELS.items() if m.kind == "polynomial")
 """Camera models that are a pinhole where all their distortion parameters are zero."""
 
-MAX_SIDE = 1_000_000
-"""Pixels; beyond any image."""
+MAX_SIDE = 1_000_000  # Pixels; beyond any image
 
 
 @dataclass(frozen=True, slots=True)

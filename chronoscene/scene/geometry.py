@@ -8,9 +8,9 @@ is float64 numpy.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from chronoscene.arrays import Array
 
 
 def rotation_from_quaternion(quaternion: ArrayLike) -> Array:

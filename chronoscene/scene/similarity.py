@@ -8,19 +8,15 @@ from itertools import combinations, islice
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.scene.geometry import pose_from_rotation_translation
-
-Array = NDArray[np.float64]
 
 NUM_SAMPLES = 200
 """Triples of points that are tried. With half of the points wrong, the chance that all
 of them have a wrong one is 3 x 10^-12."""
 
-MAX_JUDGED = 1000
-"""Points that a triple is evaluated on."""
-
-MAX_TRIPLES = 5000
-"""Triples that are tried where points are few."""
+MAX_JUDGED = 1000  # Points that a triple is evaluated on
+MAX_TRIPLES = 5000  # Triples that are tried where points are few
 
 MIN_THICKNESS = 0.02
 """Spread across a line as a share of that along it, below which points fix no rotation."""

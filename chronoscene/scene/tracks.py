@@ -12,11 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.scene.cameras import Camera, project_points
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MIN_PARALLAX = 3e-4
 """Smallest eigenvalue of the mean of ``I - d d^T`` over the rays of a point that still has a depth.

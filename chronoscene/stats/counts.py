@@ -41,15 +41,6 @@ Source: table of counts in "ChronoGS: Disentangling Invariants and Changes in Mu
 CVPR 2026 (arXiv 2511.18794). Facts only; nothing here was measured by us.
 """
 
-PAPER_TOTALS = (
-    (2_682, 1_379_697),
-    (2_404, 1_445_761),
-    (2_605, 1_524_500),
-    (1_200, 595_357),
-    (8_891, 4_945_315),
-)
-"""The last row of the table as printed: images and points of periods 0 to 3, and of all."""
-
 _BY_NAME = {name.casefold(): name for name in PAPER_COUNTS}
 
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.scene import Scene, tracks
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.stats.counts import CountRule, SceneCount, count_scene
 
-Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 CELLS = 50  # cubes along the longest edge of a scene for its coverage

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.errors import ConfigError
 from chronoscene.scene import Camera, Frame, Split
 from chronoscene.scene.geometry import pose_from_rotation_translation
@@ -16,12 +16,9 @@ from chronoscene.synth.render.noise import rng_for
 from chronoscene.synth.render.renderer import PeriodRenderer
 from chronoscene.synth.settings import SynthSettings
 
-Array = NDArray[np.float64]
-
 UNEQUAL = (1.09, 0.91, 1.0, 1.15, 0.85)
 """Views per period relative to the mean, repeated over the periods."""
-TEST_SHARE = 0.15
-"""Share of test frames."""
+TEST_SHARE = 0.15  # Share of test frames
 SPLITS: tuple[Split, Split] = ("train", "test")
 MAX_TRIES = 60
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.images.store import load_rgb
 from chronoscene.scene import Frame, Points, Scene
 from chronoscene.synth.render.mesh import MISS
@@ -19,16 +20,11 @@ from chronoscene.synth.render.noise import rng_for
 from chronoscene.synth.render.renderer import PeriodRenderer
 from chronoscene.synth.settings import SynthSettings
 
-Array = NDArray[np.float64]
-
 MIN_TRACK_LENGTH = 3
 MAX_TRACK_LENGTH = 14
-CANDIDATES_PER_POINT = 1.7
-"""Candidates per requested point; many are seen by too few frames."""
-MAX_ALBEDO_CHANGE = 0.003
-"""Maximum albedo difference between periods that share a point."""
-MAX_DEPTH = 450.0
-"""Metres; more distant points are not useful."""
+CANDIDATES_PER_POINT = 1.7  # Candidates per requested point; many are seen by too few frames
+MAX_ALBEDO_CHANGE = 0.003  # Maximum albedo difference between periods that share a point
+MAX_DEPTH = 450.0  # Metres; more distant points are not useful
 
 
 class Candidates(NamedTuple):

@@ -19,10 +19,8 @@ from chronoscene.synth.render.renderer import PeriodRenderer, PixelMaps
 
 UNCHANGED, APPEARANCE, GEOMETRY = 0, 127, 255
 """Pixel values of change masks."""
-DEPTH_TOLERANCE = 1e-3
-"""Relative difference of depth that counts as a change of geometry."""
-ALBEDO_TOLERANCE = 0.02
-"""Linear difference of albedo that counts as a change of appearance."""
+DEPTH_TOLERANCE = 1e-3  # Relative difference of depth that counts as a change of geometry
+ALBEDO_TOLERANCE = 0.02  # Linear difference of albedo that counts as a change of appearance
 SHEET_COLUMNS = 6
 JPEG_FLAGS = (
     cv2.IMWRITE_JPEG_QUALITY,

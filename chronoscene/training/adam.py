@@ -19,8 +19,7 @@ from chronoscene.kernels.compilation import kernel
 
 BETA1 = 0.9
 BETA2 = 0.999
-EPS = 1e-15
-"""Added to the root of the second moment, as in 3DGS."""
+EPS = 1e-15  # Added to the root of the second moment, as in 3DGS
 # Rounded once: 1 - float32(0.999) would be off by 5e-5.
 GAIN1 = float32(1 - BETA1)
 KEEP2 = float32(BETA2)

@@ -41,8 +41,7 @@ _RATIO = BETA1 / BETA2**0.5
 LOG_BETA2 = math.log(BETA2)
 WAY_PARTS = 3
 """Numbers for each gap: way over mean / root of square, and what is left of the two moments."""
-CHUNK = 256
-"""Rows that a task takes at a time."""
+CHUNK = 256  # Rows that a task takes at a time
 ZERO = float32(0)
 
 

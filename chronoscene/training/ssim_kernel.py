@@ -36,8 +36,7 @@ from chronoscene.kernels.vectors import LANES, multiply_add, select, splat
 RADIUS = 5
 SIGMA = 1.5
 CHANNELS = 3
-MARGIN = 16
-"""At least RADIUS * CHANNELS, and a multiple of all vector lengths."""
+MARGIN = 16  # At least RADIUS * CHANNELS, and a multiple of all vector lengths
 
 _GAUSS = [math.exp(-(i**2) / (2 * SIGMA**2)) for i in range(-RADIUS, RADIUS + 1)]
 TAPS = tuple(float32(value / sum(_GAUSS)) for value in _GAUSS)

@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 
 from chronoscene.anchors.config import AnchorConfig
-from chronoscene.anchors.density import (
-    AnchorRows,
-    DensityStatistics,
-    grow,
-    prune_mask,
-)
+from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
 
 CONFIG = AnchorConfig(random_growth=False)
 
@@ -133,8 +128,7 @@ def test_growth_stops_at_the_limit_and_repeats_with_the_seed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("visits", "opacity_sum", "kept"),
-    [(81, 0.404, False), (81, 0.406, True), (80, 0.0, True)],
+    ("visits", "opacity_sum", "kept"), [(81, 0.404, False), (81, 0.406, True), (80, 0.0, True)]
 )
 def test_faint_anchors_are_pruned(visits: float, opacity_sum: float, kept: bool) -> None:
     statistics = DensityStatistics(1, 2)

@@ -5,12 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chronoscene.bench.strategies import (
-    STRATEGIES,
-    effective_strategy,
-    make_parts,
-    training_frame,
-)
+from chronoscene.bench.strategies import STRATEGIES, effective_strategy, make_parts, training_frame
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import load_spec

@@ -14,7 +14,7 @@ from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import load_rgb
 from chronoscene.scene import Scene
-from chronoscene.stats.counts import PAPER_COUNTS, PAPER_TOTALS, count_scene
+from chronoscene.stats.counts import PAPER_COUNTS, count_scene
 from chronoscene.validation.run import validate_scene
 
 COUNTS = [(20, 700), (9, 300), (31, 1100)]
@@ -117,6 +117,16 @@ def test_a_folder_in_use_stays_as_it_is(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="new or empty"):
         write_skeleton(tmp_path, COUNTS)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+PAPER_TOTALS = (
+    (2_682, 1_379_697),
+    (2_404, 1_445_761),
+    (2_605, 1_524_500),
+    (1_200, 595_357),
+    (8_891, 4_945_315),
+)
+"""The last row of the table as printed: images and points of periods 0 to 3, and of all."""
 
 
 def test_counts_of_the_paper_add_up() -> None:

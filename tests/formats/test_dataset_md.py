@@ -33,7 +33,7 @@ def test_every_file_of_the_format_has_a_sample(folder):
     names = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     model = {f"sparse/0/{stem}.txt" for stem in ("cameras", "images", "points3D")}
     assert names == model | {
-        *("sparse/split.txt", "sparse/0/test.txt", "sparse/periods.json", "sparse/world.json"),
+        *("sparse/split.txt", "sparse/0/test.txt", "sparse/periods.json", "sparse/world.json")
     }
 
 

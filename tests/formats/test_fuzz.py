@@ -21,12 +21,7 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import FORMATS, detect_format, read_scene, writable_formats
 from chronoscene.formats.chronoscene import check_image
 from chronoscene.formats.shared.ply import read_points
-from chronoscene.images.undistortion import (
-    CameraChange,
-    move_pixels,
-    pinhole_camera,
-    sampling_map,
-)
+from chronoscene.images.undistortion import CameraChange, move_pixels, pinhole_camera, sampling_map
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES
 from chronoscene.scene.split_making import SplitSettings, make_split

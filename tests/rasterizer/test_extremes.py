@@ -15,22 +15,9 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import assume, given, settings
-from rasterizer_cases.comparison import (
-    Comparison,
-    compare,
-    everything,
-    rounding,
-    steady_pixels,
-)
+from rasterizer_cases.comparison import Comparison, compare, everything, rounding, steady_pixels
 from rasterizer_cases.exact import exact_pixels
-from rasterizer_cases.extremes import (
-    AGREES,
-    CULLED,
-    EXTREMES,
-    Extreme,
-    in_training_frame,
-    rounded,
-)
+from rasterizer_cases.extremes import AGREES, CULLED, EXTREMES, Extreme, in_training_frame, rounded
 from rasterizer_cases.mixtures import FOUND
 from rasterizer_cases.scenes import SmallScene, extreme_scenes, random_scene, well_posed
 

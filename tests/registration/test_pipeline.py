@@ -12,8 +12,9 @@ from PIL import Image
 
 from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.formats import read_scene
+from chronoscene.registration.context import Options
 from chronoscene.registration.photos.captures import read_captures
-from chronoscene.registration.pipeline import Options, run, run_into
+from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
@@ -150,7 +151,7 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
     run(read_captures(tmp_path / "first"), base, OPTIONS)
     old = read_scene(base)
     out = tmp_path / "grown"
-    registered = run_into(old, read_captures(captures / "2023"), out, OPTIONS)
+    registered = run(read_captures(captures / "2023"), out, OPTIONS, into=old)
     assert registered.route == "frozen"
     new = read_scene(out)
     assert new.num_periods == 2
@@ -219,7 +220,7 @@ def test_a_command_killed_again_and_again_ends_as_if_nothing_had_been(
         process = started([str(captures), str(out)])
         try:
             # The time grows, or a stage that takes longer would never end.
-            _, errors = process.communicate(timeout=random.uniform(0.5, 1.0) * 1.15**kills)
+            _, errors = process.communicate(timeout=random.uniform(0.3, 0.6) * 1.12**kills)
             assert process.returncode == 0, errors
         except subprocess.TimeoutExpired:
             process.kill()

@@ -16,13 +16,7 @@ from chronoscene.errors import SceneError
 from chronoscene.synth import generate, preset
 from chronoscene.validation.run import validate_scene
 
-SMALL: dict[str, Any] = {
-    "width": 32,
-    "height": 24,
-    "views": 4,
-    "points": 80,
-    "probe_spacing": 8.0,
-}
+SMALL: dict[str, Any] = {"width": 32, "height": 24, "views": 4, "points": 80, "probe_spacing": 8.0}
 
 
 def files(folder: Path) -> list[Path]:

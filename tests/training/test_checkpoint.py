@@ -8,12 +8,7 @@ import torch
 
 from chronoscene.errors import CheckpointError
 from chronoscene.scene.similarity import Sim3
-from chronoscene.training.checkpoint import (
-    META_FILE,
-    TENSOR_FILE,
-    load_tensors,
-    save_tensors,
-)
+from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE, load_tensors, save_tensors
 
 
 def example():

@@ -21,8 +21,7 @@ from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
 from chronoscene.training.splatting import Splats
 
-_ALL = np.float32(-np.inf)
-"""Opacity above which Gaussians are active, if all are to be."""
+_ALL = np.float32(-np.inf)  # Opacity above which Gaussians are active, if all are to be
 
 
 class HeadWeights(NamedTuple):

@@ -28,8 +28,7 @@ from chronoscene.kernels.memory import (
 from chronoscene.kernels.vector_math import quad_spread, quad_sum
 from chronoscene.kernels.vectors import LANES, select, splat
 
-SLICE = 1024
-"""Gradients of weights summed over the chunks by one task."""
+SLICE = 1024  # Gradients of weights summed over the chunks by one task
 ZERO = float32(0)
 ONE = float32(1)
 

@@ -31,8 +31,7 @@ from chronoscene.kernels.vectors import LANES, make_constant, select, splat, sqr
 
 _identity = make_constant([1.0, 0.0, 0.0, 0.0] * (LANES // 4))
 """The quaternion without a turn, over and over."""
-AHEAD = 16
-"""Anchors between the request for a row and its use."""
+AHEAD = 16  # Anchors between the request for a row and its use
 ZERO = float32(0)
 ONE = float32(1)
 _MIN_DISTANCE = float32(MIN_DISTANCE)

@@ -31,8 +31,7 @@ from chronoscene.anchors.decode.layout import (
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.memory import read, write
 
-OUTPUTS = (1, 7, 3)
-"""Per offset, of the heads for opacity, covariance and colour."""
+OUTPUTS = (1, 7, 3)  # Per offset, of the heads for opacity, covariance and colour
 
 
 class Decode(torch.autograd.Function):

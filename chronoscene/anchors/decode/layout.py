@@ -22,12 +22,10 @@ task works in stays in the second-level cache."""
 CHUNK = 512
 """Anchors per partial sum of weight gradients. Fixed, so that sums do not depend on the number of
 threads."""
-MIN_DISTANCE = 1e-12
-"""Of an anchor from the camera, in world units; nearer, it has no direction."""
+MIN_DISTANCE = 1e-12  # Of an anchor from the camera, in world units; nearer, it has no direction
 MIN_QUAT_NORM = 1e-12
 """Shorter quaternions carry no direction: they become the identity and get no gradient."""
-CYCLE = 3 * LANES
-"""Three numbers in turn look the same every so many lanes."""
+CYCLE = 3 * LANES  # Three numbers in turn look the same every so many lanes
 
 
 class Layout(NamedTuple):

@@ -25,8 +25,7 @@ from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Period, Scene, WorldFrame
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
-MODELS = ("sparse/0", "sparse")
-"""Where models are looked for, in this order."""
+MODELS = ("sparse/0", "sparse")  # Where models are looked for, in this order
 
 
 def find_model(path: Path) -> Path | None:

@@ -40,8 +40,7 @@ MODEL_KEYS = {
 }  # fmt: skip
 """Camera models that such a file can name, with the keys of their distortion in COLMAP's order."""
 
-_LIST_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Order of ``distortion_params``."""
+_LIST_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")  # Order of ``distortion_params``
 
 
 @dataclass(frozen=True, slots=True, eq=False)

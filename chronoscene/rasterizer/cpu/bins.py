@@ -5,9 +5,6 @@ a list; a stable counting sort by tile then keeps the order of drawing in every 
 whatever the number of parts.
 """
 
-# mypy: allow-untyped-defs
-# Numba infers the types of kernels.
-
 from __future__ import annotations
 
 from typing import Any

@@ -5,9 +5,6 @@ belongs to a block lies together: planes a power of two apart would collide in t
 store buffer.
 """
 
-# mypy: allow-untyped-defs
-# Numba infers the types of kernels.
-
 from __future__ import annotations
 
 from typing import Any
@@ -31,15 +28,11 @@ from chronoscene.rasterizer import constants
 from chronoscene.rasterizer.cpu import layout
 from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, splat, splat_int
 
-AHEAD = 6
-"""Entries by which records are asked for in advance."""
-STEPS = 32
-"""Scratch numbers of a Gaussian in a tile, see `start_gaussian`."""
-
+AHEAD = 6  # Entries by which records are asked for in advance
+STEPS = 32  # Scratch numbers of a Gaussian in a tile, see `start_gaussian`
 _STATE = 64  # numbers per block: light, red, green, blue
 _STEPS = 64 * _STATE  # where the steps are
-FORWARD_NUMBERS = _STEPS + STEPS
-"""Scratch of one worker."""
+FORWARD_NUMBERS = _STEPS + STEPS  # Scratch of one worker
 
 _lane_x = make_constant([i % 4 + 0.5 for i in range(LANES)])
 _lane_y = make_constant([i // 4 + 0.5 for i in range(LANES)])

@@ -1,8 +1,5 @@
 """The gradient of compositing, tile by tile, back to front."""
 
-# mypy: allow-untyped-defs
-# Numba infers the types of kernels.
-
 from __future__ import annotations
 
 import numpy as np
@@ -27,8 +24,7 @@ from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, spl
 
 _STATE = 96  # numbers per block: light, behind, gradient of red, green, blue, end of what counts
 _STEPS = 64 * _STATE  # where the steps are
-BACKWARD_NUMBERS = _STEPS + STEPS
-"""Scratch of one worker."""
+BACKWARD_NUMBERS = _STEPS + STEPS  # Scratch of one worker
 
 _load_rgb, _load_alpha = make_load_pixels(3, LANES), make_load_pixels(1, LANES)
 

@@ -3,9 +3,6 @@
 Matrices are tuples of vectors, by rows.
 """
 
-# mypy: allow-untyped-defs
-# Numba infers the types of kernels.
-
 from __future__ import annotations
 
 from typing import Any

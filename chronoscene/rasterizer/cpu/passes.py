@@ -31,8 +31,7 @@ _MAX_ATTEMPTS = 64
 """More than 64-bit numbers of pairs can need: room grows by `_LIST_GROWTH` each time."""
 _MAX_FREE_WORKSPACES = 4
 _CACHE_LINE = 64
-_MARGIN = 16
-"""Entries that may be read past the end, to fetch records ahead."""
+_MARGIN = 16  # Entries that may be read past the end, to fetch records ahead
 
 _free: list[Workspace] = []
 _lock = threading.Lock()

@@ -1,8 +1,5 @@
 """Gaussians onto the screen, `LANES` at a time."""
 
-# mypy: allow-untyped-defs
-# Numba infers the types of kernels.
-
 from __future__ import annotations
 
 from typing import Any

@@ -1,8 +1,5 @@
 """Gradients on the screen back into space, `LANES` Gaussians at a time."""
 
-# mypy: allow-untyped-defs
-# Numba infers the types of kernels.
-
 from __future__ import annotations
 
 from typing import Any

@@ -1,8 +1,5 @@
 """Order of drawing: a stable radix sort of depths, so that equal depths keep the input's order."""
 
-# mypy: allow-untyped-defs
-# Numba infers the types of kernels.
-
 from __future__ import annotations
 
 import numpy as np

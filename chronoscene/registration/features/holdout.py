@@ -24,8 +24,7 @@ from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import replacing
 from chronoscene.registration.features.database import keypoints_of, quiet, verified_matches
 
-MIN_LEFT = 16
-"""A pair of images keeps at least this many matches: sparse pairs stay useful."""
+MIN_LEFT = 16  # A pair of images keeps at least this many matches: sparse pairs stay useful
 
 
 @dataclass(frozen=True, slots=True, eq=False)

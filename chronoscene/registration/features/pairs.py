@@ -31,8 +31,7 @@ SIMILAR_NEIGHBOURS = 6
 WORDS = 64
 MAX_TRAINING = 20_000
 ITERATIONS = 10
-MAX_DESCRIPTORS = 2_000
-"""Of an image: those of the largest features, which are the most stable."""
+MAX_DESCRIPTORS = 2_000  # Of an image: those of the largest features, which are the most stable
 
 Pair = tuple[int, int]
 

@@ -21,8 +21,7 @@ from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.photos.photo import Capture, open_photo, taken_at
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
-PERIOD_GAP_DAYS = 14
-"""In one folder of photos, a gap of so many days begins a new period."""
+PERIOD_GAP_DAYS = 14  # In one folder of photos, a gap of so many days begins a new period
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,7 @@ GROSS_FACTOR = 20.0
 """A position farther from the median position than this many times the median distance is wrong.
 Nearer ones are judged once there are poses to compare with."""
 
-GROSS_METRES = 200.0
-"""No position nearer to the median position is a gross error."""
+GROSS_METRES = 200.0  # No position nearer to the median position is a gross error
 
 CONSTANT_METRES = 0.5
 """Positions that all lie within this distance do not describe the motion of the camera."""

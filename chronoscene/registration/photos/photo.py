@@ -15,14 +15,9 @@ from chronoscene.images.exif import ExifData, read_exif
 GPS_SIGMA = (5.0, 5.0, 10.0)
 """Metres east, north, up, if the photo states none: a consumer receiver under open sky."""
 
-MIN_SIDE = 64
-"""Pixels; smaller images are icons and previews."""
-
-HEAD_BYTES = 200_000
-"""Bytes of a file that are searched for panorama metadata."""
-
-MAX_ASPECT = 3.0
-"""Wider images are panoramas, which no perspective camera model describes."""
+MIN_SIDE = 64  # Pixels; smaller images are icons and previews
+HEAD_BYTES = 200_000  # Bytes of a file that are searched for panorama metadata
+MAX_ASPECT = 3.0  # Wider images are panoramas, which no perspective camera model describes
 
 
 @dataclass(frozen=True, slots=True)

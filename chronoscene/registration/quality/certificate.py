@@ -12,6 +12,7 @@ from itertools import combinations
 
 import numpy as np
 
+from chronoscene.arrays import Array, Mask
 from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
@@ -25,9 +26,7 @@ from chronoscene.registration.quality.misalignment import (
 from chronoscene.registration.quality.overlap import TieSpread, ground_plan, tie_spread
 from chronoscene.registration.quality.rays import (
     MAX_OBSERVATIONS,
-    Array,
     Evidence,
-    Mask,
     Placed,
     Rays,
     gather,
@@ -38,11 +37,8 @@ from chronoscene.registration.quality.surface_distance import SurfaceDistance, s
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
 
-BADLY_PLACED = 4.0
-"""Transfers whose point is less certain than this many pixels tell nothing."""
-
-AGREES = 3.0
-"""Pixels within which a held-out observation agrees with the registration."""
+BADLY_PLACED = 4.0  # Transfers whose point is less certain than this many pixels tell nothing
+AGREES = 3.0  # Pixels within which a held-out observation agrees with the registration
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chronoscene.registration.quality.rays import Array
+from chronoscene.arrays import Array
 from chronoscene.scene.similarity import SIGMA, fit_robustly
 
-MIN_POSITIONS = 4
-"""Positions that a period needs."""
+MIN_POSITIONS = 4  # Positions that a period needs
 
 SPREAD_FACTOR = 3.0
 """The positions of a period must spread over this many times the error of the receiver."""

@@ -6,18 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from chronoscene.arrays import Array
 from chronoscene.registration.quality.misalignment import (
     NOISE_FLOOR,
     generators,
     rotation_angle,
     transfer_variance,
 )
-from chronoscene.registration.quality.rays import Array, Placed, Rays, project
+from chronoscene.registration.quality.rays import Placed, Rays, project
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.similarity import SIGMA
 
-MIN_POINTS = 12
-"""Points of the other period that an image must see."""
+MIN_POINTS = 12  # Points of the other period that an image must see
 
 MAX_POINTS = 400
 MAX_IMAGES = 60

@@ -13,21 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.registration.quality.rays import Array, Ints, Placed, Rays, place, project
+from chronoscene.arrays import Array, Ints
+from chronoscene.registration.quality.rays import Placed, Rays, place, project
 from chronoscene.scene.similarity import Sim3, fit_robustly
 
-MIN_TRACKS = 12
-"""Fewer tracks do not determine seven unknowns and their spread."""
+MIN_TRACKS = 12  # Fewer tracks do not determine seven unknowns and their spread
 
 STEPS = 12
-DRAWS = 400
-"""Random motions that give the spread of an angle or a distance."""
+DRAWS = 400  # Random motions that give the spread of an angle or a distance
 
 GROSS_PIXELS = 20.0
 """Median residual above which the search starts from the positions of the points."""
 
-NOISE_FLOOR = 0.1
-"""Pixels: no feature is located better, even if a few residuals are smaller."""
+NOISE_FLOOR = 0.1  # Pixels: no feature is located better, even if a few residuals are smaller
 
 
 @dataclass(frozen=True, slots=True, eq=False)

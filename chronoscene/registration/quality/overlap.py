@@ -6,18 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chronoscene.registration.quality.rays import Array, Ints, Mask
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.registration.result import Registered
 from chronoscene.scene.tracks import select_tracks
 
-CELLS = 150
-"""Cells into which the ground plan of the scene is divided."""
-
-MIN_POINTS_IN_CELL = 3
-"""Points of each period that make a cell part of the overlap."""
-
-TIES_OF_IMAGE = 8
-"""Tie points with which an image counts as tied to the other period."""
+CELLS = 150  # Cells into which the ground plan of the scene is divided
+MIN_POINTS_IN_CELL = 3  # Points of each period that make a cell part of the overlap
+TIES_OF_IMAGE = 8  # Tie points with which an image counts as tied to the other period
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,17 +12,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.registration.result import Registered
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.tracks import MIN_PARALLAX, intersect_rays, seen_by_period, track_owners
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 MAX_OWN_ERROR = 4.0
 """Root mean square, pixels: tracks that do not even fit the images that place them are mismatched

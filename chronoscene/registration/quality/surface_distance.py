@@ -14,31 +14,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from chronoscene.arrays import Array, Mask
 from chronoscene.registration.quality.misalignment import Interval
-from chronoscene.registration.quality.rays import Array, Mask, Placed
+from chronoscene.registration.quality.rays import Placed
 from chronoscene.scene.similarity import SIGMA
 
-NEIGHBOURS = 16
-"""Points in a patch of a cloud."""
-
-MIN_NEIGHBOURS = 5
-"""Points of the other cloud that a core point needs."""
+NEIGHBOURS = 16  # Points in a patch of a cloud
+MIN_NEIGHBOURS = 5  # Points of the other cloud that a core point needs
 
 MAX_CORES = 4000
 
-MIN_CORES = 30
-"""Fewer stable core points allow no conclusion."""
-
-MAX_ROUGHNESS = 0.25
-"""Of a patch, relative to its radius: what is rougher is a bush, not a surface."""
+MIN_CORES = 30  # Fewer stable core points allow no conclusion
+MAX_ROUGHNESS = 0.25  # Of a patch, relative to its radius: what is rougher is a bush, not a surface
 
 CONFIDENCE = 1.96
 
-TRIALS = 300
-"""Triples of core points that are tried as a common shift."""
-
-NOTABLY = 1.1
-"""A shift must explain so many times the core points that no shift explains."""
+TRIALS = 300  # Triples of core points that are tried as a common shift
+NOTABLY = 1.1  # A shift must explain so many times the core points that no shift explains
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,11 +13,11 @@ from typing import Literal
 
 import numpy as np
 
+from chronoscene.arrays import Array
 from chronoscene.registration.quality.certificate import Certificate, PairFigures, PeriodFigures
 from chronoscene.registration.quality.gps_fit import GpsFit
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import MIN_TRACKS, Misalignment
-from chronoscene.registration.quality.rays import Array
 from chronoscene.registration.quality.surface_distance import SurfaceDistance
 
 Level = Literal["pass", "doubtful", "fail"]
@@ -162,8 +162,7 @@ THRESHOLDS: dict[str, Threshold] = {
 FITTED = 1.3
 """Upper limit of the ratio of the noise of an observation to its residual after fitting."""
 
-MIN_TIES = 3
-"""Tie points, clicked ones for example, that two periods need to be linked."""
+MIN_TIES = 3  # Tie points, clicked ones for example, that two periods need to be linked
 
 LACKING = ("held_out", "rotation", "shift", "occupied", "tied")
 """Checks that are doubtful for lack of evidence, which a chain of other periods can supply."""

@@ -19,24 +19,17 @@ from numpy.typing import NDArray
 from chronoscene.scene.similarity import Sim3, fit
 
 TRIALS = 1_000
-MAX_JUDGED = 4_000
-"""Matches by which a trial is judged."""
+MAX_JUDGED = 4_000  # Matches by which a trial is judged
 
 SEARCH_PIXELS = 16.0
 """Residual of an inlier while searching: points of two models of their own are this uncertain."""
 
-FINAL_PIXELS = 8.0
-"""Residual of an inlier in the end."""
+FINAL_PIXELS = 8.0  # Residual of an inlier in the end
 
 MIN_INLIERS = 15
-MIN_CELLS = 4
-"""Fewer, or all in few places, do not fix a similarity that can be trusted."""
-
-CELLS_PER_AXIS = 12
-"""Along each of the two directions in which the points spread most."""
-
-QUANTILE = 0.02
-"""Points outside of this quantile and its mirror image do not stretch the grid."""
+MIN_CELLS = 4  # Fewer, or all in few places, do not fix a similarity that can be trusted
+CELLS_PER_AXIS = 12  # Along each of the two directions in which the points spread most
+QUANTILE = 0.02  # Points outside of this quantile and its mirror image do not stretch the grid
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,27 +12,21 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Mask
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.quality.rays import sampson_distance
 from chronoscene.registration.reconstruct.models import image_pose
 
-AGREEING_PIXELS = 4.0
-"""Distance from the epipolar line up to which a match agrees with the poses."""
+AGREEING_PIXELS = 4.0  # Distance from the epipolar line up to which a match agrees with the poses
 
 MIN_SHARE = 0.7
 """Share of the matches of an image with trusted ones that must agree with its pose. It is 0.95 and
 more among right poses, and 0.05 to 0.6 in a misplaced group."""
 
-MIN_MATCHES = 30
-"""An image with fewer is not judged."""
+MIN_MATCHES = 30  # An image with fewer is not judged
+STARTS = 10  # Images from which the trusted set is grown, one at a time
+MAX_MISPLACED = 0.4  # Share of the images beyond which it is not known which of them are wrong
 
-STARTS = 10
-"""Images from which the trusted set is grown, one at a time."""
-
-MAX_MISPLACED = 0.4
-"""Share of the images beyond which it is not known which of them are wrong."""
-
-Mask = NDArray[np.bool_]
 
 Matches = Mapping[tuple[int, int], NDArray[np.int64]]
 """Verified matches of all pairs of images, by image ids. [M, 2] each"""

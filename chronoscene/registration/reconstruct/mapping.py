@@ -19,22 +19,19 @@ from chronoscene.registration.reconstruct.models import summary, write_model
 MIN_MODEL_SIZE = 3
 """Images. COLMAP's default discards models that are a large part of a small period."""
 
-SATISFIED = 0.9
-"""No further settings are tried if the largest model has this share of the images."""
+SATISFIED = 0.9  # No further settings are tried if the largest model has this share of the images
 
 LOSS_PIXELS = 1.0
 """Scale of the Cauchy loss: observations with much larger errors have little weight."""
 
-MIN_INLIERS = 20
-"""2D-3D correspondences needed to register an image with an existing model."""
+MIN_INLIERS = 20  # 2D-3D correspondences needed to register an image with an existing model
 
 MAX_ITERATIONS = 60
 FUNCTION_TOLERANCE = 1e-6
 """Bundle adjustment ends after so many steps, or at a smaller relative decrease of the cost."""
 
 MAX_REPROJECTION_ERROR = 4.0
-MIN_TRI_ANGLE = 1.5
-"""Pixels and degrees; observations and points beyond are dropped."""
+MIN_TRI_ANGLE = 1.5  # Pixels and degrees; observations and points beyond are dropped
 
 SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("default", {}),

@@ -39,11 +39,8 @@ MIN_POINTS = 50
 MIN_AGREEMENT = 0.5
 """Share of the matches among the photos of the scene that must agree with its poses."""
 
-ROUNDS = 2
-"""Of triangulation with all matches and bundle adjustment, after merging."""
-
-ATTEMPTS = 2
-"""To register an image: at the second, more of the others have poses."""
+ROUNDS = 2  # Of triangulation with all matches and bundle adjustment, after merging
+ATTEMPTS = 2  # To register an image: at the second, more of the others have poses
 
 TIE_COLOR = np.array([255, 255, 255], np.uint8)
 

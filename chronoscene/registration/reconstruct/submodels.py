@@ -27,11 +27,8 @@ from chronoscene.registration.reconstruct.models import (
 )
 from chronoscene.scene.similarity import Sim3
 
-MIN_POSITIONS = 6
-"""Consistent positions of a submodel that is placed by GPS alone: any three fit."""
-
-MIN_PAIRS = 12
-"""Pairs of points below which no alignment is attempted."""
+MIN_POSITIONS = 6  # Consistent positions of a submodel that is placed by GPS alone: any three fit
+MIN_PAIRS = 12  # Pairs of points below which no alignment is attempted
 
 
 @dataclass(frozen=True, slots=True, eq=False)

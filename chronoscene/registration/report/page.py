@@ -9,24 +9,19 @@ from collections.abc import Sequence
 from typing import Any
 
 from chronoscene import __version__
+from chronoscene.arrays import Array
 from chronoscene.io.pages import render_page
 from chronoscene.registration.quality.certificate import Certificate, PairFigures
 from chronoscene.registration.quality.certificate_json import pair_figures, period_figures
-from chronoscene.registration.quality.rays import Array
 from chronoscene.registration.quality.verdict import THRESHOLDS, Level, Verdict
 from chronoscene.registration.report.pictures import PHOTO_WIDTH, Photos, camera_map
 from chronoscene.registration.report.spots import DrawnPair, Spot, drawn_pairs, spots
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_alignment import TieAlignment
 
-FLICKERS = 8
-"""Comparisons on the page, for all pairs of periods together."""
-
-CLICKS = 6
-"""Spots suggested for clicking, for each pair of periods."""
-
-MAX_LINES = 120
-"""Matches that are drawn between two photos."""
+FLICKERS = 8  # Comparisons on the page, for all pairs of periods together
+CLICKS = 6  # Spots suggested for clicking, for each pair of periods
+MAX_LINES = 120  # Matches that are drawn between two photos
 
 COLORS = (
     "#2f7ed8", "#d9622b", "#2a9d5c", "#a44bd1", "#b8860b", "#0f9aa7", "#d1477f", "#6b7280",

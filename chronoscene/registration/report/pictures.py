@@ -12,29 +12,23 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from chronoscene.arrays import Array
 from chronoscene.errors import ChronoSceneError
 from chronoscene.images.store import load_rgb
-from chronoscene.registration.quality.rays import Array
 from chronoscene.registration.report.spots import Spot
 from chronoscene.registration.result import Registered
 from chronoscene.scene.cameras import project_points
 from chronoscene.scene.geometry import camera_centre
 
-PATCH = 260
-"""Pixels: side of a patch on the page."""
-
-MAGNIFIED = 1.5
-"""Pixels of a patch for one of the photo."""
+PATCH = 260  # Pixels: side of a patch on the page
+MAGNIFIED = 1.5  # Pixels of a patch for one of the photo
 
 PHOTO_WIDTH = 460
 
 QUALITY = 82
 
-MAP_WIDTH = 720.0
-"""Units of the drawing."""
-
-MAX_DOTS = 1500
-"""Points of the scene that are drawn."""
+MAP_WIDTH = 720.0  # Units of the drawing
+MAX_DOTS = 1500  # Points of the scene that are drawn
 
 TICK = 16.0
 

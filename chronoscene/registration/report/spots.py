@@ -7,25 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.registration.quality.certificate import PairFigures
-from chronoscene.registration.quality.rays import (
-    Array,
-    Evidence,
-    Ints,
-    Mask,
-    Placed,
-    project,
-    rays_at,
-)
+from chronoscene.registration.quality.rays import Evidence, Placed, project, rays_at
 from chronoscene.registration.result import CrossMatches, Registered
 from chronoscene.scene.cameras import project_points
 from chronoscene.scene.geometry import camera_centre
 
-MARGIN = 0.06
-"""Share of the image size; spots nearer to the edge are not shown."""
-
-MIN_MATCHES = 5
-"""Matches of a pair of images that is drawn."""
+MARGIN = 0.06  # Share of the image size; spots nearer to the edge are not shown
+MIN_MATCHES = 5  # Matches of a pair of images that is drawn
 
 
 @dataclass(frozen=True, slots=True, eq=False)

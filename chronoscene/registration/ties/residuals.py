@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
-from chronoscene.registration.quality.rays import Array, Placed, Rays, place, project, rays_at
+from chronoscene.registration.quality.rays import Placed, Rays, place, project, rays_at
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_points import TiePoints, match_images
 

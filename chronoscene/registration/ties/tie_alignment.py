@@ -13,9 +13,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.geodesy import Georeference
-from chronoscene.registration.quality.rays import Array, model_rays, place
+from chronoscene.registration.quality.rays import model_rays, place
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.residuals import (
     Clicks,
@@ -36,8 +37,7 @@ Mode = Literal["auto", "check", "replace"]
 Refine = Callable[[Mapping[str, Any]], Registered]
 """Called with poses, cameras and tie points; gives the adjusted registration."""
 
-GOOD_PIXELS = 10.0
-"""Median residual up to which mode ``auto`` keeps the existing alignment."""
+GOOD_PIXELS = 10.0  # Median residual up to which mode ``auto`` keeps the existing alignment
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,13 +16,11 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.geodesy import Georeference
 from chronoscene.scene.splits import read_text
-
-Array = NDArray[np.float64]
 
 COLUMNS = {
     "point": ("point", "point id", "point_id", "id", "name", "label"),

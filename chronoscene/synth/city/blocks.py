@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.synth.city import furniture as fur
 from chronoscene.synth.city.buildings import SLAB, Building, finished, foundation, frame, rubble
 from chronoscene.synth.city.placing import Block, Rect, floor
@@ -16,7 +16,6 @@ from chronoscene.synth.city.world import renewal_stages, site_stages, visits
 from chronoscene.synth.render.mesh import Part
 from chronoscene.synth.render.noise import rng_for
 
-Array = NDArray[np.float64]
 X = np.array([1.0, 0.0, 0.0])
 
 

@@ -6,18 +6,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.facades import Front, Wall
 from chronoscene.synth.city.roofs import add_roof
 from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 
-Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
-SLAB = 0.15
-"""Height of pavements above the road."""
+SLAB = 0.15  # Height of pavements above the road
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.render.mesh import PartBuilder, srgb
 from chronoscene.synth.render.textures import DOOR, SIGN
 
-Array = NDArray[np.float64]
 Z = np.array([0.0, 0.0, 1.0])
 
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.vegetation import trunk
 from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import CORRUGATED, PAINT, SIGN, WATER
 
-Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 Z = np.array([0.0, 0.0, 1.0])
 

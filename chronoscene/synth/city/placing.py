@@ -9,8 +9,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.synth.city import furniture as fur
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.buildings import SLAB, Building, finished
@@ -20,12 +20,9 @@ from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import PAVING
 
-Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
-PARKING = 2.0
-"""Width of the parking lane at each side of a road, metres."""
-RING = 3.0
-"""Width of pavements, metres."""
+PARKING = 2.0  # Width of the parking lane at each side of a road, metres
+RING = 3.0  # Width of pavements, metres
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.blocks import FILLERS
 from chronoscene.synth.city.buildings import Building, finished
@@ -21,14 +21,10 @@ from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import FIELDS
 from chronoscene.synth.settings import SynthSettings
 
-Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
-ROAD = 9.6
-"""Width of roads with parked cars on both sides, metres."""
-FAR = 900.0
-"""Half the extent of the countryside, metres."""
-REBUILT = ("houses", "slabs", "tower", "park")
-"""Roles of a block after it is torn down and rebuilt."""
+ROAD = 9.6  # Width of roads with parked cars on both sides, metres
+FAR = 900.0  # Half the extent of the countryside, metres
+REBUILT = ("houses", "slabs", "tower", "park")  # Roles of a block after it is torn down and rebuilt
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,18 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.render.mesh import PartBuilder, srgb
 from chronoscene.synth.render.textures import SOLAR
 
-Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
 
 
-EAVE = 0.45
-"""How far pitched roofs reach beyond the walls."""
+EAVE = 0.45  # How far pitched roofs reach beyond the walls
 
 
 def add_roof(

@@ -7,11 +7,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.render.mesh import Part, PartBuilder, cross, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 
-Array = NDArray[np.float64]
 Z = np.array([0.0, 0.0, 1.0])
 
 

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.synth.render.light import Light
 from chronoscene.synth.render.mesh import Part, merge
-
-Array = NDArray[np.float64]
 
 CHANGE_VERBS = {
     "building": "rebuild",

@@ -15,11 +15,11 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.synth.render.mesh import MISS
 from chronoscene.synth.render.noise import fbm, rng_for, smooth
 
-Array = NDArray[np.float64]
 Color = tuple[float, float, float]
 
 

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.kernels.compilation import inner
 
-Array = NDArray[np.float64]
 Color = tuple[float, float, float]
 TextureFrame = tuple[ArrayLike, ArrayLike, ArrayLike]
 """Origin and two unit axes."""
@@ -262,8 +262,7 @@ def merge(parts: Sequence[Part]) -> Part:
     )
 
 
-MISS = 0xFFFFFFFF
-"""Primitive id that the ray caster gives to rays that hit nothing."""
+MISS = 0xFFFFFFFF  # Primitive id that the ray caster gives to rays that hit nothing
 
 
 @inner

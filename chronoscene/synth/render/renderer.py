@@ -9,15 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.errors import BackendError
 from chronoscene.scene import Camera
 from chronoscene.synth.render.light import Light, Probes, probe_values, sky_args
 from chronoscene.synth.render.mesh import MISS, Part
 from chronoscene.synth.render.shade import albedo_at, camera_rays, shade, shadow_rays
 
-Array = NDArray[np.float64]
-MAX_SAMPLES = 1_500_000
-"""Maximum number of rays in memory at once."""
+MAX_SAMPLES = 1_500_000  # Maximum number of rays in memory at once
 PROBE_RAYS = 64
 SUN_SPREAD = 0.009
 """Angular radius of the sun in radians; about twice the real one, for softer shadows."""

@@ -133,8 +133,4 @@ def albedo(s, u, v, x, y, z, su, sv, seed, fw):  # type: ignore[no-untyped-def]
         c = walls.door(s, u, v, su, sv, seed, fw)
     else:
         c = walls.plain(s, u, v, seed, fw)
-    return (
-        min(0.92, max(0.004, c[0])),
-        min(0.92, max(0.004, c[1])),
-        min(0.92, max(0.004, c[2])),
-    )
+    return (min(0.92, max(0.004, c[0])), min(0.92, max(0.004, c[1])), min(0.92, max(0.004, c[2])))

@@ -10,8 +10,7 @@ from pathlib import Path, PurePosixPath
 from chronoscene.errors import SceneError
 from chronoscene.formats.chronoscene import check_name
 
-PUNCTUATION = "\"'`,;"
-"""What tables put around and after a name."""
+PUNCTUATION = "\"'`,;"  # What tables put around and after a name
 
 FORBIDDEN = re.compile(r'[<>:"|?*\\]|[ .]$')
 """What a file or folder name cannot contain, or end in, on Windows (Microsoft, *Naming Files,

@@ -9,12 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.scene.cameras import Camera, project_points
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.tracks import track_owners
-
-Array = NDArray[np.float64]
 
 MAX_TABLE = 1_000_000  # ids within a range of about this many numbers are looked up in a table
 

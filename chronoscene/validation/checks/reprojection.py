@@ -13,14 +13,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import Similarity, fit_robustly
 from chronoscene.scene.tracks import MIN_PARALLAX, intersect_rays
 from chronoscene.validation.checks import grouped
 from chronoscene.validation.scene_folder import RawScene, derived
-
-Array = NDArray[np.float64]
 
 MIN_OBSERVATIONS = 10  # observations of an image from which the median of its errors is meaningful
 

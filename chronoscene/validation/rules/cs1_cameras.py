@@ -6,8 +6,9 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from chronoscene.arrays import Array
 from chronoscene.colmap.raw_model import CAMERA, RawImages, RawModel
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.cameras import (
@@ -23,8 +24,6 @@ from chronoscene.validation import rule
 from chronoscene.validation.checks.observations import good_poses
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene, derived
-
-Array = NDArray[np.float64]
 
 VISIBLE = 0.5  # pixels; distortion that moves no pixel this far may be dropped instead of undone
 

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation import rule
@@ -15,8 +16,6 @@ from chronoscene.validation.checks.observations import good_poses
 from chronoscene.validation.checks.reprojection import image_errors, pose_limit
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene, derived
-
-Array = NDArray[np.float64]
 
 UNIT_TOLERANCE = 1e-3  # deviation of a quaternion's length from 1 beyond rounding in a text file
 

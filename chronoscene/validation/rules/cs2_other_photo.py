@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.io.wording import quote, shown
 from chronoscene.validation import rule
 from chronoscene.validation.checks import grouped
@@ -20,7 +21,6 @@ from chronoscene.validation.checks.pixels import Pixels
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
-Array = NDArray[np.float64]
 Greys = Mapping[str, NDArray[np.uint8]]
 
 MIN_CORRELATION, USUAL = 0.35, 0.5

@@ -39,8 +39,7 @@ def test_camera_model(scene, line):
 
 
 @pytest.mark.parametrize(
-    "line",
-    ["1 SIMPLE_RADIAL 64 48 50 32 24 -0.16", "1 OPENCV 64 48 50 50 32 24 0 0 0.05 0"],
+    "line", ["1 SIMPLE_RADIAL 64 48 50 32 24 -0.16", "1 OPENCV 64 48 50 50 32 24 0 0 0.05 0"]
 )
 def test_camera_distorted(scene, line):
     scene.write(CAMERAS, [line])

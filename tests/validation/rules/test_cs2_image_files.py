@@ -234,11 +234,7 @@ def test_one_transparent_colour(scene):
 
 @pytest.mark.parametrize(
     ("size", "kind", "codes"),
-    [
-        ((64, 48), 0, {"CS214", "CS507"}),
-        ((64, 48), 4, {"CS507"}),
-        ((16, 12), 1, {"CS507"}),
-    ],
+    [((64, 48), 0, {"CS214", "CS507"}), ((64, 48), 4, {"CS507"}), ((16, 12), 1, {"CS507"})],
 )
 def test_pages_of_a_tiff(scene, size, kind, codes):
     """A second page is a second image, unless it is a mask or a preview."""

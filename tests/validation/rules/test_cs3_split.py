@@ -72,10 +72,7 @@ def test_split_ambiguous(scene):
     in_folders(scene)
     scene.replace(SPLIT, "a/001.png 0", "001 0")
     scene.expect(
-        "CS306",
-        place=f"{SPLIT}:2",
-        found="'a/001.png', 'b/001.png'",
-        also={"CS702", "CS703"},
+        "CS306", place=f"{SPLIT}:2", found="'a/001.png', 'b/001.png'", also={"CS702", "CS703"}
     )
 
 

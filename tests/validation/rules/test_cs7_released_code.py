@@ -14,11 +14,7 @@ def official_parser(line):
 
 @pytest.mark.parametrize(
     ("line", "found"),
-    [
-        ("a001.png  0", "two spaces"),
-        ("a001.png\t0", "a tab"),
-        ("a001.png 0\n", "an empty line"),
-    ],
+    [("a001.png  0", "two spaces"), ("a001.png\t0", "a tab"), ("a001.png 0\n", "an empty line")],
 )
 def test_official_split_line(scene, line, found):
     scene.replace(SPLIT, "a001.png 0", line)
