@@ -27,12 +27,15 @@ class GaussianMethod(SplattingMethod):
 
     primitive = "means"
     config_class: ClassVar[type[GaussianConfig]]
+    trainer_class: ClassVar[type[GaussianTrainer]] = GaussianTrainer
     config: GaussianConfig
     model: GaussianModel
     trainer: GaussianTrainer | None
 
-    def make_model(self, parameters: dict[str, Tensor], train: TrainingSet) -> GaussianModel:
-        """The model before training."""
+    def make_model(
+        self, parameters: dict[str, Tensor], train: TrainingSet, seed: int
+    ) -> GaussianModel:
+        """The model before training; ``parameters`` are on the device of the training."""
         return GaussianModel(parameters)
 
     def restore_model(self, tensors: dict[str, Tensor]) -> GaussianModel:
@@ -54,8 +57,8 @@ class GaussianMethod(SplattingMethod):
 
     def start(self, train: TrainingSet, *, seed: int, device: str) -> GaussianTrainer:
         parameters = initialise(train, opacity=self.config.initial_opacity)
-        self.model = self.make_model({k: v.to(device) for k, v in parameters.items()}, train)
-        return GaussianTrainer(
+        self.model = self.make_model({k: v.to(device) for k, v in parameters.items()}, train, seed)
+        return self.trainer_class(
             self.config,
             self.model,
             train,

@@ -43,8 +43,5 @@ CLAMP_MARGIN = 0.3
 EPS2D = 0.3
 """Variance in pixels squared added to both axes of the projected covariance: the blur of 3DGS."""
 
-NEAR_PLANE = 0.01
-"""Default near plane, in world units: Gaussians whose centres are nearer to the camera are culled.
-All methods use it unless they are told otherwise."""
-
+NEAR_PLANE = 0.01  # Default of all methods, in units of the means: nearer Gaussians are culled
 FAR_PLANE = 1e10  # Default far plane, likewise

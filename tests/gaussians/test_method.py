@@ -66,9 +66,10 @@ class Painted(GaussianMethod):
     name = "painted"
     config_class = GaussianSplattingConfig
 
-    def make_model(self, parameters, train):
+    def make_model(self, parameters, train, seed):
         periods = 1 + max(view.period for view in train.views)
-        return PaintedModel(parameters, {"added_color": torch.zeros(periods, 3)})
+        added = torch.zeros(periods, 3, device=parameters["means"].device)
+        return PaintedModel(parameters, {"added_color": added})
 
     def restore_model(self, tensors):
         parameters = dict(tensors)
