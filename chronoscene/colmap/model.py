@@ -227,7 +227,7 @@ def _checked_points(
     if lost.any():
         found = f"image {image[lost].min()}, which it lacks"
         raise _model_error(folder, "tracks over images of the model", found)
-    row = order[slot]
+    row = slot if (known == raw.ids).all() else order[slot]
     lengths = np.diff(raw.keypoint_start)[row]
     wrong = np.flatnonzero((keypoint < 0) | (keypoint >= lengths))
     if len(wrong):

@@ -30,7 +30,7 @@ from chronoscene.registration.ties.tie_points import TiePoints
 from chronoscene.scene import Frame, Period, Points, Scene, WorldFrame
 from chronoscene.scene.cameras import project_points
 from chronoscene.scene.splits import default_tests, split_of
-from chronoscene.scene.tracks import reproject, track_owners
+from chronoscene.scene.tracks import by_image, reproject, track_owners
 from chronoscene.undistort import undistort
 
 LOG = "registration_log.json"
@@ -97,7 +97,7 @@ def point_errors(registered: Registered) -> NDArray[np.float64]:
         list(zip(registered.cameras, registered.cam_from_world, strict=True)),
         registered.points,
         registered.track_start,
-        registered.track_image,
+        by_image(registered.track_image, len(registered.cameras)),
         registered.track_xy,
     )
     errors = np.nan_to_num(np.linalg.norm(offset, axis=1), nan=0.0, posinf=0.0)

@@ -66,7 +66,7 @@ def reproject(
     views: Sequence[tuple[Camera, Array]],
     xyz: Array,
     track_start: Ints,
-    track_image: NDArray[np.integer],
+    rows_of: Sequence[Ints],
     track_xy: Array,
 ) -> tuple[Array, Array]:
     """Project every point into the images that see it, distortion included.
@@ -75,7 +75,7 @@ def reproject(
         views: Camera and cam_from_world of each image.
         xyz: In the world. [P, 3]
         track_start: Where the observations of each point begin. [P + 1]
-        track_image: Index of a view. [M]
+        rows_of: Observations of each view, see `by_image`.
         track_xy: Pixels of the observations. [M, 2]
 
     Returns:
@@ -83,10 +83,9 @@ def reproject(
         depth: World units. [M]
         Both are NaN where the point is not in front of the camera.
     """
-    point = track_owners(track_start)
+    point = track_owners(track_start).astype(np.int32)  # half the memory to read, once per view
     offset, depth = np.full((len(point), 2), np.nan), np.full(len(point), np.nan)
     with np.errstate(all="ignore"):  # absurd poses and points give NaN or infinity
-        rows_of = by_image(track_image, len(views))
         for rows, (camera, cam_from_world) in zip(rows_of, views, strict=True):
             local = xyz.take(point.take(rows), axis=0) @ cam_from_world[:3, :3].T
             local += cam_from_world[:3, 3]

@@ -110,11 +110,12 @@ def reproject(scene: Scene) -> Reprojection:
     """Project every observed point, distortion included."""
     points = scene.points
     views = [(f.camera, f.cam_from_world) for f in scene.frames]
+    rows_of = tracks.by_image(points.track_frame, len(views))
     offset, depth = tracks.reproject(
-        views, points.xyz, points.track_start, points.track_frame, points.track_xy
+        views, points.xyz, points.track_start, rows_of, points.track_xy
     )
     depth_of_frame = np.full(len(views), np.nan)
-    for frame, rows in enumerate(tracks.by_image(points.track_frame, len(views))):
+    for frame, rows in enumerate(rows_of):
         ahead = depth.take(rows)
         ahead = ahead[~np.isnan(ahead)]
         if len(ahead):

@@ -64,7 +64,7 @@ def test_reprojection_has_offset_and_depth_in_front_only() -> None:
         views,
         np.array([[1.0, 0.0, 4.0]]),
         np.array([0, 2]),
-        np.array([0, 1]),
+        by_image(np.array([0, 1]), 2),
         np.array([[120.0, 50.0], [0.0, 0.0]]),
     )
     np.testing.assert_allclose(offset[0], [5.0, 0.0])
