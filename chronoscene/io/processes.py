@@ -9,7 +9,7 @@ of a bench and steps of a registration go through it.
 
 To run benches somewhere else, on a cluster say, write a function with the signature of
 `chronoscene.bench.runner.run_in_process` that ships the job, calls
-`chronoscene.bench.worker.run_job` there, and brings the staging folder back; pass it to
+`chronoscene.bench.worker.execute` there, and brings the staging folder back; pass it to
 `chronoscene.bench.runner.run_bench` as ``execute``.
 
 Modules that are needed only once work starts are imported inside functions: ``chronoscene --help``
