@@ -67,7 +67,7 @@ def cloud_of(scene: Scene) -> Cloud:
         unit=scene.world.unit,
         labels=tuple(printable(period_name(p.id, p.label, p.date)) for p in scene.periods),
         xyz=scene.points.xyz,
-        period=assign_points(scene),
+        period=assign_points(scene.count_views()),
         centres=camera_centre(poses),
         directions=poses[:, 2, :3],
         tops=-poses[:, 1, :3],

@@ -30,7 +30,7 @@ from chronoscene.registration.ties.tie_points import TiePoints
 from chronoscene.scene import Frame, Period, Points, Scene, WorldFrame
 from chronoscene.scene.cameras import project_points
 from chronoscene.scene.splits import default_tests, split_of
-from chronoscene.scene.tracks import by_image, reproject, track_owners
+from chronoscene.scene.tracks import reproject, track_owners
 from chronoscene.undistort import undistort
 
 LOG = "registration_log.json"
@@ -93,14 +93,15 @@ def point_errors(registered: Registered) -> NDArray[np.float64]:
 
     An observation behind its camera counts as 0.
     """
-    offset, _ = reproject(
+    errors = np.zeros(len(registered.track_xy))
+    for rows, error, _ in reproject(
         list(zip(registered.cameras, registered.cam_from_world, strict=True)),
         registered.points,
         registered.track_start,
-        by_image(registered.track_image, len(registered.cameras)),
+        registered.track_image,
         registered.track_xy,
-    )
-    errors = np.nan_to_num(np.linalg.norm(offset, axis=1), nan=0.0, posinf=0.0)
+    ):
+        errors[rows] = np.nan_to_num(error, nan=0.0, posinf=0.0)
     point = track_owners(registered.track_start)
     sums = np.bincount(point, weights=errors, minlength=len(registered.points))
     return np.asarray(sums / np.maximum(np.diff(registered.track_start), 1), np.float64)

@@ -7,7 +7,7 @@ can use them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,32 +66,34 @@ def reproject(
     views: Sequence[tuple[Camera, Array]],
     xyz: Array,
     track_start: Ints,
-    rows_of: Sequence[Ints],
+    track_image: NDArray[np.integer],
     track_xy: Array,
-) -> tuple[Array, Array]:
-    """Project every point into the images that see it, distortion included.
+) -> Iterator[tuple[Ints, Array, Array]]:
+    """Project every point into the images that see it, distortion included; image by image.
 
     Args:
         views: Camera and cam_from_world of each image.
         xyz: In the world. [P, 3]
         track_start: Where the observations of each point begin. [P + 1]
-        rows_of: Observations of each view, see `by_image`.
+        track_image: Image of each observation. [M]
         track_xy: Pixels of the observations. [M, 2]
 
-    Returns:
-        offset: Projection minus observation in pixels. [M, 2]
-        depth: World units. [M]
+    Yields:
+        rows: Observations of the image, in the order of the tracks. [m]
+        error: Distance of each from the projection in pixels. [m]
+        depth: Of each point in world units. [m]
         Both are NaN where the point is not in front of the camera.
     """
     point = track_owners(track_start).astype(np.int32)  # half the memory to read, once per view
-    offset, depth = np.full((len(point), 2), np.nan), np.full(len(point), np.nan)
     with np.errstate(all="ignore"):  # absurd poses and points give NaN or infinity
-        for rows, (camera, cam_from_world) in zip(rows_of, views, strict=True):
+        for rows, (camera, cam_from_world) in zip(
+            by_image(track_image, len(views)), views, strict=True
+        ):
             local = xyz.take(point.take(rows), axis=0) @ cam_from_world[:3, :3].T
             local += cam_from_world[:3, 3]
-            offset[rows] = project_points(camera, local) - track_xy.take(rows, axis=0)
-            depth[rows] = np.where(local[:, 2] > 0, local[:, 2], np.nan)
-    return offset, depth
+            u, v = project_points(camera, local).T
+            x, y = track_xy.take(rows, axis=0).T
+            yield rows, np.hypot(u - x, v - y), np.where(local[:, 2] > 0, local[:, 2], np.nan)
 
 
 def intersect_rays(direction: Array, centre: Array, first: Ints) -> tuple[Array, Array]:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chronoscene import __version__
+from chronoscene.arrays import Ints
 from chronoscene.io import tables
 from chronoscene.io.tables import Table
 from chronoscene.scene import Scene
@@ -98,18 +98,19 @@ def period_title(period: int, label: str, date: str | None) -> str:
     return name if name == str(period) else f"{period}: {name}"
 
 
-def assign_points(scene: Scene) -> NDArray[np.int64]:
+def assign_points(views: Ints) -> Ints:
     """The one period that each point is counted in: that with the most observations of it.
 
-    Ties go to the earliest period; -1 marks a point that no image sees. [P]
+    Ties go to the earliest period; -1 marks a point that no image sees. [P, T] -> [P]
     """
-    counts = scene.count_views()
-    if not counts.size:
-        return np.full(len(counts), -1, np.int64)
-    return np.where(counts.any(axis=1), counts.argmax(axis=1), -1)
+    if not views.size:
+        return np.full(len(views), -1, np.int64)
+    return np.where(views.any(axis=1), views.argmax(axis=1), -1)
 
 
-def count_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneCount:
+def count_scene(
+    scene: Scene, *, count: CountRule = "assigned", views: Ints | None = None
+) -> SceneCount:
     """Count the images and points of a scene by period.
 
     Args:
@@ -117,9 +118,10 @@ def count_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneCount:
         count: ``assigned`` counts each point once, in the period that `assign_points` gives, so
             that the periods add up to the total; ``seen`` counts it in every period whose images
             see it.
+        views: What `Scene.count_views` gives, where that is at hand. [P, T]
     """
     if count == "assigned":
-        assigned = assign_points(scene)
+        assigned = assign_points(scene.count_views() if views is None else views)
         by_period = np.bincount(assigned[assigned >= 0], minlength=scene.num_periods)
     else:
         by_period = scene.point_periods().sum(axis=0)

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.scene import Scene, tracks
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.stats.counts import CountRule, SceneCount, count_scene
-
-Index = NDArray[np.int64]
 
 CELLS = 50  # cubes along the longest edge of a scene for its coverage
 
@@ -61,9 +58,10 @@ def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatis
     """Count and measure a scene; ``count`` is that of `count_scene`."""
     seen = scene.count_views()
     periods = scene.frame_periods
+    any_view = seen > 0
     found = reproject(scene)
     baselines = camera_baselines(scene, found.depth_of_frame)
-    coverage = period_coverage(scene.points.xyz, seen > 0)
+    coverage = period_coverage(scene.points.xyz, any_view)
     observed_in = periods[scene.points.track_frame]
     by_period = tuple(
         _measures(seen[:, p], found.residual[observed_in == p], baselines[periods == p], share)
@@ -71,16 +69,16 @@ def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatis
     )
     length = seen.sum(axis=1)
     return SceneStatistics(
-        counts=count_scene(scene, count=count),
+        counts=count_scene(scene, count=count, views=seen),
         periods=by_period,
         whole=_measures(length, found.residual, baselines, 1.0 if length.any() else None),
-        overlap=period_overlap(seen > 0),
-        in_view=in_view(scene, seen > 0, found.depth),
+        overlap=period_overlap(any_view),
+        in_view=in_view(scene, any_view, found.depth),
         unit=scene.world.unit,
     )
 
 
-def _measures(views: Index, residual: Array, baselines: Array, coverage: float | None) -> Measures:
+def _measures(views: Ints, residual: Array, baselines: Array, coverage: float | None) -> Measures:
     """Measures of some frames; ``views``: how many of them see each point."""
     length = views[views > 0]
     return Measures(
@@ -110,17 +108,17 @@ def reproject(scene: Scene) -> Reprojection:
     """Project every observed point, distortion included."""
     points = scene.points
     views = [(f.camera, f.cam_from_world) for f in scene.frames]
-    rows_of = tracks.by_image(points.track_frame, len(views))
-    offset, depth = tracks.reproject(
-        views, points.xyz, points.track_start, rows_of, points.track_xy
-    )
+    residual, depth = np.full((2, len(points.track_frame)), np.nan)
     depth_of_frame = np.full(len(views), np.nan)
-    for frame, rows in enumerate(rows_of):
-        ahead = depth.take(rows)
-        ahead = ahead[~np.isnan(ahead)]
+    projected = tracks.reproject(
+        views, points.xyz, points.track_start, points.track_frame, points.track_xy
+    )
+    for frame, (rows, error, away) in enumerate(projected):
+        residual[rows], depth[rows] = error, away
+        ahead = away[~np.isnan(away)]
         if len(ahead):
             depth_of_frame[frame] = np.median(ahead)
-    return Reprojection(np.hypot(offset[:, 0], offset[:, 1]), depth, depth_of_frame)
+    return Reprojection(residual, depth, depth_of_frame)
 
 
 def camera_baselines(scene: Scene, depths: Array) -> Array:
@@ -136,14 +134,15 @@ def camera_baselines(scene: Scene, depths: Array) -> Array:
     centres = camera_centre(np.stack([f.cam_from_world for f in scene.frames]))
     periods = scene.frame_periods
     nearest = np.full(len(centres), np.nan)
-    for i, centre in enumerate(centres):
-        others = np.delete(centres, i, axis=0)[np.delete(periods, i) == periods[i]]
-        if len(others):
-            nearest[i] = np.linalg.norm(others - centre, axis=1).min()
+    for period in range(scene.num_periods):
+        mine = np.flatnonzero(periods == period)
+        for i in mine if len(mine) > 1 else ():
+            distance = np.linalg.norm(centres[mine] - centres[i], axis=1)
+            nearest[i] = distance[mine != i].min()
     return nearest / depths
 
 
-def period_overlap(seen: NDArray[np.bool_]) -> tuple[tuple[float | None, ...], ...]:
+def period_overlap(seen: Mask) -> tuple[tuple[float | None, ...], ...]:
     """Share of the points of each period that each other sees, too. [P, T] -> [T, T]"""
     columns = seen.astype(np.float32)  # exact up to 16 million points
     both = (columns.T @ columns).astype(np.float64)
@@ -153,7 +152,7 @@ def period_overlap(seen: NDArray[np.bool_]) -> tuple[tuple[float | None, ...], .
     )
 
 
-def period_coverage(xyz: Array, seen: NDArray[np.bool_]) -> list[float | None]:
+def period_coverage(xyz: Array, seen: Mask) -> list[float | None]:
     """Coverage of each period; see `Measures.coverage`. [P, 3], [P, T] -> T values"""
     used = seen.any(axis=1) & np.isfinite(xyz).all(axis=1)
     if not used.any():
@@ -171,9 +170,7 @@ def period_coverage(xyz: Array, seen: NDArray[np.bool_]) -> list[float | None]:
     return [n / total for n in covered]
 
 
-def in_view(
-    scene: Scene, seen: NDArray[np.bool_], depths: Array
-) -> tuple[tuple[float | None, ...], ...]:
+def in_view(scene: Scene, seen: Mask, depths: Array) -> tuple[tuple[float | None, ...], ...]:
     """Share of the points of each period that the cameras of each have in view.
 
     A point is in view if it lies in front of a camera, inside of its image, and not much farther
@@ -205,19 +202,19 @@ def in_view(
     return tuple(tuple(None if np.isnan(x) else float(x) for x in row) for row in shares)
 
 
-def _evenly(rows: Index, count: int) -> Index:
+def _evenly(rows: Ints, count: int) -> Ints:
     """At most ``count`` of them, evenly spread."""
     if len(rows) <= count:
         return rows
     return rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
 
 
-def _mean(values: Array | Index) -> float | None:
+def _mean(values: Array | Ints) -> float | None:
     values = values[np.isfinite(values)]
     return float(values.mean()) if len(values) else None
 
 
-def _median(values: Array | Index) -> float | None:
+def _median(values: Array | Ints) -> float | None:
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else None
 
@@ -235,8 +232,9 @@ CORE = (10.0, 90.0)
 REACH = 0.8
 """Of the longest edge of the core, on every side: farther points are outliers. One reach for
 all axes: the towers of a flat place are not outliers."""
-ENDS = (2.0, 98.0)  # percentiles of what is left that are the ends of the scene, and `BEYOND` that
-BEYOND = 0.08  # of the distance between the two ends: an even spread of points is inside as a whole
+ENDS, BEYOND = (2.0, 98.0), 0.08
+"""Percentiles of what is left that are the ends of the scene, and what is added beyond each, as a
+share of the distance between them: an even spread of points is inside as a whole."""
 MAX_SAMPLE = 50_000  # points that are looked at: an even choice of a larger cloud is enough
 
 

@@ -71,7 +71,7 @@ def test_the_sample_model_is_consistent(scene):
 
 
 def test_counting_rule_on_the_sample(scene):
-    assert assign_points(scene).tolist() == [0, 1]
+    assert assign_points(scene.count_views()).tolist() == [0, 1]
 
 
 def test_default_split_as_stated(folder, tmp_path):

@@ -54,22 +54,23 @@ def test_observations_of_each_image_in_order(image: list[int]) -> None:
     assert by_image(np.zeros(0, np.int32), 0) == []
 
 
-def test_reprojection_has_offset_and_depth_in_front_only() -> None:
+def test_reprojection_has_error_and_depth_in_front_only() -> None:
     camera = Camera(1, "PINHOLE", 200, 100, (100.0, 100.0, 100.0, 50.0))
     views = [
         (camera, np.eye(4)),
         (camera, pose_from_rotation_translation(np.diag([-1.0, 1.0, -1.0]), np.zeros(3))),
     ]
-    offset, depth = reproject(
+    (front, error, depth), (back, *behind) = reproject(
         views,
         np.array([[1.0, 0.0, 4.0]]),
         np.array([0, 2]),
-        by_image(np.array([0, 1]), 2),
-        np.array([[120.0, 50.0], [0.0, 0.0]]),
+        np.array([0, 1]),
+        np.array([[122.0, 54.0], [0.0, 0.0]]),
     )
-    np.testing.assert_allclose(offset[0], [5.0, 0.0])
-    assert depth[0] == 4.0
-    assert np.isnan(offset[1]).all() and np.isnan(depth[1])
+    assert (front, back) == ([0], [1])
+    np.testing.assert_allclose(error, [5.0])  # from (125, 50)
+    assert depth == [4.0]
+    assert np.isnan(behind).all()
 
 
 def test_rays_meet_and_parallax_is_the_sine_of_half_their_angle() -> None:

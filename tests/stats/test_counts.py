@@ -57,7 +57,7 @@ def scenes(draw) -> Scene:
 def test_a_point_belongs_to_the_period_that_observes_it_most():
     tracks = [[0], [0, 2, 3], [1, 2], [3, 0], [2, 3, 0, 1], [], [4, 4, 0]]
     scene = scene_of([0, 0, 1, 1, 2], tracks)
-    assert assign_points(scene).tolist() == [0, 1, 0, 0, 0, -1, 2]
+    assert assign_points(scene.count_views()).tolist() == [0, 1, 0, 0, 0, -1, 2]
     counted = count_scene(scene)
     assert [p.points for p in counted.periods] == [4, 1, 1]
     assert (counted.points, counted.points_without_period) == (7, 1)
@@ -81,7 +81,7 @@ def test_assigned_periods_add_up_and_seen_ones_do_not_fall_short(scene):
 def test_assignment_equals_a_plain_loop(scene):
     """The rule spelt out point by point."""
     counts = scene.count_views()
-    assigned = assign_points(scene)
+    assigned = assign_points(scene.count_views())
     for i in range(len(scene.points)):
         span = slice(*scene.points.track_start[i : i + 2])
         periods = [scene.frames[j].period for j in scene.points.track_frame[span]]
