@@ -11,9 +11,9 @@ from chronoscene.figures import canvas
 from chronoscene.io.wording import printable
 from chronoscene.stats.counts import PeriodCount, SceneCount, period_title
 
-BAR = 0.3  # inches per scene
+BAR = 0.3  # Inches per scene
 WIDTH = 9.0
-MAX_LEGEND_ENTRIES = 12  # periods up to which each has an entry
+MAX_LEGEND_ENTRIES = 12  # Periods up to which each has an entry
 
 
 def draw_bars(counts: Sequence[SceneCount], path: Path) -> None:

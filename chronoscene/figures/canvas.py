@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from chronoscene.io.staging import replacing
 from chronoscene.io.wording import printable
 
-DPI = 200  # pixels per inch of PNG files, and of the density inside PDF and SVG files
+DPI = 200  # Pixels per inch of PNG files, and of the density inside PDF and SVG files
 WIDE_FONTS = (
     *("Noto Sans CJK SC", "Noto Sans CJK JP", "Noto Sans SC", "Source Han Sans SC"),
     *("WenQuanYi Zen Hei", "WenQuanYi Micro Hei", "Droid Sans Fallback", "Arial Unicode MS"),

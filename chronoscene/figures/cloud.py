@@ -14,8 +14,8 @@ from chronoscene.scene.geometry import camera_centre
 from chronoscene.stats.counts import assign_points, period_name
 from chronoscene.stats.measures import robust_range
 
-MARGIN = 0.03  # of the longest edge, on every side
-MIN_EDGE = 0.18  # of the longest edge: a flat scene gets room above and below it
+MARGIN = 0.03  # Of the longest edge, on every side
+MIN_EDGE = 0.18  # Of the longest edge: a flat scene gets room above and below it
 
 
 @dataclass(frozen=True, slots=True)

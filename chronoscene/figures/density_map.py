@@ -19,10 +19,10 @@ from chronoscene.figures.canvas import rgb_of
 
 Counts = NDArray[np.float32]
 
-MIN_OPACITY = 0.6  # opacity of a pixel with one point, where others have many
-DARK_QUANTILE = 0.97  # of the pixels with points: the opacity of this many points is 1
-DOT_SHARE = 0.35  # dots grow until about this share of the occupied area is covered
-MAX_DOT_RADIUS = 6  # radius in pixels
+MIN_OPACITY = 0.6  # Opacity of a pixel with one point, where others have many
+DARK_QUANTILE = 0.97  # Of the pixels with points: the opacity of this many points is 1
+DOT_SHARE = 0.35  # Dots grow until about this share of the occupied area is covered
+MAX_DOT_RADIUS = 6  # Radius in pixels
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,14 +27,14 @@ Size = tuple[float, float]
 CELL = 2
 """Pixels along each side of a cell of the density where dots are not larger than a cell: the colour
 of a single pixel can hardly be seen."""
-DRAWING = (7.6, 7.0)  # largest width and height in inches of the panels and the gap between them
+DRAWING = (7.6, 7.0)  # Largest width and height in inches of the panels and the gap between them
 GAP = 0.12
 LEFT, RIGHT, BOTTOM = 0.62, 0.15, 0.5
-TITLE, LINE = 0.4, 0.24  # height in inches of the title and of each line of the legend
+TITLE, LINE = 0.4, 0.24  # Height in inches of the title and of each line of the legend
 MIN_WIDTH = 3.5
-BEHIND = 0.7  # strength of the points where cameras are drawn, too
-PATCH = 16  # pixels along each side of the squares by which the area with points is measured
-PLAIN = (0.1, 10_000.0)  # longest edges for which coordinates are written as they are
+BEHIND = 0.7  # Strength of the points where cameras are drawn, too
+PATCH = 16  # Pixels along each side of the squares by which the area with points is measured
+PLAIN = (0.1, 10_000.0)  # Longest edges for which coordinates are written as they are
 FAR = 20.0
 """Times the longest edge: coordinates beyond would be numbers with more digits than differ."""
 AXES = "xyz"

@@ -20,7 +20,7 @@ from chronoscene.scene import Scene
 
 MAX_POINTS = 300_000
 """In a page, so that it opens at once and turns smoothly. The page says how many there are."""
-ELEVATION = np.deg2rad(35.0)  # of the first view above the plane of the scene
+ELEVATION = np.deg2rad(35.0)  # Of the first view above the plane of the scene
 
 
 def write_page(scene: Scene, path: Path, *, max_points: int = MAX_POINTS) -> None:

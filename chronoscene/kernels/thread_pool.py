@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from chronoscene.kernels.compilation import inlined, inner, kernel
 from chronoscene.kernels.memory import fetch_add, load_shared
 
-_STRIDE = 16  # numbers per phase, so that phases do not share cache lines
+_STRIDE = 16  # Numbers per phase, so that phases do not share cache lines
 _FINISHED = 8
-_PATIENCE = 64  # looks before the processor is offered to others
+_PATIENCE = 64  # Looks before the processor is offered to others
 
 _CAN_YIELD = hasattr(os, "sched_yield")
 _sched_yield = numba.types.ExternalFunction("sched_yield", numba.types.int32())
@@ -73,7 +73,7 @@ def _wait_for_change(shared, offset, value, looks):
 
 Kernel = Callable[..., Any]
 
-_GENERATION, _ACTIVE = 0, 8  # numbers that are watched without Python's lock
+_GENERATION, _ACTIVE = 0, 8  # Numbers that are watched without Python's lock
 _LOOKS = 20_000
 """How often a worker looks for the next launch before it sleeps: tens of microseconds, which is
 what passes between the kernels of one image. Waking a thread takes longer than that."""

@@ -12,7 +12,7 @@ from chronoscene.scene import Scene, tracks
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.stats.counts import CountRule, SceneCount, count_scene
 
-CELLS = 50  # cubes along the longest edge of a scene for its coverage
+CELLS = 50  # Cubes along the longest edge of a scene for its coverage
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +235,7 @@ all axes: the towers of a flat place are not outliers."""
 ENDS, BEYOND = (2.0, 98.0), 0.08
 """Percentiles of what is left that are the ends of the scene, and what is added beyond each, as a
 share of the distance between them: an even spread of points is inside as a whole."""
-MAX_SAMPLE = 50_000  # points that are looked at: an even choice of a larger cloud is enough
+MAX_SAMPLE = 50_000  # Points that are looked at: an even choice of a larger cloud is enough
 
 
 def robust_range(xyz: Array) -> Array:

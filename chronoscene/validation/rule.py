@@ -35,7 +35,7 @@ but probably not as its author intended, or another program fails on it. info: w
 nothing needs repair.
 """
 
-NOTHING = "nothing to do"  # remedy of findings that are for information only
+NOTHING = "nothing to do"  # Remedy of findings that are for information only
 
 
 @dataclass(frozen=True, slots=True)

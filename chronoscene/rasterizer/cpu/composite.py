@@ -30,8 +30,8 @@ from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, spl
 
 AHEAD = 6  # Entries by which records are asked for in advance
 STEPS = 32  # Scratch numbers of a Gaussian in a tile, see `start_gaussian`
-_STATE = 64  # numbers per block: light, red, green, blue
-_STEPS = 64 * _STATE  # where the steps are
+_STATE = 64  # Numbers per block: light, red, green, blue
+_STEPS = 64 * _STATE  # Where the steps are
 FORWARD_NUMBERS = _STEPS + STEPS  # Scratch of one worker
 
 _lane_x = make_constant([i % 4 + 0.5 for i in range(LANES)])

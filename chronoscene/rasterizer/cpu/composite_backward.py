@@ -22,8 +22,8 @@ from chronoscene.rasterizer.cpu.composite import (
 )
 from chronoscene.rasterizer.cpu.layout import LANES, PART_ROWS, PARTS, load, splat, splat_int
 
-_STATE = 96  # numbers per block: light, behind, gradient of red, green, blue, end of what counts
-_STEPS = 64 * _STATE  # where the steps are
+_STATE = 96  # Numbers per block: light, behind, gradient of red, green, blue, end of what counts
+_STEPS = 64 * _STATE  # Where the steps are
 BACKWARD_NUMBERS = _STEPS + STEPS  # Scratch of one worker
 
 _load_rgb, _load_alpha = make_load_pixels(3, LANES), make_load_pixels(1, LANES)

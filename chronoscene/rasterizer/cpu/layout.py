@@ -23,11 +23,11 @@ Array = NDArray[Any]
 # ordered by tile, block, row and column.
 TILE = 32
 TILE_PIXELS = TILE * TILE
-BLOCKS = 8  # per side of a tile
+BLOCKS = 8  # Per side of a tile
 
 # A vector holds the pixels of one block, or of half a block where vectors are narrow.
 LANES = max(vectors.LANES, 8)
-PARTS = 16 // LANES  # vectors per block
+PARTS = 16 // LANES  # Vectors per block
 PART_ROWS = LANES // 4
 splat, splat_int = vectors.make_splat("f32", LANES), vectors.make_splat("i32", LANES)
 load = memory.make_load(LANES)
@@ -36,11 +36,11 @@ load_quads = transposes.make_load_columns(4, LANES)
 
 # One Gaussian on the screen is a record of 16 numbers: one cache line.
 RECORD = 16
-MEAN_X, MEAN_Y = 0, 1  # pixels
+MEAN_X, MEAN_Y = 0, 1  # Pixels
 # alpha = 2^(LEVEL - u^2 - v^2) with u = U_X dx + U_Y dy; v = V dy, or V dx where V is negative.
 U_X, U_Y, V, LEVEL = 2, 3, 4, 5
-COLOR = 6  # three numbers
-SHEAR, HALF_WIDTH, RIGHTMOST = 9, 10, 11  # see bins.py
+COLOR = 6  # Three numbers
+SHEAR, HALF_WIDTH, RIGHTMOST = 9, 10, 11  # See bins.py
 TILES_X, TILES_Y = 12, 13  # int: first tile + (number of tiles << 16), per axis
 ROW = 14  # int: first row of sums in the backward pass, counted from that of the chunk
 INVERSE_Y = 15  # WHITEN over the standard deviation of y
@@ -56,11 +56,11 @@ LEVEL_MIN = math.log2(ALPHA_MIN)  # LEVEL - u^2 - v^2 is at least this where alp
 WHITEN = math.sqrt(0.5 * LOG2_E)  # u and v over WHITEN are standard deviations
 
 # Camera numbers in one float32 array.
-ROTATION, CENTRE, FX, FY, CX, CY = 0, 9, 12, 13, 14, 15  # centre in the world
-X_MIN, X_MAX, Y_MIN, Y_MAX = 16, 17, 18, 19  # limits of x / z and y / z for the Jacobian
+ROTATION, CENTRE, FX, FY, CX, CY = 0, 9, 12, 13, 14, 15  # Centre in the world
+X_MIN, X_MAX, Y_MIN, Y_MAX = 16, 17, 18, 19  # Limits of x / z and y / z for the Jacobian
 NEAR, FAR, BLUR = 20, 21, 22
-CENTRE_REST = 23  # what float32 cannot hold of the centre
-COFACTORS = 26  # of the rotation: row i is the cross product of the rows i + 1 and i + 2
+CENTRE_REST = 23  # What float32 cannot hold of the centre
+COFACTORS = 26  # Of the rotation: row i is the cross product of the rows i + 1 and i + 2
 CAMERA = 35
 
 CHUNK = 1024  # Gaussians that a thread takes at a time

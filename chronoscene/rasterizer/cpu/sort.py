@@ -8,7 +8,7 @@ from chronoscene.kernels.compilation import inner
 from chronoscene.kernels.thread_pool import draw, finish, wait_for
 
 DIGIT_BITS = 11
-SORT_PHASES = 3 + 3 * 3  # keys have 31 bits
+SORT_PHASES = 3 + 3 * 3  # Keys have 31 bits
 
 
 @inner(fast_math=True)

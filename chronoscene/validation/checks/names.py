@@ -19,7 +19,7 @@ Paths, and Namespaces*)."""
 DEVICES = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
 """Names that Windows reserves for devices, with any extension."""
 
-MAX_NAME_BYTES = 255  # longest name on most file systems
+MAX_NAME_BYTES = 255  # Longest name on most file systems
 
 
 def is_safe(name: str) -> bool:

@@ -15,7 +15,7 @@ from chronoscene.scene.cameras import Camera, project_points
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.tracks import track_owners
 
-MAX_TABLE = 1_000_000  # ids within a range of about this many numbers are looked up in a table
+MAX_TABLE = 1_000_000  # Ids within a range of about this many numbers are looked up in a table
 
 
 @dataclass(frozen=True, slots=True, eq=False)

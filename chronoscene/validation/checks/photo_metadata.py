@@ -17,15 +17,15 @@ from chronoscene.scene.similarity import SIGMA, Similarity, fit_robustly
 from chronoscene.validation.checks import grouped
 from chronoscene.validation.scene_folder import RawScene, derived
 
-MIN_DATES = 3  # photos with a date from which the median date of a period is meaningful
-DAY = timedelta(days=1)  # periods less than this apart may be confused by a time zone
+MIN_DATES = 3  # Photos with a date from which the median date of a period is meaningful
+DAY = timedelta(days=1)  # Periods less than this apart may be confused by a time zone
 
 MUCH_NEARER = 0.25
 """A photo is of another period if its date is within this share of the distance to its own."""
 
-MIN_PHOTOS = 6  # photos with a position from which a similarity is meaningful
-MIN_SPREAD = 10.0  # metres; smaller spreads of positions are the noise of the receiver
-MAX_UP = 0.9  # share of the cameras that look up if the model was turned over
+MIN_PHOTOS = 6  # Photos with a position from which a similarity is meaningful
+MIN_SPREAD = 10.0  # Metres; smaller spreads of positions are the noise of the receiver
+MAX_UP = 0.9  # Share of the cameras that look up if the model was turned over
 
 
 @derived

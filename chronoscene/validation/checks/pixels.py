@@ -26,8 +26,8 @@ T = TypeVar("T")
 Track = Callable[[Sequence[T], str], Iterable[T]]
 """Passes items on and shows the progress under a description."""
 
-THUMBNAIL = 32  # pixels along each side of a thumbnail
-GREY_SIDE = 160  # pixels along the longer side of a small grey image: 20 kB for each image
+THUMBNAIL = 32  # Pixels along each side of a thumbnail
+GREY_SIDE = 160  # Pixels along the longer side of a small grey image: 20 kB for each image
 
 END_MARKS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND"}
 """End markers of files. Compressed JPEG data cannot contain its own."""
@@ -36,13 +36,13 @@ ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 """Pillow's modes with transparency. Other modes may have one transparent colour."""
 
 JPEG = ("JPEG", "MPO")  # Pillow's names of JPEG files
-TAIL = 4096  # bytes at the end of a file in which its end marker is looked for
+TAIL = 4096  # Bytes at the end of a file in which its end marker is looked for
 
 _SUBFILE, _REDUCED, _MASK = 254, 1, 4
 """TIFF tag for the kind of an image in the file, and two of its bits (TIFF 6.0, page 36)."""
 
 _HEADER_THREADS = 4
-_MIN_THREADED = 32  # fewer headers than this are read before threads have started
+_MIN_THREADED = 32  # Fewer headers than this are read before threads have started
 
 _START, _SCAN, _END = b"\xff\xd8", 0xDA, 0xD9
 _RESTART_INTERVAL = 0xDD
@@ -50,7 +50,7 @@ _RESTART_INTERVAL = 0xDD
 _SEGMENTS = frozenset({0xC4, 0xDA, 0xDB, 0xDC, 0xDD, 0xFE, *range(0xE0, 0xF0)})
 """Markers that may occur between two scans: tables, comments, the next scan."""
 
-PADDING = 64  # number of equal bytes that compressed data never ends in
+PADDING = 64  # Number of equal bytes that compressed data never ends in
 
 
 @dataclass(frozen=True, slots=True)

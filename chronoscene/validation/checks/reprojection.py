@@ -21,32 +21,32 @@ from chronoscene.scene.tracks import MIN_PARALLAX, intersect_rays
 from chronoscene.validation.checks import grouped
 from chronoscene.validation.scene_folder import RawScene, derived
 
-MIN_OBSERVATIONS = 10  # observations of an image from which the median of its errors is meaningful
+MIN_OBSERVATIONS = 10  # Observations of an image from which the median of its errors is meaningful
 
 MAX_ERROR_SHARE, MIN_LIMIT = 0.01, 4.0
 """Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
 pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
 
-MAX_DEPTHS = 500  # depths sampled from an image: enough for a percentile over a period
-MIN_IMAGES = 3  # images with an error from which the median of a period is meaningful
+MAX_DEPTHS = 500  # Depths sampled from an image: enough for a percentile over a period
+MIN_IMAGES = 3  # Images with an error from which the median of a period is meaningful
 
 
-MAX_RAYS = 20_000  # observations sampled from a period
-MIN_POINTS = 10  # points that the cameras of a period must triangulate alone
+MAX_RAYS = 20_000  # Observations sampled from a period
+MIN_POINTS = 10  # Points that the cameras of a period must triangulate alone
 
 STRAY = 100.0
 """Distance of a camera from the others, in units of their median distance, beyond which its rays
 would distort all points."""
 
-FITS = 0.02  # median distance after the similarity, as a share of the extent of the points
-BETTER = 1 / 3  # share of the median distance before the similarity that may be left after it
+FITS = 0.02  # Median distance after the similarity, as a share of the extent of the points
+BETTER = 1 / 3  # Share of the median distance before the similarity that may be left after it
 
 WELL = 0.5
 """Share of the limit, and of the error that a similarity leaves, that may remain if a factor of the
 focal length explains everything: to cameras that see one place from one distance, a wrong scale
 looks nearly like a wrong focal length."""
 
-SAME_FOCAL = 0.002  # relative difference of focal lengths too small to explain anything
+SAME_FOCAL = 0.002  # Relative difference of focal lengths too small to explain anything
 
 AXES = "xyz"
 
@@ -54,7 +54,7 @@ WORSE = 3.0
 """Ratio of median reprojection errors, of a period to the best one or of an image to its period,
 beyond which it stands out."""
 
-MIN_ERROR = 1.0  # pixels; smaller errors are fine whatever their ratio to the rest
+MIN_ERROR = 1.0  # Pixels; smaller errors are fine whatever their ratio to the rest
 
 MAX_WRONG = 0.5
 """Share of the images of a period with a pose that does not fit, beyond which the period is at

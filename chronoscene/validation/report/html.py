@@ -21,11 +21,11 @@ from chronoscene.validation import rule
 from chronoscene.validation.checks.names import is_safe
 from chronoscene.validation.rule import SEVERITIES, Finding, SceneReport, Severity, is_valid
 
-MAX_PICTURES = 24  # pictures of one scene
-MAX_SIDE_BY_SIDE = 3  # pictures of one finding
-PICTURE_SIDE = 160  # pixels
-MAX_FILE_BYTES = 50_000_000  # larger image files are not opened for a picture
-MAX_ROWS = 100  # findings of one rule that are listed
+MAX_PICTURES = 24  # Pictures of one scene
+MAX_SIDE_BY_SIDE = 3  # Pictures of one finding
+PICTURE_SIDE = 160  # Pixels
+MAX_FILE_BYTES = 50_000_000  # Larger image files are not opened for a picture
+MAX_ROWS = 100  # Findings of one rule that are listed
 
 TITLES: dict[Severity, str] = {"error": "Errors", "warning": "Warnings", "info": "Remarks"}
 

@@ -16,10 +16,10 @@ from chronoscene.validation.checks import grouped
 from chronoscene.validation.report.rule_list import COLOURS
 from chronoscene.validation.rule import SEVERITIES, Finding, SceneReport, Summary, is_valid
 
-MAX_PLACES = 3  # places listed of findings that differ only in their place
-MAX_CODES = 8  # rules listed of those that were skipped for one reason
-MAX_LINES = 5  # different lines shown of one rule
-MIN_WIDTH = 40  # columns below which lines are not wrapped further
+MAX_PLACES = 3  # Places listed of findings that differ only in their place
+MAX_CODES = 8  # Rules listed of those that were skipped for one reason
+MAX_LINES = 5  # Different lines shown of one rule
+MIN_WIDTH = 40  # Columns below which lines are not wrapped further
 
 
 def write_text(reports: Sequence[SceneReport], *, strict: bool = False) -> str:

@@ -25,20 +25,20 @@ from chronoscene.validation.checks.observations import good_poses
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene, derived
 
-VISIBLE = 0.5  # pixels; distortion that moves no pixel this far may be dropped instead of undone
+VISIBLE = 0.5  # Pixels; distortion that moves no pixel this far may be dropped instead of undone
 
 MAX_ANGLE, MIN_ANGLE = 150.0, 1.0
 """Horizontal field of view, in degrees, that a pinhole photo may plausibly have."""
 
-UNEQUAL = 0.1  # relative difference of fx and fy; pixels are square to a few percent in any camera
+UNEQUAL = 0.1  # Relative difference of fx and fy; pixels are square to a few percent in any camera
 
 UNDISTORT = "undistort the images and the model: chronoscene undistort SCENE OUT"
 PERSPECTIVE = "render perspective views of the panoramas, and register those"
 DROP = "write the camera as PINHOLE or SIMPLE_PINHOLE; its distortion is below half a pixel"
 NO_DISTORTION = "PINHOLE, SIMPLE_PINHOLE, or a radial or OPENCV model without distortion"
 
-SAME_ANGLE = 1e-3  # radians between two records of one pose beyond rounding in a text file
-SAME_PLACE = 1e-3  # the same for positions, as a share of the extent of the cameras
+SAME_ANGLE = 1e-3  # Radians between two records of one pose beyond rounding in a text file
+SAME_PLACE = 1e-3  # The same for positions, as a share of the extent of the cameras
 
 
 @rule.error("CS131", bad="`1 PINHOLE 640 480 -500 500 320 240`", remedy="correct the camera")

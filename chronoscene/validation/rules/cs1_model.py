@@ -17,7 +17,7 @@ from chronoscene.validation.checks.names import is_portable, is_safe, spelling
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
-MAX_ID = 2**31 - 2  # largest id in COLMAP's databases
+MAX_ID = 2**31 - 2  # Largest id in COLMAP's databases
 
 
 @rule.error(

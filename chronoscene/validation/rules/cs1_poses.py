@@ -17,7 +17,7 @@ from chronoscene.validation.checks.reprojection import image_errors, pose_limit
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene, derived
 
-UNIT_TOLERANCE = 1e-3  # deviation of a quaternion's length from 1 beyond rounding in a text file
+UNIT_TOLERANCE = 1e-3  # Deviation of a quaternion's length from 1 beyond rounding in a text file
 
 MAX_DISTANCE = 1000.0
 """Distance from the origin in extents of the scene. Single precision has 7 digits: at this distance

@@ -28,7 +28,7 @@ KINDS = {
 }
 """Extension to Pillow's names of the formats found in such files. Cameras put MPO into ``.jpg``."""
 
-BLANK = 2.0  # grey levels between the means of the darkest and the brightest part of an image
+BLANK = 2.0  # Grey levels between the means of the darkest and the brightest part of an image
 
 
 @rule.error(

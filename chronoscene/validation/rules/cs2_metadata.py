@@ -19,21 +19,21 @@ from chronoscene.validation.checks.photo_metadata import GpsFit, dates_of, of_ot
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
-SLACK = 31  # days by which the photos may miss the date in ``periods.json``
+SLACK = 31  # Days by which the photos may miss the date in ``periods.json``
 
 DAYS = (365, 30, 0)
 """Days from the first to the last that a date with no, one and two hyphens stands for."""
 
-GPS_FAR = 30.0  # metres; receivers in cameras and phones are accurate to about ten in the open
-GPS_SIGMAS = 6.0  # outliers are also this many standard deviations of the fit away
+GPS_FAR = 30.0  # Metres; receivers in cameras and phones are accurate to about ten in the open
+GPS_SIGMAS = 6.0  # Outliers are also this many standard deviations of the fit away
 
 GPS_LOOSE = 0.5
 """Standard deviation of the fit, as a share of the spread, beyond which nothing fits at all."""
 
-FILM_DIAGONAL, FILM_WIDTH = 43.2666, 36.0  # millimetres; manufacturers refer to one or the other
-FOCAL_RATIO = 1.4  # undistortion and cropping change the focal length by less
-MIN_PERIOD_DATES = 5  # photos with a date from which one of them can be an outlier
-MIN_APART = timedelta(days=183)  # visits to a place that form one period may be months apart
+FILM_DIAGONAL, FILM_WIDTH = 43.2666, 36.0  # Millimetres; manufacturers refer to one or the other
+FOCAL_RATIO = 1.4  # Undistortion and cropping change the focal length by less
+MIN_PERIOD_DATES = 5  # Photos with a date from which one of them can be an outlier
+MIN_APART = timedelta(days=183)  # Visits to a place that form one period may be months apart
 
 APART_RATIO = 10.0
 """An outlier is also this many times as far from the median date as three quarters of the
@@ -42,9 +42,9 @@ photos."""
 ONE_VISIT = timedelta(minutes=5)
 """Photos that follow each other this closely were taken on one visit."""
 
-PURE = 0.9  # share of the images whose period must be that of most images in their group
-MIN_GROUP = 3  # images of a group from which a majority is meaningful
-MIN_WITH_YEAR = 0.9  # share of the images of a period whose names must have one year in common
+PURE = 0.9  # Share of the images whose period must be that of most images in their group
+MIN_GROUP = 3  # Images of a group from which a majority is meaningful
+MIN_WITH_YEAR = 0.9  # Share of the images of a period whose names must have one year in common
 
 _BEGIN = re.compile(
     r"(?:p|t|day|date|time|epoch|period|visit)[-_]?\d+(?=[-_.])|(?:19[89]|20[0-4])\d(?:-?\d\d){0,2}(?!\d)",

@@ -29,16 +29,16 @@ one, if at least a quarter of the photos of the scene are above the second. Meas
 renders, also of different seasons and at dusk: 0.44 to 0.98 for the right photo, with a median over
 a scene of 0.72 and more; 0.5 and less for a wrong one, with a median of 0.1."""
 
-MAX_TRIED = 12  # images whose photo is looked for among all photos if hardly any photo fits
+MAX_TRIED = 12  # Images whose photo is looked for among all photos if hardly any photo fits
 
 OF_USUAL = 0.4
 """A wrong photo is also below this share of the median of its period: where everything was rebuilt
 and little registered, points have the colours of another period. Measured: a median of 0.51, a
 minimum of 0.23."""
 
-MAX_WRONG = 0.5  # share of the photos of a period beyond which the whole period is reported
-MIN_OBSERVATIONS = 30  # observations of an image from which their correlation is meaningful
-LUMA = (0.299, 0.587, 0.114)  # weights of red, green and blue in brightness (ITU-R BT.601)
+MAX_WRONG = 0.5  # Share of the photos of a period beyond which the whole period is reported
+MIN_OBSERVATIONS = 30  # Observations of an image from which their correlation is meaningful
+LUMA = (0.299, 0.587, 0.114)  # Weights of red, green and blue in brightness (ITU-R BT.601)
 
 TURNS = {
     "rotated by 180 degrees": np.s_[::-1, ::-1],

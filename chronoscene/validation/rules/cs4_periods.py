@@ -12,10 +12,10 @@ from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs3_split import meant_in_split, names_on_bad_lines, problem_hit
 from chronoscene.validation.scene_folder import RawScene
 
-MIN_TRAIN = 5  # training views below which a period can hardly be reconstructed
-UNEVEN = 3  # ratio between the number of test views of a period and its fair share
-MIN_OFF = 3  # deviation from the fair share, in test views, that is worth a warning
-UNEQUAL = 10  # ratio between the numbers of training views of two periods
+MIN_TRAIN = 5  # Training views below which a period can hardly be reconstructed
+UNEVEN = 3  # Ratio between the number of test views of a period and its fair share
+MIN_OFF = 3  # Deviation from the fair share, in test views, that is worth a warning
+UNEQUAL = 10  # Ratio between the numbers of training views of two periods
 
 
 @rule.error(

@@ -20,8 +20,8 @@ from chronoscene.validation.scene_folder import RawScene, derived
 Table = NDArray[np.bool_]
 """Whether a point is seen in a period. [P, T]"""
 
-MIN_SHARED = 10  # shared points from which a similarity between two periods can be told from chance
-MAX_BLOCK = 10_000_000  # points times periods that are counted at a time
+MIN_SHARED = 10  # Shared points from which a similarity between two periods can be told from chance
+MAX_BLOCK = 10_000_000  # Points times periods that are counted at a time
 
 DEPTH_RATIO = 10.0
 """Between the median depths of two periods without shared points: nothing else indicates scale."""
@@ -29,12 +29,12 @@ DEPTH_RATIO = 10.0
 UNIT_TOLERANCE = 0.1
 """Relative difference between the unit and the metre by GPS that its noise can explain."""
 
-NEAREST, FARTHEST = 0.01, 50_000.0  # plausible range of metres between cameras and points
-APART = 0.05  # share of a period's points that cameras of another period should at least see
-OWN = 0.5  # share of a period's points that its own cameras must see
-MAX_PERIODS = 100  # all pairs are compared
-MAX_POINTS, MAX_IMAGES = 3000, 300  # points and images of all periods together that are compared
-REACH = 3.0  # how far a camera sees, in units of the 95th percentile of the depths in its period
+NEAREST, FARTHEST = 0.01, 50_000.0  # Plausible range of metres between cameras and points
+APART = 0.05  # Share of a period's points that cameras of another period should at least see
+OWN = 0.5  # Share of a period's points that its own cameras must see
+MAX_PERIODS = 100  # All pairs are compared
+MAX_POINTS, MAX_IMAGES = 3000, 300  # Points and images of all periods together that are compared
+REACH = 3.0  # How far a camera sees, in units of the 95th percentile of the depths in its period
 
 
 @rule.warning(

@@ -15,10 +15,10 @@ from chronoscene.validation.checks.observations import Observations
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
 
-MAX_SHORT = 0.01  # share of the points up to which short tracks do not matter
-MIN_COLOURED = 100  # points from which their colours are judged
-SAME_COLOUR = 0.95  # share of points of one colour; snow and night skies have many shades
-COLOURED_SAMPLE = 50_000  # points whose colours are looked at
+MAX_SHORT = 0.01  # Share of the points up to which short tracks do not matter
+MIN_COLOURED = 100  # Points from which their colours are judged
+SAME_COLOUR = 0.95  # Share of points of one colour; snow and night skies have many shades
+COLOURED_SAMPLE = 50_000  # Points whose colours are looked at
 
 MAX_DUPLICATES = 0.05
 """Share of points on top of another one. Up to one percent was seen in COLMAP's models."""
@@ -27,7 +27,7 @@ SAME_POINT = 1e-6
 """Edge of the cells in which points are one, in median distances of the points from their centre:
 copies that went through single precision differ by a tenth of that."""
 
-SAMPLE = 10_000  # points from which that distance is taken
+SAMPLE = 10_000  # Points from which that distance is taken
 
 FAR = 100.0
 """Distance of a point from the centre, in units of the median distance of points and cameras."""

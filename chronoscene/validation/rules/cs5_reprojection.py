@@ -17,10 +17,10 @@ from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs1_poses import other_convention
 from chronoscene.validation.scene_folder import RawScene, derived
 
-MAX_OUTSIDE = 0.05  # share of observations outside the image; undistortion leaves a few there
+MAX_OUTSIDE = 0.05  # Share of observations outside the image; undistortion leaves a few there
 MAX_BEHIND = 0.5  # Share of observations behind their camera. A consistent model has none.
-MAX_WRONG = 0.5  # share of the images of a period beyond which one finding reports all of them
-MIN_STORED = 0.9  # share of the points that must have an error stored with them
+MAX_WRONG = 0.5  # Share of the images of a period beyond which one finding reports all of them
+MIN_STORED = 0.9  # Share of the points that must have an error stored with them
 
 
 @rule.warning(

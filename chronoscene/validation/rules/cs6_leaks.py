@@ -25,23 +25,23 @@ SAME_PLACE = 1e-3
 """Distance of two cameras, in typical depths of the scene, below which they are in one place: it
 moves points by a pixel or two in an image of 1600."""
 
-SAME_DIRECTION = 2e-3  # difference of two rotation matrices; about a tenth of a degree
+SAME_DIRECTION = 2e-3  # Difference of two rotation matrices; about a tenth of a degree
 
 MAX_DIFFERENCE = 3.0
 """Root mean square difference of two thumbnails in grey levels 0..255. Measured: photos saved again
 as JPEG differ by 0.1 to 1.8 (quality 50 and more), neighbouring frames of a video by 9 and more,
 aerial photos of one flight by 30 and more."""
 
-FEATURELESS = 4.0  # standard deviation of a thumbnail below which it looks like any other
-ROUNDING = 1.01  # margin by which pairs pass to the exact comparison
-MAX_TRIED = 8  # images compared pixel by pixel with one that looks like all of them
+FEATURELESS = 4.0  # Standard deviation of a thumbnail below which it looks like any other
+ROUNDING = 1.01  # Margin by which pairs pass to the exact comparison
+MAX_TRIED = 8  # Images compared pixel by pixel with one that looks like all of them
 
 MIN_CORRELATION = 0.997
 """Correlation of grey thumbnails beyond which two photos are one. Measured: a photo made darker,
 brighter, warmer or with more contrast 0.9985 and more; neighbouring frames of a video 0.989 and
 less, aerial photos of one flight 0.9 and less."""
 
-PLAIN = 8.0  # standard deviation of a grey thumbnail, in grey levels, below which rounding matters
+PLAIN = 8.0  # Standard deviation of a grey thumbnail, in grey levels, below which rounding matters
 
 _BLOCK = 8
 _ROWS = 256

@@ -30,14 +30,14 @@ GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "I;16B", "I;16L", "I;16N")
 VOXEL, NEAR = 0.001, 0.2
 """World units; constants of the released code, and of 3D Gaussian splatting."""
 
-MIN_LOST = 0.1  # share of points or observations worth reporting
-SAMPLE = 10_000  # points from which the extent of the scene is estimated
+MIN_LOST = 0.1  # Share of points or observations worth reporting
+SAMPLE = 10_000  # Points from which the extent of the scene is estimated
 
 CROWDED = 10
 """Points lie on surfaces: on a square of side a, n points are about a / sqrt(n) apart. If that is
 this many voxels, no two of them share one."""
 
-OFF_CENTRE = 0.5  # pixels; half a pixel is a difference of convention, not of the lens
+OFF_CENTRE = 0.5  # Pixels; half a pixel is a difference of convention, not of the lens
 
 
 @rule.warning(
