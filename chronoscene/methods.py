@@ -223,6 +223,24 @@ def build_config(
     return config_class(**values)
 
 
+def config_from_values(spec: MethodSpec, values: Mapping[str, Any]) -> Any:
+    """Make the frozen config of a method from all of its values, as JSON gives them back.
+
+    Raises:
+        ConfigError: If the config class has other fields: the method has changed since.
+    """
+    listed = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    try:
+        return import_object(spec.config)(**listed)
+    except TypeError as error:
+        raise ConfigError(
+            f"{spec.name}: configuration",
+            expected="the options that this version of the method has",
+            found=str(error),
+            todo="use the version of the software that made the run, or run bench again",
+        ) from error
+
+
 def _parse_like(place: str, value: Any, default: Any) -> Any:
     if not isinstance(value, str) or isinstance(default, str):
         return value

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -14,7 +13,7 @@ from chronoscene.bench.job import Job, check_job
 from chronoscene.bench.predictions import freeze_ground_truth
 from chronoscene.bench.provenance import code_version, scene_hash
 from chronoscene.bench.strategies import check_scene, effective_strategy
-from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import MAX_WIDTH, ImageStore
 from chronoscene.methods import MethodSpec, load_spec
@@ -153,13 +152,7 @@ def is_finished(job: Job, spec: MethodSpec, overwrite: bool = False) -> bool:
     if not (job.folder / results.RUN_FILE).is_file():
         return False
     results.read_run(job.folder)
-    path = job.folder / results.CONFIG_FILE
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CheckpointError(
-            path, expected="the config of the run", found=str(error), todo="delete the run"
-        ) from error
+    stored = results.read_config(job.folder)
     wanted = job.document(spec)
     if stored == wanted:
         return True

@@ -12,6 +12,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -143,6 +144,25 @@ def read_run(folder: Path) -> RunRecord:
         ) from error
     except ValidationError as error:
         raise damaged(path, error) from error
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Read ``config.json``, as `Job.document` gave it.
+
+    Raises:
+        CheckpointError: If it is missing or damaged.
+    """
+    path = folder / CONFIG_FILE
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        found = "" if isinstance(document["config"]["method_config"], dict) else "none in it"
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        found = str(error)
+    if found:
+        raise CheckpointError(
+            path, expected="the config of the run", found=found, todo="delete the run"
+        )
+    return dict(document)
 
 
 def read_rows(folder: Path) -> list[Row]:

@@ -20,6 +20,7 @@ from typing import Any
 from chronoscene.bench import results
 from chronoscene.bench.display import ProgressDisplay
 from chronoscene.bench.job import Job, StopRule
+from chronoscene.bench.opening import write_source
 from chronoscene.bench.predictions import (
     ImageWriter,
     ground_truth_folder,
@@ -82,6 +83,7 @@ def run_job(job: Job) -> None:
     write_text_atomic(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
     scene = read_scene(job.scene_root)
     parts = make_parts(scene, ImageStore(scene, max_width=job.max_width), job.strategy)
+    write_source(job, scene, parts[0].train.training_from_world)
     writer = ImageWriter(staging / results.PREDICTIONS)
     before = time.perf_counter()
     periods = parts[0].train.num_periods

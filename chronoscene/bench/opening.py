@@ -1,0 +1,208 @@
+"""A finished run, opened again: its models render any camera at any period that they claim."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from chronoscene.bench.job import Job
+from chronoscene.bench.results import CHECKPOINT, RunRecord, damaged, read_config, read_run
+from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.formats import read_scene
+from chronoscene.io.staging import write_text_atomic
+from chronoscene.methods import (
+    Method,
+    MethodSpec,
+    Prediction,
+    View,
+    config_from_values,
+    import_object,
+    load_spec,
+)
+from chronoscene.scene import Camera, Scene
+from chronoscene.scene.similarity import Sim3
+
+SOURCE_FILE = "source.json"
+
+
+class RunSource(BaseModel):
+    """Where a run comes from: what its files need besides themselves to be used again."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    method: str
+    """What `load_spec` takes: a name or ``module:SPEC``."""
+    plugin_path: str | None
+    """Folder from which ``module:SPEC`` was imported."""
+    scene_root: str
+    scene_format: str
+    training_from_world: list[list[float]]
+    """Similarity transform as a matrix. [4, 4]"""
+
+
+def write_source(job: Job, scene: Scene, training_from_world: Sim3) -> None:
+    """Write ``source.json`` of a run into its staging folder."""
+    source = RunSource(
+        method=job.method,
+        plugin_path=job.plugin_path,
+        scene_root=job.scene_root,
+        scene_format=scene.format,
+        training_from_world=training_from_world.to_matrix().tolist(),
+    )
+    write_text_atomic(
+        Path(job.staging) / SOURCE_FILE, json.dumps(source.model_dump(), indent=1) + "\n"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class OpenRun:
+    """The models of a finished run. Made by `open_run`."""
+
+    folder: Path
+    record: RunRecord
+    spec: MethodSpec
+    source: RunSource
+    config: Any
+    """Of the method."""
+    training_from_world: Sim3
+    device: str
+    _models: dict[str, Method] = field(default_factory=dict)
+
+    @property
+    def num_periods(self) -> int:
+        """Periods of the scene, numbered from 0."""
+        return len(self.record.period_labels)
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether periods in between, such as 0.5, can be rendered."""
+        return self.spec.period_input == "continuous" and self.record.strategy == "joint"
+
+    def check_period(self, period: float) -> None:
+        """Refuse a period that the models do not claim.
+
+        Raises:
+            ConfigError: If it is outside of those of the scene, or fractional where the method
+                takes whole ones only.
+        """
+        last = self.num_periods - 1
+        if not 0 <= period <= last:
+            labels = ", ".join(f"{i} ({name})" for i, name in self.record.period_labels.items())
+            raise ConfigError(
+                f"period {period:g}",
+                expected=f"one from 0 to {last}",
+                found="none of this scene",
+                todo=f"choose among {labels}",
+            )
+        if period != int(period) and not self.is_continuous:
+            raise ConfigError(
+                f"period {period:g}",
+                expected=f"a whole number: {self.spec.title} under strategy {self.record.strategy} "
+                "knows no time between the periods",
+                found="a fraction",
+                todo=f"choose {int(period)} or {int(period) + 1}",
+            )
+
+    def model(self, period: float) -> Method:
+        """The model that answers for a period, loaded at its first use."""
+        part = f"period-{int(period)}" if self.record.strategy == "separate" else ""
+        if part not in self._models:
+            self._models[part] = self._load(self.folder / CHECKPOINT / part)
+        return self._models[part]
+
+    def _load(self, folder: Path) -> Method:
+        if not folder.is_dir():
+            raise CheckpointError(
+                folder,
+                expected="the model of the run",
+                found="no such folder",
+                todo="copy it there, or delete the run and run bench again",
+            )
+        method: Method = import_object(self.spec.method)(self.config)
+        method.load(folder, device=self.device)
+        return method
+
+    def render(
+        self, camera: Camera, cam_from_world: NDArray[np.float64], period: float
+    ) -> Prediction:
+        """Render what a camera sees as of a period.
+
+        Args:
+            camera: Without distortion.
+            cam_from_world: Pose in the world of the scene. [4, 4]
+            period: From 0 to the last; fractional only if `is_continuous`.
+
+        Returns:
+            The image; depth, where the method gives it, in units of the world.
+
+        Raises:
+            ConfigError: If no model claims the period.
+        """
+        self.check_period(period)
+        pose = self.training_from_world.apply_to_pose(cam_from_world)
+        view = View(camera.K, camera.width, camera.height, pose)
+        told = float(period) if self.record.strategy == "joint" else 0.0
+        prediction = self.model(period).render(view, told)
+        if prediction.depth is None:
+            return prediction
+        return replace(prediction, depth=prediction.depth / self.training_from_world.scale)
+
+    def scene(self, root: Path | None = None) -> Scene:
+        """The scene that the run was trained on, or ``root`` where it has moved.
+
+        Raises:
+            SceneError: If it is not there, or cannot be read.
+        """
+        return read_scene(root or Path(self.source.scene_root), format=self.source.scene_format)
+
+
+def open_run(folder: Path, *, device: str = "cpu", plugin_path: Path | None = None) -> OpenRun:
+    """Open the folder of a finished run, ``RUNS/<scene>/<method>-<strategy>-<preset>/seed<k>``.
+
+    Models are loaded when they are first asked for. The scene need not be there.
+
+    Args:
+        folder: With ``run.json``.
+        device: ``cpu`` or ``cuda``.
+        plugin_path: Where ``module:SPEC`` is now, if it has moved.
+
+    Raises:
+        CheckpointError: If the folder has no finished run, or a file is damaged.
+        ConfigError: If the method is not installed.
+    """
+    record = read_run(folder)
+    source = _read_source(folder / SOURCE_FILE)
+    for path in filter(None, (plugin_path, source.plugin_path)):
+        if str(path) not in sys.path:
+            sys.path.append(str(path))
+    spec = load_spec(source.method)
+    return OpenRun(
+        folder=folder,
+        record=record,
+        spec=spec,
+        source=source,
+        config=config_from_values(spec, read_config(folder)["config"]["method_config"]),
+        training_from_world=Sim3.from_matrix(source.training_from_world),
+        device=device,
+    )
+
+
+def _read_source(path: Path) -> RunSource:
+    try:
+        return RunSource.model_validate_json(path.read_bytes())
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            path,
+            expected="where the run comes from",
+            found="no such file: an earlier version made the run",
+            todo="run bench again with --overwrite",
+        ) from error
+    except ValidationError as error:
+        raise damaged(path, error) from error
