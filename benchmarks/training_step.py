@@ -42,7 +42,7 @@ from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
 from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
 from chronoscene.rasterizer.cpu import Render
-from chronoscene.training import losses
+from chronoscene.training import losses, splatting
 from chronoscene.training.adam import DenseTable
 from chronoscene.training.row_adam import RowAdam
 
@@ -56,6 +56,7 @@ PARTS: tuple[tuple[str, Any, str], ...] = (
     ("loss, backward", losses._PhotometricLoss, "backward"),
     ("rasterize, backward", Render, "backward"),
     ("decode, backward", Decode, "backward"),
+    ("check of gradients", splatting, "all_finite"),
     ("density statistics", DensityStatistics, "update"),
     ("fetch anchors", RowAdam, "fetch"),
     ("Adam, seen anchors", RowAdam, "step"),

@@ -28,6 +28,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.scene.similarity import Sim3
 
 PeriodInput = Literal["none", "label", "continuous"]
+Skipped = Literal["empty", "not finite"]
 ENTRY_POINT_GROUP = "chronoscene.methods"
 
 
@@ -123,6 +124,9 @@ class StepReport:
     loss: float
     primitives: int
     """Gaussians or anchors held now."""
+    skipped: Skipped | None = None
+    """Why nothing was learned, so that no parameter and no moment of the optimiser changed:
+    ``empty``, the view shows no primitive; ``not finite``, the loss or a gradient was not."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,13 +18,18 @@ from torch import Tensor
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
 from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
-from chronoscene.methods import StepReport, TrainingSet, TrainingView
+from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.adam import Adam, DenseTable
 from chronoscene.training.losses import mean_volume, photometric_loss
 from chronoscene.training.row_adam import make_table
 from chronoscene.training.schedule import ViewSampler, downscale_image, downscale_view, log_linear
-from chronoscene.training.splatting import camera_centre_tensor, draw, finite_rows
+from chronoscene.training.splatting import (
+    camera_centre_tensor,
+    collect_gradients,
+    draw,
+    finite_rows,
+)
 
 AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]
 
@@ -83,21 +88,22 @@ class AnchorTrainer:
         if done <= self.config.coarse_until:
             factor = self.config.coarse_factor
             view, photo = downscale_view(view, factor), downscale_image(photo, factor)
-        visible = self.model.visible(view)
-        if len(visible) == 0:  # nothing to learn from; the image is the background
-            return StepReport(loss=float("nan"), primitives=len(self.model))
-        loss = self._learn(view, photo, visible, done)
+        loss, skipped = self._learn(view, photo, done)
         resized = self._densify_if_due(index, done)
-        self._update(done, resized=resized)
-        return StepReport(loss=loss, primitives=len(self.model))
+        if skipped is None:
+            self._update(done, resized=resized)
+        self.optimizer.zero_grad()
+        return StepReport(loss, len(self.model), skipped)
 
     def _progress_after(self, index: int, progress: float) -> float:
         """Share of the training that is over once this step is done."""
         return progress * (index + 1) / index if index > 0 else 1.0 / self.config.iterations
 
     def _learn(
-        self, view: TrainingView, photo: NDArray[np.uint8], visible: np.ndarray, done: float
-    ) -> float:
+        self, view: TrainingView, photo: NDArray[np.uint8], done: float
+    ) -> tuple[float, Skipped | None]:
+        """Loss, and why the step must be skipped, if it must."""
+        visible = self.model.visible(view)
         everything = torch.arange(len(visible), device=self.model.device)
         splats, positions = self._seen(visible, view.period).decode_active(
             self._one_period, self._seen_from(view), everything
@@ -109,10 +115,13 @@ class AnchorTrainer:
         if self.config.scale_weight:
             volume = mean_volume(splats.scales, splats.opacities)
             loss = loss + self.config.scale_weight * volume
-        loss.backward()
-        if self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN:
+        skipped = collect_gradients(loss, raster.info, [self.optimizer, *self.tables.values()])
+        collects = (
+            self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN
+        )
+        if collects and skipped is None:
             self._collect(view, visible, positions, splats.opacities, raster.info)
-        return float(loss.detach())
+        return float(loss.detach()), skipped
 
     def _seen(self, visible: np.ndarray, period: int) -> AnchorModel:
         """The visible anchors with the features of one period: a model of a single period."""
@@ -201,7 +210,6 @@ class AnchorTrainer:
         where the anchors then have new tensors without gradients."""
         rates = {name: log_linear(done, *rate) for name, rate in self.rates.items()}
         self.optimizer.step(rates)
-        self.optimizer.zero_grad()
         if not resized:
             for name, table in self.tables.items():
                 if name in rates:

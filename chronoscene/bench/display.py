@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 from rich.console import Console
@@ -58,8 +59,9 @@ class ProgressDisplay:
         self, iteration: int, seconds: float, report: StepReport, psnr: float | None
     ) -> None:
         """Show one step; the observer of `training_loop.train`."""
-        past = report.loss if self._loss is None else self._loss
-        self._loss = SMOOTHING * past + (1 - SMOOTHING) * report.loss
+        if report.skipped is None and math.isfinite(report.loss):
+            past = report.loss if self._loss is None else self._loss
+            self._loss = SMOOTHING * past + (1 - SMOOTHING) * report.loss
         now, progress = time.monotonic(), self._stop.progress(iteration, seconds)
         if self._live and self._task is not None and (now - self._shown > REFRESH or progress == 1):
             self._shown = now
@@ -74,7 +76,9 @@ class ProgressDisplay:
     def status(self, iteration: int, seconds: float, psnr: float | None) -> str:
         """The state of the training in one line."""
         left = self._stop.seconds_left(iteration, seconds)
-        pieces = [f"iteration {iteration}", f"loss {self._loss:.4f}"]
+        pieces = [f"iteration {iteration}"]
+        if self._loss is not None:
+            pieces.append(f"loss {self._loss:.4f}")
         if psnr is not None:
             pieces.append(f"{psnr:.2f} dB")
         pieces.append(f"{iteration / max(seconds, 1e-9):.1f} it/s")

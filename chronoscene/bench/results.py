@@ -74,6 +74,10 @@ class RunRecord(BaseModel):
     """Numbers stored in the checkpoint."""
     warmup_seconds: float
     """Compiling and loading of kernels before the clock starts; not part of `seconds`."""
+    empty_steps: int = 0
+    """Steps whose view showed nothing of the model; nothing is learned from them."""
+    skipped_steps: int = 0
+    """Steps that changed nothing since their loss or a gradient was not finite."""
     setup_seconds: float
     """Share of `seconds` before the first step."""
     render_seconds: float

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.methods import (
     Method,
     MethodSpec,
+    Skipped,
     StepReport,
     TrainingSet,
     TrainingView,
@@ -34,8 +36,16 @@ PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 """Shares of the training at which the probe views are rendered."""
 
 
+NOT_FINITE_LIMIT = 50
+"""Steps in a row without a finite loss and finite gradients that end a training."""
+
+
 class TrainingError(ChronoSceneError):
-    """A training that cannot continue: a loss that is not finite, or an invalid image."""
+    """A training that cannot continue: numbers that are not finite, or an invalid image."""
+
+
+class DivergedError(TrainingError):
+    """`NOT_FINITE_LIMIT` steps in a row were skipped; the model is as it was before them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +83,10 @@ class Trained:
     seconds: float
     setup_seconds: float
     iterations: int
+    empty_steps: int
+    """Whose view showed no primitive."""
+    skipped_steps: int
+    """Whose loss or gradients were not finite."""
     curve: tuple[CurvePoint, ...]
 
 
@@ -120,7 +134,8 @@ def train(
         observer: Shows the progress.
 
     Raises:
-        TrainingError: If the loss is not finite.
+        DivergedError: If the method skipped too many steps in a row.
+        TrainingError: If it took as many with a loss that is not finite.
     """
     seed_everything(seed)
     clock = Stopwatch()
@@ -129,24 +144,36 @@ def train(
     setup_seconds = clock.seconds
     curve: list[CurvePoint] = []
     due = list(PROBE_SHARES)
-    iteration = 0
+    iteration, last_good = 0, 0
+    skips: Counter[Skipped | None] = Counter()
     while (progress := stop.progress(iteration, clock.seconds)) < 1.0:
         with clock:
             report = method.step(iteration, progress)
         iteration += 1
+        skipped = report.skipped
         if not math.isfinite(report.loss):
-            raise TrainingError(
+            skipped = "not finite"
+        skips[skipped] += 1
+        if skipped != "not finite":
+            last_good = iteration
+        elif iteration - last_good == NOT_FINITE_LIMIT:
+            todo = "lower the learning rates, or report this with the scene"
+            if report.skipped:
+                todo = f"the model of iteration {last_good} is kept in checkpoint; {todo}"
+            raise (DivergedError if report.skipped else TrainingError)(
                 f"model {part.name}, iteration {iteration}",
-                expected="a finite loss",
-                found=str(report.loss),
-                todo="lower the learning rates, or report this with the scene",
+                expected="a finite loss and finite gradients",
+                found=f"{NOT_FINITE_LIMIT} steps in a row without",
+                todo=todo,
             )
         done = stop.progress(iteration, clock.seconds)
         if due and done >= due[0]:
             due = [share for share in due if share > done]
             curve.append(_probe(method, part, truth, clock.seconds, iteration))
         observer(iteration, clock.seconds, report, curve[-1].psnr if curve else None)
-    return Trained(clock.seconds, setup_seconds, iteration, tuple(curve))
+    return Trained(
+        clock.seconds, setup_seconds, iteration, skips["empty"], skips["not finite"], tuple(curve)
+    )
 
 
 def _probe(

@@ -37,6 +37,7 @@ from chronoscene.bench.scoring import aggregate, score_folder
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.bench.training_loop import (
     CurvePoint,
+    DivergedError,
     Trained,
     forget_peak_memory,
     probe_frames,
@@ -113,7 +114,7 @@ def run_job(job: Job) -> None:
     record.aggregates, record.periods = aggregate(scores.rows)
     record.skipped = scores.skipped
     record.warmup_seconds = warmup_seconds
-    record.notices = [*job.notices, *([notice] if notice else [])]
+    record.notices = [*job.notices, *([notice] if notice else []), *_skips(job, record)]
     results.write_run(staging, record, scores.rows)
 
 
@@ -150,16 +151,21 @@ def _run_part(
 ) -> PartOutcome:
     """Train one model, save it, and render the test views that it answers for."""
     method: Method = import_object(spec.method)(job.method_config(spec))
-    trained = train(
-        method,
-        part,
-        stop,
-        _probe_truth(job, part),
-        seed=job.seed,
-        device=machine.device,
-        observer=display.update,
-    )
-    _save(method, Path(job.staging) / results.CHECKPOINT, part)
+    checkpoint = Path(job.staging) / results.CHECKPOINT
+    try:
+        trained = train(
+            method,
+            part,
+            stop,
+            _probe_truth(job, part),
+            seed=job.seed,
+            device=machine.device,
+            observer=display.update,
+        )
+    except DivergedError:
+        _save(method, checkpoint, part)  # as the last good step left it
+        raise
+    _save(method, checkpoint, part)
     before = time.perf_counter()
     for frame in part.test:
         image = render_bytes(method, part, frame)
@@ -213,6 +219,8 @@ def _record(
         periods={},
         seconds=sum(o.trained.seconds for o in outcomes),
         iterations=sum(o.trained.iterations for o in outcomes),
+        empty_steps=sum(o.trained.empty_steps for o in outcomes),
+        skipped_steps=sum(o.trained.skipped_steps for o in outcomes),
         primitives=sum(o.size.primitives for o in outcomes),
         checkpoint_bytes=sum(path.stat().st_size for path in saved if path.is_file()),
         peak_memory_bytes=peaks[0],
@@ -237,6 +245,16 @@ def _record(
         started=started,
         notices=[],
     )
+
+
+def _skips(job: Job, record: results.RunRecord) -> list[str]:
+    """What to say of steps that taught nothing."""
+    reasons = {
+        "empty: their photos show nothing of the model": record.empty_steps,
+        "skipped: their loss or gradients were not finite": record.skipped_steps,
+    }
+    steps = record.iterations
+    return [f"{job.label}: {n} of {steps} steps {why}" for why, n in reasons.items() if n]
 
 
 def execute(document: dict[str, Any], _: Report) -> None:

@@ -20,7 +20,7 @@ from chronoscene.rasterizer import Rasterization
 from chronoscene.training.adam import Adam
 from chronoscene.training.losses import photometric_loss
 from chronoscene.training.schedule import ViewSampler, log_linear
-from chronoscene.training.splatting import draw
+from chronoscene.training.splatting import collect_gradients, draw
 
 _SPLIT_STREAM = 1  # Keeps the samples of splits apart from other draws of the same seed
 
@@ -102,13 +102,15 @@ class GaussianTrainer:
         raster = draw(splats, view, self.background, near_plane=self.config.near_plane)
         loss = self.loss(raster, number)
         self.optimizer.zero_grad()
-        loss.backward()
-        if due.collect:
+        skipped = collect_gradients(loss, raster.info, [self.optimizer])
+        if skipped:
+            self.optimizer.zero_grad()
+        elif due.collect:
             self.statistics.add(raster.info, view.width, view.height)
         if due.densify:
             self._densify(index, prune_large=due.prune_large)
         self._update(due)
-        return StepReport(loss=float(loss.detach()), primitives=len(self.model))
+        return StepReport(float(loss.detach()), len(self.model), skipped)
 
     def loss(self, raster: Rasterization, number: int) -> Tensor:
         """Photometric loss against the photo of view ``number``; methods may add terms."""

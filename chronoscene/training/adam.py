@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,6 +74,10 @@ class Adam:
         """Drop all gradients."""
         for value in self.params.values():
             value.grad = None
+
+    def gradients(self) -> list[Tensor]:
+        """All gradients that there are."""
+        return [value.grad for value in self.params.values() if value.grad is not None]
 
     @torch.no_grad()
     def step(self, lrs: Mapping[str, float], skip: Collection[str] = ()) -> None:
@@ -195,6 +199,43 @@ def adam_blocks(values, grads, means, squares, rate, root, eps):  # type: ignore
         adam_block(values[part], grads[part], means[part], squares[part], rate, root, eps)
 
 
+def all_finite(tensors: Iterable[Tensor]) -> bool:
+    """Whether no number is nan or infinite; costs far less than an update of the same size."""
+    for tensor in tensors:
+        if not is_cpu_float32(tensor):
+            finite = bool(tensor.isfinite().all())
+        else:
+            bits = tensor.detach().contiguous().view(-1).numpy().view(np.int32)
+            largest = largest_bits_of_blocks(bits) if len(bits) > BLOCK else largest_bits(bits)
+            finite = largest < INFINITY_BITS
+        if not finite:
+            return False
+    return True
+
+
+INFINITY_BITS = 0x7F800000
+"""Magnitude bits of a float32: those of finite numbers are smaller, those of nan larger."""
+
+
+@kernel
+def largest_bits(bits):  # type: ignore[no-untyped-def]
+    """Largest magnitude of float32 numbers given as int32, as an integer."""
+    largest = np.int32(0)
+    for i in range(bits.shape[0]):
+        largest = max(largest, bits[i] & np.int32(0x7FFFFFFF))
+    return largest
+
+
+@kernel(parallel=True)
+def largest_bits_of_blocks(bits):  # type: ignore[no-untyped-def]
+    """The same for a large array, blocks spread over the threads."""
+    size = bits.shape[0]
+    found = np.empty((size + BLOCK - 1) // BLOCK, np.int32)
+    for block in prange(len(found)):
+        found[block] = largest_bits(bits[block * BLOCK : min((block + 1) * BLOCK, size)])
+    return found.max()
+
+
 class DenseTable:
     """A trained tensor with one row per anchor, of which a step reads some rows. [R, ...]
 
@@ -214,6 +255,11 @@ class DenseTable:
     def value(self) -> Tensor:
         """The table; up to date after `flush`."""
         return self._adam.params["table"].detach()
+
+    def gradients(self) -> list[Tensor]:
+        """The gradient that `step` will use, if there is one."""
+        grad = None if self._fetched is None else self._fetched[1].grad
+        return [] if grad is None else [grad]
 
     def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
         """Copies of some rows and blocks, up to date, as a leaf that collects a gradient.

@@ -101,6 +101,10 @@ class RowAdam:
         self._fetched = rows, places, out.requires_grad_()
         return out
 
+    def gradients(self) -> list[Tensor]:
+        grad = None if self._fetched is None else self._fetched[2].grad
+        return [] if grad is None else [grad]
+
     def step(self, rate: float) -> None:
         root = (1 - BETA2 ** (self.steps + 1)) ** -0.5
         corrected = rate / (1 - BETA1 ** (self.steps + 1))

@@ -8,6 +8,7 @@ trainer that changes its tensors.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -19,10 +20,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from chronoscene.errors import SceneError
-from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
-from chronoscene.rasterizer import Rasterization, rasterize
+from chronoscene.methods import MethodSize, Prediction, Skipped, StepReport, TrainingSet, View
+from chronoscene.rasterizer import RasterInfo, Rasterization, rasterize
 from chronoscene.scene.geometry import camera_centre
+from chronoscene.training.adam import Adam, DenseTable, all_finite
 from chronoscene.training.checkpoint import load_tensors, save_tensors
+from chronoscene.training.row_adam import RowAdam
 
 
 def finite_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -90,6 +93,26 @@ def draw(
         render_depth=render_depth,
         check_finite=check_finite,
     )
+
+
+def collect_gradients(
+    loss: Tensor, info: RasterInfo, optimizers: Iterable[Adam | DenseTable | RowAdam]
+) -> Skipped | None:
+    """The backward pass of a training step.
+
+    Args:
+        loss: What to minimise.
+        info: Of the rasterization.
+        optimizers: Those that step after it.
+
+    Returns:
+        Why the step must be skipped, if it must: the optimisers may not use what they have then.
+    """
+    if not (info.radii > 0).any():
+        return "empty"
+    loss.backward()
+    gradients = (gradient for optimizer in optimizers for gradient in optimizer.gradients())
+    return None if all_finite([loss]) and all_finite(gradients) else "not finite"
 
 
 def prediction_of(raster: Rasterization) -> Prediction:

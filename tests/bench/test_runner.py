@@ -94,7 +94,9 @@ def test_failures_stop_nobody_else(finished_bench):
     assert len(outcome.finished) == 2
     reasons = {f.method: f.reason for f in outcome.failures}
     assert reasons["raises"] == "RuntimeError: the toy is broken (see error.log)"
-    assert "iteration 6: expected a finite loss, found nan" in reasons["not-finite"]
+    assert "iteration 55: expected a finite loss and finite" in reasons["not-finite"]
+    kept = runs / "ring/not-finite-joint-balanced/seed0/checkpoint/model.json"
+    assert np.isfinite(json.loads(kept.read_text())["colors"]).all()
     assert reasons["killed"] == "the process ended with signal SIGKILL (out of memory?)"
     assert "the toy is broken" in (runs / "ring/raises-joint-balanced/seed0/error.log").read_text()
     assert any("blind takes no period" in line for line in said)

@@ -1,5 +1,6 @@
 """The loop: progress, probes off the clock, failures that say what happened."""
 
+import math
 import random
 import time
 
@@ -10,8 +11,10 @@ import torch
 from chronoscene.bench.job import StopRule
 from chronoscene.bench.strategies import EXTENT_MARGIN, make_parts
 from chronoscene.bench.training_loop import (
+    NOT_FINITE_LIMIT,
     PROBE_SHARES,
     WARM_UP_STEPS,
+    DivergedError,
     Stopwatch,
     TrainingError,
     made_up_set,
@@ -22,7 +25,7 @@ from chronoscene.bench.training_loop import (
     warm_up,
 )
 from chronoscene.images.store import ImageStore
-from chronoscene.methods import import_object, load_spec
+from chronoscene.methods import StepReport, import_object, load_spec
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene.geometry import camera_centre
 
@@ -114,10 +117,38 @@ def test_whichever_limit_is_first(part):
     assert run(toy(sleep=0.02), part, StopRule(10**6, 0.1)).iterations < 10
 
 
-def test_a_loss_that_is_not_finite_ends_the_training(part):
-    message = "model all, iteration 6: expected a finite loss, found nan"
-    with pytest.raises(TrainingError, match=message):
-        run(toy("NotFinite"), part, StopRule(20, None))
+def reporting(skipped_at, loss=math.nan, skipped="not finite"):
+    """A method that reports some of its steps as skipped."""
+    method = toy()
+    step = method.step
+
+    def reported(index, progress):
+        return StepReport(loss, 1, skipped) if index in skipped_at else step(index, progress)
+
+    method.step = reported
+    return method
+
+
+def test_steps_that_taught_nothing_are_counted(part):
+    trained = run(reporting({3, 4, 9}), part, StopRule(20, None))
+    assert (trained.iterations, trained.empty_steps, trained.skipped_steps) == (20, 0, 3)
+    trained = run(reporting(range(20), 0.5, "empty"), part, StopRule(20, None))
+    assert (trained.iterations, trained.empty_steps, trained.skipped_steps) == (20, 20, 0)
+
+
+def test_only_a_run_of_steps_that_are_not_finite_ends_the_training(part):
+    often = [i for i in range(400) if i % NOT_FINITE_LIMIT]
+    trained = run(reporting(often), part, StopRule(400, None))
+    assert trained.skipped_steps == len(often)
+    message = "iteration 57: expected a finite loss and finite gradients, found 50 steps in a row "
+    with pytest.raises(DivergedError, match=f"{message}.* model of iteration 7 is kept"):
+        run(reporting(range(7, 400)), part, StopRule(400, None))
+
+
+def test_a_method_that_goes_on_with_a_loss_that_is_not_finite_keeps_no_model(part):
+    with pytest.raises(TrainingError, match=r"iteration 57: .*; lower the learning") as caught:
+        run(reporting(range(7, 400), skipped=None), part, StopRule(400, None))
+    assert not isinstance(caught.value, DivergedError)
 
 
 def test_images_that_are_not_finite_are_refused(part):

@@ -116,6 +116,19 @@ def test_anchors_grow_and_only_mlps_move_in_that_step(
     assert not torch.equal(made.model.offsets[:start], before["offsets"])
 
 
+def test_a_round_is_not_lost_to_an_empty_step(
+    noise_set: Callable[[int], TrainingSet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = _set_up(ChronoGSConfig(**GROWING), noise_set(2))
+    for index in range(11):
+        made.step(index, index / 24)
+    start, weights = len(made.model), made.model.heads["opacity"].w1.detach().clone()
+    monkeypatch.setattr(made.trainer.model, "visible", lambda view: np.zeros(0, np.int64))
+    report = made.step(11, 11 / 24)
+    assert report.skipped == "empty" and report.primitives > start
+    assert torch.equal(made.model.heads["opacity"].w1, weights)
+
+
 def test_faint_anchors_go_but_never_all(noise_set: Callable[[int], TrainingSet]) -> None:
     made = _set_up(ChronoGSConfig(**GROWING), noise_set(2))
     made.step(0, 0.0)
@@ -240,7 +253,7 @@ def test_a_view_that_sees_nothing_teaches_nothing(
     with torch.no_grad():
         made.model.anchors[:, 2] += 100.0  # behind every camera
     before = {n: t.detach().clone() for n, t in made.model.tensors().items()}
-    made.step(0, 0.0)
+    assert made.step(0, 0.0).skipped == "empty"
     for name, tensor in made.model.tensors().items():
         torch.testing.assert_close(tensor, before[name], rtol=0, atol=0)
     prediction = made.render(noise_set(3).views[0], 1)

@@ -9,7 +9,7 @@ from toy_scene import EXTENT, HEIGHT, SHORT, WIDTH, toy_scene
 
 from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.gaussians.config import GaussianConfig
-from chronoscene.gaussians.model import SHAPES, logit
+from chronoscene.gaussians.model import SHAPES, logit, opacities_of
 from chronoscene.gaussians.trainer import Timeline
 from chronoscene.training.schedule import ViewSampler
 from chronoscene.training.splatting import draw
@@ -118,6 +118,29 @@ def test_a_reset_leaves_the_opacities_alone_otherwise():
     assert torch.equal(method.model.parameters["logit_opacities"], before.clamp_max(logit(0.01)))
     assert not method.trainer.optimizer.state()["logit_opacities.mean"].any()
     assert not torch.equal(method.model.parameters["means"], means)
+
+
+def test_an_empty_step_changes_nothing_but_the_schedule_goes_on():
+    """Every camera is turned away, also when a round and a reset are due."""
+    scene = toy_scene()
+    turn = np.diag([-1.0, 1.0, -1.0, 1.0])
+    method = GaussianSplatting(replace(SHORT, reset_interval=3_000, gradient_threshold=0.0))
+    method.setup(scene, seed=0, device="cpu")
+    for i in range(24):
+        method.step(i, i / 250)
+    trainer, before = method.trainer, {n: t.clone() for n, t in method.model.tensors().items()}
+    moments = {name: values.clone() for name, values in trainer.optimizer.state().items()}
+    views = tuple(replace(v, cam_from_world=turn @ v.cam_from_world) for v in scene.views)
+    trainer.train = replace(scene, views=views)
+    assert trainer.step(23, 23 / 250).skipped == "empty"
+    assert all(torch.equal(t, before[name]) for name, t in method.model.tensors().items())
+    after = trainer.optimizer.state()
+    assert all(torch.equal(after[name], values) for name, values in moments.items())
+    report = trainer.step(24, 24 / 250)
+    assert report.skipped == "empty" and report.primitives > 60
+    assert trainer.step(25, 0.1).skipped == "empty"
+    logits = method.model.parameters["logit_opacities"].detach()
+    assert opacities_of(logits).max() < 0.0101
 
 
 def test_a_set_that_died_out_still_trains_and_renders():

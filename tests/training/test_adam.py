@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chronoscene.errors import ShapeError
-from chronoscene.training.adam import BLOCK, Adam
+from chronoscene.training.adam import BLOCK, Adam, all_finite
 
 # Worst of 1200 runs of 20 steps with rates up to 0.1: 1.7e-6, from rounding in another order.
 TOLERANCE = 5e-6
@@ -92,6 +92,20 @@ def test_zero_gradients_for_long_end_at_zero_moments() -> None:
         adam.step({"x": 0.1})
     assert bool((adam.state()["x.mean"] == 0).all())
     assert bool(value.isfinite().all())
+
+
+@pytest.mark.parametrize("size", [0, 1, 20, 3 * BLOCK + 77])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_all_finite_sees_every_number(size: int, dtype: torch.dtype) -> None:
+    value = leaf(size, dtype=dtype).detach() * torch.finfo(dtype).tiny
+    value[: size // 2] = -torch.finfo(dtype).max
+    assert all_finite([torch.zeros(3), value])
+    for index in {0, size // 2, size - 1} & set(range(size)):
+        for bad in ("nan", "inf", "-inf"):
+            spoilt = value.clone()
+            spoilt[index] = float(bad)
+            assert not all_finite([torch.zeros(3), spoilt])
+    assert all_finite([value.view(1, -1).T])
 
 
 def test_nan_gradient_stays_visible() -> None:

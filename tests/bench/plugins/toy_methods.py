@@ -6,7 +6,7 @@ import json
 import os
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -64,9 +64,12 @@ class Raises(MeanColour):
 
 
 class NotFinite(MeanColour):
+    """Skips every step from the sixth on."""
+
     def step(self, index, progress):
-        report = super().step(index, progress)
-        return StepReport(float("nan"), 1) if index == 5 else report
+        if index >= 5:
+            return StepReport(float("nan"), 1, "not finite")
+        return super().step(index, progress)
 
 
 class BadImage(MeanColour):
@@ -98,6 +101,8 @@ def spec(name, cls, period_input="label"):
 MEAN = spec("mean", MeanColour)
 BLIND = spec("blind", MeanColour, period_input="none")
 RAISES = spec("raises", Raises)
-NOT_FINITE = spec("not-finite", NotFinite)
+NOT_FINITE = replace(
+    spec("not-finite", NotFinite), presets={"balanced": {"iterations": 60}, "short": {}}
+)
 BAD_IMAGE = spec("bad-image", BadImage)
 KILLED = spec("killed", Killed)
