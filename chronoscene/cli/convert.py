@@ -26,16 +26,19 @@ def _period_help() -> str:
     return f"How images are grouped into periods, where the format leaves a choice. {rules}."
 
 
-def format_option(scene: str) -> Callable[[Any], Any]:
-    """The option ``--format`` of a command that reads one scene."""
+def reading_options(scene: str) -> Callable[[Any], Any]:
+    """The options ``--dataset-format`` and ``--period-by`` of a command that reads scenes."""
+    formats = click.Choice(format_names())
     help = f"Format of {scene}.  [default: detected]"
-    return click.option("--format", "scene_format", type=click.Choice(format_names()), help=help)
+    format_option = click.option("--dataset-format", type=formats, help=help)
+    period_option = click.option("--period-by", metavar="RULE", help=_period_help())
+    return lambda command: format_option(period_option(command))
 
 
 @click.command("convert")
 @click.argument("source", type=click.Path(path_type=Path), metavar="SRC")
 @click.argument("out", type=click.Path(path_type=Path))
-@format_option("SRC")
+@reading_options("SRC")
 @click.option(
     "--to",
     "target",
@@ -44,16 +47,15 @@ def format_option(scene: str) -> Callable[[Any], Any]:
     show_default=True,
     help="Format of OUT.",
 )
-@click.option("--period-by", metavar="RULE", help=_period_help())
 @click.option(
     "--link", type=click.Choice(["hard", "sym"]), help="Link the images instead of copying them."
 )
 def command(
     source: Path,
     out: Path,
-    scene_format: str | None,
-    target: str,
+    dataset_format: str | None,
     period_by: str | None,
+    target: str,
     link: str | None,
 ) -> None:
     """Convert the scene SRC from any supported format and write it to the new folder OUT.
@@ -65,7 +67,7 @@ def command(
         done = convert(
             source,
             out,
-            source_format=scene_format,
+            source_format=dataset_format,
             target=target,
             period_by=period_by,
             image_source=LINKS[link],

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.convert import describe_period, format_option
+from chronoscene.cli.convert import describe_period, reading_options
 from chronoscene.cli.output import check_place, emit, writing_to
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
@@ -64,14 +64,15 @@ from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, Split
     help="Also write the scene with the new split to this new folder. Images are hard-linked where "
     "the file system allows it.",
 )
-@format_option("SCENE")
+@reading_options("SCENE")
 def command(
     source: Path,
     out: Path | None,
     fraction: float | None,
     every: int | None,
     scene_out: Path | None,
-    scene_format: str | None,
+    dataset_format: str | None,
+    period_by: str | None,
     **options: Any,
 ) -> None:
     """Choose new test images of SCENE and write their names to the file OUT.
@@ -80,7 +81,7 @@ def command(
     SCENE is not changed: --scene-out writes a copy with the new split.
     """
     _check_targets(source, out, scene_out)
-    scene = read_scene(source, format=scene_format)
+    scene = read_scene(source, format=dataset_format, period_by=period_by)
     split = make_split(scene, SplitSettings(fraction=_fraction(fraction, every), **options))
     for frame in split.scene.frames:
         our_format.check_writable_name(source, frame)

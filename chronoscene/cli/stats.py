@@ -12,10 +12,11 @@ from typing import Any, Literal
 
 import click
 
+from chronoscene.cli.convert import reading_options
 from chronoscene.cli.output import check_file, check_place, emit, writing_to
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats import find_scenes, format_names, read_scene
+from chronoscene.formats import find_scenes, read_scene
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.tables import FORMATS
@@ -48,6 +49,7 @@ class Request:
     """What to do with each scene."""
 
     dataset_format: str | None
+    period_by: str | None
     count: CountRule
     layout: Layout
     figures: Path | None
@@ -106,11 +108,7 @@ class Request:
     metavar="OUT",
     help="Write an interactive page of each scene, for a browser, to this folder.",
 )
-@click.option(
-    "--dataset-format",
-    type=click.Choice(format_names()),
-    help="Format of the scenes.  [default: detected]",
-)
+@reading_options("the scenes")
 @click.pass_context
 def command(
     context: click.Context,
@@ -140,7 +138,7 @@ def command(
     were read, 1 if some were, 2 if none was or the command is used wrongly.
     """
     request = Request(**options)  # type: ignore[arg-type]
-    paths = [p for f in folders for p in in_paper_order(_scenes(f, request.dataset_format))]
+    paths = [p for f in folders for p in in_paper_order(_scenes(f, request))]
     _check_places(request, out, paths)
     items = list(zip(paths, _file_names(paths), strict=True))
     work = map_parallel(partial(examine, request), items, lost=_lost)
@@ -179,7 +177,7 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
     path, name = item
     keep_freed_memory()  # arrays as large as the model come and go
     try:
-        scene = read_scene(path, format=request.dataset_format)
+        scene = read_scene(path, format=request.dataset_format, period_by=request.period_by)
     except ChronoSceneError as error:
         return Unreadable(str(path), str(error))
     except OSError as error:
@@ -202,9 +200,9 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
     return measure_scene(scene, count=request.count)
 
 
-def _scenes(folder: Path, dataset_format: str | None) -> list[Path]:
+def _scenes(folder: Path, request: Request) -> list[Path]:
     """The scenes of a folder, and beside them what looks like one, so that nothing is lost."""
-    found = find_scenes(folder, format=dataset_format)
+    found = find_scenes(folder, format=request.dataset_format, period_by=request.period_by)
     if found == [folder]:
         return found
     beside = {p for name in SCENE_PARTS for p in folder.glob(f"*/{name}") if p.is_dir()}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.convert import LINKS, describe, format_option
+from chronoscene.cli.convert import LINKS, describe, reading_options
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.formats import read_scene
@@ -33,14 +33,15 @@ from chronoscene.undistort import Undistortion, undistort
     type=click.Choice(["hard", "sym"]),
     help="Link images that do not change instead of copying them.",
 )
-@format_option("SCENE")
+@reading_options("SCENE")
 def command(
     source: Path,
     out: Path,
     center: bool,
     threads: int | None,
     link: str | None,
-    scene_format: str | None,
+    dataset_format: str | None,
+    period_by: str | None,
 ) -> None:
     """Undistort the images of SCENE and write it with PINHOLE cameras to the new folder OUT.
 
@@ -51,7 +52,7 @@ def command(
     check_outside(out, [source])
     with progress_bar() as bar:
         done = undistort(
-            read_scene(source, format=scene_format),
+            read_scene(source, format=dataset_format, period_by=period_by),
             out,
             center=center,
             threads=threads,

@@ -20,6 +20,20 @@ from chronoscene.scene.scene import PointTable
 MODEL_FILES = ("cameras", "images", "points3D")  # Stems of the files that every model has
 FORMS = (".bin", ".txt")  # Suffixes of model files
 
+PLACES = {
+    "sparse": "images",  # COLMAP, GLOMAP
+    "colmap/sparse": "images",  # nerfstudio
+    "distorted/sparse": "input",  # the conversion script of 3DGS, before it undistorts
+    "dense/0/sparse": "dense/0/images",  # COLMAP's automatic reconstruction, undistorted
+    "dense/sparse": "dense/images",  # COLMAP's undistorter
+    "reconstruction": "images",  # hloc, pycolmap
+    "sfm": "images",
+    "": "images",
+}
+"""Where programs leave models in a project, and where the images are that these belong to.
+
+The model is in the folder itself or in a numbered one inside of it, which comes first."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawImages:
@@ -130,10 +144,10 @@ def model_files(folder: Path) -> dict[str, str]:
     return next(complete, {**forms[1], **forms[0]})
 
 
-def numbered_models(scene: Path) -> list[Path]:
-    """Folders ``sparse/0``, ``sparse/1`` ... that have files of a model, in this order."""
+def numbered_models(folder: Path) -> list[Path]:
+    """Folders ``0``, ``1`` ... that have files of a model, in this order."""
     try:
-        folders = [p for p in (scene / "sparse").iterdir() if re.fullmatch("[0-9]{1,9}", p.name)]
+        folders = [p for p in folder.iterdir() if re.fullmatch("[0-9]{1,9}", p.name)]
     except OSError:
         return []
     return [p for p in sorted(folders, key=lambda p: (int(p.name), p.name)) if model_files(p)]
@@ -146,3 +160,19 @@ def model_kind(folder: Path) -> Literal["binary", "text"] | None:
     if len(files) < len(MODEL_FILES) or len(forms) > 1:
         return None
     return "binary" if forms == {".bin"} else "text"
+
+
+def find_model(project: Path) -> tuple[str, str] | None:
+    """The model of a project and the folder of its images, both below the project; None if none.
+
+    Of several models the first in the order of `PLACES`, complete or not.
+    """
+    for place, images in PLACES.items():
+        if place == "distorted/sparse" and not (project / images).is_dir():
+            images = "images"  # the script was stopped, or the folder renamed
+        for folder in numbered_models(project / place) if place else ():
+            return f"{place}/{folder.name}", images
+        # Beside other files, cameras.txt or images.txt alone may be anything.
+        if model_files(project / place) if place else model_kind(project):
+            return place, images
+    return None

@@ -5,6 +5,8 @@ A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and wher
 - ``write(scene, out, image_source=..., progress=...)`` and ``losses(scene)``, which lists what of
   the scene the format cannot hold;
 - ``PERIOD_BY``, the values of ``read(path, period_by=...)``, where periods can be chosen;
+- ``assign(images, names, ...)``, which a format has whose periods follow from the image names of a
+  COLMAP model: so the validator can look at that model as it is;
 - ``remarks(path)``, which lists what of a folder does not become part of the scene.
 """
 
@@ -15,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.checks import check_choice
-from chronoscene.colmap.raw_model import model_kind
+from chronoscene.colmap.raw_model import find_model, model_kind
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Scene
 
@@ -29,6 +31,12 @@ FORMATS = {
     "wat": "chronoscene.formats.wat",
 }
 """Format name to the module that reads it."""
+
+COLMAP = "colmap-folders"
+"""What a COLMAP project is read as where ``--period-by`` says what its periods are."""
+
+FAR_UP = 4
+"""How far above a wrong folder the right one may be: ``dense/0/sparse/0`` has four folders."""
 
 
 def format_names() -> tuple[str, ...]:
@@ -46,8 +54,12 @@ def load_format(name: str) -> Any:
     return import_module(FORMATS[name])
 
 
-def detect_format(path: Path) -> str:
+def detect_format(path: Path, *, period_by: str | None = None) -> str:
     """Name of the one format whose marks a folder has.
+
+    Args:
+        path: Folder of one scene.
+        period_by: How images are to be grouped: then a COLMAP project needs no folders of periods.
 
     Raises:
         SceneError: If no format matches; lists what was looked for.
@@ -56,7 +68,7 @@ def detect_format(path: Path) -> str:
         found = "a file" if path.exists() else "nothing"
         raise SceneError(path, expected="a scene folder", found=found, todo="check the path")
     modules = {name: load_format(name) for name in format_names()}
-    matching = [name for name, module in modules.items() if module.matches(path)]
+    matching = _matching(path, period_by)
     if len(matching) == 1:
         return matching[0]
     if matching:
@@ -64,8 +76,10 @@ def detect_format(path: Path) -> str:
             path,
             expected="a folder of one format",
             found=f"marks of {' and '.join(matching)}",
-            todo="choose one with --format (stats: --dataset-format)",
+            todo="choose one with --dataset-format",
         )
+    if _is_colmap(path):
+        raise _no_periods(path)
     looked_for = "; ".join(f"{name}: {module.MARKS}" for name, module in modules.items())
     content = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
     raise SceneError(
@@ -76,40 +90,74 @@ def detect_format(path: Path) -> str:
     )
 
 
+def _matching(path: Path, period_by: str | None) -> list[str]:
+    """Names of the formats whose marks a folder has."""
+    matching = [name for name in format_names() if load_format(name).matches(path)]
+    return matching or ([COLMAP] if period_by is not None and _is_colmap(path) else [])
+
+
+def _is_colmap(path: Path) -> bool:
+    """Whether a folder has a COLMAP model and the images that it is of."""
+    found = find_model(path)
+    return found is not None and (path / found[1]).is_dir()
+
+
 def _advice(path: Path) -> str:
     """What to do about a folder that no format matches."""
-    from chronoscene.formats.shared.colmap_layout import find_model  # it loads pycolmap
-
-    if model_kind(path):
-        return "move this COLMAP model to sparse/0 in a folder with images/"
-    if find_model(path) and (path / "images").is_dir():
-        return (
-            "assign images to periods: write sparse/split.txt, or convert the folder with "
-            "--format colmap-folders --period-by table:FILE"
-        )
+    above = path.resolve().parents[:FAR_UP]
+    if project := next((folder for folder in above if _is_colmap(folder)), None):
+        return f"give the folder of the whole project, {project}"
+    if model := find_model(path):
+        place = f"in {model[0]}" if model[0] else "here"
+        return f"copy the images of the COLMAP model {place} to {model[1]}/ in this folder"
     advice = "give the folder of one scene; DATASET.md describes its files"
-    if (path / "images").is_dir() and not (path / "sparse").exists():
-        return f"register these photos (chronoscene register), or {advice}"
+    if (path / "images").is_dir():
+        if model_folder := _model_below(path):
+            return f"copy the COLMAP model in {model_folder} to sparse/0"
+        if not (path / "sparse").exists():
+            return f"register these photos (chronoscene register), or {advice}"
     return advice
 
 
-def find_scenes(path: Path, *, format: str | None = None) -> list[Path]:
+def _model_below(path: Path) -> str | None:
+    """A COLMAP model in a place that nobody would guess, below a folder."""
+    deep = ("/".join("*" * depth) for depth in range(1, FAR_UP + 1))
+    files = (file for stars in deep for file in sorted(path.glob(f"{stars}/cameras.*")))
+    folders = (file.parent for file in files if model_kind(file.parent))
+    return next((folder.relative_to(path).as_posix() for folder in folders), None)
+
+
+def _no_periods(path: Path) -> SceneError:
+    from chronoscene.formats.shared.grouping import NAME_PERIODS  # it loads pycolmap
+
+    model, images = find_model(path) or ("", "")
+    return SceneError(
+        path,
+        expected=f"periods of the images: folders in {images}/, or sparse/split.txt",
+        found=f"neither beside the COLMAP model in {model or 'this folder'}",
+        todo=f"{NAME_PERIODS}, or write sparse/split.txt as DATASET.md says",
+    )
+
+
+def find_scenes(
+    path: Path, *, format: str | None = None, period_by: str | None = None
+) -> list[Path]:
     """The scene folder itself, or the scenes directly inside a folder, sorted by name.
 
     Raises:
         SceneError: If there is no scene; lists what was looked for.
     """
-    modules = [load_format(name) for name in ([format] if format else format_names())]
 
     def is_scene(folder: Path) -> bool:
-        return any(module.matches(folder) for module in modules)
+        matching = _matching(folder, period_by)
+        return bool(matching) if format is None else format in matching
 
     if path.is_dir() and not is_scene(path):
         inside = sorted(child for child in path.iterdir() if child.is_dir() and is_scene(child))
         if inside:
             return inside
     if format is None:
-        detect_format(path)
+        detect_format(path, period_by=period_by)
     return [path]
 
 
@@ -128,14 +176,14 @@ def read_scene(
         ConfigError: If the format or the grouping is unknown.
     """
     path = Path(path)
-    name = format if format is not None else detect_format(path)
+    name = format if format is not None else detect_format(path, period_by=period_by)
     module = load_format(name)
     if period_by is not None and not hasattr(module, "PERIOD_BY"):
         raise ConfigError(
             "--period-by",
             expected=f"no such option for {name}, which defines its own periods",
             found=repr(period_by),
-            todo="leave it out",
+            todo="leave it out, or name another --dataset-format",
         )
     options = {} if period_by is None else {"period_by": period_by}
     scene: Scene = module.read(path, **options)

@@ -9,6 +9,7 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from chronoscene.colmap.model import Model, PosedImage, read_model, write_model
+from chronoscene.colmap.raw_model import find_model
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared.json_values import (
     parse_periods,
@@ -56,7 +57,7 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
     path = Path(path)
     entries, problems = splits.parse_split_text(splits.read_text(path / SPLIT))
     raise_first(path / SPLIT, problems)
-    model = model or read_model(path / MODEL)
+    model = model or _read_model(path)
     for image in model.images:
         check_image(path / MODEL, image)
     names = [image.name for image in model.images]
@@ -74,6 +75,19 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
         format=NAME,
         world=read_world(path),
     )
+
+
+def _read_model(path: Path) -> Model:
+    """The model, which this format has in one place only."""
+    found = find_model(path)
+    if found is not None and found[0] != MODEL:
+        raise SceneError(
+            path / MODEL,
+            expected="the COLMAP model",
+            found=f"one in {found[0] or 'the scene folder'} instead",
+            todo=f"move its files to {MODEL}",
+        )
+    return read_model(path / MODEL)
 
 
 def remarks(path: Path) -> list[str]:

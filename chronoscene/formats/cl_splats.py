@@ -54,9 +54,8 @@ def _is_level(path: Path) -> bool:
 
 
 def _is_real(path: Path) -> bool:
-    if colmap_layout.find_model(path) is None:
-        return False
-    return any(map(_DAY.match, colmap_layout.scan(path / "images")[1]))
+    found = colmap_layout.find_model(path)
+    return found is not None and any(map(_DAY.match, colmap_layout.scan(found[1])[1]))
 
 
 def read(path: Path, *, period_by: str = "step") -> Scene:
@@ -71,18 +70,16 @@ def read(path: Path, *, period_by: str = "step") -> Scene:
         return _read_level(path, period_by)
     if period_by != "step":
         raise rule_error(period_by, ["step"])
-    model = colmap_layout.read_images(path, path / "images")
-    steps = {image.name: _step(image.name) for image in model.images}
+    return colmap_layout.read_scene(path, assign, NAME)
+
+
+def assign(images: Path, names: list[str]) -> colmap_layout.Assigned:
+    """Periods and test images of a real scene by the names of the images."""
+    steps = {name: _step(name) for name in names}
     order = sorted(set(steps.values()), key=natural_key)
-    return colmap_layout.make_scene(
-        path,
-        path / "images",
-        model,
-        group_labels(steps, order),
-        set(sorted(steps)[::TEST_EVERY]),
-        rule=f"every {TEST_EVERY}th image of all in name order (index 0, {TEST_EVERY}, ...)",
-        format=NAME,
-    )
+    rule = f"every {TEST_EVERY}th image of all in name order (index 0, {TEST_EVERY}, ...)"
+    tests = set(sorted(steps)[::TEST_EVERY])
+    return colmap_layout.Assigned(group_labels(steps, order), tests, rule)
 
 
 def _step(name: str) -> str:
@@ -138,7 +135,9 @@ def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list
 
 def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
-    if _is_level(path) and not (path / POINTS).exists():
+    if not (path / TRAIN).exists():
+        return colmap_layout.remarks(path)
+    if not (path / POINTS).exists():
         return [f"the level has no {POINTS}: the scene has no points"]
     return []
 

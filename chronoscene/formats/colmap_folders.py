@@ -1,34 +1,43 @@
 """Plain COLMAP with one folder of images per period: ``images/<period>/...`` and ``sparse/0``.
 
 The first folder of an image name is its period; periods are in the natural order of the folders
-(``t2`` before ``t10``), which are also their labels. ``sparse/0/test.txt`` lists the test images
-where it exists, as in the ChronoScene format.
+(``t2`` before ``t10``), which are also their labels. With ``--period-by``, the dates of the photos
+or a table are the periods instead, and images need no folders. ``sparse/0/test.txt`` lists the test
+images where it exists, as in the ChronoScene format.
 """
 
 from __future__ import annotations
 
+from datetime import date
+from functools import partial
 from pathlib import Path
 
 from chronoscene.errors import SceneError
-from chronoscene.formats import wat
-from chronoscene.formats.chronoscene import read_tests
+from chronoscene.formats import nerfstudio, wat
 from chronoscene.formats.shared import colmap_layout, grouping
+from chronoscene.images.exif import read_exif, taken_at
 from chronoscene.images.store import ImageSource, Progress
+from chronoscene.io.wording import shown
 from chronoscene.scene import Scene
 
 NAME = "colmap-folders"
 MARKS = "images/<period>/ and sparse/0/"  # What `matches` looks for
 
-PERIOD_BY = ("folder", "table:FILE")
-"""The first folder of the names (default), or a CSV file with the columns file and period."""
+DATES = ("year", "month", "day", "gap:DAYS", "count:N")
+
+PERIOD_BY = ("folder", *DATES, "table:FILE")
+"""The first folder of the names (default), dates of the photos, or a CSV file with the columns file
+and period."""
 
 
 def matches(path: Path) -> bool:
     """Whether a folder has images in folders and a model, and is not clearly of WAT."""
-    images = path / "images"
-    if colmap_layout.find_model(path) is None or not colmap_layout.is_in_folders(images):
+    found = colmap_layout.find_model(path)
+    if found is None or not colmap_layout.is_in_folders(found[1]):
         return False
-    folders, _ = colmap_layout.scan(images)
+    if found[0] == path / nerfstudio.COLMAP and nerfstudio.matches(path):
+        return False  # a model that nerfstudio made its file from
+    folders, _ = colmap_layout.scan(found[1])
     # Where both formats put the folders in the same order, WAT wins; else one must be named.
     return not (wat.matches(path) and folders == sorted(folders, key=grouping.natural_key))
 
@@ -40,34 +49,65 @@ def read(path: Path, *, period_by: str = "folder") -> Scene:
         SceneError: If it is damaged, or images are not in folders.
         ConfigError: If ``period_by`` is not in `PERIOD_BY`.
     """
-    path = Path(path)
-    model = colmap_layout.read_images(path, path / "images")
-    names = [image.name for image in model.images]
+    return colmap_layout.read_scene(Path(path), partial(assign, period_by=period_by), NAME)
+
+
+def assign(images: Path, names: list[str], *, period_by: str = "folder") -> colmap_layout.Assigned:
+    """Periods by the names of the images, or otherwise.
+
+    Raises:
+        SceneError: If an image has no period.
+        ConfigError: If ``period_by`` is not in `PERIOD_BY`.
+    """
+    kind = period_by.partition(":")[0]
     if period_by.startswith(grouping.TABLE):
         grouped = grouping.group_by_table(names, Path(period_by.removeprefix(grouping.TABLE)))
     elif period_by == "folder":
-        labels = {name: _folder(path, name) for name in names}
+        labels = {name: _folder(images, name) for name in names}
         order = sorted(set(labels.values()), key=grouping.natural_key)
         grouped = grouping.group_labels(labels, order)
+    elif kind in {rule.partition(":")[0] for rule in DATES}:
+        grouped = grouping.group_dates(_dates(images, names), period_by)
     else:
         raise grouping.rule_error(period_by, PERIOD_BY)
-    tests, rule = read_tests(path, names, grouped[0])
-    return colmap_layout.make_scene(
-        path, path / "images", model, grouped, tests, rule=rule, format=NAME
-    )
+    return colmap_layout.Assigned(grouped)
 
 
-def _folder(path: Path, name: str) -> str:
+def _folder(images: Path, name: str) -> str:
     folder, slash, _ = name.partition("/")
     if not slash:
         raise SceneError(
-            path / "images",
+            images,
             expected="every image in a folder of its period",
             found=repr(name),
-            todo="name the periods with --period-by table:FILE (columns file and period), or "
-            "write sparse/split.txt as DATASET.md says",
+            todo=grouping.NAME_PERIODS,
         )
     return folder
+
+
+def _dates(images: Path, names: list[str]) -> dict[str, date]:
+    """The day on which each photo was taken."""
+    times = {name: taken_at(images / name, read_exif(images / name)) for name in names}
+    if lost := [name for name, time in times.items() if time is None]:
+        if missing := [name for name in lost if not (images / name).is_file()]:
+            raise SceneError(
+                images,
+                expected="a file of every image of the model",
+                found=f"none of {shown(missing)}",
+                todo="copy the photos there, or name the periods with --period-by table:FILE",
+            )
+        raise SceneError(
+            images,
+            expected="a date of every photo: EXIF DateTimeOriginal, or a file name that begins "
+            "with 2023-04-17 or 20230417",
+            found=f"none in {len(lost)} of {len(names)}: {shown(lost)}",
+            todo="name the periods of all photos with --period-by table:FILE, a CSV file with the "
+            "columns file and period",
+        )
+    return {name: time.date() for name, time in times.items() if time is not None}
+
+
+remarks = colmap_layout.remarks
 
 
 def write(

@@ -30,7 +30,7 @@ from chronoscene.scene import Scene
 from chronoscene.scene.splits import NameIndex, parse_test_text, read_text
 
 NAME = "neusc"
-MARKS = "dense/images/ and dense/sparse/"  # What `matches` looks for
+MARKS = "dense/images/ with dates in the names, and dense/sparse/"  # What `matches` looks for
 
 PERIOD_BY = ("year", "month", "day", "gap:DAYS", "count:N")
 """How dates become periods; by year unless told otherwise."""
@@ -43,7 +43,10 @@ LISTS = ("annots", "")
 
 def matches(path: Path) -> bool:
     """Whether a folder has an undistorted model below ``dense/``."""
-    return (path / "dense/images").is_dir() and colmap_layout.find_model(path / "dense") is not None
+    if colmap_layout.find_model(path / "dense") is None:
+        return False
+    _, images = colmap_layout.scan(path / "dense/images")
+    return any(re.match("[0-9]{4}-|none_", name, re.IGNORECASE) for name in images)
 
 
 def read(path: Path, *, period_by: str = "year") -> Scene:
@@ -54,7 +57,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
         ConfigError: If ``period_by`` is not in `PERIOD_BY`.
     """
     path = Path(path)
-    model = colmap_layout.read_images(path / "dense", path / "dense/images")
+    model, _ = colmap_layout.read_images(path / "dense")
     used = _used_names(path, model)
     dates = {name: when for name in used if (when := _date(path, name)) is not None}
     if not dates:
@@ -78,7 +81,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
 
 def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
-    model = colmap_layout.read_images(path / "dense", path / "dense/images")
+    model, _ = colmap_layout.read_images(path / "dense")
     left_out = len(model.images) - len([n for n in _used_names(path, model) if _date(path, n)])
     found = []
     if left_out:

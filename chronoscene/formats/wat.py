@@ -45,9 +45,8 @@ SCENES = (
 def matches(path: Path) -> bool:
     """Whether a folder has the name of a scene of WAT, and its layout."""
     name = path.resolve().name.lower().removesuffix("_resized")
-    if name not in SCENES or colmap_layout.find_model(path) is None:
-        return False
-    return colmap_layout.is_in_folders(path / "images")
+    found = colmap_layout.find_model(path) if name in SCENES else None
+    return found is not None and colmap_layout.is_in_folders(found[1])
 
 
 def read(path: Path) -> Scene:
@@ -56,31 +55,33 @@ def read(path: Path) -> Scene:
     Raises:
         SceneError: If it is damaged, or images are not in folders.
     """
-    path = Path(path)
-    model = colmap_layout.read_images(path, path / "images")
-    tasks = {image.name: _task(path, image.name) for image in model.images}
+    return colmap_layout.read_scene(Path(path), assign, NAME)
+
+
+def assign(images: Path, names: list[str]) -> colmap_layout.Assigned:
+    """Periods and test images by the names of the images.
+
+    Raises:
+        SceneError: If an image is in no folder.
+    """
+    tasks = {name: _task(images, name) for name in names}
     grouped = group_labels(tasks, list(dict.fromkeys(tasks[name] for name in sorted(tasks))))
-    return colmap_layout.make_scene(
-        path,
-        path / "images",
-        model,
-        grouped,
-        default_tests(grouped[0]),
-        rule=DEFAULT_RULE,
-        format=NAME,
-    )
+    return colmap_layout.Assigned(grouped, default_tests(grouped[0]), DEFAULT_RULE)
 
 
-def _task(path: Path, name: str) -> str:
+def _task(images: Path, name: str) -> str:
     folder, slash, _ = name.rpartition("/")
     if not slash:
         raise SceneError(
-            path / "images",
+            images,
             expected="every image in the folder of its task",
             found=repr(name),
-            todo="give the folder of one scene of WAT, or name its --format",
+            todo="if this is no scene of WAT, name its --dataset-format (colmap-folders, say)",
         )
     return folder
+
+
+remarks = colmap_layout.remarks
 
 
 def write(

@@ -97,6 +97,17 @@ def exif_of(image: Image.Image) -> ExifData:
         return ExifData()
 
 
+def taken_at(path: Path, exif: ExifData) -> datetime | None:
+    """When a photo was taken: from EXIF, else from a date at the start of its file name."""
+    if exif.date is not None:
+        return exif.date
+    found = re.match(r"((?:19|20)\d{2})[-_]?(\d{2})[-_]?(\d{2})(?!\d)", path.name, re.ASCII)
+    try:
+        return datetime(*map(int, found.groups())) if found else None  # type: ignore[arg-type]
+    except ValueError:
+        return None
+
+
 def _ifd(tags: Image.Exif, key: int) -> Mapping[int, Any]:
     try:
         return tags.get_ifd(key)

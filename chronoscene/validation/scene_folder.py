@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from chronoscene.colmap import raw_model
 from chronoscene.colmap.model import read_raw_model
-from chronoscene.colmap.raw_model import FORMS, MODEL_FILES, RawImages, RawModel, RawPoints
+from chronoscene.colmap.raw_model import RawImages, RawModel, RawPoints
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST
 from chronoscene.scene import Camera, splits
@@ -31,9 +31,6 @@ from chronoscene.validation.checks.observations import Observations, Reprojectio
 from chronoscene.validation.checks.pixels import Header, Pixels, Track
 
 T = TypeVar("T")
-
-MODEL_PLACES = (MODEL, "sparse", "colmap/sparse/0", "dense/sparse", "dense/0/sparse", "")
-"""Where a model is looked for; only the first place is right."""
 
 MAX_CELLS = 500_000_000
 """Largest table of points times periods, in bytes. Real scenes have a few percent of this."""
@@ -106,11 +103,8 @@ class RawScene:
     @cached_property
     def model_place(self) -> str | None:
         """Where the model is, relative to the scene folder; None if there is none."""
-        for place in MODEL_PLACES:
-            if any((self.root / place / f"{s}{e}").is_file() for s in MODEL_FILES for e in FORMS):
-                return place
-        numbered = raw_model.numbered_models(self.root)  # the first one may have been deleted
-        return f"sparse/{numbered[0].name}" if numbered else None
+        found = raw_model.find_model(self.root)
+        return found[0] if found else None
 
     @cached_property
     def model(self) -> RawModel | None:

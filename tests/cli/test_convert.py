@@ -47,7 +47,7 @@ def test_options_of_the_source(make_scene_folder, tmp_path):
     (folder / "sparse/split.txt").unlink()
     table = tmp_path / "periods.csv"
     table.write_text("file,period\na.png,2016\nb.png,2023\n")
-    options = ["--format", "colmap-folders", "--period-by", f"table:{table}"]
+    options = ["--dataset-format", "colmap-folders", "--period-by", f"table:{table}"]
     result = run(folder, tmp_path / "out", *options)
     assert "  period 1 (2023): 0 train, 1 test" in result.stdout
     assert [p.date for p in read_scene(tmp_path / "out").periods] == ["2016", "2023"]

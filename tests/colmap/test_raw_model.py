@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.colmap.model import read_model, read_raw_model, read_reconstruction
-from chronoscene.colmap.raw_model import model_files
+from chronoscene.colmap.raw_model import MODEL_FILES, find_model, model_files
 from chronoscene.colmap.text import read_points, read_rigs
 from chronoscene.scene.geometry import rotation_from_quaternion
 
@@ -110,3 +110,25 @@ def test_unreadable_file_is_a_damage(make_scene_folder, target, monkeypatch):
     monkeypatch.setattr(Path, "read_bytes", refuse)
     raw = read_raw_model(make_scene_folder(form="text") / "sparse" / "0")
     assert [(d.file, d.found) for d in raw.damages] == [(f"{target}.txt", "Permission denied")]
+
+
+def test_where_a_model_is(tmp_path):
+    def model(place, stems=MODEL_FILES):
+        (tmp_path / place).mkdir(parents=True, exist_ok=True)
+        for stem in stems:
+            (tmp_path / place / f"{stem}.bin").touch()
+
+    model("2016")  # of a year, not the 2016th model of this project
+    model("", ["images"])  # perhaps a list of images
+    assert find_model(tmp_path) is None
+    model("")
+    assert find_model(tmp_path) == ("", "images")
+    model("distorted/sparse/0")
+    assert find_model(tmp_path) == ("distorted/sparse/0", "images")
+    (tmp_path / "input").mkdir()
+    assert find_model(tmp_path) == ("distorted/sparse/0", "input")
+    model("sparse", ["images"])
+    assert find_model(tmp_path) == ("sparse", "images")
+    model("sparse/10")
+    model("sparse/2")
+    assert find_model(tmp_path) == ("sparse/2", "images")

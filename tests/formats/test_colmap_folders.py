@@ -1,13 +1,16 @@
 """Plain COLMAP, one folder of images per period."""
 
 import dataclasses
+import shutil
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
+from chronoscene.convert import remarks_on
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats import colmap_folders, detect_format, read_scene
+from chronoscene.formats import colmap_folders, detect_format, find_scenes, read_scene
 from chronoscene.formats.shared.colmap_layout import period_folders
 from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.scene import Period
@@ -80,16 +83,20 @@ def test_tables_that_are_refused(colmap_folder, tmp_path, text, message):
 
 
 def test_unknown_grouping_names_those_that_there_are(colmap_folder):
-    with pytest.raises(ConfigError, match="one of folder, table:FILE, found 'year'"):
-        read_scene(colmap_folder(DATED), period_by="year")
+    with pytest.raises(ConfigError, match=r"one of folder, year, .*, table:FILE, found 'decade'"):
+        read_scene(colmap_folder(DATED), period_by="decade")
 
 
 def test_no_model_and_no_images(colmap_folder):
     folder = colmap_folder(DATED)
     (folder / "images").rename(folder / "photos")
-    with pytest.raises(SceneError, match="no folder of images"):
+    with pytest.raises(SceneError, match="found no folder images/"):
         read_scene(folder, format="colmap-folders")
+    (folder / "photos").rename(folder / "images")
     (folder / "sparse/0/points3D.bin").unlink()
+    with pytest.raises(SceneError, match=r"expected a COLMAP model: .*, found cameras.bin, fr"):
+        read_scene(folder, format="colmap-folders")
+    shutil.rmtree(folder / "sparse/0")
     with pytest.raises(SceneError, match="found no model"):
         read_scene(folder, format="colmap-folders")
 
@@ -165,9 +172,7 @@ def test_folders_that_differ_in_zeros_have_one_order(colmap_folder):
 
 def test_images_without_periods_are_refused_with_the_way_out(colmap_folder):
     folder = colmap_folder(["a.png", "b.png"])
-    with pytest.raises(
-        SceneError, match=r"sparse/split\.txt, or convert the folder with --format colmap-f"
-    ):
+    with pytest.raises(SceneError, match=r"--period-by year, month or day .* sparse/split\.txt"):
         read_scene(folder)
 
 
@@ -185,3 +190,123 @@ def test_lines_of_a_table_are_counted_as_an_editor_does(tmp_path):
         (f"{tmp_path}/t.csv:5", "a.png", "2016"),
         (f"{tmp_path}/t.csv:7", "b.png", "2017"),
     ]
+
+
+def move_model(folder, place, images="images"):
+    """Put the model of a folder, and perhaps its images, where another program leaves them."""
+    (folder / place).parent.mkdir(parents=True, exist_ok=True)
+    (folder / "sparse/0").rename(folder / place)
+    if not any((folder / "sparse").iterdir()):
+        (folder / "sparse").rmdir()
+    (folder / images).parent.mkdir(parents=True, exist_ok=True)
+    (folder / "images").rename(folder / images)
+
+
+@pytest.mark.parametrize(
+    ("place", "images"),
+    [
+        ("sparse/1", "images"),
+        ("colmap/sparse/0", "images"),
+        ("distorted/sparse/0", "input"),
+        ("distorted/sparse/0", "images"),
+        ("dense/sparse", "dense/images"),
+        ("dense/0/sparse", "dense/0/images"),
+        ("reconstruction", "images"),
+        ("reconstruction/0", "images"),
+        ("sfm", "images"),
+    ],
+)
+def test_models_are_found_where_programs_leave_them(colmap_folder, place, images):
+    folder = colmap_folder(DATED)
+    old = read_scene(folder)
+    assert remarks_on(old) == []
+    move_model(folder, place, images)
+    scene = read_scene(folder)
+    assert scene.format == "colmap-folders" and scene.periods == old.periods
+    assert scene.image_path(scene.frames[0]).is_file()
+    assert remarks_on(scene) == [f"the model is read from {place}, the images from {images}"]
+    assert find_scenes(folder.parent) == [folder]
+
+
+def test_the_usual_place_wins(colmap_folder):
+    folder = colmap_folder(DATED)
+    for place in ("distorted/sparse/0", "dense/sparse"):
+        shutil.copytree(folder / "sparse/0", folder / place)
+    (folder / "sparse/0/points3D.bin").unlink()
+    with pytest.raises(SceneError, match=r"sparse/0: expected a COLMAP model: cameras, images and"):
+        read_scene(folder)  # and is not replaced in silence by another model
+
+
+def test_a_model_of_nerfstudio_is_not_read_in_its_stead(nerfstudio_folder, colmap_folder):
+    folder = nerfstudio_folder(DATED)
+    shutil.copytree(colmap_folder(DATED) / "sparse", folder / "colmap/sparse")
+    assert detect_format(folder) == "nerfstudio"
+    assert read_scene(folder, format="colmap-folders").num_periods == 2
+
+
+def test_projects_are_named_where_a_part_of_one_is_given(colmap_folder):
+    folder = colmap_folder(DATED)
+    for part in ("sparse/0", "sparse", "images/2016"):
+        with pytest.raises(SceneError, match=f"; give the folder of the whole project, {folder}$"):
+            read_scene(folder / part)
+
+
+def test_a_model_where_nobody_looks_is_named(colmap_folder):
+    folder = colmap_folder(DATED)
+    move_model(folder, "out/model")
+    with pytest.raises(SceneError, match=r"; copy the COLMAP model in out/model to sparse/0$"):
+        read_scene(folder)
+    (folder / "sparse").mkdir()
+    (folder / "out/model").rename(folder / "sparse/0")
+    (folder / "images").rename(folder / "photos")
+    todo = r"; copy the images of the COLMAP model in sparse/0 to images/ in this folder$"
+    with pytest.raises(SceneError, match=todo):
+        read_scene(folder)
+
+
+def dated_folder(colmap_folder, dates):
+    """A project with photos of these dates, None for none, directly in ``images/``."""
+    names = [f"{i}.jpg" for i in range(len(dates))]
+    folder = colmap_folder(names)
+    for name, taken in zip(names, dates, strict=True):
+        exif = Image.Exif()
+        if taken:
+            exif.get_ifd(0x8769)[0x9003] = f"{taken} 12:00:00"
+            exif[0x8769] = 0
+        Image.new("RGB", (64, 48)).save(folder / "images" / name, exif=exif)
+    return folder
+
+
+DAYS = ["2016:05:03", "2016:05:04", "2016:09:01", "2023:04:17"]
+
+
+@pytest.mark.parametrize(
+    ("by", "periods", "labels"),
+    [
+        ("year", [0, 0, 0, 1], ["2016", "2023"]),
+        ("month", [0, 0, 1, 2], ["2016-05", "2016-09", "2023-04"]),
+        ("day", [0, 1, 2, 3], ["2016-05-03", "2016-05-04", "2016-09-01", "2023-04-17"]),
+        ("count:2", [0, 0, 0, 1], ["2016-05-03 to 2016-09-01", "2023-04-17"]),
+    ],
+)
+def test_periods_from_the_dates_of_photos(colmap_folder, by, periods, labels):
+    folder = dated_folder(colmap_folder, DAYS)
+    scene = read_scene(folder, period_by=by)
+    assert [f.period for f in scene.frames] == periods
+    assert [p.label for p in scene.periods] == labels
+    assert find_scenes(folder.parent, period_by=by) == [folder]
+
+
+def test_dates_in_file_names_count_too(colmap_folder):
+    scene = read_scene(colmap_folder(["a/20160503_1.png", "a/2023-04-17.png"]), period_by="year")
+    assert [p.label for p in scene.periods] == ["2016", "2023"]
+
+
+def test_photos_without_a_date_are_named(colmap_folder):
+    folder = dated_folder(colmap_folder, [*DAYS, None, None, None, None])
+    found = r"found none in 4 of 8: '4.jpg', '5.jpg', '6.jpg' and 1 more; .*--period-by table:FILE"
+    with pytest.raises(SceneError, match=found):
+        read_scene(folder, period_by="year")
+    (folder / "images/5.jpg").unlink()
+    with pytest.raises(SceneError, match=r"expected a file of every image.*none of '5.jpg'; copy"):
+        read_scene(folder, period_by="year")

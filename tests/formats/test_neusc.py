@@ -114,3 +114,10 @@ def test_names_without_a_date_are_refused(pointz, name):
 def test_lists_that_leave_nothing(pointz):
     with pytest.raises(SceneError, match=r"none after train\.txt and trash\.txt"):
         read_scene(pointz(NAMES, train=["17", "18"]))
+
+
+def test_other_undistorted_models_are_not_of_this_format(pointz):
+    folder = pointz(["a.png", "b.png"])
+    assert not neusc.matches(folder)
+    (folder / "dense/images/a.png").rename(folder / "dense/images/none_a.png")
+    assert neusc.matches(folder)

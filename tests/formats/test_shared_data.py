@@ -73,9 +73,9 @@ def test_images_without_poses_are_refused(shared_data, name):
 @pytest.mark.parametrize("name", BARE_MODELS)
 def test_bare_models_are_refused_with_what_to_do(shared_data, name):
     folder = shared_data / "colmap_models" / name
-    with pytest.raises(SceneError, match="move this COLMAP model to sparse/0 in a folder with im"):
+    with pytest.raises(SceneError, match="copy the images of the COLMAP model here to images/"):
         detect_format(folder)
-    with pytest.raises(SceneError, match="expected images/ and a COLMAP model in sparse/0 or sp"):
+    with pytest.raises(SceneError, match=r"expected images/ and a COLMAP model.* no folder im"):
         read_scene(folder, format="colmap-folders")
 
 

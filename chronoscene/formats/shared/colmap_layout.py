@@ -9,14 +9,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from chronoscene.colmap import raw_model
 from chronoscene.colmap.model import Model, read_model, write_model
-from chronoscene.colmap.raw_model import model_kind
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared.grouping import Grouped, label_date, natural_key
@@ -25,14 +25,24 @@ from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Period, Scene, WorldFrame
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
-MODELS = ("sparse/0", "sparse")  # Where models are looked for, in this order
+USUAL = ("sparse/0", "sparse")  # Where everybody looks for a model
 
 
-def find_model(path: Path) -> Path | None:
-    """Folder of the model of a scene that is not in the ChronoScene format."""
-    if (path / our_format.SPLIT).exists():
-        return None
-    return next((path / m for m in MODELS if model_kind(path / m) is not None), None)
+@dataclass(frozen=True, slots=True)
+class Assigned:
+    """What a format knows of the images of a model by their names."""
+
+    grouped: Grouped
+    tests: set[str] | None = None
+    """None where they are those of the ChronoScene format: a list in a file, or the default."""
+    rule: str = ""
+    """The rule that chose ``tests``, in words."""
+
+
+def find_model(path: Path) -> tuple[Path, Path] | None:
+    """Folders of the model and the images of a scene that is not in the ChronoScene format."""
+    found = None if (path / our_format.SPLIT).exists() else raw_model.find_model(path)
+    return None if found is None else (path / found[0], path / found[1])
 
 
 def scan(folder: Path) -> tuple[list[str], list[str]]:
@@ -59,20 +69,42 @@ def is_in_folders(images: Path) -> bool:
     return bool(folders) and not files
 
 
-def read_images(path: Path, images: Path) -> Model:
-    """Read and check the model of a scene.
+def read_scene(path: Path, assign: Callable[[Path, list[str]], Assigned], format: str) -> Scene:
+    """Read a scene whose periods follow from the names of its images.
+
+    Args:
+        path: Folder of the scene.
+        assign: Periods and tests of the images with these names, which are in this folder.
+        format: Name of the format.
+
+    Raises:
+        SceneError: If the model is missing or damaged.
+    """
+    model, images = read_images(path)
+    names = [image.name for image in model.images]
+    assigned = assign(images, names)
+    tests, rule = assigned.tests, assigned.rule
+    if tests is None:
+        tests, rule = our_format.read_tests(path, names, assigned.grouped[0])
+    return make_scene(path, images, model, assigned.grouped, tests, rule=rule, format=format)
+
+
+def read_images(path: Path) -> tuple[Model, Path]:
+    """Read and check the model of a scene; also the folder of its images.
 
     Raises:
         SceneError: If it is missing or empty, or has an unusable name, pose or camera.
     """
-    folder = find_model(path)
-    if folder is None or not images.is_dir():
+    found = find_model(path)
+    if found is None or not found[1].is_dir():
+        images = "images" if found is None else found[1].relative_to(path).as_posix()
         raise SceneError(
             path,
-            expected=f"{images.relative_to(path)}/ and a COLMAP model in {' or '.join(MODELS)}",
-            found="no model" if folder is None else "no folder of images",
-            todo="copy the missing folder there",
+            expected=f"{images}/ and a COLMAP model, in {USUAL[0]} for example",
+            found="no model" if found is None else f"no folder {images}/",
+            todo="copy what is missing there",
         )
+    folder, images_root = found
     model = read_model(folder)
     if not model.images:
         raise SceneError(
@@ -80,7 +112,15 @@ def read_images(path: Path, images: Path) -> Model:
         )
     for image in model.images:
         our_format.check_image(folder, image)
-    return model
+    return model, images_root
+
+
+def remarks(path: Path) -> list[str]:
+    """Where the model is that is read, if not where it would be looked for."""
+    found = raw_model.find_model(path)
+    if found is None or found[0] in USUAL:
+        return []
+    return [f"the model is read from {found[0] or 'the folder itself'}, the images from {found[1]}"]
 
 
 def keep_images(model: Model, names: Collection[str]) -> Model:

@@ -27,6 +27,12 @@ OPTION = "--period-by"
 
 TABLE = "table:"
 
+NAME_PERIODS = (
+    "name the periods: --period-by year, month or day (dates of the photos), or --period-by "
+    "table:FILE (a CSV file with the columns file and period)"
+)
+"""What to do about a COLMAP project that says nothing of periods."""
+
 _CALENDAR = {"year": 4, "month": 7, "day": 10}
 """Characters of an ISO date that images of one period share."""
 

@@ -16,9 +16,9 @@ from pathlib import Path, PurePosixPath
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.formats.shared.json_values import is_iso_date
-from chronoscene.images.exif import read_exif
+from chronoscene.images.exif import read_exif, taken_at
 from chronoscene.kernels.runtime import available_threads
-from chronoscene.registration.photos.photo import Capture, open_photo, taken_at
+from chronoscene.registration.photos.photo import Capture, open_photo
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 PERIOD_GAP_DAYS = 14  # In one folder of photos, a gap of so many days begins a new period

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from chronoscene.images.exif import ExifData, read_exif
+from chronoscene.images.exif import ExifData, read_exif, taken_at
 
 GPS_SIGMA = (5.0, 5.0, 10.0)
 """Metres east, north, up, if the photo states none: a consumer receiver under open sky."""
@@ -104,14 +104,3 @@ def _position(exif: ExifData) -> Gps | None:
             # Stated deviations are of the antenna at the fix, not at the shutter: at least 2 cm.
             sigma = (max(east, 0.02), max(north, 0.02), max(up, 0.03))
     return Gps(exif.latitude, exif.longitude, exif.altitude, relative, sigma)
-
-
-def taken_at(path: Path, exif: ExifData) -> datetime | None:
-    """When a photo was taken: from EXIF, else from a date at the start of its file name."""
-    if exif.date is not None:
-        return exif.date
-    found = re.match(r"((?:19|20)\d{2})[-_]?(\d{2})[-_]?(\d{2})(?!\d)", path.name, re.ASCII)
-    try:
-        return datetime(*map(int, found.groups())) if found else None  # type: ignore[arg-type]
-    except ValueError:
-        return None

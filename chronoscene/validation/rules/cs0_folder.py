@@ -53,7 +53,7 @@ def model_misplaced(scene: RawScene) -> Iterator[Hit]:
 def several_models(scene: RawScene) -> Iterator[Hit]:
     """COLMAP built several models that it could not merge; only `sparse/0/` is read."""
     place = scene.model_place
-    numbered = (f"sparse/{folder.name}" for folder in numbered_models(scene.root))
+    numbered = (f"sparse/{folder.name}" for folder in numbered_models(scene.root / "sparse"))
     others = [name for name in numbered if name not in (place, our_format.MODEL)]
     if others:
         yield Hit("sparse", f"a single model, {place}", f"also {shown(others)}", count=len(others))
