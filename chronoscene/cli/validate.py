@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from chronoscene.cli.convert import reading_options
 from chronoscene.cli.output import check_file, check_place, emit
 from chronoscene.cli.progress import tracked
 from chronoscene.io.processes import map_parallel
@@ -21,7 +22,7 @@ from chronoscene.validation.report.rule_list import describe_rule
 from chronoscene.validation.report.text import write_text
 from chronoscene.validation.rule import SceneReport, is_valid
 from chronoscene.validation.rules import choose_rules
-from chronoscene.validation.run import find_folders, lost_report, validate_scene
+from chronoscene.validation.run import Reading, find_folders, lost_report, validate_scene
 from chronoscene.validation.scene_folder import Track, no_progress
 
 WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
@@ -84,10 +85,13 @@ def _explain(context: click.Context, option: click.Parameter, value: str | None)
     metavar="OUT",
     help="Write a corrected copy to this new folder and report what remains.",
 )
+@reading_options("the scenes")
 @click.pass_context
 def command(
     context: click.Context,
     folder: Path,
+    dataset_format: str | None,
+    period_by: str | None,
     output_format: str,
     out: Path | None,
     sarif: Path | None,
@@ -106,7 +110,8 @@ def command(
     Exit status: 0 if the scene is valid, 1 if there are errors (with --strict, also warnings), 2 if
     there is no scene or the command is used wrongly.
     """
-    check = partial(_check, _codes(select), _codes(ignore), decode)
+    reading = Reading(dataset_format, period_by)
+    check = partial(_check, _codes(select), _codes(ignore), decode, reading)
     choose_rules(_codes(select), _codes(ignore))  # whatever is wrong with them is said first
     folders = find_folders(folder)
     for option, file in (("--out", out), ("--sarif", sarif), ("--html", html)):
@@ -116,7 +121,7 @@ def command(
     if fix is not None:
         check_outside(fix, folders, option="--fix")
         check_place("--fix", fix)
-        folders = _fix(folder, folders, fix)
+        folders = _fix(folder, folders, fix, reading)
     if len(folders) == 1:
         reports = [check(folders[0], track=tracked)]
     else:
@@ -131,20 +136,26 @@ def command(
 
 
 def _check(
-    select: list[str], ignore: list[str], decode: bool, path: Path, *, track: Track = no_progress
+    select: list[str],
+    ignore: list[str],
+    decode: bool,
+    reading: Reading,
+    path: Path,
+    *,
+    track: Track = no_progress,
 ) -> SceneReport:
     """One scene, perhaps in a process of its own, which is given names of rules, not rules."""
     keep_freed_memory()  # arrays as large as the model come and go
     rules = choose_rules(select, ignore)
-    return validate_scene(path, rules=rules, decode=decode, track=track)
+    return validate_scene(path, rules=rules, decode=decode, track=track, reading=reading)
 
 
-def _fix(folder: Path, scenes: Sequence[Path], out: Path) -> list[Path]:
+def _fix(folder: Path, scenes: Sequence[Path], out: Path, reading: Reading) -> list[Path]:
     """Corrected copies of the scenes; what was done goes to standard error."""
     copies = []
     for scene in scenes:
         copy = out if scene == folder else out / scene.name
-        repairs = fix_scene(scene, copy)
+        repairs = fix_scene(scene, copy, reading)
         click.echo(printable(f"{copy}: {counted(len(repairs), 'correction')}"), err=True)
         for repair in repairs:
             click.echo(printable(f"  {repair.code or 'also'}: {repair.text}"), err=True)

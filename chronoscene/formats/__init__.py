@@ -177,17 +177,26 @@ def read_scene(
     """
     path = Path(path)
     name = format if format is not None else detect_format(path, period_by=period_by)
-    module = load_format(name)
-    if period_by is not None and not hasattr(module, "PERIOD_BY"):
+    scene: Scene = load_format(name).read(path, **period_options(name, period_by))
+    return scene
+
+
+def period_options(name: str, period_by: str | None) -> dict[str, str]:
+    """Arguments of ``read`` and ``assign`` of a format.
+
+    Raises:
+        ConfigError: If the format leaves no choice of periods.
+    """
+    if period_by is None:
+        return {}
+    if not hasattr(load_format(name), "PERIOD_BY"):
         raise ConfigError(
             "--period-by",
             expected=f"no such option for {name}, which defines its own periods",
             found=repr(period_by),
             todo="leave it out, or name another --dataset-format",
         )
-    options = {} if period_by is None else {"period_by": period_by}
-    scene: Scene = module.read(path, **options)
-    return scene
+    return {"period_by": period_by}
 
 
 def writable_formats() -> tuple[str, ...]:

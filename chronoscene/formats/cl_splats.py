@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from chronoscene.errors import SceneError
@@ -68,13 +69,17 @@ def read(path: Path, *, period_by: str = "step") -> Scene:
     path = Path(path)
     if (path / TRAIN).exists():
         return _read_level(path, period_by)
+    return colmap_layout.read_scene(path, partial(assign, period_by=period_by), NAME)
+
+
+def assign(images: Path, names: list[str], *, period_by: str = "step") -> colmap_layout.Assigned:
+    """Periods and test images of a real scene by the names of the images.
+
+    Raises:
+        ConfigError: If ``period_by`` is not ``step``.
+    """
     if period_by != "step":
         raise rule_error(period_by, ["step"])
-    return colmap_layout.read_scene(path, assign, NAME)
-
-
-def assign(images: Path, names: list[str]) -> colmap_layout.Assigned:
-    """Periods and test images of a real scene by the names of the images."""
     steps = {name: _step(name) for name in names}
     order = sorted(set(steps.values()), key=natural_key)
     rule = f"every {TEST_EVERY}th image of all in name order (index 0, {TEST_EVERY}, ...)"

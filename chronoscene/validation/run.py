@@ -7,16 +7,18 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from chronoscene import formats
-from chronoscene.colmap.raw_model import model_files
+from chronoscene.colmap.raw_model import find_model, model_files
 from chronoscene.convert import remarks_on
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import chronoscene as our_format
+from chronoscene.formats import load_format
 from chronoscene.images.store import place_image
 from chronoscene.io.wording import printable
 from chronoscene.validation.checks.reprojection import period_errors
@@ -32,10 +34,26 @@ from chronoscene.validation.rule import (
 )
 from chronoscene.validation.rules import all_rules
 from chronoscene.validation.rules.cs0_folder import RULES_ON_ORIGINS
+from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE
 from chronoscene.validation.scene_folder import Origin, RawScene, Track, no_progress
 
 RULE_FAILED = "CS000"
 """Code of the finding that a rule itself failed: a bug of ours, reported as such."""
+
+RELEASED_CODE = "CS7"  # Codes of the rules on what the released ChronoGS code reads
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What a user says of the scenes: how to read them."""
+
+    format: str | None = None
+    """Name of the format; None to find out."""
+    period_by: str | None = None
+    """How images are grouped into periods, where the format leaves a choice."""
+
+
+AS_DETECTED = Reading()
 
 UNKNOWN = Summary(None, None, None, None, 0, ())
 
@@ -76,40 +94,56 @@ def _looks_like_scene(path: Path) -> bool:
     return ours or other_format(path) is not None
 
 
-def other_format(path: Path) -> str | None:
-    """The format of a folder that is certainly not in the ChronoScene format, else None.
+def other_format(path: Path, reading: Reading = AS_DETECTED) -> str | None:
+    """The format of a folder that is not in the ChronoScene format, not even with faults.
 
-    A model in ``sparse/0/`` without ``split.txt`` counts as a faulty ChronoScene folder: its images
-    may be in subfolders for other reasons than periods.
+    A ``split.txt`` in a wrong place says that it is meant to be.
     """
-    if our_format.matches(path) or model_files(path / our_format.MODEL):
+    if reading.format is not None:
+        return None if reading.format == our_format.NAME else reading.format
+    if our_format.matches(path) or any((path / place).is_file() for place in SPLIT_ELSEWHERE):
         return None
     try:
-        return formats.detect_format(path)
+        return formats.detect_format(path, period_by=reading.period_by)
     except (ChronoSceneError, OSError):
         return None
 
 
+def is_project(path: Path, format: str) -> bool:
+    """Whether a folder of another format is a COLMAP project that can be checked where it is."""
+    found = find_model(path)
+    return found is not None and found[1] == "images" and hasattr(load_format(format), "assign")
+
+
+def _project(scene: RawScene, format: str, reading: Reading) -> Origin:
+    """A COLMAP project, with its periods as its format sees them."""
+    module = load_format(format)
+    read = partial(formats.read_scene, scene.root, format=format, period_by=reading.period_by)
+    options = formats.period_options(format, reading.period_by)
+    remarks = tuple(module.remarks(scene.root))
+    try:
+        assigned = module.assign(scene.root / "images", scene.names, **options)
+    except SceneError as error:
+        return Origin(format, error, remarks, read)
+    return Origin(format, None, remarks, read, assigned if scene.names else None)
+
+
 @contextmanager
-def in_our_format(path: Path) -> Iterator[tuple[Path, Origin | None]]:
-    """The folder itself, or a temporary ChronoScene folder of the same scene and its origin."""
-    name = other_format(path)
-    if name is None:
-        yield path, None
-        return
+def in_our_format(path: Path, format: str, reading: Reading) -> Iterator[tuple[Path, Origin]]:
+    """A temporary ChronoScene folder of the scene, or its own one if it cannot be read."""
     with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
         ours = Path(temporary) / "scene"
         try:
-            scene = formats.read_scene(path, format=name)
+            scene = formats.read_scene(path, format=format, period_by=reading.period_by)
             our_format.write(scene, ours, image_source="none")
             (ours / "images").mkdir(exist_ok=True)
             for frame in scene.frames:
                 source = scene.image_path(frame)
                 if source.is_file():
                     place_image(source, ours / "images" / frame.name, "symlink")
-            origin = Origin(name, remarks=tuple(remarks_on(scene)))
-        except ChronoSceneError as error:
-            origin = Origin(name, error)
+            origin = Origin(format, remarks=tuple(remarks_on(scene)))
+        except SceneError as error:
+            origin = Origin(format, error)
         yield path if origin.error else ours, origin
 
 
@@ -119,23 +153,35 @@ def validate_scene(
     rules: Sequence[Rule] | None = None,
     decode: bool = False,
     track: Track = no_progress,
+    reading: Reading = AS_DETECTED,
 ) -> SceneReport:
     """Run rules on one scene folder. Reads only; never raises for what is in the folder.
 
-    A scene in another format is checked as `chronoscene convert` would write it.
+    A COLMAP project is checked where it is, a scene in another format as `chronoscene convert`
+    would write it.
 
     Args:
         path: The scene folder.
         rules: Rules to run (see `chronoscene.validation.rules.choose_rules`); None for all.
         decode: Whether to decode all images: slower, finds damaged pixels and copied images.
         track: Shows the progress of slow parts.
+        reading: What the user says of the format and the periods.
+
+    Raises:
+        ConfigError: If the format has no such periods.
     """
-    with quiet_numbers(), in_our_format(Path(path)) as (root, origin):
-        scene = RawScene(root, decode=decode, track=track, origin=origin)
-        report = _validate(scene, all_rules() if rules is None else rules)
-    if origin is None:
-        return report
-    return replace(report, name=printable(Path(path).resolve().name), path=Path(path))
+    path = Path(path)
+    chosen = all_rules() if rules is None else rules
+    name = other_format(path, reading)
+    with quiet_numbers():
+        if name is None or is_project(path, name):
+            scene = RawScene(path, decode=decode, track=track)
+            scene.origin = None if name is None else _project(scene, name, reading)
+            return _validate(scene, chosen)
+        with in_our_format(path, name, reading) as (root, origin):
+            scene = RawScene(root, decode=decode, track=track, origin=origin)
+            report = _validate(scene, chosen)
+    return replace(report, name=printable(path.resolve().name), path=path)
 
 
 @contextmanager
@@ -174,7 +220,10 @@ def _validate(scene: RawScene, rules: Sequence[Rule]) -> SceneReport:
 
 def _reason_to_skip(rule: Rule, scene: RawScene, findings: Sequence[Finding]) -> str | None:
     origin = scene.origin
-    if origin is not None and origin.error is not None and rule.code not in RULES_ON_ORIGINS:
+    if origin is not None and origin.is_project:
+        if rule.code.startswith(RELEASED_CODE):
+            return f"the released code does not read {origin.format}"
+    elif origin is not None and origin.error and rule.code not in RULES_ON_ORIGINS:
         return f"the folder cannot be read as {origin.format}"
     for attribute in rule.needs:
         if getattr(scene, attribute) is None:

@@ -20,8 +20,9 @@ from chronoscene.colmap import raw_model
 from chronoscene.colmap.model import read_raw_model
 from chronoscene.colmap.raw_model import RawImages, RawModel, RawPoints
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST
-from chronoscene.scene import Camera, splits
+from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, read_periods
+from chronoscene.formats.shared.colmap_layout import Assigned
+from chronoscene.scene import Camera, Period, Scene, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.splits import NameEntry, Problem, SplitEntry
 from chronoscene.scene.tracks import seen_by_period
@@ -67,14 +68,22 @@ class TextFile:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """The format that a scene was converted from."""
+    """The format of a scene that is not in ours: converted from it, or a COLMAP project."""
 
     format: str
     """Name in `chronoscene.formats`."""
     error: ChronoSceneError | None = None
-    """Why the scene cannot be read; then there is nothing to check."""
+    """Why the scene, or of a project the periods, cannot be read."""
     remarks: tuple[str, ...] = ()
     """What the conversion leaves out."""
+    read: Callable[[], Scene] | None = None
+    """Reader of a COLMAP project, which is checked where it is; None for a converted scene."""
+    assigned: Assigned | None = None
+    """Periods and tests of a COLMAP project."""
+
+    @property
+    def is_project(self) -> bool:
+        return self.read is not None
 
 
 @dataclass(eq=False)
@@ -92,7 +101,33 @@ class RawScene:
 
     def reason(self, attribute: str) -> str:
         """Why an attribute is None."""
+        if self.is_project and attribute in ("split", "split_text"):
+            return f"{SPLIT} is no part of a COLMAP project"
         return _REASONS[attribute]
+
+    @property
+    def is_project(self) -> bool:
+        """Whether this is a COLMAP project without ``split.txt``."""
+        return self.origin is not None and self.origin.is_project
+
+    @property
+    def _by_format(self) -> Assigned | None:
+        return self.origin.assigned if self.origin is not None else None
+
+    @property
+    def period_place(self) -> str:
+        """Where the periods of the images stand."""
+        return "images" if self.is_project else SPLIT
+
+    def period_table(self) -> tuple[Period, ...]:
+        """Labels and dates of the periods.
+
+        Raises:
+            ChronoSceneError: If the file that has them is invalid.
+        """
+        if self._by_format is not None:
+            return self._by_format.grouped[1]
+        return read_periods(self.root, len(self.period_ids))
 
     @cached_property
     def name(self) -> str:
@@ -176,7 +211,7 @@ class RawScene:
 
     @cached_property
     def split_text(self) -> TextFile | None:
-        return read_text_file(self.root / SPLIT)
+        return None if self.is_project else read_text_file(self.root / SPLIT)
 
     @cached_property
     def _parsed_split(self) -> tuple[list[SplitEntry], list[Problem]]:
@@ -194,6 +229,8 @@ class RawScene:
 
     @cached_property
     def _assigned(self) -> tuple[dict[str, int], list[Problem]]:
+        if self._by_format is not None:
+            return self._by_format.grouped[0], []
         return splits.assign_periods(self.names, self.split or [])
 
     @property
@@ -205,13 +242,18 @@ class RawScene:
     @property
     def periods(self) -> dict[str, int] | None:
         """Period by image name, for the images that have exactly one."""
-        if self.split is None or self.images is None:
+        if self.images is None or (self.split is None and self._by_format is None):
             return None
         return self._assigned[0]
 
     @cached_property
     def test_text(self) -> TextFile | None:
-        return read_text_file(self.root / TEST)
+        return None if self.has_own_tests else read_text_file(self.root / TEST)
+
+    @property
+    def has_own_tests(self) -> bool:
+        """Whether the format decides by itself what test images are."""
+        return self._by_format is not None and self._by_format.tests is not None
 
     @cached_property
     def test(self) -> list[NameEntry] | None:
@@ -231,6 +273,8 @@ class RawScene:
         """Names of the test images, by ``test.txt`` or the default split."""
         if self.periods is None:
             return None
+        if self._by_format is not None and self._by_format.tests is not None:
+            return self._by_format.tests
         if self.test is not None:
             return self._tested[0]
         return None if os.path.lexists(self.root / TEST) else splits.default_tests(self.periods)

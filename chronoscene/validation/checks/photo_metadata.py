@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats.chronoscene import read_periods
 from chronoscene.geodesy import Georeference, median_longitude
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import SIGMA, Similarity, fit_robustly
@@ -63,12 +62,12 @@ def of_other_period(scene: RawScene) -> dict[str, tuple[datetime, datetime, int]
 
 @derived
 def stated_dates(scene: RawScene) -> dict[int, str]:
-    """Dates in ``periods.json`` by period; none if the file is invalid, which has its own rule."""
+    """Dates of the periods in ``periods.json``; none if it is invalid, which has its own rule."""
     ids = scene.period_ids
     if ids != list(range(len(ids))):
         return {}
     try:
-        periods = read_periods(scene.root, len(ids))
+        periods = scene.period_table()
     except ChronoSceneError:
         return {}
     return {period.id: period.date for period in periods if period.date is not None}

@@ -23,16 +23,17 @@ from chronoscene.validation.repair import contents
 from chronoscene.validation.repair.contents import Repair
 from chronoscene.validation.rules.cs2_image_files import images_of_other_shape
 from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE, TEST_ELSEWHERE
-from chronoscene.validation.run import other_format, quiet_numbers
+from chronoscene.validation.run import AS_DETECTED, Reading, is_project, other_format, quiet_numbers
 from chronoscene.validation.scene_folder import RawScene, TextFile, read_text_file
 
 
-def fix_scene(root: Path, out: Path) -> list[Repair]:
+def fix_scene(root: Path, out: Path, reading: Reading = AS_DETECTED) -> list[Repair]:
     """Write a corrected copy; the folder appears complete or not at all.
 
     Args:
         root: The scene.
         out: Folder that does not exist yet, or is empty, and is not inside the scene.
+        reading: What the user says of the format.
 
     Returns:
         The corrections.
@@ -42,11 +43,11 @@ def fix_scene(root: Path, out: Path) -> list[Repair]:
         SceneError: If ``out`` is in use or cannot be written.
     """
     check_outside(out, [root], option="--fix")
-    name = other_format(root)
-    if name is not None:
+    name = other_format(root, reading)
+    if name is not None and not is_project(root, name):
         raise ConfigError(
             f"--fix of {root}",
-            expected="a scene in the ChronoScene format",
+            expected="a scene in the ChronoScene format, or a COLMAP project",
             found=f"one in {name}",
             todo="convert it with chronoscene convert, then correct the result",
         )

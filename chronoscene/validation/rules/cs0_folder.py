@@ -39,7 +39,7 @@ def no_images_folder(scene: RawScene) -> Iterator[Hit]:
 def model_misplaced(scene: RawScene) -> Iterator[Hit]:
     """The COLMAP model is not in `sparse/0/`, where readers look for it."""
     place = scene.model_place
-    if place is not None and place != our_format.MODEL:
+    if place is not None and place != our_format.MODEL and not scene.is_project:
         found = f"a model in {place}/" if place else "a model at the top of the folder"
         yield Hit(our_format.MODEL, "the COLMAP model", found)
 
@@ -68,7 +68,7 @@ def several_models(scene: RawScene) -> Iterator[Hit]:
 def bad_periods_json(scene: RawScene) -> Iterator[Hit]:
     """`sparse/periods.json` is invalid."""
     ids = scene.period_ids
-    if ids != list(range(len(ids))):
+    if scene.is_project or ids != list(range(len(ids))):
         return  # has its own rule
     if len(scene.periods or ()) < len(scene.names):
         return  # a period may be missing, which has its own rule
@@ -93,10 +93,14 @@ def bad_world_json(scene: RawScene) -> Iterator[Hit]:
     remedy="nothing to do; `chronoscene convert DIR OUT` converts it for other tools",
 )
 def other_format(scene: RawScene) -> Iterator[Hit]:
-    """The folder is in another format. It is checked as `chronoscene convert` would write it;
-    places refer to the converted scene."""
-    if scene.origin is not None and scene.origin.error is None:
-        yield Hit(".", "a scene in the ChronoScene format", f"a scene in {scene.origin.format}")
+    """The folder is in another format. It is checked as `chronoscene convert` would write it, and
+    places refer to the converted scene. A COLMAP project is checked where it is."""
+    origin = scene.origin
+    if origin is not None and origin.error is None:
+        found = f"a scene in {origin.format}"
+        if origin.assigned is not None:
+            found += f", with the periods {shown(p.label for p in origin.assigned.grouped[1])}"
+        yield Hit(".", "a scene in the ChronoScene format", found)
 
 
 @rule.error("CS007", bad="a `transforms.json` without poses", remedy="correct the file named here")
@@ -127,7 +131,9 @@ def other_format_left_out(scene: RawScene) -> Iterator[Hit]:
 def reader_refuses(scene: RawScene, model: RawModel, images: RawImages) -> Iterator[Hit]:
     """No other rule found an error, but the reader (or COLMAP itself) rejects the scene."""
     try:
-        if model_kind(model.folder) == "binary":  # the rules have checked points and tracks
+        if scene.origin is not None and scene.origin.read is not None:
+            scene.origin.read()
+        elif model_kind(model.folder) == "binary":  # the rules have checked points and tracks
             posed = read_poses(scene.root / our_format.MODEL, images)
             our_format.read(scene.root, model=Model(posed, Points.empty()))
         else:
@@ -139,5 +145,5 @@ def reader_refuses(scene: RawScene, model: RawModel, images: RawImages) -> Itera
 def _relative_hit(root: Path, error: ChronoSceneError, place: str) -> Hit:
     """An error as a hit, with its place relative to the scene folder if it is inside."""
     top = os.path.join(root, "")
-    where = error.place.removeprefix(top) if error.place.startswith(top) else place
+    where = place if error.place == str(root) else error.place.removeprefix(top)
     return Hit(where, error.expected, error.found, error.todo)

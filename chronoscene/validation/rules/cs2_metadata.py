@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from chronoscene.colmap.raw_model import RawImages
-from chronoscene.formats.chronoscene import PERIODS, SPLIT
+from chronoscene.formats.chronoscene import PERIODS
 from chronoscene.io.wording import counted, shown
 from chronoscene.validation import rule
 from chronoscene.validation.checks import grouped, photo_metadata
@@ -74,13 +74,18 @@ def exif_period_order(scene: RawScene) -> Iterator[Hit]:
         first = date.fromisoformat(stated + "-01" * (2 - hyphens)).toordinal()
         if not -SLACK <= medians[period].toordinal() - first <= DAYS[hyphens] + SLACK:
             expected = f"the date of the photos of period {period}, {medians[period]:%Y-%m-%d}"
-            yield Hit(PERIODS, expected, stated)
+            yield Hit(_dates_place(scene), expected, stated)
+
+
+def _dates_place(scene: RawScene) -> str:
+    """Where the dates of the periods stand."""
+    return scene.period_place if scene.is_project else PERIODS
 
 
 @rule.warning(
     "CS222",
     bad="a photo of 2023 among those of 2016",
-    remedy="look at the photo; correct its period in split.txt",
+    remedy="look at the photo; correct its period",
     needs=("periods",),
 )
 def exif_other_period(scene: RawScene) -> Iterator[Hit]:
@@ -205,7 +210,7 @@ def one_visit_in_two_periods(scene: RawScene, periods: dict[str, int]) -> Iterat
     for (one, other), pairs in found.items():
         text = f"{counted(len(pairs), 'pair')} within five minutes: {shown(pairs[0])}"
         expected = f"photos of periods {one} and {other} at different times"
-        yield Hit(SPLIT, expected, text, count=len(pairs))
+        yield Hit(scene.period_place, expected, text, count=len(pairs))
 
 
 @rule.warning(
@@ -223,7 +228,7 @@ def names_period_order(scene: RawScene) -> Iterator[Hit]:
         digits = min(len(stated[earlier]), len(stated[later]))  # dates of different precision
         if stated[earlier][:digits] > stated[later][:digits]:
             expected = f"a date after {stated[earlier]}, the date of period {earlier}"
-            yield Hit(f"{PERIODS} (period {later})", expected, stated[later])
+            yield Hit(f"{_dates_place(scene)} (period {later})", expected, stated[later])
     years = _years(scene)
     for earlier, later in pairwise(sorted(years)):
         if years[earlier] > years[later]:
@@ -253,9 +258,9 @@ def _year(name: str) -> int | None:
 @rule.warning(
     "CS228",
     bad="`2016/a.jpg` in period 1, all other images of `2016/` in period 0",
-    remedy="look at the image; correct its period in split.txt",
+    remedy="look at the image; correct its period",
 )
-def names_other_period(periods: dict[str, int]) -> Iterator[Hit]:
+def names_other_period(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
     """The folders of the images, or the dates or period numbers that their names begin with, match
     the periods, except for a few images."""
     groups = grouped((_folder_or_begin(name), name) for name in periods)
@@ -273,7 +278,7 @@ def names_other_period(periods: dict[str, int]) -> Iterator[Hit]:
         for name in groups[key]:
             if periods[name] != period:
                 expected = f"period {period}, as for the other images with {key!r}"
-                yield Hit(f"{SPLIT} ({name})", expected, f"period {periods[name]}")
+                yield Hit(f"{scene.period_place} ({name})", expected, f"period {periods[name]}")
 
 
 def _folder_or_begin(name: str) -> str | None:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator
 
 from chronoscene.formats.chronoscene import SPLIT, TEST
+from chronoscene.formats.shared.grouping import NAME_PERIODS
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene.splits import DEFAULT_RULE, NameEntry, NameIndex, Problem, ProblemKind
 from chronoscene.validation import rule
@@ -39,7 +40,7 @@ def _problems(file: str, problems: Iterable[Problem], kind: ProblemKind) -> Iter
 )
 def split_absent(scene: RawScene) -> Iterator[Hit]:
     """There is no `sparse/split.txt`, so no image has a period."""
-    if os.path.lexists(scene.root / SPLIT):
+    if scene.is_project or os.path.lexists(scene.root / SPLIT):
         return
     elsewhere = [p for p in SPLIT_ELSEWHERE if (scene.root / p).is_file()]
     if elsewhere:
@@ -47,7 +48,7 @@ def split_absent(scene: RawScene) -> Iterator[Hit]:
     else:
         similar = _similar_files(scene)
         found = "no such file" + (f"; there is {shown(similar)}" if similar else "")
-        yield Hit(SPLIT, "the periods of the images", found, _by_folders(scene))
+        yield Hit(SPLIT, "the periods of the images", found, _convert(scene))
 
 
 def _similar_files(scene: RawScene) -> list[str]:
@@ -63,14 +64,13 @@ def _similar_files(scene: RawScene) -> list[str]:
     return found
 
 
-def _by_folders(scene: RawScene) -> str | None:
-    """The remedy if the folders of the images may be the periods."""
-    folders = sorted({file.split("/")[0] for file in scene.files if "/" in file})
-    if len(folders) < 2 or not all("/" in file for file in scene.files):
+def _convert(scene: RawScene) -> str | None:
+    """The remedy if there are a model and images, so that the command can write the file."""
+    if scene.model_place is None or not scene.files:
         return None
     return (
-        'write one line "<image name> <period id>" for each image; if the folders '
-        f"{shown(folders)} are the periods, chronoscene convert DIR OUT makes a scene of them"
+        'write one line "<image name> <period id>" for each image; or let chronoscene convert DIR '
+        f"OUT do it, and {NAME_PERIODS}"
     )
 
 
@@ -192,7 +192,7 @@ def split_line_ends(split_text: TextFile) -> Iterator[Hit]:
 )
 def test_absent(scene: RawScene) -> Iterator[Hit]:
     """There is no `sparse/0/test.txt`; the default split is used."""
-    if os.path.lexists(scene.root / TEST) or test_elsewhere(scene):
+    if os.path.lexists(scene.root / TEST) or test_elsewhere(scene) or scene.has_own_tests:
         return
     size = "" if scene.tests is None else f" gives {counted(len(scene.tests), 'test view')}"
     yield Hit(TEST, "a list of test images", f"none; {DEFAULT_RULE}{size}")
@@ -208,13 +208,14 @@ def test_misplaced(scene: RawScene) -> Iterator[Hit]:
 
 def test_elsewhere(scene: RawScene) -> list[str]:
     """Places where ``test.txt`` is, but is not read."""
-    return [place for place in TEST_ELSEWHERE if (scene.root / place).is_file()]
+    places = () if scene.has_own_tests else TEST_ELSEWHERE
+    return [place for place in places if (scene.root / place).is_file()]
 
 
 @rule.error("CS323", bad="a `test.txt` in an old Windows encoding", remedy="save it as UTF-8 text")
 def test_not_text(scene: RawScene) -> Iterator[Hit]:
     """`test.txt` is not a readable text file."""
-    return _not_text(scene, TEST, scene.test_text)
+    return iter(()) if scene.has_own_tests else _not_text(scene, TEST, scene.test_text)
 
 
 @rule.warning(

@@ -18,6 +18,9 @@ MIN_OFF = 3  # Deviation from the fair share, in test views, that is worth a war
 UNEQUAL = 10  # Ratio between the numbers of training views of two periods
 
 
+REGISTER_MORE = "register more images of this period"
+
+
 @rule.error(
     "CS401",
     bad="ids 2016 and 2023; ids 0 and 2",
@@ -55,22 +58,23 @@ def period_empty(scene: RawScene, split: list[SplitEntry]) -> Iterator[Hit]:
 @rule.error(
     "CS403",
     bad="all images of period 1 are in `test.txt`",
-    remedy="remove some of its images from test.txt",
+    remedy="remove some of its images from sparse/0/test.txt",
     needs=("tests",),
 )
 def period_without_train(scene: RawScene) -> Iterator[Hit]:
     """A period has no training view."""
-    default = "register more of its images, or list none of them in a new sparse/0/test.txt"
-    for period, (train, _test) in _views(scene).items():
-        if train == 0:
-            remedy = default if scene.test is None else None
-            yield Hit(TEST, f"a training view in period {period}", "none", remedy)
+    for period, (train, test) in _views(scene).items():
+        if train == 0 and scene.test is None:  # then test.txt is not there to be corrected
+            place, found = f"period {period}", f"{counted(test, 'image')}, for testing"
+            yield Hit(place, "two or more images, one for training", found, REGISTER_MORE)
+        elif train == 0:
+            yield Hit(TEST, f"a training view in period {period}", "none")
 
 
 @rule.warning(
     "CS404",
     bad="a `test.txt` with images of period 0 only",
-    remedy="add some of its images to test.txt",
+    remedy="add some of its images to sparse/0/test.txt",
     needs=("tests",),
 )
 def period_without_test(scene: RawScene) -> Iterator[Hit]:
@@ -84,7 +88,7 @@ def period_without_test(scene: RawScene) -> Iterator[Hit]:
     "CS405",
     what=f"A period has fewer than {MIN_TRAIN} training views.",
     bad="a period of three photos",
-    remedy="register more images of this period",
+    remedy=REGISTER_MORE,
     needs=("tests",),
 )
 def period_few_views(scene: RawScene) -> Iterator[Hit]:
@@ -99,12 +103,12 @@ def period_few_views(scene: RawScene) -> Iterator[Hit]:
 @rule.info(
     "CS406",
     bad="a `split.txt` with period 0 only",
-    remedy="nothing to do, unless split.txt should have more periods",
+    remedy="nothing to do, unless there should be more periods",
 )
 def single_period(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
     """All images are of one period, so nothing can change."""
     if len(scene.period_ids) == 1 and len(periods) == len(scene.names):
-        yield Hit(SPLIT, "two or more periods", "one")
+        yield Hit(scene.period_place, "two or more periods", "one")
 
 
 @rule.error(

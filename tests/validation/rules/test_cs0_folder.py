@@ -1,12 +1,13 @@
 import shutil
 
 import pytest
+from PIL import Image
 
 from chronoscene.convert import convert
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.validation.repair.fix import fix_scene
-from chronoscene.validation.run import find_folders, other_format, validate_scene
+from chronoscene.validation.run import Reading, find_folders, other_format, validate_scene
 
 
 def test_no_images_folder(scene):
@@ -122,14 +123,127 @@ def test_folders_of_other_formats_are_found(scene, studio, tmp_path):
     assert find_folders(tmp_path) == [scene.root, studio]
 
 
-def test_a_model_in_its_place_is_of_our_format(scene):
-    """Even where the folders of its images could be periods: the missing file is the fault."""
+def test_a_list_of_periods_in_a_wrong_place_is_of_our_format(project):
+    """Even where the folders of its images could be periods: the file is meant to count."""
+    assert other_format(project.root) == "colmap-folders"
+    project.write("split.txt", "")
+    assert other_format(project.root) is None
+    assert "CS301" in codes(project.validate())
+
+
+@pytest.fixture
+def project(scene):
+    """The good scene as a COLMAP project: no split.txt, images in ``2016/`` and ``2023/``."""
+    for letter, year in (("a", "2016"), ("b", "2023")):
+        scene.path(f"images/{year}").mkdir()
+        for image in sorted(scene.path("images").glob(f"{letter}*")):
+            image.rename(image.parent / year / image.name)
+            for place in ("sparse/0/images.txt", "sparse/0/test.txt"):
+                if image.name in scene.path(place).read_text():
+                    scene.replace(place, image.name, f"{year}/{image.name}")
     scene.path("sparse/split.txt").unlink()
-    shutil.move(scene.path("images"), scene.path("images_"))
-    scene.path("images").mkdir()
-    shutil.move(scene.path("images_"), scene.path("images/2016"))
-    assert other_format(scene.root) is None
-    assert "CS301" in codes(scene.validate())
+    return scene
+
+
+def test_colmap_project(project):
+    report = project.validate(decode=True)
+    assert codes(report) == {"CS006", "CS507"}
+    (said,) = [f for f in report.findings if f.code == "CS006"]
+    assert said.found == "a scene in colmap-folders, with the periods '2016', '2023'"
+    assert [(p.images, p.test) for p in report.summary.periods] == [(7, 1), (7, 1)]
+    assert {s.reason for s in report.skipped} == {
+        "sparse/split.txt is no part of a COLMAP project",
+        "the released code does not read colmap-folders",
+    }
+
+
+def test_faults_of_a_colmap_project_are_all_found_where_they_are(project):
+    shutil.copy(project.path("images/2016/a001.png"), project.path("images/2023/b002.png"))
+    project.path("images/2016/a000.png").unlink()
+    project.write("sparse/0/points3D.txt", "broken\n")
+    project.write("sparse/0/test.txt", "2016/a003.png\nnobody\n")
+    found = {(f.code, f.place) for f in project.validate().findings}
+    assert found == {
+        ("CS006", "."),
+        ("CS103", "sparse/0/points3D.txt:1"),
+        ("CS201", "images/2016/a000.png"),
+        ("CS324", "sparse/0/test.txt:2"),
+        ("CS404", "sparse/0/test.txt"),
+        ("CS602", "images/2016/a001.png"),
+    }
+
+
+def test_the_model_of_a_project_may_be_where_its_program_left_it(project):
+    model = project.path("colmap/sparse/0")
+    model.parent.mkdir(parents=True)
+    project.path("sparse/0").rename(model)
+    report = project.validate()
+    said = {f.code: f.found for f in report.findings}
+    assert said.keys() == {"CS006", "CS008", "CS321", "CS507"}
+    assert said["CS008"] == "the model is read from colmap/sparse/0, the images from images"
+
+
+def test_the_reader_of_a_project_has_the_last_word(project, monkeypatch):
+    def refuse(path, **_):
+        raise SceneError(path / "images", expected="better ones", found="these", todo="go")
+
+    monkeypatch.setattr("chronoscene.formats.colmap_folders.read", refuse)
+    (said,) = [f for f in project.validate().findings if f.severity == "error"]
+    assert (said.code, said.place, said.found) == ("CS009", "images", "these")
+
+
+def test_images_of_a_project_outside_of_its_periods(project):
+    project.replace("sparse/0/images.txt", "2016/a000.png", "a000.png")
+    errors = {f.code: f for f in project.validate().findings if f.severity == "error"}
+    assert errors.keys() == {"CS007", "CS201"}  # and no word of split.txt
+    assert (errors["CS007"].place, errors["CS007"].found) == ("images", "'a000.png'")
+
+
+def test_dates_that_contradict_the_folders_of_a_project(project):
+    for i in range(7):
+        image, exif = project.path(f"images/2023/b00{i}.png"), Image.Exif()
+        exif.get_ifd(0x8769)[0x9003] = "2016:05:03 12:00:00"
+        exif[0x8769] = 0
+        pixels = Image.open(image)
+        pixels.save(image, exif=exif)
+    (said,) = [f for f in project.validate().findings if f.code == "CS221"]
+    assert said.place == "images"
+    assert (said.expected[-10:], said.found) == ("2016-05-03", "2023")
+
+
+def test_projects_whose_test_images_their_format_chooses(project, tmp_path):
+    street = project.root.rename(tmp_path / "street")  # a name of WAT, which has no test.txt
+    report = validate_scene(street)
+    assert [(p.images, p.test) for p in report.summary.periods] == [(7, 1), (7, 1)]
+    assert codes(report) == {"CS006", "CS507"}
+    (street / "sparse/0/test.txt").write_text("")
+    assert codes(validate_scene(street)) == {"CS006", "CS507"}
+
+
+def test_what_the_user_says_of_a_project(scene, tmp_path):
+    """Flat folders have the periods that a table names; and a format has only its own rules."""
+    scene.path("sparse/split.txt").unlink()
+    names = [p.name for p in scene.path("images").iterdir()]
+    table = tmp_path / "periods.csv"
+    table.write_text("file,period\n" + "".join(f"{n},{n[0]}\n" for n in names))
+    report = validate_scene(scene.root, reading=Reading(period_by=f"table:{table}"))
+    assert codes(report) == {"CS006", "CS507"}
+    table.write_text("file,period\na000.png,1\n")
+    report = validate_scene(scene.root, reading=Reading(period_by=f"table:{table}"))
+    (said,) = [f for f in report.findings if f.severity == "error"]
+    assert (said.code, said.place) == ("CS007", str(table))
+    with pytest.raises(ConfigError, match="one of folder, year"):
+        validate_scene(scene.root, reading=Reading(period_by="decade"))
+    with pytest.raises(ConfigError, match="no such option for wat"):
+        validate_scene(scene.root, reading=Reading("wat", "year"))
+
+
+def test_projects_are_corrected(project, tmp_path):
+    project.path("sparse/0").rename(project.path("sparse/1"))
+    repairs = fix_scene(project.root, tmp_path / "fixed")
+    assert [r.code for r in repairs] == ["CS002", ""]
+    copy = validate_scene(tmp_path / "fixed")
+    assert not copy.count("error") and other_format(copy.path) == "colmap-folders"
 
 
 def test_other_formats_are_not_corrected(studio, tmp_path):

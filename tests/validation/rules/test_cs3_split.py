@@ -1,3 +1,5 @@
+import shutil
+
 import pytest
 from PIL import Image
 
@@ -21,11 +23,14 @@ def test_split_absent(scene):
     scene.expect("CS301", place=SPLIT, found="no such file")
 
 
-def test_split_absent_where_folders_may_be_periods(make_scene):
-    scene = make_scene()
+def test_split_absent_where_a_command_can_write_it(scene):
     scene.path(SPLIT).unlink()
     (finding,) = [f for f in scene.validate().findings if f.code == "CS301"]
-    assert "if the folders 'a', 'b' are the periods, chronoscene convert" in finding.remedy
+    assert "chronoscene convert DIR OUT do it, and name the periods: --period-by" in finding.remedy
+    assert "table:FILE (a CSV file with the columns file and period)" in finding.remedy
+    shutil.rmtree(scene.path("images"))
+    (finding,) = [f for f in scene.validate().findings if f.code == "CS301"]
+    assert finding.remedy == 'write one line "<image name> <period id>" for each image'
 
 
 @pytest.mark.parametrize("file", ["Split.txt", "splits.txt", "split.txt.txt", "0/split.csv"])

@@ -27,6 +27,14 @@ def test_period_without_train(scene):
     scene.expect("CS403", place=TEST, found="none")
 
 
+def test_period_of_one_image(make_scene):
+    """Without test.txt it is a test image; the way out is not in that file."""
+    report = make_scene({"a.png": 0, "b0.png": 1, "b1.png": 1}).validate()
+    (finding,) = [f for f in report.findings if f.code == "CS403"]
+    assert (finding.place, finding.found) == ("period 0", "1 image, for testing")
+    assert finding.remedy == "register more images of this period"
+
+
 def test_period_without_test(scene):
     scene.write(TEST, ["a003.png"])
     report = scene.expect("CS404", place=TEST, found="none")
