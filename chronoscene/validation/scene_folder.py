@@ -26,7 +26,7 @@ from chronoscene.scene import Camera, Period, Scene, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.splits import NameEntry, Problem, SplitEntry
 from chronoscene.scene.tracks import seen_by_period
-from chronoscene.validation.checks import observations, pixels
+from chronoscene.validation.checks import grouped, observations, pixels
 from chronoscene.validation.checks.names import is_safe
 from chronoscene.validation.checks.observations import Observations, Reprojection
 from chronoscene.validation.checks.pixels import Header, Pixels, Track
@@ -176,6 +176,13 @@ class RawScene:
         """Cameras by id, those with a plausible size and focal length."""
         usable = (c for c in self.cameras or () if c.is_usable and c.model != "EQUIRECTANGULAR")
         return {camera.camera_id: camera for camera in usable}
+
+    @cached_property
+    def images_of_camera(self) -> dict[int, list[str]]:
+        """Names of the images of each camera, by its id."""
+        if self.images is None:
+            return {}
+        return grouped(zip(self.images.camera_ids.tolist(), self.images.names, strict=True))
 
     @cached_property
     def observations(self) -> Observations | None:

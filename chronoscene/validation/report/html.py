@@ -64,7 +64,7 @@ def _block(findings: list[Finding], pictures: Pictures) -> dict[str, Any]:
         "what": rule.explain(first),
         "rows": [(f, pictures.of(f.place, f.also)) for f in findings[:MAX_ROWS]],
         "total": len(findings),
-        "remedies": list(dict.fromkeys(f.remedy for f in findings if f.remedy != rule.NOTHING))[:5],
+        "remedies": list(dict.fromkeys(f.remedy for f in findings if f.remedy != rule.NOTHING)),
     }
 
 

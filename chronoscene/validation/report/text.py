@@ -70,8 +70,11 @@ def _rule(code: str, findings: list[Finding]) -> list[str]:
     lines += [f"    {line}" for line in folded[:MAX_LINES]]
     if len(folded) > MAX_LINES:
         lines.append(f"    and {len(folded) - MAX_LINES} more (--format json lists all)")
-    remedies = dict.fromkeys(f.remedy for f in findings if f.remedy != rule.NOTHING)
-    return lines + [f"    to do: {remedy}" for remedy in list(remedies)[:MAX_LINES]]
+    remedies = grouped((f.remedy, f.place) for f in findings if f.remedy != rule.NOTHING)
+    for remedy, places in list(remedies.items())[:MAX_LINES]:
+        of = f" for {_places(places)}" if len(places) < len(findings) else ""
+        lines.append(f"    to do{of}: {remedy}")
+    return lines
 
 
 def _fold(findings: Iterable[Finding]) -> list[str]:
@@ -79,9 +82,14 @@ def _fold(findings: Iterable[Finding]) -> list[str]:
     places = grouped((f"expected {f.expected}, found {f.found}", f.place) for f in findings)
     lines = []
     for text, where in places.items():
-        rest = f" and {len(where) - MAX_PLACES} more" if len(where) > MAX_PLACES else ""
-        lines.append(f"{', '.join(where[:MAX_PLACES])}{rest}: {text}")
+        lines.append(f"{_places(where)}: {text}")
     return lines
+
+
+def _places(where: Sequence[str]) -> str:
+    """The first few places, and how many more there are."""
+    rest = f" and {len(where) - MAX_PLACES} more" if len(where) > MAX_PLACES else ""
+    return f"{', '.join(where[:MAX_PLACES])}{rest}"
 
 
 def _summary(summary: Summary) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from chronoscene.arrays import Array
 from chronoscene.colmap.raw_model import CAMERA, RawImages, RawModel
+from chronoscene.formats.shared.grouping import NAME_PERIODS
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.cameras import (
     PINHOLE_MODELS,
@@ -32,9 +33,16 @@ MAX_ANGLE, MIN_ANGLE = 150.0, 1.0
 
 UNEQUAL = 0.1  # Relative difference of fx and fy; pixels are square to a few percent in any camera
 
-UNDISTORT = "undistort the images and the model: chronoscene undistort SCENE OUT"
+UNDISTORT = "undistort the images and the model: chronoscene undistort DIR OUT"
+NAME_AND_UNDISTORT = (
+    "write sparse/split.txt first; or let chronoscene undistort DIR OUT do it together with the "
+    f"images, and {NAME_PERIODS}"
+)
 PERSPECTIVE = "render perspective views of the panoramas, and register those"
-DROP = "write the camera as PINHOLE or SIMPLE_PINHOLE; its distortion is below half a pixel"
+DROP = (
+    "write the camera as PINHOLE or SIMPLE_PINHOLE without its distortion, which is below half a "
+    "pixel; or undistort as other cameras"
+)
 NO_DISTORTION = "PINHOLE, SIMPLE_PINHOLE, or a radial or OPENCV model without distortion"
 
 SAME_ANGLE = 1e-3  # Radians between two records of one pose beyond rounding in a text file
@@ -57,7 +65,7 @@ def camera_model(scene: RawScene, cameras: Sequence[Camera]) -> Iterator[Hit]:
     """A camera model cannot be used as a pinhole camera."""
     for camera in cameras:
         if camera.model not in (*PINHOLE_MODELS, *POLYNOMIAL_MODELS):
-            remedy = PERSPECTIVE if camera.model == "EQUIRECTANGULAR" else None
+            remedy = PERSPECTIVE if camera.model == "EQUIRECTANGULAR" else _undistort(scene)
             yield Hit(scene.camera_place(camera), NO_DISTORTION, camera.model, remedy)
 
 
@@ -68,8 +76,15 @@ def camera_distorted(scene: RawScene) -> Iterator[Hit]:
         if not camera.is_pinhole:
             shift = displacement(camera)
             found = f"{camera.model} with distortion that moves pixels by up to {shift:.3g} px"
-            remedy = DROP if shift < VISIBLE else None
+            if images := scene.images_of_camera.get(camera.camera_id):
+                found += f" in {counted(len(images), 'image')}: {shown(images)}"
+            remedy = DROP if shift < VISIBLE else _undistort(scene)
             yield Hit(scene.camera_place(camera), "a camera without distortion", found, remedy)
+
+
+def _undistort(scene: RawScene) -> str:
+    """The remedy that works on this folder: without periods, none of our commands reads it."""
+    return UNDISTORT if scene.periods is not None else NAME_AND_UNDISTORT
 
 
 @rule.info(

@@ -101,3 +101,11 @@ def test_strict_makes_a_scene_with_warnings_not_valid(scene):
     report = scene.validate()
     assert "not valid" not in Page(write_html([report])).text
     assert "not valid" in Page(write_html([report], strict=True)).text
+
+
+def test_each_of_several_remedies_stands_with_its_finding(scene):
+    more = ["1 SIMPLE_RADIAL 64 48 50 32 24 -0.16", "2 RADIAL 64 48 50 32 24 0.0001 -0.0001"]
+    scene.write("sparse/0/cameras.txt", more)
+    page = write_html([scene.validate()])
+    rows = [row for row in page.split("<li>") if "cameras.txt (camera" in row and "px" in row]
+    assert ["chronoscene undistort" in row for row in rows] == [True, False]

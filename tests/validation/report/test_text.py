@@ -58,6 +58,12 @@ def test_equal_findings_are_folded():
     assert len(lines) == 5
 
 
+def test_each_of_several_remedies_says_what_it_is_for():
+    lines = text_of(report(finding(0), finding(1, remedy="draw it"), finding(2))).splitlines()
+    assert "    to do for images/0.jpg, images/2.jpg: copy it" in lines
+    assert "    to do for images/1.jpg: draw it" in lines
+
+
 def test_many_different_findings_are_cut():
     lines = text_of(report(*(finding(i, found=f"x{i}") for i in range(12)))).splitlines()
     assert sum("expected an image" in line for line in lines) == 5

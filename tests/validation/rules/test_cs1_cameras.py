@@ -2,10 +2,13 @@ import struct
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from chronoscene.cli import cli
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import to_pycolmap
 from chronoscene.validation.rules.cs1_cameras import displacement
+from chronoscene.validation.run import validate_scene
 
 CAMERAS = "sparse/0/cameras.txt"
 PLACE = f"{CAMERAS} (camera 1)"
@@ -44,6 +47,31 @@ def test_camera_model(scene, line):
 def test_camera_distorted(scene, line):
     scene.write(CAMERAS, [line])
     scene.expect("CS133", place=PLACE, found=line.split()[1])
+
+
+def test_which_images_a_distorted_camera_took(scene):
+    lines = scene.lines(CAMERAS)
+    scene.write(CAMERAS, [*lines, "2 SIMPLE_RADIAL 64 48 50 32 24 -0.16"])
+    scene.edit_fields("sparse/0/images.txt", 2, {8: "2"})
+    report = scene.validate()
+    (finding,) = [f for f in report.findings if f.code == "CS133"]
+    assert finding.found.endswith("px in 1 image: 'a001.png'")
+    assert finding.remedy == "undistort the images and the model: chronoscene undistort DIR OUT"
+
+
+def test_undistorting_a_model_without_periods(scene, tmp_path):
+    """The remedy, followed to the letter."""
+    scene.write(CAMERAS, ["1 SIMPLE_RADIAL 64 48 50 32 24 -0.16"])
+    names = [p.name for p in scene.path("images").iterdir()]
+    table = tmp_path / "periods.csv"
+    table.write_text("file,period\n" + "".join(f"{n},{n[0]}\n" for n in names))
+    scene.path("sparse/split.txt").unlink()
+    (finding,) = [f for f in scene.validate().findings if f.code == "CS133"]
+    assert "chronoscene undistort DIR OUT" in finding.remedy and "table:FILE" in finding.remedy
+    out = tmp_path / "out"
+    command = ["undistort", str(scene.root), str(out), "--period-by", f"table:{table}"]
+    assert CliRunner().invoke(cli, command).exit_code == 0
+    assert not validate_scene(out).count("error")
 
 
 def test_distortion_that_nobody_sees_may_be_dropped(scene):
