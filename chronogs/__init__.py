@@ -32,4 +32,5 @@ SPEC = MethodSpec(
         "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
         "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
     },
+    resumable=True,
 )

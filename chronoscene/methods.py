@@ -56,6 +56,7 @@ class MethodSpec:
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Preset name to the values that differ from the defaults of the config class."""
     resumable: bool = False
+    """Whether it has `Method.save_training` and `Method.load_training`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,6 +167,23 @@ class Method(Protocol):
         """Read what `save` wrote; `render` then gives the same pixels."""
 
     def size(self) -> MethodSize: ...
+
+    def save_training(self, folder: Path) -> None:
+        """Write everything that the steps to come depend on into an existing empty folder.
+
+        That is the model as the optimiser has it, moments, statistics for densification, generators
+        of random numbers and places in schedules; no step may notice that it was asked for. Only
+        where the spec says ``resumable``.
+
+        Raises:
+            OSError: If the disk refuses.
+        """
+
+    def load_training(self, folder: Path) -> None:
+        """Go on from what `save_training` wrote; `setup` was called as before it.
+
+        On a CPU the steps to come then give the same bits as without the interruption.
+        """
 
 
 def import_object(reference: str) -> Any:

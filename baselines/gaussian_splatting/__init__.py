@@ -27,4 +27,5 @@ SPEC = MethodSpec(
             "max_gaussians": 40_000,
         },
     },
+    resumable=True,
 )

@@ -29,4 +29,5 @@ SPEC = MethodSpec(
         "balanced": _SHORT | {"iterations": 2_500, "density_interval": 50},
         "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
     },
+    resumable=True,
 )

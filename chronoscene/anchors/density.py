@@ -21,7 +21,8 @@ from chronoscene.training.splatting import rms_spacing
 Float = NDArray[np.float32]
 MIN_DISTANCE = 1e-7
 """Lower bound of a neighbour distance: keeps the log-scales of coinciding points finite."""
-_COUNTERS = ("opacity_sum", "visits", "motion", "grad_sum", "hits")
+COUNTERS = ("opacity_sum", "visits", "motion", "grad_sum", "hits")
+"""Arrays of `DensityStatistics`."""
 
 
 def cell_indices(
@@ -153,14 +154,14 @@ class DensityStatistics:
 
     def extend(self, count: int) -> None:
         """Make room for new anchors, which start with zeros."""
-        for name in _COUNTERS:
+        for name in COUNTERS:
             old = getattr(self, name)
             room = np.zeros((count, *old.shape[1:]), np.float32)
             setattr(self, name, np.concatenate([old, room]))
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
         """Forget the anchors outside a mask. [A]"""
-        for name in _COUNTERS:
+        for name in COUNTERS:
             setattr(self, name, getattr(self, name)[mask])
 
 

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
-from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
+from chronoscene.anchors.density import COUNTERS, AnchorRows, DensityStatistics, grow, prune_mask
 from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
 from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.adam import Adam, DenseTable
+from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.losses import mean_volume, photometric_loss
 from chronoscene.training.row_adam import make_table
 from chronoscene.training.schedule import ViewSampler, downscale_image, downscale_view, log_linear
@@ -135,6 +136,43 @@ class AnchorTrainer:
             global_features=model.global_features[period : period + 1],
             heads=model.heads,
         )
+
+    def state(self) -> TrainingState:
+        """Everything that the steps to come depend on."""
+        tensors = {f"model.{n}": t for n, t in self.model.tensors().items() if n not in self.tables}
+        sources = {f"table.{name}": table.state() for name, table in self.tables.items()}
+        sources["adam"] = self.optimizer.state()
+        if self.statistics is not None:
+            counters = {n: torch.from_numpy(getattr(self.statistics, n)) for n in COUNTERS}
+            sources["statistics"] = counters
+        for prefix, source in sources.items():
+            tensors |= {f"{prefix}.{name}": tensor for name, tensor in source.items()}
+        values = {
+            "views_drawn": self.sampler.drawn,
+            "growth_generator": self.growth_generator.bit_generator.state,
+            "noise_generator": self.noise_generator.bit_generator.state,
+        }
+        return TrainingState(tensors, values)
+
+    @torch.no_grad()
+    def load_state(self, state: TrainingState) -> None:
+        """Go on from what `state` gave, in a trainer that was made alike."""
+        model, stored = self.model, parts(state.tensors, "model")
+        model.anchors = stored["anchors"].to(model.anchors)
+        for name, tensor in model.tensors().items():
+            if name != "anchors" and name not in self.tables:
+                tensor.copy_(stored[name])
+        for name, table in self.tables.items():
+            setattr(model, name, table.load_state(parts(state.tensors, f"table.{name}")))
+        self.optimizer.load_state(parts(state.tensors, "adam"))
+        self.statistics = None
+        if counters := parts(state.tensors, "statistics"):
+            self.statistics = DensityStatistics(len(model), model.layout.offsets)
+            for name in COUNTERS:
+                setattr(self.statistics, name, counters[name].numpy().copy())
+        self.sampler.drawn = state.values["views_drawn"]
+        self.growth_generator.bit_generator.state = state.values["growth_generator"]
+        self.noise_generator.bit_generator.state = state.values["noise_generator"]
 
     def snapshot(self) -> AnchorModel:
         """The model up to date: in `model`, anchors that no view saw lately lag behind."""

@@ -26,8 +26,10 @@ class GradientStatistics:
     """Mean gradient of the projected centres over the views in which a Gaussian was seen."""
 
     def __init__(self, count: int, device: str | torch.device) -> None:
-        self._sums = torch.zeros(count, device=device)
-        self._views = torch.zeros(count, device=device)
+        self.sums = torch.zeros(count, device=device)
+        """Of the norms. [N]"""
+        self.views = torch.zeros(count, device=device)
+        """Number of views. [N]"""
 
     def add(self, info: RasterInfo, width: int, height: int) -> None:
         """Count one view whose ``backward`` is done.
@@ -42,12 +44,12 @@ class GradientStatistics:
         # Norm of d loss / d (u, v), with u and v in half image sizes: no matter the resolution.
         x, y = gradient[:, 0] * (0.5 * width), gradient[:, 1] * (0.5 * height)
         seen = (info.radii[0] > 0).all(-1)
-        self._sums += torch.where(seen, (x * x + y * y).sqrt(), 0.0)
-        self._views += seen
+        self.sums += torch.where(seen, (x * x + y * y).sqrt(), 0.0)
+        self.views += seen
 
     def mean(self) -> Tensor:
         """Mean norm; 0 where never seen. [N]"""
-        return self._sums / self._views.clamp_min(1)
+        return self.sums / self.views.clamp_min(1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

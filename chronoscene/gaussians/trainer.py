@@ -18,6 +18,7 @@ from chronoscene.gaussians.model import GaussianModel
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.adam import Adam
+from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.losses import photometric_loss
 from chronoscene.training.schedule import ViewSampler, log_linear
 from chronoscene.training.splatting import collect_gradients, draw
@@ -46,7 +47,8 @@ class Timeline:
 
     def __init__(self, config: GaussianConfig) -> None:
         self.config = config
-        self._last_moment = 0
+        self.last_moment = 0
+        """Of the latest step; 0 before the first."""
 
     def at(self, index: int, progress: float) -> Due:
         """What is due at a step; arguments as `chronoscene.methods.Method.step`."""
@@ -54,11 +56,11 @@ class Timeline:
         length = config.schedule_length if config.stretch else config.iterations
         moment = round(progress * length) + 1
         # A squeezed schedule jumps over moments, so what counts is that a multiple was passed.
-        passed_reset = moment // config.reset_interval > self._last_moment // config.reset_interval
+        passed_reset = moment // config.reset_interval > self.last_moment // config.reset_interval
         round_is_due = (index + 1) % config.densify_interval == 0
         growing = moment < config.densify_until
         progress = moment / config.schedule_length
-        self._last_moment = moment
+        self.last_moment = moment
         return Due(
             moment=moment,
             sh_degree=min(config.sh_degree, moment // config.sh_interval),
@@ -111,6 +113,36 @@ class GaussianTrainer:
             self._densify(index, prune_large=due.prune_large)
         self._update(due)
         return StepReport(float(loss.detach()), len(self.model), skipped)
+
+    def state(self) -> TrainingState:
+        """Everything that the steps to come depend on; methods may add to it."""
+        tensors = {f"model.{name}": tensor for name, tensor in self.model.tensors().items()}
+        tensors |= {f"adam.{name}": tensor for name, tensor in self.optimizer.state().items()}
+        tensors |= {"statistics.sums": self.statistics.sums}
+        tensors |= {"statistics.views": self.statistics.views}
+        values = {
+            "views_drawn": self.sampler.drawn,
+            "last_moment": self.timeline.last_moment,
+            "sh_degree": self.model.sh_degree,
+        }
+        return TrainingState(tensors, values)
+
+    @torch.no_grad()
+    def load_state(self, state: TrainingState) -> None:
+        """Go on from what `state` gave, in a trainer that was made alike."""
+        model, statistics = self.model, self.statistics
+        stored, adam, counts = (parts(state.tensors, n) for n in ("model", "adam", "statistics"))
+        for name, tensor in model.parameters.items():
+            model.parameters[name] = stored[name].to(tensor, copy=True).requires_grad_()
+        for name, tensor in model.shared.items():
+            tensor.copy_(stored[name])
+        self.optimizer = Adam(model.tensors())
+        self.optimizer.load_state(adam)
+        statistics.sums = counts["sums"].to(statistics.sums)
+        statistics.views = counts["views"].to(statistics.views)
+        self.sampler.drawn = state.values["views_drawn"]
+        self.timeline.last_moment = state.values["last_moment"]
+        model.sh_degree = state.values["sh_degree"]
 
     def loss(self, raster: Rasterization, number: int) -> Tensor:
         """Photometric loss against the photo of view ``number``; methods may add terms."""

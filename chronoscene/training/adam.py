@@ -302,6 +302,17 @@ class DenseTable:
         had not been called."""
         return self.value
 
+    def state(self) -> dict[str, Tensor]:
+        """Everything that later steps depend on, by name."""
+        return {"value": self.value, **self._adam.state()}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> Tensor:
+        """Restore what `state` gave, with any number of rows; returns the table."""
+        self._fetched = None
+        self._adam = Adam({"table": state["value"].to(self.value, copy=True).requires_grad_()})
+        self._adam.load_state(state)
+        return self.value
+
     def extend(self, new_rows: Tensor) -> Tensor:
         """Append rows with zero moments; returns the table. [n, ...]"""
         self._fetched = None

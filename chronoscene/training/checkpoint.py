@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
@@ -21,28 +21,54 @@ from chronoscene.io.staging import replacing, write_text_atomic
 
 TENSOR_FILE = "model.safetensors"
 META_FILE = "model.json"
+TRAINING = "training"
+"""Stem of the files that hold a training."""
 FORMAT_VERSION = 1
 
 
-def save_tensors(folder: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
+class TrainingState(NamedTuple):
+    """Everything that the steps to come depend on."""
+
+    tensors: dict[str, Tensor]
+    values: dict[str, Any]
+    """What JSON can hold."""
+
+
+def parts(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors ``<prefix>.<name>``, by name."""
+    start = f"{prefix}."
+    return {k.removeprefix(start): t for k, t in tensors.items() if k.startswith(start)}
+
+
+def save_tensors(
+    folder: Path, tensors: Mapping[str, Tensor], meta: Mapping[str, Any], *, stem: str = "model"
+) -> None:
     """Write ``model.safetensors`` and ``model.json`` into an existing folder.
 
     Args:
+        folder: Where to.
         tensors: Stored contiguous, in the order of their names, from any device.
         meta: Whatever JSON can hold without NaN.
+        stem: Of the names of the files.
+
+    Raises:
+        OSError: If the disk refuses.
     """
     # Copies, since views that share memory cannot be told apart in the file.
     stored = {k: tensors[k].detach().cpu().contiguous().clone() for k in sorted(tensors)}
-    with replacing(folder / TENSOR_FILE) as partial:
-        save_file(stored, partial)
+    with replacing(folder / f"{stem}.safetensors") as partial:
+        try:
+            save_file(stored, partial)
+        except SafetensorError as error:  # how it reports a full disk
+            raise OSError(str(error)) from error
         digest = _sha256(partial)
     document = {**meta, "format_version": FORMAT_VERSION, "tensors_sha256": digest}
     text = json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n"
-    write_text_atomic(folder / META_FILE, text)
+    write_text_atomic(folder / f"{stem}.json", text)
 
 
 def load_tensors(
-    folder: Path, *, device: str = "cpu", method: str | None = None
+    folder: Path, *, device: str = "cpu", method: str | None = None, stem: str = "model"
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors by name and the content of ``model.json``, as `save_tensors` wrote them.
 
@@ -50,21 +76,21 @@ def load_tensors(
         folder: Folder of the model.
         device: Where the tensors go.
         method: Name of the method that the model must be of, if given.
+        stem: Of the names of the files.
 
     Raises:
         CheckpointError: If a file is missing or damaged, or the model is of another method.
     """
-    meta = _read_meta(folder / META_FILE)
+    described = folder / f"{stem}.json"
+    meta = _read_meta(described)
     if method is not None and meta.get("method") != method:
         todo = "name another folder or another method"
-        raise _refusal(
-            folder / META_FILE, f"a model of {method}", f"one of {meta.get('method')}", todo
-        )
-    path = folder / TENSOR_FILE
+        raise _refusal(described, f"a model of {method}", f"one of {meta.get('method')}", todo)
+    path = folder / f"{stem}.safetensors"
     if not path.is_file():
         raise _refusal(path, "the tensors of the model", "no such file", "train again")
     if _sha256(path) != meta["tensors_sha256"]:
-        raise _refusal(path, f"the digest given in {META_FILE}", "another one")
+        raise _refusal(path, f"the digest given in {described.name}", "another one")
     try:
         return load_file(path, device=device), meta
     except SafetensorError as error:

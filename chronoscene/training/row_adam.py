@@ -8,7 +8,7 @@ are next read, all steps at once, so a step costs what it reads, however large t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -143,6 +143,31 @@ class RowAdam:
         copies = self.fetch(rows, range(len(self._widths))).detach()
         self._fetched = fetched
         return copies.view(self.value.shape)
+
+    def state(self) -> dict[str, Tensor]:
+        settled = max(self.steps - _HORIZON + 1, 0)
+        return {
+            "value": self.value,
+            "mean": self._mean,
+            "square": self._square,
+            "stamps": torch.from_numpy(self._stamps),
+            "steps": torch.tensor(self.steps),
+            "speeds": torch.tensor(self._speeds[-_HORIZON:], dtype=torch.float64),
+            "settled": torch.from_numpy(self._settled[:settled]),
+        }
+
+    def load_state(self, state: Mapping[str, Tensor]) -> Tensor:
+        tables = (state[name].clone() for name in ("value", "mean", "square"))
+        self.value, self._mean, self._square = tables
+        self._stamps = state["stamps"].numpy().copy()
+        self.steps = int(state["steps"])
+        self._speeds = state["speeds"].tolist()
+        self._ways = self._new_ways()
+        settled = state["settled"].numpy()
+        room = np.empty(_HORIZON, np.float32)
+        self._settled = np.concatenate([settled, room])
+        self._fetched = None
+        return self.value
 
     def extend(self, new_rows: Tensor) -> Tensor:
         self.flush()

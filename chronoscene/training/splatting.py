@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from chronoscene.errors import SceneError
+from chronoscene.errors import CheckpointError, SceneError, ShapeError
 from chronoscene.methods import MethodSize, Prediction, Skipped, StepReport, TrainingSet, View
 from chronoscene.rasterizer import RasterInfo, Rasterization, rasterize
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.adam import Adam, DenseTable, all_finite
-from chronoscene.training.checkpoint import load_tensors, save_tensors
+from chronoscene.training.checkpoint import TRAINING, TrainingState, load_tensors, save_tensors
 from chronoscene.training.row_adam import RowAdam
 
 
@@ -167,7 +167,11 @@ class SplattingMethod(ABC):
 
     @abstractmethod
     def start(self, train: TrainingSet, *, seed: int, device: str) -> Any:
-        """Build the initial model; returns what trains it by ``step``, arguments as there."""
+        """Build the initial model; returns what trains it by ``step``, arguments as there.
+
+        Where the method can be resumed, it gives a `TrainingState` by ``state`` and takes one by
+        ``load_state``.
+        """
 
     @abstractmethod
     def draw(self, view: View, period: float) -> Rasterization:
@@ -212,6 +216,23 @@ class SplattingMethod(ABC):
         self.background = torch.tensor(self.meta["background"], dtype=torch.float32, device=device)
         self.restore(folder, tensors, device)
         self.trainer = None
+
+    def save_training(self, folder: Path) -> None:
+        state = self.trainer.state()
+        meta = {"method": self.name, "version": self.version, "values": state.values}
+        save_tensors(folder, state.tensors, meta, stem=TRAINING)
+
+    def load_training(self, folder: Path) -> None:
+        tensors, meta = load_tensors(folder, method=self.name, stem=TRAINING)
+        try:
+            self.trainer.load_state(TrainingState(tensors, meta["values"]))
+        except (KeyError, RuntimeError, ShapeError) as error:
+            raise CheckpointError(
+                folder,
+                expected=f"a training that {self.name} {self.version} can go on with",
+                found=f"{type(error).__name__}: {error}",
+                todo="go on with the version of the software that began it",
+            ) from error
 
     def size(self) -> MethodSize:
         """Number of primitives, and of all stored numbers."""

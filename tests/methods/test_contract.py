@@ -208,6 +208,74 @@ def test_a_loaded_model_renders_equal_pixels_and_saves_equal_bytes(trained, tmp_
     assert contents(tmp_path) == contents(trained.folder)
 
 
+def go_on(method, start, stop=tiny_training.STEPS):
+    return [method.step(i, i / tiny_training.STEPS) for i in range(start, stop)]
+
+
+@pytest.fixture(scope="module")
+def interrupted(spec, trained, tmp_path_factory):
+    """A method after part of the training, and what it saved to go on from."""
+    if not spec.resumable:
+        pytest.skip("the method cannot be resumed")
+    method = import_object(spec.method)(tiny_training.small_config(spec))
+    method.setup(trained.data, seed=0, device="cpu")
+    go_on(method, 0, 63)
+    folder = tmp_path_factory.mktemp(f"{spec.name}-training")
+    method.save_training(folder)
+    return method, folder
+
+
+def resumed(trained, folder):
+    method = import_object(trained.spec.method)(tiny_training.small_config(trained.spec))
+    method.setup(trained.data, seed=0, device="cpu")
+    method.load_training(folder)
+    return method
+
+
+def test_a_resumed_training_ends_with_the_same_bytes(trained, interrupted, tmp_path):
+    folders = [tmp_path / name for name in ("model", "ours", "theirs")]
+    for folder in folders:
+        folder.mkdir()
+    method = resumed(trained, interrupted[1])
+    method.save_training(folders[1])
+    assert contents(folders[1]) == contents(interrupted[1])
+    assert go_on(method, 63) == trained.reports[63:]
+    method.save(folders[0])
+    assert contents(folders[0]) == contents(trained.folder)
+
+
+def test_saving_a_training_and_a_step_that_is_not_finite_change_nothing(
+    trained, interrupted, tmp_path, monkeypatch
+):
+    """The step counts as a drawn view, and nothing else of the training is different."""
+    from chronoscene.training.losses import _PhotometricLoss
+
+    method = resumed(trained, interrupted[1])
+    backward = _PhotometricLoss.backward
+
+    def poisoned(ctx, *grads):
+        gradient, *others = backward(ctx, *grads)
+        return gradient * np.inf, *others
+
+    with monkeypatch.context() as patch:
+        patch.setattr(_PhotometricLoss, "backward", staticmethod(poisoned))
+        assert method.step(63, 63 / tiny_training.STEPS).skipped == "not finite"
+    method.trainer.sampler.drawn -= 1
+    method.save_training(tmp_path)
+    before = json.loads((interrupted[1] / "training.json").read_text())
+    after = json.loads((tmp_path / "training.json").read_text())
+    assert after["tensors_sha256"] == before["tensors_sha256"]
+    assert method.step(63, 63 / tiny_training.STEPS) == trained.reports[63]
+
+
+@pytest.mark.parametrize("file", ["training.json", "training.safetensors"])
+def test_a_damaged_training_is_refused(trained, interrupted, tmp_path, file):
+    for name, content in contents(interrupted[1]).items():
+        (tmp_path / name).write_bytes(content[:-9] if name == file else content)
+    with pytest.raises(CheckpointError, match=file.replace(".", r"\.")):
+        resumed(trained, tmp_path)
+
+
 @pytest.mark.parametrize("damage", ["missing", "cut", "edited", "empty"])
 def test_damaged_checkpoints_are_refused(trained, tmp_path, damage):
     files = contents(trained.folder)

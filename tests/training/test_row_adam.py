@@ -148,3 +148,22 @@ def test_equal_bits_for_any_number_of_threads() -> None:
         results.append(both.lazy.flush())
     numba.set_num_threads(previous)
     assert torch.equal(*results)
+
+
+def test_a_table_goes_on_from_its_state_with_the_same_bits() -> None:
+    """Also rows that wait for longer than the horizon, before and after the interruption."""
+    first, second = (Both(6, [3, 2], seed=4) for _ in range(2))
+    for both in (first, second):
+        both.step(1.0, [0, 1], 0.02)
+        for _ in range(row_adam._HORIZON + 40):
+            both.step(0.3, [0], 0.01)
+    state = {name: tensor.clone() for name, tensor in first.lazy.state().items()}
+    second.lazy = RowAdam(torch.zeros(2, 5), [3, 2])
+    assert torch.equal(second.lazy.load_state(state), state["value"])
+    for both in (first, second):
+        for _ in range(row_adam._HORIZON + 40):
+            both.step(0.3, [0], 0.01)
+        both.step(1.0, [0, 1], 0.01)
+    ours, theirs = first.lazy.state(), second.lazy.state()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    first.compare()
