@@ -16,12 +16,14 @@ SPEC = MethodSpec(
         "paper": {},
         "balanced": {
             "iterations": 2_500,
+            "length_unit": "training",
             "stretch": True,
             "reset_interval": 7_500,
             "max_gaussians": 60_000,
         },
         "fast": {
             "iterations": 1_000,
+            "length_unit": "training",
             "stretch": True,
             "reset_interval": 30_000,
             "max_gaussians": 40_000,

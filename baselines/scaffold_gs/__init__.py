@@ -7,6 +7,7 @@ from typing import Any
 from chronoscene.methods import MethodSpec
 
 _SHORT: dict[str, Any] = {
+    "length_unit": "training",
     "voxel_size": 0.5,
     "voxel_unit": "spacing",
     "max_initial_anchors": 100_000,

@@ -5,15 +5,17 @@ Defaults are those of the official ChronoGS code, whose numbers are mostly those
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from typing import Self
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
-from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.training.splatting import SplattingConfig
 
 
 @dataclass(frozen=True)
-class AnchorConfig:
+class AnchorConfig(SplattingConfig):
     """Shared options. ``(a, b)`` is a learning rate that falls log-linearly from a to b."""
 
     iterations: int = 40_000
@@ -61,8 +63,6 @@ class AnchorConfig:
     visibility: str = "radius"
     """Anchors decoded per view. ``radius``: projected footprint touches the image (code);
     ``frustum``: centre inside the image (paper)."""
-    near_plane: float = NEAR_PLANE
-    """Nearest depth that is decoded and drawn, in units of the training frame."""
 
     # Resolution
     coarse_until: float = 0.0
@@ -71,10 +71,9 @@ class AnchorConfig:
     coarse_factor: int = 2
 
     # Loss
-    ssim_weight: float = 0.2
-    """Weight of 1 - SSIM; L1 gets the rest."""
     scale_weight: float = 0.01
-    """Weight of the mean product of the three scales (code; 0 in the paper)."""
+    """Weight of the mean product of the three scales, a volume in `length_unit` (code; 0 in the
+    paper)."""
     direction_noise: float = 0.0
     """Standard deviation of the random shift of the camera centre that the MLPs see in training,
     in units of the camera's distance from the mean anchor. Not in the papers."""
@@ -86,7 +85,7 @@ class AnchorConfig:
 
     # Learning rates
     offset_lr: tuple[float, float] = (0.01, 0.0001)
-    """Multiplied by the extent of the cameras."""
+    """Multiplied by the extent of the cameras, in `length_unit`."""
     feature_lr: tuple[float, float] = (0.0075, 0.0075)
     scaling_lr: tuple[float, float] = (0.007, 0.007)
     opacity_lr: tuple[float, float] = (0.002, 0.00002)
@@ -128,9 +127,11 @@ class AnchorConfig:
     """Candidates are dropped at random: half of them at the coarsest level, fewer at finer ones
     (code)."""
     max_log_scale: float = 0.05
-    """Upper bound of the logarithm of the Gaussians' scale, applied at each round (code)."""
+    """Upper bound of the logarithm of the Gaussians' scale in `length_unit`, applied at each round
+    (code)."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, known in _CHOICES.items():
             check_choice(name, getattr(self, name), known)
         for head in self.direction_heads:
@@ -141,6 +142,23 @@ class AnchorConfig:
                 raise ConfigError(
                     name, expected=f"at least {low}", found=str(value), todo="correct the value"
                 )
+
+    def in_training_frame(self, training_from_world: float) -> Self:
+        """As for every method; also bound and volume of scales, and the learning rate of offsets.
+
+        Offsets that are multiples of an anchor's scale have no unit, but the official code
+        multiplies their learning rate by the extent of the cameras, which has one.
+        """
+        config = super().in_training_frame(training_from_world)
+        if self.length_unit == "training":
+            return config
+        factor = 1 / training_from_world if self.offset_unit == "anchor" else 1.0
+        return replace(
+            config,
+            max_log_scale=self.max_log_scale + math.log(training_from_world),
+            scale_weight=self.scale_weight / training_from_world**3,
+            offset_lr=(self.offset_lr[0] * factor, self.offset_lr[1] * factor),
+        )
 
 
 HEADS = ("opacity", "covariance", "color")  # The three MLPs
@@ -159,7 +177,6 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 
 _LOWER_BOUNDS: dict[str, float] = {
     "iterations": 1,
-    "near_plane": 0.0,
     "offsets_per_anchor": 1,
     "voxel_size": 0.0,
     "point_stride": 1,

@@ -9,11 +9,11 @@ from dataclasses import asdict, dataclass
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
-from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.training.splatting import SplattingConfig
 
 
 @dataclass(frozen=True)
-class GaussianConfig:
+class GaussianConfig(SplattingConfig):
     """Shared options. A *moment* is an iteration of the schedule; see `stretch`."""
 
     iterations: int = 30_000
@@ -25,11 +25,6 @@ class GaussianConfig:
     schedule_length: int = 30_000
     """Moments that the schedule was made for; the learning rate of the positions falls over
     them."""
-    near_plane: float = NEAR_PLANE
-    """Nearest depth that is drawn, in units of the training frame. The default is common to all
-    methods here; the official rasterizer has 0.2 in units of its scene, whatever their size."""
-    ssim_weight: float = 0.2
-    """Weight of 1 - SSIM in the loss; L1 gets the rest (lambda)."""
 
     # Colour
     sh_degree: int = 3
@@ -82,7 +77,10 @@ class GaussianConfig:
 
     def __post_init__(self) -> None:
         check_choice("sh_degree", str(self.sh_degree), ("0", "1", "2", "3"))
+        super().__post_init__()
         for name, value in asdict(self).items():
+            if isinstance(value, str):
+                continue
             low = 1 if name in _AT_LEAST_ONE else 0
             if not value >= low:
                 raise ConfigError(

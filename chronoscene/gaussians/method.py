@@ -80,7 +80,8 @@ class GaussianMethod(SplattingMethod):
 
     def restore(self, folder: Path, tensors: dict[str, Tensor], device: str) -> None:
         try:
-            self.config = self.config_class(**self.meta["config"])
+            # Models from before there was a choice of units do not name theirs.
+            self.config = self.config_class(**{"length_unit": "training", **self.meta["config"]})
         except (KeyError, TypeError) as error:
             raise CheckpointError(
                 folder / META_FILE,

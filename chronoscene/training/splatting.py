@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from chronoscene.errors import CheckpointError, SceneError, ShapeError
+from chronoscene.checks import check_choice
+from chronoscene.errors import CheckpointError, ConfigError, SceneError, ShapeError
 from chronoscene.methods import MethodSize, Prediction, Skipped, StepReport, TrainingSet, View
-from chronoscene.rasterizer import RasterInfo, Rasterization, rasterize
+from chronoscene.rasterizer import NEAR_PLANE, RasterInfo, Rasterization, rasterize
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.adam import Adam, DenseTable, all_finite
 from chronoscene.training.checkpoint import TRAINING, TrainingState, load_tensors, save_tensors
@@ -56,6 +57,42 @@ def rms_spacing(points: NDArray[np.floating], neighbours: int = 3) -> NDArray[np
     # The first neighbour is the point itself, or a twin at distance 0, which is the same.
     distances, _ = cKDTree(points).query(points, k=neighbours + 1)
     return np.sqrt(np.square(distances[:, 1:]).mean(axis=1))
+
+
+@dataclass(frozen=True)
+class SplattingConfig:
+    """Options of all methods that splat Gaussians."""
+
+    length_unit: str = "world"
+    """Unit of the options that are lengths. ``world``: that of the scene, as in released code;
+    ``training``: that of the training frame, in which the farthest camera is at distance 1, so
+    that the unit of the scene does not matter."""
+    near_plane: float = NEAR_PLANE
+    """Nearest depth that is drawn, in `length_unit`. The default is common to all methods here; the
+    official rasterizer of 3DGS has 0.2."""
+    ssim_weight: float = 0.2
+    """Weight of 1 - SSIM in the loss; L1 gets the rest."""
+
+    def __post_init__(self) -> None:
+        check_choice("length_unit", self.length_unit, ("world", "training"))
+        if not self.near_plane >= 0.0:
+            raise ConfigError(
+                "near_plane",
+                expected="at least 0.0",
+                found=str(self.near_plane),
+                todo="correct the value",
+            )
+
+    def in_training_frame(self, training_from_world: float) -> Self:
+        """The same options with all lengths in units of the training frame.
+
+        Args:
+            training_from_world: Scale of the training frame: its units per unit of the world.
+        """
+        if self.length_unit == "training":
+            return self
+        near_plane = self.near_plane * training_from_world
+        return replace(self, length_unit="training", near_plane=near_plane)
 
 
 class Splats(NamedTuple):
@@ -147,7 +184,8 @@ class SplattingMethod(ABC):
     `AnchorMethod` and `GaussianMethod` are the two kinds of models that there are.
 
     Args:
-        config: Options of the method, a frozen dataclass.
+        config: Options of the method, a frozen dataclass on `SplattingConfig`. From `setup` on,
+            `config` holds them with lengths in units of the training frame.
     """
 
     name: ClassVar[str]
@@ -186,6 +224,7 @@ class SplattingMethod(ABC):
         """Rebuild the model from `stored_tensors` and `meta`."""
 
     def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
+        self.config = self.config.in_training_frame(train.training_from_world.scale)
         background = np.array(train.background, np.float32)
         self.background = torch.from_numpy(background).to(device)
         self.meta = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from chronoscene.errors import CheckpointError
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet
 from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.scene.similarity import Sim3
 from chronoscene.training.schedule import log_linear
 
 Make = Callable[..., ChronoGS]
@@ -41,7 +43,7 @@ def train(made: ChronoGS, steps: int) -> ChronoGS:
 
 
 def test_learning_rates_at_start_middle_and_end(method: Make) -> None:
-    made = method()
+    made = method(length_unit="training")
     rates = made.rates(1.1)
     at = {name: [log_linear(p, *rate) for p in (0.0, 0.5, 1.0)] for name, rate in rates.items()}
     assert at["opacity.w1"] == pytest.approx([2e-3, 2e-4, 2e-5])
@@ -144,7 +146,10 @@ def test_faint_anchors_go_but_never_all(noise_set: Callable[[int], TrainingSet])
     for name in ("offsets", "features", "log_scales"):
         assert trainer.tables[name].value.data_ptr() == getattr(trainer.model, name).data_ptr()
         assert len(getattr(made.model, name)) == len(before[::2]) == len(statistics.visits)
-    assert made.model.log_scales[0].tolist() == pytest.approx([3.0] * 3 + [0.05] * 3)
+    assert made.model.log_scales[0].tolist() == pytest.approx(
+        [3.0] * 3
+        + [0.05 + np.log(0.5)] * 3  # 0.05 in the world, of which one unit is half a one here
+    )
     statistics.visits[:] = 100.0
     statistics.opacity_sum[:] = 0.0
     trainer._prune(statistics)
@@ -205,10 +210,65 @@ def test_a_loaded_model_gives_the_same_pixels(
     ).read_bytes()
 
 
+def in_world_units(scene: TrainingSet, factor: float) -> TrainingSet:
+    """A normalised set as the released code trains on it: not normalised."""
+    return replace(
+        scene,
+        views=tuple(
+            replace(v, cam_from_world=moved(v.cam_from_world, factor)) for v in scene.views
+        ),
+        points=scene.points * np.float32(factor),
+        camera_extent=scene.camera_extent * factor,
+        training_from_world=Sim3.identity(),
+    )
+
+
+def moved(pose: np.ndarray, factor: float) -> np.ndarray:
+    return pose * np.array([1.0, 1.0, 1.0, factor])
+
+
+@pytest.mark.parametrize("factor", [0.25, 8.0])
+def test_the_defaults_train_as_the_released_code_does_in_world_units(
+    noise_set: Callable[[int], TrainingSet], factor: float
+) -> None:
+    """Near plane, offset rate, volume weight and scale bound: wrong in one, and models differ."""
+    options = GROWING | {
+        "voxel_unit": "world",
+        "voxel_size": 0.08 * factor,
+        "near_plane": 1.9 * factor,  # cuts the nearest points off
+        "scale_weight": 300.0 / factor**3,
+        "max_log_scale": float(np.log(0.06 * factor)),
+    }
+    scene = replace(noise_set(2), training_from_world=Sim3(1 / factor, np.eye(3), np.zeros(3)))
+    ours = train(_set_up(ChronoGSConfig(**options), scene), 24)
+    released = train(_set_up(ChronoGSConfig(**options), in_world_units(scene, factor)), 24)
+    mine, theirs = ours.model.tensors(), released.model.tensors()
+    assert mine.keys() == theirs.keys()
+    shift = {"anchors": (factor, 0.0), "log_scales": (1.0, np.log(factor))}
+    for name, tensor in mine.items():
+        scale, offset = shift.get(name, (1.0, 0.0))
+        difference = tensor * scale + offset - theirs[name]
+        # Where a gradient is next to nothing, Adam makes a step of what rounding leaves.
+        assert torch.quantile(difference.abs(), 0.99) < 1e-3 * max(1.0, scale), name
+    bound = ours.model.log_scales[:, 3:].max().item()
+    assert bound == pytest.approx(np.log(0.06), abs=0.02)  # reached, up to the steps since
+
+
+def test_in_units_of_the_training_frame_the_scene_does_not_matter(
+    noise_set: Callable[[int], TrainingSet],
+) -> None:
+    config = ChronoGSConfig(**GROWING, length_unit="training")
+    large = replace(noise_set(2), training_from_world=Sim3(1e-3, np.eye(3), np.zeros(3)))
+    one, two = (train(_set_up(config, scene), 24) for scene in (noise_set(2), large))
+    for name, tensor in one.model.tensors().items():
+        assert torch.equal(tensor, two.model.tensors()[name]), name
+
+
 def test_a_near_plane_is_trained_stored_and_rendered_with(
     noise_set: Callable[[int], TrainingSet], tmp_path: Path
 ) -> None:
-    near = train(_set_up(ChronoGSConfig(**GROWING, near_plane=2.0), noise_set(2)), 24)
+    options = GROWING | {"length_unit": "training"}
+    near = train(_set_up(ChronoGSConfig(**options, near_plane=2.0), noise_set(2)), 24)
     near.save(tmp_path)
     loaded = ChronoGS(ChronoGSConfig())
     loaded.load(tmp_path, device="cpu")
@@ -217,14 +277,14 @@ def test_a_near_plane_is_trained_stored_and_rendered_with(
     for name in ("rgb", "alpha", "depth"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
     assert ours.depth[ours.alpha > 0].min() >= 2.0
-    usual = train(_set_up(ChronoGSConfig(**GROWING), noise_set(2)), 24).render(view, 0)
+    usual = train(_set_up(ChronoGSConfig(**options), noise_set(2)), 24).render(view, 0)
     assert usual.depth[usual.alpha > 0].min() < 2.0
 
 
 def test_models_from_before_the_near_plane_was_stored_have_the_default(
     noise_set: Callable[[int], TrainingSet], method: Make, tmp_path: Path
 ) -> None:
-    made = method()
+    made = method(length_unit="training")
     made.save(tmp_path)
     meta = json.loads((tmp_path / "model.json").read_text())
     del meta["layout"]["near_plane"], meta["config"]["near_plane"]

@@ -12,6 +12,7 @@ from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.errors import CheckpointError
 from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.gaussians.model import GaussianModel
+from chronoscene.scene.similarity import Sim3
 
 
 def test_saved_models_render_the_same(tmp_path):
@@ -50,6 +51,17 @@ def test_a_near_plane_is_trained_stored_and_rendered_with(tmp_path):
     assert mine.depth[mine.alpha > 0].min() >= 1.0
     usual = train(scene, replace(SHORT, iterations=3)).render(scene.views[0], 0)
     assert usual.depth[usual.alpha > 0].min() < 1.0
+
+
+def test_a_near_plane_in_world_units_is_that_of_the_training_frame_times_its_scale(tmp_path):
+    scene = replace(toy_scene(), training_from_world=Sim3(0.25, np.eye(3), np.zeros(3)))
+    world = train(scene, replace(SHORT, iterations=3, near_plane=4.0, length_unit="world"))
+    frame = train(scene, replace(SHORT, iterations=3, near_plane=1.0, length_unit="training"))
+    world.save(tmp_path)
+    loaded = GaussianSplatting(GaussianSplattingConfig())
+    loaded.load(tmp_path, device="cpu")
+    images = [m.render(scene.views[0], 0).rgb for m in (world, frame, loaded)]
+    assert np.array_equal(images[0], images[1]) and np.array_equal(images[0], images[2])
 
 
 class PaintedModel(GaussianModel):

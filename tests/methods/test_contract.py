@@ -112,6 +112,25 @@ def test_training_lowers_a_finite_loss(trained):
     assert losses[-15:].mean() < 0.8 * losses[:5].mean()
 
 
+def test_short_presets_do_not_depend_on_the_unit_of_the_scene(spec, trained):
+    """Millimetres instead of metres change nothing; presets named paper may do as papers did."""
+    for preset in spec.presets:
+        if preset.startswith("paper"):
+            continue
+        images = []
+        for scale in (0.25, 0.25e-3):
+            frame = dataclasses.replace(trained.data.training_from_world, scale=scale)
+            data = dataclasses.replace(trained.data, training_from_world=frame)
+            config = build_config(spec, preset=preset, overrides={"iterations": 3})
+            method = import_object(spec.method)(config)
+            tiny_training.seed_everything(0)
+            method.setup(data, seed=0, device="cpu")
+            for index in range(3):
+                method.step(index, index / 3)
+            images.append(method.render(data.views[0], 0.0).rgb)
+        np.testing.assert_array_equal(*images, err_msg=preset)
+
+
 def test_training_views_are_learned_at_their_periods(trained):
     """The error is well below that of the best constant image of each view."""
     for i in (0, len(trained.data.views) - 1):
