@@ -14,7 +14,7 @@ from chronoscene.io.staging import check_outside
 from chronoscene.registration.context import CALIBRATIONS, Options
 from chronoscene.registration.features.matching import MIN_PHOTOS
 from chronoscene.registration.output import Inspection
-from chronoscene.registration.photos.captures import read_captures
+from chronoscene.registration.photos.captures import find_captures, read_captures
 from chronoscene.registration.pipeline import run
 from chronoscene.registration.result import ROUTES, Registered
 
@@ -135,26 +135,27 @@ def command(
     Exit status: 0 unless the verdict is fail, 1 if it is (the scene is written), 2 if the photos
     cannot be registered, or wrong usage.
     """
-    for option, place in (("OUT", out), ("--work", settings["work"])):
-        if place is not None:
-            check_outside(
-                place, [captures if captures.is_dir() else captures.parent], option=option
-            )
-            check_place(option, place)
-    found = read_captures(captures, table=table)
+    folder, table = find_captures(captures, table)
     options = Options(**settings)
+    for option, place in (("OUT", out), ("--work", options.work_folder(out))):
+        check_outside(place, [folder, *([] if scene is None else [scene])], option=option)
+        check_place(option, place)
+    found = read_captures(folder, table=table)
     inspections: list[Inspection] = []
-    with progress_bar(log=True) as report:
-        if scene is not None:
-            check_outside(out, [scene], option="OUT")
-        registered = run(
-            found,
-            out,
-            options,
-            into=None if scene is None else read_scene(scene),
-            report=report,
-            inspected=inspections.append,
-        )
+    try:
+        with progress_bar(log=True) as report:
+            registered = run(
+                found,
+                out,
+                options,
+                into=None if scene is None else read_scene(scene),
+                report=report,
+                inspected=inspections.append,
+            )
+    except BaseException as error:
+        for note in getattr(error, "__notes__", ()):
+            click.echo(f"note: {note}", err=True)
+        raise
     emit(summary(registered, out) + "".join(i.summary for i in inspections), None)
     if any(i.verdict.level == "fail" for i in inspections):
         context.exit(FAILED)

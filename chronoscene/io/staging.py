@@ -41,13 +41,7 @@ def staged_folder(out: Path) -> Iterator[Path]:
         SceneError: If ``out`` is a file or has content, or the disk refuses.
     """
     try:
-        if out.resolve() == Path.cwd():  # a shell would stay in the folder that is replaced
-            raise SceneError(
-                out,
-                expected="a folder other than the current one",
-                found="the current folder",
-                todo="run the command from its parent folder, or name a new folder",
-            )
+        check_not_current(out)
         out = out.resolve()
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise SceneError(
@@ -71,6 +65,21 @@ def staged_folder(out: Path) -> Iterator[Path]:
             found=error.strerror or str(error),
             todo="choose another folder, or make room",
         ) from error
+
+
+def check_not_current(out: Path) -> None:
+    """Refuse to replace the current folder: a shell would stay in the one that is removed.
+
+    Raises:
+        SceneError: If the path is the current folder.
+    """
+    if out.resolve() == Path.cwd():
+        raise SceneError(
+            out,
+            expected="a folder other than the current one",
+            found="the current folder",
+            todo="run the command from its parent folder, or name a new folder",
+        )
 
 
 def check_outside(place: Path, scenes: Iterable[Path], *, option: str = "") -> None:

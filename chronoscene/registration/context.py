@@ -52,6 +52,10 @@ class Options:
     page: bool = False
     """Whether to write ``registration.html``."""
 
+    def work_folder(self, out: Path) -> Path:
+        """Where intermediate results of a scene are."""
+        return (self.work or Path(f"{out.resolve()}.work")).resolve()
+
     def record(self) -> dict[str, Any]:
         """The options that are set, for the log."""
         values = {name: getattr(self, name) for name in self.__slots__}

@@ -18,7 +18,7 @@ from chronoscene.arrays import Ints
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.store import Progress
-from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.staging import check_not_current, write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, certify
 from chronoscene.registration.quality.certificate_json import to_json
 from chronoscene.registration.quality.verdict import Verdict, judge
@@ -109,6 +109,7 @@ def point_errors(registered: Registered) -> NDArray[np.float64]:
 
 def check_free(out: Path, *, overwrite: bool) -> None:
     """Refuse a path that is in use, unless it is a registration that may be replaced."""
+    check_not_current(out)
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return
     if overwrite and out.is_dir() and (out / LOG).is_file():

@@ -62,7 +62,7 @@ def run(
             todo="omit one of the two",
         )
     output.check_free(out, overwrite=options.overwrite)
-    work = (options.work or out.with_name(f"{out.name}.work")).resolve()
+    work = options.work_folder(out)
     points = None
     if options.tie_points is not None:
         points = read_tie_points(options.tie_points, scale=options.tie_scale)

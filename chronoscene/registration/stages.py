@@ -105,6 +105,8 @@ def read_record(path: Path) -> dict[str, Any] | None:
 def work_folder(path: Path, patience: float = PATIENCE) -> Iterator[int]:
     """Create a work folder and keep others out of it while the block runs.
 
+    What ends the block early gets a note that the folder was kept, and what for.
+
     Args:
         path: The folder.
         patience: Seconds to wait for another process to leave it.
@@ -128,7 +130,14 @@ def work_folder(path: Path, patience: float = PATIENCE) -> Iterator[int]:
                     todo="wait for it to end, or choose another folder (--work)",
                 )
             time.sleep(0.1)
-        yield lock.fileno()
+        try:
+            yield lock.fileno()
+        except BaseException as error:
+            error.add_note(
+                f"{path} was kept: run the same command again to continue from there, or delete "
+                "the folder to start from scratch"
+            )
+            raise
 
 
 def _locked(descriptor: int) -> bool:
@@ -184,8 +193,8 @@ def run_step(
             f"step {step}",
             expected="the step to finish",
             found=f"{outcome.cause} ({said})" if said else outcome.cause,
-            todo="what was computed before is kept: run the command again, with --threads 1 or "
-            f"other settings if it happens again; see {log}",
+            todo="run the command again; if it happens again, try --threads 1 or other settings; "
+            f"see {log}",
         )
     if "error" in outcome.message:
         raise RegistrationError(**outcome.message["error"])

@@ -13,7 +13,7 @@ from PIL import Image
 
 from chronoscene.cli import cli as main
 from chronoscene.cli import register
-from chronoscene.errors import ChronoSceneError, ConfigError
+from chronoscene.errors import ChronoSceneError, ConfigError, RegistrationError, SceneError
 
 
 def call(*arguments: str | Path) -> Result:
@@ -62,8 +62,73 @@ def test_too_few_photos_end_in_one_message(tmp_path: Path, count: int) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_the_scene_does_not_go_into_the_photos(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "places",
+    [["in/out"], ["out", "--work", "in/work"], ["out", "--into", "old", "--work", "old/work"]],
+)
+def test_nothing_goes_into_the_photos_or_the_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, places: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    photos(Path("in/a"), 3)
+    Path("old").mkdir()
+    before = sorted(Path().rglob("*"))
+    done = call("in", *places)
+    assert isinstance(done.exception, ConfigError), done.output
+    assert sorted(Path().rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        ("captures", "nothing there; check the path"),
+        ("notes.txt", "another file; check the path"),
+        ("empty", "no image files; copy the photos there"),
+    ],
+)
+def test_captures_that_are_missing_are_what_the_message_is_about(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str, found: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("notes.txt").write_text("mine")
+    Path("empty").mkdir()
+    done = call(given, "out")
+    assert str(done.exception) == (
+        f"{given}: expected a folder of photos, or a CSV table of images and their periods, "
+        f"found {found}"
+    )
+
+
+def test_the_current_folder_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     photos(tmp_path / "in/a", 3)
-    done = call(tmp_path / "in", tmp_path / "in/out")
-    assert isinstance(done.exception, ConfigError)
-    assert not (tmp_path / "in/out").exists()
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path / "out")
+    done = call(tmp_path / "in", ".")
+    assert isinstance(done.exception, SceneError), done.output
+    assert done.exception.found == "the current folder"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "out"]
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt(), SystemExit(143), None])
+def test_a_run_that_ends_early_says_what_the_work_folder_is_kept_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: BaseException | None
+) -> None:
+    """Ctrl-C, SIGTERM, or an error: here too few photos."""
+    photos(tmp_path / "in/a", 1 if end is None else 3)
+
+    def stop(*inputs: Any) -> None:
+        raise end or AssertionError
+
+    if end is not None:
+        monkeypatch.setattr("chronoscene.registration.pipeline.find_matches", stop)
+    done = call(tmp_path / "in", tmp_path / "out")
+    assert done.exit_code != 0
+    assert (
+        f"note: {tmp_path / 'out.work'} was kept: run the same command again to continue from "
+        "there, or delete the folder to start from scratch\n"
+    ) in done.stderr
+    assert (tmp_path / "out.work").is_dir()
+    if end is None:
+        assert isinstance(done.exception, RegistrationError)

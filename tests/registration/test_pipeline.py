@@ -250,7 +250,8 @@ def test_photos_that_show_nothing_are_refused_and_work_is_kept(tmp_path: Path) -
     for i in range(3):
         pixels = np.random.default_rng(i).integers(0, 256, (120, 160, 3), np.uint8)
         Image.fromarray(pixels).save(folder / f"{i}.png")
-    with pytest.raises(RegistrationError, match="features and matches are kept"):
+    with pytest.raises(RegistrationError, match="found no pair of photos") as caught:
         run(read_captures(folder), tmp_path / "out", OPTIONS)
+    assert caught.value.__notes__[0].startswith(f"{tmp_path / 'out.work'} was kept: ")
     assert (tmp_path / "out.work" / "stage-matches.json").is_file()
     assert not (tmp_path / "out").exists()

@@ -58,6 +58,15 @@ class _Listed:
     label: str
 
 
+def find_captures(path: Path, table: Path | None) -> tuple[Path, Path | None]:
+    """The folder of the photos and the table of their periods; arguments as in `read_captures`."""
+    if path.is_dir():
+        return path, table
+    if table is None and path.suffix.lower() == ".csv" and path.is_file():
+        return path.parent, path
+    raise _nothing(path, "another file" if path.exists() else "nothing there", "check the path")
+
+
 def read_captures(path: Path, *, table: Path | None = None) -> Captures:
     """Find the photographs of all periods.
 
@@ -68,11 +77,7 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
     Raises:
         SceneError: If there are no photos, or the table is wrong.
     """
-    path = Path(path)
-    if table is None and path.suffix.lower() == ".csv" and path.is_file():
-        path, table = path.parent, path
-    if not path.is_dir():
-        raise _nothing(path, "nothing")
+    path, table = find_captures(Path(path), table)
     remarks: list[str] = []
     if table is not None:
         listed = _from_table(path, table)
@@ -226,10 +231,10 @@ def _check_names(root: Path, images: Sequence[Capture]) -> None:
             )
 
 
-def _nothing(path: Path, found: str) -> SceneError:
+def _nothing(path: Path, found: str, todo: str = "copy the photos there") -> SceneError:
     return SceneError(
         path,
-        expected="a folder with a subfolder of photos per period, or a CSV of image and period",
+        expected="a folder of photos, or a CSV table of images and their periods",
         found=found,
-        todo="copy the photos there",
+        todo=todo,
     )

@@ -78,13 +78,13 @@ def _merged(
 ) -> dict[str, Any]:
     """Align, merge, adjust and write submodels; the result of the step."""
     if not submodels:
-        also = "tie points align models, they do not create them; "
+        also = "; tie points align models, they do not create them"
         raise RegistrationError(
             "structure from motion",
             expected=f"a model of {len(arguments['periods'])} photos",
-            found="no pair of photos that initialises one",
-            todo="add photos that overlap by more than half, taken from different positions; "
-            f"{also if arguments['keep_unplaced'] else ''}features and matches are kept",
+            found="no pair of photos to start it from",
+            todo="add photos that overlap by more than half, taken from different positions"
+            f"{also if arguments['keep_unplaced'] else ''}",
         )
     _, matches = verified_matches(job.database)
     priors, keep_unplaced = Priors.of(arguments["priors"]), arguments["keep_unplaced"]
@@ -196,7 +196,7 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
             expected="photos that match those of the scene",
             found="none that could be registered",
             todo="add photos with viewpoints like those of the scene, or register all periods "
-            "together; features and matches are kept",
+            "together",
         )
     report("adjusting", 0, 1)
     ended = adjust(model, constant=old, threads=job.threads)
