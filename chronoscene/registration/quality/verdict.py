@@ -412,4 +412,5 @@ def _words(certificate: Certificate, level: Level, findings: list[Finding]) -> s
         if level == "fail"
         else "The registration may be correct, but the measurements do not prove it."
     )
-    return f"{start} {first.place.capitalize()}: {first.found}."
+    place = first.place[0].upper() + first.place[1:]  # labels stay as they are
+    return f"{start} {place}: {first.found}."

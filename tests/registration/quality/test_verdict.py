@@ -1,0 +1,401 @@
+"""Every check of the verdict by itself: a value just inside its limit, and one just outside.
+
+The certificates are made by hand. Limits are written here as numbers, so that a changed threshold
+shows; the scene measures 50 units and the focal length is 1000 pixels, so that forgotten factors
+show as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import combinations
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from chronoscene.registration.quality.certificate import (
+    Certificate,
+    HeldOut,
+    PairFigures,
+    PeriodFigures,
+)
+from chronoscene.registration.quality.gps_fit import GpsFit
+from chronoscene.registration.quality.localisation import Excess, Localisation
+from chronoscene.registration.quality.misalignment import Interval, Misalignment
+from chronoscene.registration.quality.overlap import TieSpread
+from chronoscene.registration.quality.surface_distance import SurfaceDistance
+from chronoscene.registration.quality.verdict import Verdict, judge
+from chronoscene.scene.similarity import Sim3
+
+Change = Callable[[Certificate, float], Certificate]
+
+
+def misalignment(rotation: float = 0.03, shift: float = 0.03) -> Misalignment:
+    """Intervals from 0 to twice the value. Degrees and world units."""
+    sizes = (Interval(x, 0.0, 2 * x) for x in (rotation, shift, 1e-3))
+    return Misalignment(40, Sim3.identity(), *sizes)
+
+
+def made(count: int = 2) -> Certificate:
+    """A registration that passes with room in every figure."""
+    gps = GpsFit(
+        positions=20, median=3.0, largest=9.0, outliers=0,
+        scale=1.0, scale_error=0.01, turn=0.0, turn_error=0.5,
+        offset=np.zeros(3), offset_error=np.array([0.3, 0.1, 50.0]),
+    )  # fmt: skip
+    local = Localisation(10, 10, 0.01, 0.01, Excess(0.01, 0.0), Excess(0.01, 0.0))
+    pair = PairFigures(
+        a=0,
+        b=1,
+        ties=TieSpread(500, 90, 0.8, 0.9, 1.0, 1.0, (), np.zeros((0, 3))),
+        held_out=HeldOut(40, 300, 0.5, 1.2, 0.5, 0.95, 0.01, 0.02, 20, 0.4, 200),
+        misalignment=misalignment(),
+        by_all=misalignment(),
+        localised_b=local,
+        localised_a=local,
+        surfaces=SurfaceDistance(900, 800, 0.01, 0.03, 0.05, Interval(0.01, 0.0, 0.02)),
+    )
+    labels = ("May 2016", "May 2017", "May 2018", "May 2019")[:count]
+    return Certificate(
+        route="joint",
+        unit="metre",
+        extent=50.0,
+        focal=1000.0,
+        labels=labels,
+        periods=tuple(
+            PeriodFigures(i, label, 20, 20, {}, 0.5, 1000, gps) for i, label in enumerate(labels)
+        ),
+        pairs=tuple(replace(pair, a=a, b=b) for a, b in combinations(range(count), 2)),
+        evidence=cast(Any, None),  # the verdict does not look at it
+    )
+
+
+def with_period(certificate: Certificate, period: int = 1, **changes: Any) -> Certificate:
+    periods = list(certificate.periods)
+    periods[period] = replace(periods[period], **changes)
+    return replace(certificate, periods=tuple(periods))
+
+
+def with_gps(certificate: Certificate, period: int = 1, **changes: Any) -> Certificate:
+    gps = certificate.periods[period].gps
+    assert isinstance(gps, GpsFit)
+    return with_period(certificate, period, gps=replace(gps, **changes))
+
+
+def with_pair(
+    certificate: Certificate, pair: tuple[int, int] = (0, 1), **changes: Any
+) -> Certificate:
+    changed = tuple(replace(p, **changes) if (p.a, p.b) == pair else p for p in certificate.pairs)
+    return replace(certificate, pairs=changed)
+
+
+def with_part(
+    certificate: Certificate, part: str, pair: tuple[int, int] = (0, 1), **changes: Any
+) -> Certificate:
+    """Change fields of one of the figures of a pair."""
+    figures = next(getattr(p, part) for p in certificate.pairs if (p.a, p.b) == pair)
+    return with_pair(certificate, pair, **{part: replace(figures, **changes)})
+
+
+def apart(certificate: Certificate, pair: tuple[int, int], ties: int = 0) -> Certificate:
+    """Take all measurements of the alignment from a pair."""
+    nothing = "nothing is seen by both"
+    changed = with_part(certificate, "ties", pair, points=ties)
+    return with_pair(
+        changed, pair, held_out=nothing, misalignment=nothing, by_all=nothing,
+        localised_a=nothing, localised_b=nothing, surfaces=nothing,
+    )  # fmt: skip
+
+
+def found(verdict: Verdict) -> list[tuple[str, str]]:
+    return [(f.check, f.level) for f in verdict.findings]
+
+
+def test_a_registration_that_is_good_in_everything_passes() -> None:
+    for count in (1, 2, 4):
+        verdict = judge(made(count))
+        assert verdict.level == "pass"
+        assert not verdict.findings
+        assert set(verdict.pairs.values()) <= {"pass"}
+
+
+LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
+    # name: (check, level of what is outside, change, value inside, value outside)
+    "registered": ("registered", "doubtful", lambda c, x: with_period(c, photos=x), 33, 34),
+    "registered, fail": ("registered", "fail", lambda c, x: with_period(c, photos=x), 200, 201),
+    "registered, first": (
+        "registered", "doubtful", lambda c, x: with_period(c, 0, photos=x), 33, 34,
+    ),
+    "images": ("images", "doubtful", lambda c, x: with_period(c, registered=x, photos=x), 5, 4),
+    "images, fail": ("images", "fail", lambda c, x: with_period(c, registered=x, photos=x), 3, 2),
+    "rotation, all ties": (
+        "rotation", "doubtful",
+        lambda c, x: with_part(c, "by_all", rotation=Interval(0.04, 0.0, x)), 0.0999, 0.1001,
+    ),
+    "rotation, all ties, fail": (
+        "rotation", "fail",
+        lambda c, x: with_part(c, "by_all", rotation=Interval(0.3, x, 0.5)), 0.0999, 0.1001,
+    ),
+    "rotation, held out": (
+        "rotation", "doubtful",
+        lambda c, x: with_part(c, "misalignment", rotation=Interval(0.04, 0.0, x)), 0.1999, 0.2001,
+    ),
+    "rotation, held out, estimate": (
+        "rotation", "doubtful",
+        lambda c, x: with_part(c, "misalignment", rotation=Interval(x, 0.0, 0.15)), 0.0999, 0.1001,
+    ),
+    "rotation, held out, fail": (
+        "rotation", "fail",
+        lambda c, x: with_part(c, "misalignment", rotation=Interval(0.3, x, 0.5)), 0.0999, 0.1001,
+    ),
+    "shift, all ties": (
+        "shift", "doubtful",
+        lambda c, x: with_part(c, "by_all", shift=Interval(0.04, 0.0, x)), 0.0999, 0.1001,
+    ),
+    "shift, all ties, fail": (
+        "shift", "fail",
+        lambda c, x: with_part(c, "by_all", shift=Interval(0.3, x, 0.5)), 0.0999, 0.1001,
+    ),
+    "shift, held out": (
+        "shift", "doubtful",
+        lambda c, x: with_part(c, "misalignment", shift=Interval(0.04, 0.0, x)), 0.1999, 0.2001,
+    ),
+    "shift, held out, estimate": (
+        "shift", "doubtful",
+        lambda c, x: with_part(c, "misalignment", shift=Interval(x, 0.0, 0.15)), 0.0999, 0.1001,
+    ),
+    "shift, held out, fail": (
+        "shift", "fail",
+        lambda c, x: with_part(c, "misalignment", shift=Interval(0.3, x, 0.5)), 0.0999, 0.1001,
+    ),
+    "agreeing": (
+        "agreeing", "doubtful", lambda c, x: with_part(c, "held_out", agreeing=x), 0.751, 0.749,
+    ),
+    "agreeing, fail": (
+        "agreeing", "fail", lambda c, x: with_part(c, "held_out", agreeing=x), 0.151, 0.149,
+    ),
+    # With an error of 0.5 px, 1.3 times that is noise: 1.745 px are 0.1 degrees, 6.981 px 0.4.
+    "excess": (
+        "excess", "doubtful", lambda c, x: with_part(c, "held_out", noise=x), 1.862, 1.863,
+    ),
+    "excess, fail": (
+        "excess", "fail", lambda c, x: with_part(c, "held_out", noise=x), 7.011, 7.012,
+    ),
+    "occupied": (
+        "occupied", "doubtful", lambda c, x: with_part(c, "ties", occupied=x), 0.151, 0.149,
+    ),
+    "tied, first": ("tied", "doubtful", lambda c, x: with_part(c, "ties", tied_a=x), 0.501, 0.499),
+    "tied, second": ("tied", "doubtful", lambda c, x: with_part(c, "ties", tied_b=x), 0.501, 0.499),
+    "localised, first, rotation": (
+        "localised", "doubtful",
+        lambda c, x: with_part(c, "localised_a", rotation_excess=Excess(x, 0.0)), 0.0599, 0.0601,
+    ),
+    "localised, second, centre": (
+        "localised", "doubtful",
+        lambda c, x: with_part(c, "localised_b", centre_excess=Excess(x, 0.0)), 0.0599, 0.0601,
+    ),
+    "localised, rotation, fail": (
+        "localised", "fail",
+        lambda c, x: with_part(c, "localised_a", rotation_excess=Excess(5.0, x)), 0.999, 1.001,
+    ),
+    "localised, centre, fail": (
+        "localised", "fail",
+        lambda c, x: with_part(c, "localised_b", centre_excess=Excess(5.0, x)), 0.999, 1.001,
+    ),
+    "clouds": (
+        "clouds", "doubtful",
+        lambda c, x: with_part(c, "surfaces", shift=Interval(x, 0.01, 0.2)), 0.0749, 0.0751,
+    ),
+    "clouds, interval": (
+        "clouds", "doubtful",
+        lambda c, x: with_part(c, "surfaces", shift=Interval(0.2, x, 0.5)), 0.0, 1e-6,
+    ),
+    "surfaces": (
+        "surfaces", "doubtful", lambda c, x: with_part(c, "surfaces", beyond=x), 0.299, 0.301,
+    ),
+    # The spread of the difference is hypot(0.3, 0.3) m; three times that is 1.273 m.
+    "gps offset, east": (
+        "gps_offset", "doubtful",
+        lambda c, x: with_gps(c, offset=np.array([x, 0.0, 0.0])), 6.27, 6.28,
+    ),
+    "gps offset, north": (
+        "gps_offset", "doubtful",
+        lambda c, x: with_gps(c, 0, offset=np.array([0.0, x, 0.0])), 6.27, 6.28,
+    ),
+    "gps offset, fail": (
+        "gps_offset", "fail",
+        lambda c, x: with_gps(c, offset=np.array([x, 0.0, 0.0])), 16.27, 16.28,
+    ),
+    "gps residual": ("gps_residual", "doubtful", lambda c, x: with_gps(c, median=x), 11.9, 12.1),
+    "gps scale": ("gps_scale", "doubtful", lambda c, x: with_gps(c, scale=x), 1.0499, 1.0501),
+    "gps scale, small": (
+        "gps_scale", "doubtful", lambda c, x: with_gps(c, scale=x), 0.9501, 0.9499,
+    ),
+    "gps scale, fail": ("gps_scale", "fail", lambda c, x: with_gps(c, scale=x), 1.1299, 1.1301),
+    "gps turn": ("gps_turn", "doubtful", lambda c, x: with_gps(c, turn=x), 3.49, 3.51),
+    "gps turn, clockwise": ("gps_turn", "doubtful", lambda c, x: with_gps(c, turn=x), -3.49, -3.51),
+    "gps turn, fail": ("gps_turn", "fail", lambda c, x: with_gps(c, turn=x), 11.49, 11.51),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_each_check_has_its_limit(name: str) -> None:
+    check, level, change, inside, outside = LIMITS[name]
+    milder = [(check, "doubtful")] if level == "fail" else []
+    assert found(judge(change(made(), inside))) == milder
+    verdict = judge(change(made(), outside))
+    assert found(verdict) == [(check, level)]
+    assert verdict.level == level
+
+
+@pytest.mark.parametrize("noisy", [0, 1])
+def test_the_noise_of_matching_is_that_of_the_noisier_period(noisy: int) -> None:
+    certificate = with_part(made(), "held_out", noise=1.86)
+    assert not judge(certificate).findings
+    calm = with_period(certificate, 1 - noisy, error=0.1)
+    assert not judge(calm).findings
+    for error in (0.1, None):
+        both_calm = with_period(calm, noisy, error=error)
+        assert found(judge(both_calm)) == [("excess", "doubtful")]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: with_gps(c, offset=np.array([0.0, 0.0, 80.0])),  # heights are not judged
+        lambda c: with_gps(c, scale=None, scale_error=None, turn=None, turn_error=None),
+        lambda c: with_period(c, gps="the frame is not georeferenced"),
+        lambda c: with_part(c, "held_out", tracks=11, agreeing=0.0, noise=50.0),
+        lambda c: with_part(
+            c, "localised_a", images=2, rotation_excess=Excess(50.0, 40.0)
+        ),
+        lambda c: with_pair(c, localised_a="no image", localised_b="no image"),
+        lambda c: with_pair(c, surfaces="too few for surfaces"),
+    ],
+    ids=["height", "short path", "no GPS", "11 tracks", "2 images", "no image", "no surfaces"],
+)  # fmt: skip
+def test_what_cannot_be_judged_is_not(change: Callable[[Certificate], Certificate]) -> None:
+    assert judge(change(made())).level == "pass"
+
+
+def test_a_dozen_tracks_and_three_images_are_enough_to_be_judged() -> None:
+    tracks = with_part(made(), "held_out", tracks=12, agreeing=0.7)
+    assert found(judge(tracks)) == [("agreeing", "doubtful")]
+    images = with_part(made(), "localised_b", images=3, rotation_excess=Excess(0.5, 0.1))
+    assert found(judge(images)) == [("localised", "doubtful")]
+
+
+@pytest.mark.parametrize(
+    "missing", [("misalignment",), ("by_all",), ("misalignment", "by_all")], ids="+".join
+)
+@pytest.mark.parametrize("tracks", [0, 8, 40])
+def test_without_both_measurements_there_is_no_pass(missing: tuple[str, ...], tracks: int) -> None:
+    """Many held-out tracks that do not determine the alignment prove no more than few."""
+    certificate = with_part(made(), "held_out", tracks=tracks)
+    verdict = judge(with_pair(certificate, **dict.fromkeys(missing, "all in one spot")))
+    assert found(verdict) == [("held_out", "doubtful")]
+    assert f"{min(tracks, 11)} tracks, expected at least 12 (" in verdict.findings[0].found
+
+
+def test_without_held_out_tracks_the_ties_can_still_prove_an_error() -> None:
+    nothing = with_pair(made(), held_out="no track", misalignment="no track")
+    assert found(judge(nothing)) == [("held_out", "doubtful")]
+    wrong = with_part(nothing, "by_all", rotation=Interval(0.4, 0.2, 0.6))
+    assert found(judge(wrong)) == [("rotation", "fail"), ("held_out", "doubtful")]
+
+
+def test_three_ties_are_a_link_and_two_are_none() -> None:
+    linked, unlinked = (judge(apart(made(), (0, 1), ties=n)) for n in (3, 2))
+    assert linked.pairs[0, 1] == "doubtful"
+    assert found(linked) == [("held_out", "doubtful")]
+    assert unlinked.pairs[0, 1] is None
+    assert found(unlinked) == [("link", "fail")]
+
+
+def test_measured_tracks_link_without_any_tie() -> None:
+    """Clicked points alone, say, or held-out tracks alone."""
+    for measured in ({"by_all": misalignment()}, {"held_out": made().pairs[0].held_out}):
+        verdict = judge(with_pair(apart(made(), (0, 1)), **measured))
+        assert verdict.pairs[0, 1] == "doubtful"
+        assert verdict.level == "doubtful"
+
+
+@pytest.mark.parametrize(("rotation", "shift"), [(1.0, 0.0), (0.0, 1.0)])
+def test_a_chain_counts_as_far_as_its_errors_add_up(rotation: float, shift: float) -> None:
+    """Two links of 0.0707 degrees, or of 0.1414% of the extent, make 0.1 or 0.2%."""
+
+    def chained(size: float) -> Verdict:
+        certificate = apart(made(3), (0, 2))
+        link = misalignment(max(rotation * size, 1e-3) / 2, max(shift * size, 1e-3) / 2)
+        for pair in ((0, 1), (1, 2)):
+            certificate = with_pair(certificate, pair, by_all=link)
+        return judge(certificate)
+
+    assert chained(0.0707).level == "pass"
+    beyond = chained(0.0708)
+    assert found(beyond) == [("chain", "doubtful")]
+    assert "within 1 times the limits" in beyond.findings[0].found
+    assert beyond.pairs == {(0, 1): "pass", (0, 2): None, (1, 2): "pass"}
+
+
+def test_a_chain_has_no_doubtful_link() -> None:
+    certificate = with_part(apart(made(3), (0, 2)), "held_out", (1, 2), agreeing=0.7)
+    verdict = judge(certificate)
+    assert found(verdict) == [("agreeing", "doubtful"), ("chain", "doubtful")]
+    assert verdict.findings[1].found == "no chain of good pairs links them"
+
+
+def test_a_period_that_nothing_links_fails_with_each_of_the_others() -> None:
+    verdict = judge(apart(apart(made(3), (0, 2)), (1, 2)))
+    assert found(verdict) == [("link", "fail")] * 2
+    assert [f.place for f in verdict.findings] == [
+        "periods May 2016 and May 2018",
+        "periods May 2017 and May 2018",
+    ]
+
+
+WEAK: dict[str, Callable[[Certificate], Certificate]] = {
+    "held_out": lambda c: with_pair(c, (0, 2), misalignment="few"),
+    "rotation": lambda c: with_part(c, "by_all", (0, 2), rotation=Interval(0.04, 0.0, 0.3)),
+    "shift": lambda c: with_part(c, "by_all", (0, 2), shift=Interval(0.04, 0.0, 0.3)),
+    "occupied": lambda c: with_part(c, "ties", (0, 2), occupied=0.05),
+    "tied": lambda c: with_part(c, "ties", (0, 2), tied_b=0.1),
+    "agreeing": lambda c: with_part(c, "held_out", (0, 2), agreeing=0.5),
+    "excess": lambda c: with_part(c, "held_out", (0, 2), noise=3.0),
+    "localised": lambda c: with_part(c, "localised_a", (0, 2), rotation_excess=Excess(0.3, 0.0)),
+    "clouds": lambda c: with_part(c, "surfaces", (0, 2), shift=Interval(0.2, 0.1, 0.3)),
+    "surfaces": lambda c: with_part(c, "surfaces", (0, 2), beyond=0.5),
+}
+"""Doubt about the pair of the first and the last of three periods."""
+
+
+@pytest.mark.parametrize("check", WEAK)
+def test_a_chain_supplies_evidence_but_refutes_nothing(check: str) -> None:
+    verdict = judge(WEAK[check](made(3)))
+    assert verdict.pairs[0, 2] == "doubtful"
+    lacking = check in ("held_out", "rotation", "shift", "occupied", "tied")
+    assert found(verdict) == ([] if lacking else [(check, "doubtful")])
+    # A chain that is itself loose supplies nothing.
+    loose = made(3)
+    for pair in ((0, 1), (1, 2)):
+        loose = with_pair(loose, pair, by_all=misalignment(rotation=0.045))
+    assert (check, "doubtful") in found(judge(WEAK[check](loose)))
+
+
+def test_a_chain_does_not_heal_a_failure() -> None:
+    turned = with_part(made(3), "by_all", (0, 2), rotation=Interval(0.4, 0.2, 0.6))
+    assert found(judge(turned)) == [("rotation", "fail")]
+
+
+def test_the_worst_comes_first_and_is_what_the_text_names() -> None:
+    certificate = with_period(with_part(made(), "held_out", agreeing=0.1), 0, photos=50)
+    verdict = judge(certificate)
+    assert found(verdict) == [("agreeing", "fail"), ("registered", "doubtful")]
+    assert verdict.text.startswith("The periods do not fit each other")
+    assert "Periods May 2016 and May 2017: share of held-out observations" in verdict.text
+    assert [len(verdict.todo), verdict.todo[0]] == [2, verdict.findings[0].todo]
+    doubtful = judge(with_period(made(), photos=50))
+    assert "Period May 2017: share of the photos" in doubtful.text
+    assert "do not prove it" in doubtful.text
