@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from chronoscene.arrays import Ints
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.store import Progress
@@ -38,10 +37,10 @@ GEOREFERENCE = "georeference.json"
 CERTIFICATE = "registration.json"
 PAGE = "registration.html"
 
-SAME_PIXELS = 1.0  # Two observations in one image this near to each other are of one point..
-
-SAME_ERROR = 4.0
-"""...if the point projects into the new images this near to their observations, in pixels."""
+SAME_PIXELS = 1.0  # Observations in one image that are nearer to each other can be of one point
+SAME_ERROR = (
+    4.0  # Pixels: they are if it projects into the new images this near to where they see it
+)
 
 
 def as_scene(registered: Registered, name: str) -> Scene:
@@ -88,7 +87,7 @@ def as_points(registered: Registered) -> Points:
     )
 
 
-def point_errors(registered: Registered) -> NDArray[np.float64]:
+def point_errors(registered: Registered) -> Array:
     """Mean reprojection error of each point, pixels; 0 without observations. [P]
 
     An observation behind its camera counts as 0.
@@ -196,21 +195,19 @@ def extend_tracks(scene: Scene, new: Scene, frames: Sequence[Frame]) -> Points:
     """
     index = {frame.name: i for i, frame in enumerate(frames)}
     a, b = scene.points, new.points
-    old_frame = np.array([index[f.name] for f in scene.frames], np.int64)
-    a_point, a_frame = track_owners(a.track_start), old_frame[a.track_frame]
-    b_point = track_owners(b.track_start)
-    b_frame = np.array([index[f.name] for f in new.frames], np.int64)[b.track_frame]
-    by_new = ~np.isin(b_frame, old_frame)
-    target = _same_points(a, a_point, a_frame, b, b_point, b_frame, by_new)
-    target[_misfits(a, target, b, b_point, b_frame, by_new, frames)] = -1
+    before = _Sightings.of(scene, index)
+    again = _Sightings.of(new, index)
+    by_new = ~np.isin(again.frame, [index[f.name] for f in scene.frames])
+    target = _same_points(before, again.select(~by_new), len(b))
+    target[_misfits(a.xyz, target, again.select(by_new), frames)] = -1
 
     is_new = np.zeros(len(b), bool)
-    is_new[b_point[by_new]] = True
+    is_new[again.point[by_new]] = True
     is_new &= target < 0
     number = np.where(target < 0, np.cumsum(is_new) - 1 + len(a), target)
-    rows = np.flatnonzero(is_new[b_point] | (by_new & (target[b_point] >= 0)))
-    point = np.concatenate([a_point, number[b_point[rows]]])
-    frame = np.concatenate([a_frame, b_frame[rows]])
+    added = again.select(is_new[again.point] | (by_new & (target[again.point] >= 0)))
+    point = np.concatenate([before.point, number[added.point]])
+    frame = np.concatenate([before.frame, added.frame])
     order = np.argsort(point, kind="stable")
     # An image observes a point once: the first observation counts.
     key = point * len(frames) + frame
@@ -224,56 +221,73 @@ def extend_tracks(scene: Scene, new: Scene, frames: Sequence[Frame]) -> Points:
         error=np.concatenate([a.error, b.error[is_new]]),
         track_start=np.searchsorted(point[order], np.arange(len(a) + count + 1)).astype(np.int64),
         track_frame=frame[order].astype(np.int32),
-        track_xy=np.concatenate([a.track_xy, b.track_xy[rows]])[order],
+        track_xy=np.concatenate([a.track_xy, added.xy])[order],
     )
 
 
-def _same_points(
-    a: Points,
-    a_point: Ints,
-    a_frame: Ints,
-    b: Points,
-    b_point: Ints,
-    b_frame: Ints,
-    by_new: NDArray[np.bool_],
-) -> Ints:
-    """Old point that each new point shares most of its old observations with; -1 without. [b]"""
-    shared = np.full(len(b_point), -1, np.int64)
-    for frame in np.unique(b_frame[~by_new]).tolist():
-        mine, theirs = np.flatnonzero(b_frame == frame), np.flatnonzero(a_frame == frame)
-        if not len(theirs):
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sightings:
+    """Observations of points (O observations)."""
+
+    point: Ints
+    frame: Ints
+    xy: Array
+
+    @classmethod
+    def of(cls, scene: Scene, index: Mapping[str, int]) -> _Sightings:
+        """All of a scene, by the index of each frame's name."""
+        frame = np.array([index[f.name] for f in scene.frames], np.int64)
+        points = scene.points
+        return cls(track_owners(points.track_start), frame[points.track_frame], points.track_xy)
+
+    def select(self, rows: Mask) -> _Sightings:
+        return _Sightings(self.point[rows], self.frame[rows], self.xy[rows])
+
+
+def _same_points(before: _Sightings, again: _Sightings, count: int) -> Ints:
+    """Old point that each new point shares most of its old observations with; -1 without. [count]
+
+    Args:
+        before: Of the old points.
+        again: Of the new points by the same images.
+        count: Number of new points.
+    """
+    shared = np.full(len(again.point), -1, np.int64)
+    for frame in np.unique(again.frame).tolist():
+        mine, theirs = np.flatnonzero(again.frame == frame), before.select(before.frame == frame)
+        if not len(theirs.point):
             continue
-        distance, nearest = cKDTree(a.track_xy[theirs]).query(b.track_xy[mine])
+        distance, nearest = cKDTree(theirs.xy).query(again.xy[mine])
         near = distance < SAME_PIXELS
-        shared[mine[near]] = a_point[theirs[nearest[near]]]
-    target = np.full(len(b), -1, np.int64)
-    observed = np.bincount(b_point[~by_new], minlength=len(b))
+        shared[mine[near]] = theirs.point[nearest[near]]
+    target = np.full(count, -1, np.int64)
+    observed = np.bincount(again.point, minlength=count)
     found = shared >= 0
     pairs, counts = np.unique(
-        np.column_stack([b_point[found], shared[found]]), axis=0, return_counts=True
+        np.column_stack([again.point[found], shared[found]]), axis=0, return_counts=True
     )
     most = 2 * counts > observed[pairs[:, 0]]
     target[pairs[most, 0]] = pairs[most, 1]
     return target
 
 
-def _misfits(
-    a: Points,
-    target: Ints,
-    b: Points,
-    b_point: Ints,
-    b_frame: Ints,
-    by_new: NDArray[np.bool_],
-    frames: Sequence[Frame],
-) -> Ints:
-    """New points whose old point does not project to where new images see it."""
+def _misfits(xyz: Array, target: Ints, added: _Sightings, frames: Sequence[Frame]) -> Ints:
+    """New points whose old point does not project to where new images see it.
+
+    Args:
+        xyz: Old points. [N, 3]
+        target: Old point of each new point, or -1.
+        added: Of the new points by new images.
+        frames: All frames.
+    """
+    added = added.select(target[added.point] >= 0)
     bad = [np.zeros(0, np.int64)]
-    for i in np.unique(b_frame[by_new]).tolist():
-        mine = np.flatnonzero((b_frame == i) & (target[b_point] >= 0))
+    for i in np.unique(added.frame).tolist():
+        mine = added.select(added.frame == i)
         pose = frames[i].cam_from_world
-        local = a.xyz[target[b_point[mine]]] @ pose[:3, :3].T + pose[:3, 3]
-        error = np.linalg.norm(project_points(frames[i].camera, local) - b.track_xy[mine], axis=1)
-        bad.append(b_point[mine[~(error < SAME_ERROR)]])
+        local = xyz[target[mine.point]] @ pose[:3, :3].T + pose[:3, 3]
+        error = np.linalg.norm(project_points(frames[i].camera, local) - mine.xy, axis=1)
+        bad.append(mine.point[~(error < SAME_ERROR)])
     return np.concatenate(bad)
 
 

@@ -1,6 +1,5 @@
 """A small city at two dates, and databases of known poses for routes that need no photos."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,8 +17,6 @@ from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.similarity import fit
 from chronoscene.synth import SynthSettings, generate
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))  # generated_registrations
 
 Array = NDArray[np.float64]
 

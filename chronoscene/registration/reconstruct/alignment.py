@@ -26,8 +26,8 @@ SEARCH_PIXELS = 16.0
 
 FINAL_PIXELS = 8.0  # Residual of an inlier in the end
 
-MIN_INLIERS = 15
-MIN_CELLS = 4  # Fewer, or all in few places, do not fix a similarity that can be trusted
+MIN_INLIERS = 15  # Fewer do not fix a similarity that can be trusted
+MIN_CELLS = 4  # Neither do many in fewer places than these
 CELLS_PER_AXIS = 12  # Along each of the two directions in which the points spread most
 QUANTILE = 0.02  # Points outside of this quantile and its mirror image do not stretch the grid
 

@@ -24,8 +24,8 @@ from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registe
 from chronoscene.scene import Camera, Points
 from chronoscene.scene.geometry import camera_centre
 
-MIN_CROSS_PAIRS = 3
-MIN_CROSS_MATCHES = 100  # Verified pairs of images, and matches in them, that connect two periods
+MIN_CROSS_PAIRS = 3  # Verified pairs of images that connect two periods
+MIN_CROSS_MATCHES = 100  # Matches in these pairs that connect two periods
 
 MIN_SHARE = 0.6
 """Share of the photos of each period that the joint route must register; else the separate route is

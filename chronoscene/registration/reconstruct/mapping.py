@@ -30,8 +30,8 @@ MAX_ITERATIONS = 60
 FUNCTION_TOLERANCE = 1e-6
 """Bundle adjustment ends after so many steps, or at a smaller relative decrease of the cost."""
 
-MAX_REPROJECTION_ERROR = 4.0
-MIN_TRI_ANGLE = 1.5  # Pixels and degrees; observations and points beyond are dropped
+MAX_REPROJECTION_ERROR = 4.0  # Pixels; observations that are further off are dropped
+MIN_TRI_ANGLE = 1.5  # Degrees; points whose rays meet at smaller angles are dropped
 
 SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("default", {}),

@@ -153,7 +153,7 @@ def find_links(
     links = {}
     for (i, j), items in sorted(between.items()):
         joined = point_pairs(submodels[j].model, submodels[i].model, items)
-        alignment = align_by_points(joined) if len(joined) >= MIN_PAIRS else None
+        alignment = None if joined is None else align_by_points(joined)
         if alignment is not None:
             links[i, j] = alignment
     return links
@@ -163,50 +163,40 @@ def point_pairs(
     source: pycolmap.Reconstruction,
     target: pycolmap.Reconstruction,
     items: Sequence[tuple[int, int, NDArray[np.int64]]],
-) -> PointPairs:
-    """Points of two models that matches join, each pair of points once.
+) -> PointPairs | None:
+    """Points of two models that matches join, each pair once; None if they are too few.
 
     Args:
         source: Model of the second image of each item.
         target: Model of the first.
         items: Image ids (target, source) and keypoint indices. [M, 2]
     """
+    in_target = {a: _views(target, target.images[a]) for a in {a for a, _, _ in items}}
+    in_source = {b: _views(source, source.images[b]) for b in {b for _, b, _ in items}}
     seen: set[tuple[int, int]] = set()
-    rows: dict[str, list[Any]] = {name: [] for name in PointPairs.__slots__}
+    rows = []
     for a, b, pairs in items:
-        in_target, in_source = target.images[a], source.images[b]
-        points_a, points_b = _point_ids(in_target), _point_ids(in_source)
         for ka, kb in pairs.tolist():
-            key = (points_a[ka], points_b[kb])
-            if key[0] < 0 or key[1] < 0 or key in seen:
+            if ka not in in_target[a] or kb not in in_source[b]:
                 continue
-            seen.add(key)
-            rows["target"].append(target.points3D[key[0]].xyz)
-            rows["source"].append(source.points3D[key[1]].xyz)
-            for side, model, image, k in (
-                ("target", target, in_target, ka),
-                ("source", source, in_source, kb),
-            ):
-                camera = model.cameras[image.camera_id]
-                rows[f"{side}_ray"].append(camera.cam_from_img(image.points2D[k].xy))
-                rows[f"{side}_focal"].append(camera.mean_focal_length())
-                rows[f"{side}_pose"].append(image_pose(image))
-    return _as_pairs(rows)
+            (point_a, view_a), (point_b, view_b) = in_target[a][ka], in_source[b][kb]
+            if (point_a, point_b) not in seen:
+                seen.add((point_a, point_b))
+                rows.append([x for both in zip(view_b, view_a, strict=True) for x in both])
+    if len(rows) < MIN_PAIRS:
+        return None
+    return PointPairs(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def _as_pairs(rows: Mapping[str, Sequence[Any]]) -> PointPairs:
-    shapes = {"pose": (-1, 4, 4), "ray": (-1, 2), "focal": (-1,), "source": (-1, 3)}
-    arrays = {
-        name: np.array(values, np.float64).reshape(shapes.get(name.rpartition("_")[2], (-1, 3)))
-        for name, values in rows.items()
+def _views(model: pycolmap.Reconstruction, image: pycolmap.Image) -> dict[int, tuple[int, Any]]:
+    """Point id, and (point, pose, ray, focal length), of keypoints that have a point and a ray."""
+    camera, pose, points = model.cameras[image.camera_id], image_pose(image), model.points3D
+    rays, focal = camera.cam_from_img(image.points2D), camera.mean_focal_length()
+    return {
+        k: (p.point3D_id, (points[p.point3D_id].xyz, pose, ray, focal))
+        for k, (p, ray) in enumerate(zip(image.points2D, rays, strict=True))
+        if p.has_point3D() and np.isfinite(ray).all()
     }
-    rays = np.hstack([arrays["source_ray"], arrays["target_ray"]])
-    return PointPairs(**arrays).select(np.flatnonzero(np.isfinite(rays).all(axis=1)))
-
-
-def _point_ids(image: pycolmap.Image) -> list[int]:
-    """Point of each keypoint; -1 without one."""
-    return [p.point3D_id if p.has_point3D() else -1 for p in image.points2D]
 
 
 def place_by_links(

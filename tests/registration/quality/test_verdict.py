@@ -119,6 +119,9 @@ def test_a_registration_that_is_good_in_everything_passes() -> None:
         assert verdict.level == "pass"
         assert not verdict.findings
         assert set(verdict.pairs.values()) <= {"pass"}
+        assert verdict.text.startswith(
+            "There is only" if count == 1 else f"The {count} periods lie"
+        )
 
 
 LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
@@ -248,6 +251,14 @@ def test_each_check_has_its_limit(name: str) -> None:
     verdict = judge(change(made(), outside))
     assert found(verdict) == [(check, level)]
     assert verdict.level == level
+
+
+def test_a_finding_states_the_limit_that_was_passed() -> None:
+    for agreeing, limit in ((0.7, "0.75"), (0.1, "0.15")):
+        (finding,) = judge(with_part(made(), "held_out", agreeing=agreeing)).findings
+        assert finding.found.endswith(f": {agreeing}, expected at least {limit}")
+    (finding,) = judge(with_gps(made(), median=14.0)).findings
+    assert finding.found.endswith(": 14 m, expected at most 12")
 
 
 @pytest.mark.parametrize("noisy", [0, 1])

@@ -12,8 +12,8 @@ from chronoscene.registration.reconstruct.alignment import (
     cells,
     residual_pixels,
 )
-from chronoscene.scene.geometry import pose_from_rotation_translation
 from chronoscene.scene.similarity import Sim3
+from chronoscene.synth.flights import look_at
 
 Array = NDArray[np.float64]
 
@@ -22,22 +22,12 @@ TRUTH = Sim3(
 )
 
 
-def looking_at(centre: Array, target: Array, up: tuple[float, float, float] = (0, 0, 1)) -> Array:
-    forward = (target - centre) / np.linalg.norm(target - centre)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return pose_from_rotation_translation(rotation, -rotation @ centre)
-
-
 def make_pairs(rng: np.random.Generator, points: Array, moved: Array) -> PointPairs:
     """Points seen by cameras above them in both models; ``moved`` is where the source has them."""
     inverse = TRUTH.inverse()
     rows = len(points)
     poses = [
-        looking_at(
-            np.array([*rng.uniform(-30, 30, 2), 40.0]), np.array([*rng.uniform(-5, 5, 2), 0])
-        )
+        look_at(np.array([*rng.uniform(-30, 30, 2), 40.0]), np.array([*rng.uniform(-5, 5, 2), 0]))
         for _ in range(rows)
     ]
     target_pose = np.stack(poses)
