@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 from generated_registrations import CaseSettings, generate_case, pose_errors
 
+from chronoscene.registration.quality import certificate as certificate_module
 from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
 from chronoscene.registration.quality.certificate_json import pair_figures, period_figures, to_json
 from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation
-from chronoscene.registration.quality.misalignment import Misalignment
+from chronoscene.registration.quality.misalignment import Misalignment, Transfers
 from chronoscene.registration.quality.overlap import tie_spread
 from chronoscene.registration.quality.rays import Placed, gather
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
@@ -234,6 +236,67 @@ def test_tie_spread_tells_a_cluster_from_a_spread() -> None:
     assert values[0].occupied > 0.5 > 0.15 > values[1].occupied
     assert values[0].hull > 0.7 > 0.2 > values[1].hull
     assert len(values[1].gaps) == 20
+
+
+@pytest.mark.parametrize(
+    ("error", "expected", "agreeing"),
+    [(2.99, 1.0, 1.0), (3.01, 1.0, 0.0), (2.99, 0.5, 1.0), (5.99, 2.0, 1.0), (6.01, 2.0, 0.0)],
+)
+def test_an_observation_agrees_within_three_pixels_or_three_deviations(
+    good: Registered,
+    monkeypatch: pytest.MonkeyPatch,
+    error: float,
+    expected: float,
+    agreeing: float,
+) -> None:
+    monkeypatch.setattr(certificate_module, "transfer_errors", constant(error, expected))
+    held_out = certify(good).pairs[0].held_out
+    assert isinstance(held_out, HeldOut)
+    assert held_out.agreeing == agreeing
+    assert held_out.noise == pytest.approx(error / expected)
+
+
+def test_points_that_are_placed_badly_tell_nothing(
+    good: Registered, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What leaves four pixels open is no measurement."""
+    monkeypatch.setattr(certificate_module, "transfer_errors", constant(1.0, 3.99))
+    assert isinstance(certify(good).pairs[0].held_out, HeldOut)
+    monkeypatch.setattr(certificate_module, "transfer_errors", constant(1.0, 4.01))
+    assert isinstance(certify(good).pairs[0].held_out, str)
+
+
+def constant(error: float, expected: float) -> Callable[[Transfers], tuple[np.ndarray, ...]]:
+    """All observations with one error and one expected deviation, pixels."""
+    return lambda moved: tuple(np.full(len(moved), x) for x in (error, expected, 0.1))
+
+
+def test_limits_of_the_overlap_and_of_tied_images(good: Registered) -> None:
+    """Three points of each period make a cell common; eight ties make an image tied."""
+    # Cells 0 and 1 have three points of either period, cell 2 has two of the second.
+    cell = np.array([0] * 3 + [1] * 6 + [2] * 5)
+    of_a = np.array([1] * 3 + [1, 1, 1, 0, 0, 0] + [1, 1, 1, 0, 0], bool)
+    of_b = np.array([1] * 3 + [0, 0, 0, 1, 1, 1] + [0, 0, 0, 1, 1], bool)
+    points = np.random.default_rng(0).uniform(0, 1, (len(cell), 3))
+    model = replace(good, points=points, **tracks_of(points, [range(8), range(7)]))
+    images = np.array([0, 1])
+    model = replace(model, names=good.names[:2], periods=images)
+    found = tie_spread(model, np.stack([of_a, of_b], 1), 0, 1, (points[:, :2], cell))
+    assert (found.points, found.cells, found.occupied) == (3, 2, 0.5)
+    every = np.ones((len(cell), 2), bool)
+    found = tie_spread(model, every, 0, 1, (points[:, :2], cell))
+    assert (found.tied_a, found.tied_b, found.loose) == (1.0, 0.0, (1,))
+
+
+def tracks_of(points: np.ndarray, seen: Sequence[range]) -> dict[str, np.ndarray]:
+    """Tracks where each image sees some of the points."""
+    pairs = sorted((p, i) for i, mine in enumerate(seen) for p in mine)
+    point, image = np.array(pairs).T
+    return {
+        "track_start": np.searchsorted(point, np.arange(len(points) + 1)),
+        "track_image": image,
+        "track_xy": np.zeros((len(pairs), 2)),
+    }
 
 
 def plane(rng: np.random.Generator, count: int, noise: float) -> np.ndarray:

@@ -1,6 +1,8 @@
 """Clicked points instead of matches: two dates that no feature connects, in the whole command."""
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,10 +10,19 @@ from generated_registrations import pose_errors
 from PIL import Image, ImageOps
 
 from chronoscene.formats import read_scene
+from chronoscene.registration.context import Context, Options
+from chronoscene.registration.features.matching import Matched
 from chronoscene.registration.output import Inspection
-from chronoscene.registration.photos.captures import read_captures
-from chronoscene.registration.pipeline import Options, run
+from chronoscene.registration.photos.captures import Captures, read_captures
+from chronoscene.registration.photos.gps_priors import locate
+from chronoscene.registration.photos.inputs import Inputs
+from chronoscene.registration.pipeline import run
+from chronoscene.registration.reconstruct.estimation import estimate, refined
+from chronoscene.registration.reconstruct.models import known_images
 from chronoscene.registration.result import Registered
+from chronoscene.registration.stages import Stages, work_folder
+from chronoscene.registration.ties.tie_alignment import tie
+from chronoscene.registration.ties.tie_points import read_tie_points
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.synth import SynthSettings, generate
@@ -79,6 +90,16 @@ def placed(root: Path, out: Path, clicks: Path | None) -> tuple[Registered, str]
     return model, found[0].verdict.level
 
 
+def assert_placed_by_clicks(model: Registered, truth: Mapping[str, np.ndarray]) -> None:
+    """The second period lies where the precision of the clicks puts it."""
+    poses = np.stack([truth[name] for name in model.names])
+    rotation, centre = pose_errors(model.cam_from_world, poses, model.periods == 0)
+    extent = np.linalg.norm(np.ptp(camera_centre(poses), axis=0))
+    second = model.periods == 1
+    assert np.median(rotation[second]) < 0.2
+    assert np.median(centre[second]) < 0.003 * extent
+
+
 @pytest.mark.slow
 def test_clicks_replace_an_alignment_that_failed(
     truth: Scene, negatives: Path, tmp_path: Path
@@ -92,10 +113,55 @@ def test_clicks_replace_an_alignment_that_failed(
     assert verdict != "pass"  # clicks took part in the estimation: nothing proves it
     assert len(model.names) >= len(truth.frames) - 3
     known = {f.name: f.cam_from_world for f in truth.frames}
-    poses = np.stack([known[Path(name).name] for name in model.names])
-    rotation, centre = pose_errors(model.cam_from_world, poses, model.periods == 0)
-    extent = np.linalg.norm(np.ptp(camera_centre(poses), axis=0))
-    second = model.periods == 1
-    assert second.sum() >= 9
-    assert np.median(rotation[second]) < 0.2
-    assert np.median(centre[second]) < 0.003 * extent
+    assert (model.periods == 1).sum() >= 9
+    assert_placed_by_clicks(model, {name: known[Path(name).name] for name in model.names})
+
+
+def write_projections(case: Any, path: Path, count: int) -> None:
+    """Points near the middle of a case, each clicked in three images of either period."""
+    rng = np.random.default_rng(4)
+    model = known_images(case.database)  # its cameras end with it
+    cameras = {str(i.name): i.camera for i in model.images.values()}
+    lines = ["point,image,x,y\n"]
+    for i, xyz in enumerate(rng.uniform(-1, 1, (count, 3))):
+        for period in (0, 1):
+            for name in [n for n, p in sorted(case.periods.items()) if p == period][i % 2 :: 3]:
+                local = case.truth[name][:3, :3] @ xyz + case.truth[name][:3, 3]
+                x, y = cameras[name].img_from_cam(local) + rng.normal(0, CLICK_PIXELS, 2)
+                lines.append(f"p{i},{name},{x:.2f},{y:.2f}\n")
+    path.write_text("".join(lines))
+
+
+def test_clicks_place_a_period_that_nothing_matches(
+    make_case: Callable[..., Any], tmp_path: Path
+) -> None:
+    """The same on given matches instead of photos: all that comes after matching, in seconds."""
+    case = make_case(cross_matches=0.0)
+    clicks = tmp_path / "clicks.csv"
+    write_projections(case, clicks, 12)
+    inputs = Inputs(
+        captures=Captures(case.folder, (), (), (), ()), scene=None, images=(), periods=case.periods,
+        labels=LABELS, dates=LABELS, refused={}, positions=locate(()), georeference=None,
+    )  # fmt: skip
+    nothing = np.zeros(0, np.int64)
+    np.savez(
+        case.folder / "held_out.npz",
+        names=np.frombuffer(b"{}", np.uint8), track=nothing, image=nothing, xy=np.zeros((0, 2)),
+    )  # fmt: skip
+    with work_folder(case.folder) as lock:
+        options = Options(threads=1, tie_points=clicks)
+        context = Context(case.folder, Stages(case.folder), options, None, lock)
+        first = estimate(inputs, Matched({}, {}, {}, {}), context)
+        result = tie(
+            first,
+            read_tie_points(clicks),
+            lambda arguments: refined(first, arguments, inputs, context),
+        )
+    assert len({case.periods[name] for name in first.unplaced}) == 1
+    model = result.model
+    assert result.replaced and len(model.names) == len(case.truth)
+    linking = np.array(
+        [len(set(model.periods[image])) for image in np.split(model.track_image, model.track_start)]
+    )
+    assert (linking == 2).sum() == 12  # the adjustment had the clicked points
+    assert_placed_by_clicks(model, case.truth)
