@@ -69,7 +69,7 @@ FAILED = 1  # Exit status if the verdict is fail
     type=click.IntRange(0),
     default=DEFAULTS.exhaustive_limit,
     show_default=True,
-    help="Up to so many photos, all pairs are matched.",
+    help="Match all pairs if there are at most this many photos, else likely pairs.",
 )
 @click.option(
     "--held-out",
@@ -83,15 +83,15 @@ FAILED = 1  # Exit status if the verdict is fail
     type=click.Choice(["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]),
     default=DEFAULTS.camera_model,
     show_default=True,
-    help="COLMAP's model of the cameras that are calibrated.",
+    help="Camera model of COLMAP that is fitted to the photos.",
 )
 @click.option(
     "--calibration",
     type=click.Choice(CALIBRATIONS),
     default=DEFAULTS.calibration,
     show_default=True,
-    help="Whether a camera is calibrated for each period that it took photos of; auto: if the "
-    f"periods are more than a day apart and have at least {MIN_PHOTOS} of its photos.",
+    help="Whether a camera is calibrated anew for each period; auto: for periods more than a day "
+    f"apart that have at least {MIN_PHOTOS} of its photos.",
 )
 @click.option(
     "--threads",
@@ -101,8 +101,8 @@ FAILED = 1  # Exit status if the verdict is fail
 @click.option(
     "--tie-points",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="CSV of point, image, x, y and optional world coordinates, or ODM's gcp_list.txt: checks "
-    "the alignment, and replaces one that failed.",
+    help="CSV of point, image, x, y and optional world coordinates, or ODM's gcp_list.txt: points "
+    "that check the alignment, and replace one that failed.",
 )
 @click.option(
     "--tie-scale",
@@ -130,10 +130,10 @@ def command(
 
     CAPTURES is a folder with a subfolder of photos for each period; or a folder of photos, whose
     periods are proposed from their dates; or a CSV of image and period. A run that was stopped
-    continues where it was when the command is run again.
+    continues where it was when the same command is run again.
 
-    Exit status: 0 unless the verdict is fail, 1 if it is (the scene is written), 2 if the photos
-    cannot be registered, or wrong usage.
+    Exit status: 0 if the verdict is pass or doubtful, 1 if it is fail (the scene is written
+    nevertheless), 2 if the photos cannot be registered or the usage is wrong.
     """
     folder, table = find_captures(captures, table)
     options = Options(**settings)
@@ -171,6 +171,8 @@ def summary(registered: Registered, out: Path) -> str:
     for name, reason in sorted(registered.unregistered.items())[:10]:
         lines.append(f"  {name}: {reason}")
     if len(registered.unregistered) > 10:
-        lines.append(f"  ... and {len(registered.unregistered) - 10} more; see the log")
+        lines.append(
+            f"  ... and {len(registered.unregistered) - 10} more; see registration_log.json"
+        )
     lines.append(f"{len(registered.points)} points; decisions in {out / 'registration_log.json'}")
     return "\n".join(lines) + "\n"

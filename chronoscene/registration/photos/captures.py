@@ -161,7 +161,7 @@ def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str]]:
         label = group[0][0].date().isoformat()
         listed += [_Listed(p, p.relative_to(root).as_posix(), label) for _, p in group]
     labels = ", ".join(f"{g[0][0].date()} ({len(g)} photos)" for g in groups)
-    return listed, [f"one folder: periods proposed from the dates of the photos: {labels}"]
+    return listed, [f"periods proposed from the dates of the photos: {labels}"]
 
 
 def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Captures:
@@ -179,7 +179,7 @@ def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Capt
         else:
             images.append(capture)
     if not images:
-        raise _nothing(root, f"{len(refused)} files, none of them usable: {refused[0][2]}")
+        raise _nothing(root, f"{len(refused)} files, none usable ({refused[0][2]})")
     images.sort(key=lambda c: c.name)
     periods = tuple(
         CapturePeriod(label, _period_date(label, [c for c in images if c.period == i]))

@@ -52,7 +52,9 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
     none = np.zeros(count, bool)
     has = np.array([c.gps is not None for c in captures], bool)
     if has.sum() < 3:
-        remark = f"{int(has.sum())} of {count} photos have a GPS position: too few for a frame"
+        remark = (
+            f"{int(has.sum())} of {count} photos have a GPS position: too few to define a frame"
+        )
         return Positions(None, nothing, nothing, none, (remark,))
     latitude, longitude = (_stated(captures, name) for name in ("latitude", "longitude"))
     height, kind, remarks = _heights(captures, has)
@@ -70,7 +72,8 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
     spread = np.ptp(enu[plausible], axis=0) if plausible.any() else np.zeros(3)
     if plausible.sum() < 3 or spread.max() < CONSTANT_METRES:
         remarks.append(
-            f"all GPS positions lie within {CONSTANT_METRES} m: one fix for all photos, not usable"
+            f"all GPS positions lie within {CONSTANT_METRES} m: they do not describe the motion of "
+            "the camera"
         )
         return Positions(None, nothing, nothing, none, tuple(remarks))
     remarks.insert(0, f"{int(has.sum())} of {count} photos have a GPS position; frame {frame.crs}")

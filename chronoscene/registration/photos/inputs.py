@@ -150,7 +150,7 @@ def _check_enough(
     present = {c.period for c in usable}
     for i, period in enumerate(captures.periods):
         if i not in present:
-            context.stages.remark("captures", f"period {period.label} has no photo left")
+            context.stages.remark("captures", f"period {period.label} has no usable photos")
 
 
 def _new_period(captures: Captures) -> tuple[str, str | None]:
@@ -206,7 +206,7 @@ def _check_pinhole(scene: Scene, frame: Frame) -> None:
     if not camera.is_pinhole or size != (camera.width, camera.height):
         raise SceneError(
             scene.image_path(frame),
-            expected="an image without distortion, of the size of its camera",
+            expected="an undistorted image, of the same size as its camera",
             found=f"{camera.model} {camera.width} x {camera.height}, file {size[0]} x {size[1]}",
             todo="undistort the scene first: chronoscene undistort",
         )
@@ -235,7 +235,7 @@ def drop_copies(captures: Sequence[Capture], digests: dict[str, str]) -> Prepare
         refused.append((capture.name, capture.period, reason))
     kept.sort(key=lambda c: c.name)
     across = sum("earlier period" in reason for *_, reason in refused)
-    remarks = [f"{across} photos are copies of photos of an earlier period"] if across else []
+    remarks = [f"{across} photos are copies of photos from an earlier period"] if across else []
     return Prepared(tuple(kept), tuple(refused), tuple(remarks))
 
 
@@ -268,9 +268,9 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
     if turned:
         remarks.append(f"{turned} photos have an orientation tag: set to 1, pixels left as stored")
     if converted:
-        remarks.append(f"{converted} files converted to PNG: no plain 8-bit colours")
+        remarks.append(f"{converted} files converted to PNG: they were not plain 8-bit RGB or grey")
     if renamings := sum(a != c.name for a, c in zip(plain, captures, strict=True)):
-        remarks.append(f"blanks in {renamings} names replaced by underscores")
+        remarks.append(f"spaces in the names of {renamings} photos replaced by underscores")
     return names, remarks
 
 

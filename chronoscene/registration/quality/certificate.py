@@ -16,7 +16,6 @@ from chronoscene.arrays import Array, Mask
 from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
-    MIN_TRACKS,
     Misalignment,
     Transfers,
     measure,
@@ -191,7 +190,7 @@ def _pair(
         figures = _held_out(moved, good, (placed_a, placed_b), _epipolar(model, evidence, periods))
         measured = measure(moved, placed_a, placed_b, centres)
         misalignment = measured or (
-            f"{figures.tracks} held-out tracks: fewer than {MIN_TRACKS}, or all in one spot"
+            f"{figures.tracks} held-out tracks are too few, or too close together"
         )
     by_all = measure(*_all_transfers(model, evidence, a, b), centres)
     of_a, of_b = (evidence.ties.where(model.periods[evidence.ties.image] == p) for p in periods)
@@ -203,7 +202,8 @@ def _pair(
         ties=spread,
         held_out=figures,
         misalignment=misalignment,
-        by_all=by_all or "too few tracks are seen by two images of one period, or all in one spot",
+        by_all=by_all
+        or "tracks seen by two images of one period are too few, or too close together",
         localised_b=localise(of_b, evidence.ties_placed[a]),
         localised_a=localise(of_a, evidence.ties_placed[b]),
         surfaces=surface_distance(evidence.clouds[a], evidence.clouds[b], middle, sigma),

@@ -75,7 +75,7 @@ def period_figures(certificate: Certificate, period: PeriodFigures) -> Iterator[
     both = (max(0.0, float(offset - 2 * error)), float(offset + 2 * error))
     yield Figure("GPS against cameras, horizontal", float(offset), "m", over, None, both)
     yield Figure("GPS against cameras, vertical", float(gps.offset[2]), "m", over)
-    short = "the path is short against the noise of the GPS"
+    short = "the path is too short for the noise of the GPS"
     for name, unit, value, spread in (
         ("scale against own GPS", "", gps.scale, gps.scale_error),
         ("turn against own GPS", "degrees", gps.turn, gps.turn_error),

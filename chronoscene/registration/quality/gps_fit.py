@@ -47,7 +47,7 @@ def fit_gps(centres: Array, gps: Array) -> GpsFit | str:
     """
     has = np.isfinite(gps).all(axis=1)
     if has.sum() < MIN_POSITIONS:
-        return f"only {int(has.sum())} images have a GPS position"
+        return f"fewer than {MIN_POSITIONS} images have a GPS position"
     source, target = centres[has], gps[has]
     fitted = fit_robustly(source, target)
     difference = target - source

@@ -60,13 +60,13 @@ THRESHOLDS: dict[str, Threshold] = {
         Threshold(
             "registered", "share of the photos of a period that are registered", "",
             0.6, 0.1, True,
-            "what is measured here does not cover a period of which most photos are missing",
-            "see in registration_log.json why photos are missing; add photos with viewpoints "
+            "measurements say little about a period most of whose photos are missing",
+            "registration_log.json says why photos are missing; add photos with viewpoints "
             "between those of the dates",
         ),
         Threshold(
             "images", "registered images of a period", "images", 5, 3, True,
-            "fewer images do not determine points by themselves, so nothing can be checked",
+            "fewer images cannot place points by themselves, so nothing can be checked",
             "add photos of this period",
         ),
         Threshold(
@@ -93,8 +93,9 @@ THRESHOLDS: dict[str, Threshold] = {
         Threshold(
             "excess", "held-out residual beyond the noise of matching, as an angle", "degrees",
             0.1, 0.4, False,
-            "what no similarity explains is a period deformed by drift (doming), or a wrong camera",
-            "calibrate each date (--calibration per-period), or add oblique photos; else "
+            "errors that no similarity explains come from drift that deforms a period (doming), or "
+            "from a wrong camera",
+            "calibrate each date (--calibration per-period), or add oblique photos; otherwise "
             + _CONTROL,
         ),
         Threshold(
@@ -109,7 +110,7 @@ THRESHOLDS: dict[str, Threshold] = {
             _CLICK,
         ),
         Threshold(
-            "localised", "pose of images localised from the other period, beyond its noise",
+            "localised", "pose error of images localised from the other period, beyond its noise",
             "times 0.1 degrees or 0.2%", 0.6, 10.0, False,
             "the points of each period must place the images of the other correctly",
             _LOOK,
@@ -131,8 +132,8 @@ THRESHOLDS: dict[str, Threshold] = {
         Threshold(
             "gps_offset", "horizontal offset between the GPS of two periods, beyond its spread",
             "m", 5.0, 15.0, False,
-            "the bias of a receiver is up to about 3.5 m from day to day; that of heights is "
-            "larger, so they are not judged",
+            "the bias of a receiver varies by up to about 3.5 m from day to day; heights vary "
+            "more, so they are not judged",
             f"if the GPS is reliable, {_CLICK}",
         ),
         Threshold(
@@ -146,13 +147,13 @@ THRESHOLDS: dict[str, Threshold] = {
         Threshold(
             "gps_scale", "scale of a period against its own GPS, beyond its spread", "%",
             2.0, 10.0, False,
-            "GPS has errors of position, hardly of scale",
+            "GPS errs in position, hardly in scale",
             _CONTROL,
         ),
         Threshold(
             "gps_turn", "heading of a period against its own GPS, beyond its spread", "degrees",
             2.0, 10.0, False,
-            "GPS has errors of position, hardly of direction",
+            "GPS errs in position, hardly in direction",
             _CONTROL,
         ),
     )
@@ -266,7 +267,7 @@ def _between_gps(certificate: Certificate) -> Iterator[Finding]:
             spread = np.hypot(one.offset_error[:2], other.offset_error[:2]).max()
             beyond = distance - 3 * float(spread)
             place = f"periods {p.label} and {q.label}"
-            yield from _check("gps_offset", beyond, place, f"; {distance:.1f} m with it")
+            yield from _check("gps_offset", beyond, place, f" ({distance:.1f} m in all)")
 
 
 def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Finding]:

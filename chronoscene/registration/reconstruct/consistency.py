@@ -139,7 +139,9 @@ def deregister_misplaced(
     wrong = misplaced(pair_agreements(model, matches), model.reg_image_ids(), trusted)
     if wrong:
         names = ", ".join(sorted(str(model.images[i].name) for i in wrong))
-        remarks.append(f"{names}: deregistered: matches with the other photos contradict the pose")
+        remarks.append(
+            f"{names}: deregistered, because matches with other photos contradict the pose"
+        )
     for image_id in wrong:
         model.deregister_frame(model.images[image_id].frame_id)
     return len(wrong)

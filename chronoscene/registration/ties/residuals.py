@@ -152,7 +152,9 @@ def residuals(
         alone = np.concatenate(places)
         xyz = by_all.get(track, control.get(name, alone.mean(axis=0) if len(alone) else None))
         if xyz is None or not len(mine):
-            note = "clicked in one image, or without parallax" if len(mine) else "not registered"
+            note = (
+                "clicked in only one image, or without parallax" if len(mine) else "not registered"
+            )
             if len(mine) > 2:
                 note = "its clicks do not meet in one point"
             yield PointResidual(name, len(mine), labels, None, None, len(mine) > 2, note)

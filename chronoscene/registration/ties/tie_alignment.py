@@ -111,7 +111,7 @@ def _align_periods(
         moves[p], used = found
         rejected = [clicks.names[t] for t, u in zip(shared[p], used, strict=True) if not u]
         note = f"; without {', '.join(rejected)}" if rejected else ""
-        remarks.append(f"period {model.labels[p]}: by {int(used.sum())} tie points{note}")
+        remarks.append(f"period {model.labels[p]}: aligned by {int(used.sum())} tie points{note}")
         done[p] = dict(zip(own[p].track.tolist(), moves[p].apply(own[p].xyz), strict=True))
     return move_periods(model, moves), remarks
 
@@ -125,7 +125,7 @@ def _too_few(model: Registered, tie_points: TiePoints, period: int, count: int) 
         tie_points.path,
         expected="three points or more that are not collinear, each clicked in two images of "
         f"period {model.labels[period]} and in two of another period",
-        found=f"{count} such points{also}",
+        found=f"{count} such {'point' if count == 1 else 'points'}{also}",
         todo="click more points, spread over the scene, each in two images of both periods",
     )
 
@@ -172,7 +172,9 @@ def _to_control(
     target = np.array([control[name] for _, name in known]).reshape(-1, 3)
     found = fit_few(source, target)
     if found is None:
-        remark = f"{len(known)} control points can be placed: three are needed, not collinear"
+        remark = (
+            f"{len(known)} control points can be placed; three that are not collinear are needed"
+        )
         return model, False, [remark]
     move, used = found
     rejected = [name for (_, name), u in zip(known, used, strict=True) if not u]

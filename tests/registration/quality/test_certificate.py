@@ -354,7 +354,8 @@ def test_gps_finds_offset_scale_and_turn() -> None:
     assert found.scale == pytest.approx(1.1, abs=0.03)
     assert found.turn == pytest.approx(5.0, abs=1.5)
     assert found.largest > 150 > 3 > found.median
-    assert isinstance(fit_gps(centres[:3], gps[:3]), str)
+    assert fit_gps(centres[6:9], gps[6:9]) == "fewer than 4 images have a GPS position"
+    assert isinstance(fit_gps(centres[6:10], gps[6:10]), GpsFit)
     assert isinstance(fit_gps(centres, np.full_like(centres, np.nan)), str)
 
 

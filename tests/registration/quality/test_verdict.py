@@ -139,7 +139,7 @@ LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
     ),
     "rotation, all ties, fail": (
         "rotation", "fail",
-        lambda c, x: with_part(c, "by_all", rotation=Interval(0.3, x, 0.5)), 0.0999, 0.1001,
+        lambda c, x: with_part(c, "by_all", rotation=Interval(x, x, 0.5)), 0.0999, 0.1001,
     ),
     "rotation, held out": (
         "rotation", "doubtful",
@@ -151,7 +151,7 @@ LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
     ),
     "rotation, held out, fail": (
         "rotation", "fail",
-        lambda c, x: with_part(c, "misalignment", rotation=Interval(0.3, x, 0.5)), 0.0999, 0.1001,
+        lambda c, x: with_part(c, "misalignment", rotation=Interval(x, x, 0.5)), 0.0999, 0.1001,
     ),
     "shift, all ties": (
         "shift", "doubtful",
@@ -159,7 +159,7 @@ LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
     ),
     "shift, all ties, fail": (
         "shift", "fail",
-        lambda c, x: with_part(c, "by_all", shift=Interval(0.3, x, 0.5)), 0.0999, 0.1001,
+        lambda c, x: with_part(c, "by_all", shift=Interval(x, x, 0.5)), 0.0999, 0.1001,
     ),
     "shift, held out": (
         "shift", "doubtful",
@@ -171,7 +171,7 @@ LIMITS: dict[str, tuple[str, str, Change, float, float]] = {
     ),
     "shift, held out, fail": (
         "shift", "fail",
-        lambda c, x: with_part(c, "misalignment", shift=Interval(0.3, x, 0.5)), 0.0999, 0.1001,
+        lambda c, x: with_part(c, "misalignment", shift=Interval(x, x, 0.5)), 0.0999, 0.1001,
     ),
     "agreeing": (
         "agreeing", "doubtful", lambda c, x: with_part(c, "held_out", agreeing=x), 0.751, 0.749,
@@ -259,6 +259,13 @@ def test_a_finding_states_the_limit_that_was_passed() -> None:
         assert finding.found.endswith(f": {agreeing}, expected at least {limit}")
     (finding,) = judge(with_gps(made(), median=14.0)).findings
     assert finding.found.endswith(": 14 m, expected at most 12")
+    for part in ("misalignment", "by_all"):
+        wide = with_part(made(), part, rotation=Interval(0.04, 0.0, 0.3))
+        (finding,) = judge(wide).findings
+        assert finding.found.endswith(
+            f": {0.04 if part == 'misalignment' else 0.03} degrees, but up to 0.3 cannot be ruled "
+            "out; expected at most 0.1"
+        )
 
 
 @pytest.mark.parametrize("noisy", [0, 1])
@@ -275,7 +282,10 @@ def test_the_noise_of_matching_is_that_of_the_noisier_period(noisy: int) -> None
 @pytest.mark.parametrize(
     "change",
     [
-        lambda c: with_gps(c, offset=np.array([0.0, 0.0, 80.0])),  # heights are not judged
+        lambda c: with_gps(c, offset=np.array([0.0, 0.0, 80.0])),
+        lambda c: with_gps(
+            with_gps(c, offset=np.array([20.0, 0.0, 0.0])), 0, offset=np.array([20.0, 0.0, 0.0])
+        ),
         lambda c: with_gps(c, scale=None, scale_error=None, turn=None, turn_error=None),
         lambda c: with_period(c, gps="the frame is not georeferenced"),
         lambda c: with_part(c, "held_out", tracks=11, agreeing=0.0, noise=50.0),
@@ -285,7 +295,10 @@ def test_the_noise_of_matching_is_that_of_the_noisier_period(noisy: int) -> None
         lambda c: with_pair(c, localised_a="no image", localised_b="no image"),
         lambda c: with_pair(c, surfaces="too few for surfaces"),
     ],
-    ids=["height", "short path", "no GPS", "11 tracks", "2 images", "no image", "no surfaces"],
+    ids=[
+        "height", "common offset", "short path", "no GPS", "11 tracks", "2 images", "no image",
+        "no surfaces",
+    ],
 )  # fmt: skip
 def test_what_cannot_be_judged_is_not(change: Callable[[Certificate], Certificate]) -> None:
     assert judge(change(made())).level == "pass"
@@ -313,6 +326,7 @@ def test_without_both_measurements_there_is_no_pass(missing: tuple[str, ...], tr
 def test_without_held_out_tracks_the_ties_can_still_prove_an_error() -> None:
     nothing = with_pair(made(), held_out="no track", misalignment="no track")
     assert found(judge(nothing)) == [("held_out", "doubtful")]
+    assert "0 tracks, expected at least 12" in judge(nothing).findings[0].found
     wrong = with_part(nothing, "by_all", rotation=Interval(0.4, 0.2, 0.6))
     assert found(judge(wrong)) == [("rotation", "fail"), ("held_out", "doubtful")]
 
