@@ -122,6 +122,7 @@ def resume(part: Part, preset: str, model: Path, seed: int) -> AnchorTrainer:
         voxel_size=0.01,  # of no consequence: nothing grows here
         seed=seed,
         rates=method.rates(part.train.camera_extent),
+        feature_rows=method.feature_rows(part.train),
     )
 
 

@@ -6,14 +6,11 @@ names both. `model` holds what is special about it; the rest is shared with Scaf
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from chronogs.config import ChronoGSConfig
 from chronogs.model import ChronoGSModel
-from chronogs.periods import period_weights
 from chronogs.sharing import pack_features, share_periods, unpack_features
 from chronoscene.anchors.method import AnchorMethod
 from chronoscene.anchors.model import AnchorLayout
@@ -46,9 +43,6 @@ class ChronoGS(AnchorMethod):
         self, stored: dict[str, Tensor], layout: AnchorLayout
     ) -> dict[str, Tensor]:
         return unpack_features(stored, layout)
-
-    def weights(self, period: float) -> NDArray[np.float32]:
-        return period_weights(period, self.num_periods)
 
     @torch.no_grad()
     def render_split(

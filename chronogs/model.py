@@ -50,24 +50,18 @@ class ChronoGSModel(AnchorModel):
 
     @staticmethod
     def input_dim(layout: AnchorLayout, head: str) -> int:
+        if layout.fusion == "concat":
+            return AnchorModel.input_dim(layout, head)
         direction = 3 if head in layout.direction_heads else 0
-        if layout.fusion == "sum":
-            return max(layout.base_dim, layout.period_dim, layout.global_dim) + direction
-        global_dim = layout.global_dim if head in layout.global_heads else 0
-        return layout.base_dim + layout.period_dim + direction + global_dim
+        return max(layout.base_dim, layout.period_dim, layout.global_dim) + direction
 
     def first_layer(self, head: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         layout, w1 = self.layout, self.heads[head].w1
+        if layout.fusion == "concat":
+            return super().first_layer(head)
+        # w (b + v + g) = w b + w v + w g: features that are added share their columns.
         dims = (layout.base_dim, layout.period_dim, layout.global_dim)
-        unseen = zero_columns(w1, layout.global_dim)
-        if layout.fusion == "sum":
-            # w (b + v + g) = w b + w v + w g: features that are added share their columns.
-            feature_dim = max(dims)
-            base, period, table = (w1[:, : feature_dim if n else 0] for n in dims)
-            direction = w1[:, feature_dim:]
-        else:
-            global_dim = dims[2] if head in layout.global_heads else 0
-            direction_dim = w1.shape[1] - dims[0] - dims[1] - global_dim
-            parts = [dims[0], dims[1], direction_dim, global_dim]
-            base, period, direction, table = w1.split(parts, dim=1)
-        return base, period, direction, table if head in layout.global_heads else unseen
+        base, period, table = (w1[:, : max(dims) if n else 0] for n in dims)
+        if head not in layout.global_heads:
+            table = zero_columns(w1, layout.global_dim)
+        return base, period, w1[:, max(dims) :], table

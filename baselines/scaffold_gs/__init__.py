@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from chronoscene.methods import MethodSpec
@@ -14,6 +15,13 @@ _SHORT: dict[str, Any] = {
     "max_anchors": 200_000,
 }
 
+_PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {},
+    "fast": _SHORT | {"iterations": 800, "density_interval": 40, "offsets_per_anchor": 5},
+    "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
+    "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
+}
+
 SPEC = MethodSpec(
     name="scaffold-gs",
     title="Scaffold-GS",
@@ -24,11 +32,16 @@ SPEC = MethodSpec(
     devices=("cpu", "cuda"),
     method="baselines.scaffold_gs.method:ScaffoldGS",
     config="baselines.scaffold_gs.config:ScaffoldGSConfig",
-    presets={
-        "paper": {},
-        "fast": _SHORT | {"iterations": 800, "density_interval": 40, "offsets_per_anchor": 5},
-        "balanced": _SHORT | {"iterations": 2_500, "density_interval": 50},
-        "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
-    },
+    presets=_PRESETS,
     resumable=True,
 )
+
+PERIOD_SPEC = replace(
+    SPEC,
+    name="scaffold-gs-period",
+    title="Scaffold-GS, period appearance",
+    period_input="continuous",
+    method="baselines.scaffold_gs.method:ScaffoldGSPeriod",
+    presets={name: {"appearance_dim": 32, **values} for name, values in _PRESETS.items()},
+)
+"""The obvious baseline that knows of time: an appearance vector per period instead of per image."""

@@ -9,14 +9,15 @@ from chronoscene.anchors.config import AnchorConfig
 
 @dataclass(frozen=True)
 class ScaffoldGSConfig(AnchorConfig):
-    """No appearance vectors, no feature bank, no view distance: as in all published scripts.
-
-    Scaffold-GS with an appearance vector per period is ChronoGS with ``period_dim`` 0, ``base_dim``
-    32 and ``global_heads`` ``("color",)``.
-    """
+    """No feature bank, no view distance: as in all published scripts."""
 
     iterations: int = 30_000
     base_dim: int = 32
     """Length of the feature of an anchor."""
     statistics_from: float = 500 / 30_000
     density_from: float = 1_500 / 30_000
+    appearance_dim: int = 0
+    """Length of the appearance vectors that the colour MLP sees; 0, none, in all published scripts.
+    ``scaffold-gs`` has one per training image and renders with their mean,
+    ``scaffold-gs-period`` one per period."""
+    appearance_lr: tuple[float, float] = (0.05, 0.0005)

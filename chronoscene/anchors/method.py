@@ -14,6 +14,7 @@ from torch import Tensor
 from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.density import initial_anchors, resolve_voxel_size
 from chronoscene.anchors.model import LAYERS, AnchorLayout, AnchorModel
+from chronoscene.anchors.periods import period_weights
 from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import TrainingSet, View
@@ -30,9 +31,13 @@ class AnchorMethod(SplattingMethod):
     config: AnchorConfig
     trainer: AnchorTrainer | None
 
-    def layout(self, num_periods: int) -> AnchorLayout:
+    def layout(self, train: TrainingSet) -> AnchorLayout:
         """Sizes and rules of the model."""
-        return AnchorLayout.of(self.config, num_periods)
+        return AnchorLayout.of(self.config, train.num_periods)
+
+    def feature_rows(self, train: TrainingSet) -> NDArray[np.int64]:
+        """Which of the features that vary each training view has; here that of its period. [V]"""
+        return np.array([view.period for view in train.views])
 
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
         """Start and end of the learning rate of every tensor, by its name in the model."""
@@ -47,8 +52,8 @@ class AnchorMethod(SplattingMethod):
         return rates
 
     def weights(self, period: float) -> NDArray[np.float32]:
-        """Weights of the features of the periods; here there is one for all. [T]"""
-        return np.ones(1, np.float32)
+        """Weights of the features that vary; here by their periods. [T]"""
+        return period_weights(period, self.num_periods)
 
     def after_update(self) -> AfterUpdate | None:
         """What a method does to the features after each optimiser step; here nothing."""
@@ -81,7 +86,7 @@ class AnchorMethod(SplattingMethod):
         anchors, size = initial_anchors(
             points, size, origin=config.voxel_origin, limit=config.max_initial_anchors
         )
-        layout, generator = self.layout(train.num_periods), torch.Generator().manual_seed(seed)
+        layout, generator = self.layout(train), torch.Generator().manual_seed(seed)
         self._model = self.model_class.start(layout, config, anchors, generator).to(device)
         self.meta |= {"layout": dataclasses.asdict(layout), "voxel_size": size}
         return AnchorTrainer(
@@ -91,6 +96,7 @@ class AnchorMethod(SplattingMethod):
             voxel_size=size,
             seed=seed,
             rates=self.rates(train.camera_extent),
+            feature_rows=self.feature_rows(train),
             after_update=self.after_update(),
         )
 

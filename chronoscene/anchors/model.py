@@ -232,15 +232,18 @@ class AnchorModel:
     def input_dim(layout: AnchorLayout, head: str) -> int:
         """Inputs of the first layer of an MLP: base, period, direction, global side by side."""
         direction = 3 if head in layout.direction_heads else 0
-        return layout.base_dim + layout.period_dim + direction + layout.global_dim
+        global_dim = layout.global_dim if head in layout.global_heads else 0
+        return layout.base_dim + layout.period_dim + direction + global_dim
 
     def first_layer(self, head: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Columns of ``w1`` that act on the base, period, direction and global input. [H, ·]"""
         layout, w1 = self.layout, self.heads[head].w1
         direction = 3 if head in layout.direction_heads else 0
-        dims = [layout.base_dim, layout.period_dim, direction, layout.global_dim]
-        base, period, direction_columns, table = w1.split(dims, dim=1)
-        return base, period, direction_columns, table
+        dims = [layout.base_dim, layout.period_dim, direction]
+        base, period, directions, table = w1.split([*dims, w1.shape[1] - sum(dims)], dim=1)
+        if head not in layout.global_heads:
+            table = zero_columns(w1, layout.global_dim)
+        return base, period, directions, table
 
     def _kernel_head(self, name: str) -> HeadWeights:
         """Weights with the inputs of the kernel; one that the MLP does not see has zero columns."""

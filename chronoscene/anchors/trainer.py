@@ -53,6 +53,8 @@ class AnchorTrainer:
     """All random choices follow from it."""
     rates: Mapping[str, tuple[float, float]]
     """Learning rates by tensor name."""
+    feature_rows: NDArray[np.int64]
+    """Which of the features that vary each view has, mostly its period. [V]"""
     after_update: AfterUpdate | None = None
     """Called with the model and the learning rates after each step that changed the features;
     every step then updates the features of all anchors."""
@@ -62,7 +64,8 @@ class AnchorTrainer:
         layout, tensors = model.layout, model.tensors()
         trained = {n: t for n, t in tensors.items() if n in self.rates and t.numel() > 0}
         self.rates = {name: self.rates[name] for name in trained}
-        blocks = [layout.base_dim, *[layout.period_dim] * layout.num_periods]
+        varying = layout.num_periods if layout.period_dim else 0
+        blocks = [layout.base_dim, *[layout.period_dim] * varying]
         self.tables = {
             "offsets": make_table(model.offsets),
             "features": make_table(model.features, blocks),
@@ -89,7 +92,7 @@ class AnchorTrainer:
         if done <= self.config.coarse_until:
             factor = self.config.coarse_factor
             view, photo = downscale_view(view, factor), downscale_image(photo, factor)
-        loss, skipped = self._learn(view, photo, done)
+        loss, skipped = self._learn(view, photo, int(self.feature_rows[position]), done)
         resized = self._densify_if_due(index, done)
         if skipped is None:
             self._update(done, resized=resized)
@@ -101,12 +104,12 @@ class AnchorTrainer:
         return progress * (index + 1) / index if index > 0 else 1.0 / self.config.iterations
 
     def _learn(
-        self, view: TrainingView, photo: NDArray[np.uint8], done: float
+        self, view: TrainingView, photo: NDArray[np.uint8], row: int, done: float
     ) -> tuple[float, Skipped | None]:
         """Loss, and why the step must be skipped, if it must."""
         visible = self.model.visible(view)
         everything = torch.arange(len(visible), device=self.model.device)
-        splats, positions = self._seen(visible, view.period).decode_active(
+        splats, positions = self._seen(visible, row).decode_active(
             self._one_period, self._seen_from(view), everything
         )
         near_plane = self.model.layout.near_plane
@@ -124,16 +127,17 @@ class AnchorTrainer:
             self._collect(view, visible, positions, splats.opacities, raster.info)
         return float(loss.detach()), skipped
 
-    def _seen(self, visible: np.ndarray, period: int) -> AnchorModel:
-        """The visible anchors with the features of one period: a model of a single period."""
+    def _seen(self, visible: np.ndarray, row: int) -> AnchorModel:
+        """The visible anchors with one of the features that vary: a model of a single period."""
         tables, model = self.tables, self.model
+        blocks = (0, 1 + row) if model.layout.period_dim else (0,)
         return type(model)(
             self._seen_layout,
             anchors=model.anchors[torch.from_numpy(visible).to(model.device)],
             offsets=tables["offsets"].fetch(visible),
-            features=tables["features"].fetch(visible, (0, 1 + period)),
+            features=tables["features"].fetch(visible, blocks),
             log_scales=tables["log_scales"].fetch(visible),
-            global_features=model.global_features[period : period + 1],
+            global_features=model.global_features[row : row + 1],
             heads=model.heads,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 
 from baselines.scaffold_gs import SPEC
 from baselines.scaffold_gs.config import ScaffoldGSConfig
-from baselines.scaffold_gs.method import ScaffoldGS
+from baselines.scaffold_gs.method import ScaffoldGS, ScaffoldGSPeriod
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.methods import TrainingSet, TrainingView, build_config
@@ -105,3 +106,37 @@ def test_the_period_changes_nothing(train_set: TrainingSet, tmp_path: Path) -> N
 @pytest.mark.parametrize("preset", SPEC.presets)
 def test_every_preset_builds(preset: str) -> None:
     assert build_config(SPEC, preset=preset).base_dim == 32
+
+
+def test_appearance_of_each_image_is_rendered_with_its_mean(train_set: TrainingSet) -> None:
+    made = ScaffoldGS(ScaffoldGSConfig(**GROWING, appearance_dim=8))
+    made.setup(train_set, seed=0, device="cpu")
+    start = made.model.global_features.detach().clone()
+    assert start.shape == (len(train_set.views), 8)
+    made.step(0, 0.0)
+    moved = (made.model.global_features != start).any(dim=1)
+    assert moved.sum() == 1, "a step trains the vector of its image alone"
+    with torch.no_grad():
+        image = made.render(train_set.views[0], 0).rgb
+        made.model.global_features.copy_(made.model.global_features.mean(dim=0).expand_as(start))
+        np.testing.assert_allclose(made.render(train_set.views[0], 0).rgb, image, atol=1e-6)
+
+
+def test_appearance_of_a_period_is_chronogs_without_features_that_vary(
+    train_set: TrainingSet,
+) -> None:
+    views = tuple(replace(view, period=i % 2) for i, view in enumerate(train_set.views))
+    two = replace(train_set, views=views, num_periods=2, point_periods=np.ones((50, 2), bool))
+    ours = ScaffoldGSPeriod(ScaffoldGSConfig(**GROWING, appearance_dim=8))
+    theirs = ChronoGS(
+        ChronoGSConfig(**GROWING, base_dim=32, period_dim=0, global_dim=8, global_heads=("color",))
+    )
+    for made in (ours, theirs):
+        made.setup(two, seed=7, device="cpu")
+        for index in range(20):
+            made.step(index, index / 20)
+    for name, tensor in ours.model.tensors().items():
+        assert torch.equal(tensor, theirs.model.tensors()[name]), name
+    images = [ours.render(two.views[0], period).rgb for period in (0, 0.5, 1)]
+    assert not np.array_equal(images[0], images[2])
+    np.testing.assert_array_equal(images[1], theirs.render(two.views[0], 0.5).rgb)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronogs.periods import period_weights
+from chronoscene.anchors.periods import period_weights
 from chronoscene.errors import ConfigError
 
 
