@@ -81,7 +81,7 @@ def undistort(
                 path,
                 expected=f"an image file that can be written: {', '.join(WRITABLE)}",
                 found=repr(path.suffix),
-                todo="convert the images first",
+                todo="save it as PNG, and rename it in the model",
             )
     changes = undistortion.plan_cameras(scene, center=center)
     new, observations_lost, points_lost = undistortion.move_observations(scene, changes)

@@ -77,6 +77,8 @@ class Job:
     """One run. Paths are absolute."""
 
     scene_root: str
+    scene_format: str
+    """Name in `chronoscene.formats`."""
     scene: str
     scene_hash: str
     split_hash: str

@@ -45,6 +45,8 @@ class BenchSettings:
     threads: int | None = None
     device: str = "auto"
     lpips_weights: Path | None = None
+    dataset_format: str | None = None
+    """Of the scenes; None to find out."""
     overwrite: bool = False
     """Whether finished runs with other settings may be replaced."""
 
@@ -55,7 +57,7 @@ def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]
     split_overrides(settings, [spec for _, spec in specs])
     if settings.lpips_weights is not None:
         check_available(settings.lpips_weights)
-    scenes = [read_scene(path) for path in settings.scenes]
+    scenes = [read_scene(path, format=settings.dataset_format) for path in settings.scenes]
     _check_names(scenes)
     commit = code_version()
     plan: dict[Path, tuple[Job, MethodSpec]] = {}
@@ -119,6 +121,7 @@ def _scene_jobs(
         strategy, notice = effective_strategy(spec, wanted)
         job = Job(
             scene_root=str(scene.root.resolve()),
+            scene_format=scene.format,
             scene=scene.name,
             scene_hash=digest,
             split_hash=split,

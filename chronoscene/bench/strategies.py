@@ -94,13 +94,17 @@ def check_scene(scene: Scene) -> None:
                 found=frame.camera.model,
                 todo=f"run 'chronoscene undistort {scene.root} OUT' and use OUT",
             )
-    for split in ("train", "test"):
+    for split, todo in (
+        ("train", "register more images of each period, or hold out some periods: --strategy "
+         "periods --period ID of chronoscene split"),
+        ("test", "choose some: chronoscene split"),
+    ):  # fmt: skip
         if not any(f.split == split for f in scene.frames):
             raise SceneError(
                 scene.root,
                 expected=f"at least one {split} image",
                 found=f"none ({scene.split_rule})",
-                todo="change the split, for example with chronoscene split",
+                todo=f"{todo} {scene.root} --scene-out NEW, and use NEW",
             )
 
 

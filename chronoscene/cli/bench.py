@@ -12,6 +12,7 @@ from chronoscene.bench.job import parse_duration
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.strategies import STRATEGIES
 from chronoscene.checks import check_choice
+from chronoscene.cli.convert import format_option
 from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.results import split_list
 from chronoscene.errors import ConfigError
@@ -36,6 +37,7 @@ EXISTING = click.Path(path_type=Path, exists=True)
     show_default=True,
     help=f"One or several of {', '.join(STRATEGIES)}, separated by commas.",
 )
+@format_option("the scenes")
 @click.option("--preset", default="balanced", show_default=True, help="Preset of the methods.")
 @click.option(
     "--budget", help="Stop after this time on the training clock, such as 90s, 5m or 1h30m."

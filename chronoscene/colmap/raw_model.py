@@ -176,3 +176,11 @@ def find_model(project: Path) -> tuple[str, str] | None:
         if model_files(project / place) if place else model_kind(project):
             return place, images
     return None
+
+
+def find_stray_model(project: Path) -> str | None:
+    """A complete model below a project, in a place where nobody would look."""
+    deep = ("/".join("*" * depth) for depth in range(1, 5))
+    files = (file for stars in deep for file in sorted(project.glob(f"{stars}/cameras.*")))
+    folders = (file.parent for file in files if model_kind(file.parent))
+    return next((folder.relative_to(project).as_posix() for folder in folders), None)

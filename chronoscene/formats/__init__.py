@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.checks import check_choice
-from chronoscene.colmap.raw_model import find_model, model_kind
+from chronoscene.colmap.raw_model import find_model, find_stray_model
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Scene
 
@@ -76,7 +76,7 @@ def detect_format(path: Path, *, period_by: str | None = None) -> str:
             path,
             expected="a folder of one format",
             found=f"marks of {' and '.join(matching)}",
-            todo="choose one with --dataset-format",
+            todo="name one with --dataset-format, in chronoscene convert or in this command",
         )
     if _is_colmap(path):
         raise _no_periods(path)
@@ -104,27 +104,24 @@ def _is_colmap(path: Path) -> bool:
 
 def _advice(path: Path) -> str:
     """What to do about a folder that no format matches."""
-    above = path.resolve().parents[:FAR_UP]
-    if project := next((folder for folder in above if _is_colmap(folder)), None):
+    if project := project_above(path):
         return f"give the folder of the whole project, {project}"
     if model := find_model(path):
         place = f"in {model[0]}" if model[0] else "here"
         return f"copy the images of the COLMAP model {place} to {model[1]}/ in this folder"
     advice = "give the folder of one scene; DATASET.md describes its files"
     if (path / "images").is_dir():
-        if model_folder := _model_below(path):
+        if model_folder := find_stray_model(path):
             return f"copy the COLMAP model in {model_folder} to sparse/0"
         if not (path / "sparse").exists():
             return f"register these photos (chronoscene register), or {advice}"
     return advice
 
 
-def _model_below(path: Path) -> str | None:
-    """A COLMAP model in a place that nobody would guess, below a folder."""
-    deep = ("/".join("*" * depth) for depth in range(1, FAR_UP + 1))
-    files = (file for stars in deep for file in sorted(path.glob(f"{stars}/cameras.*")))
-    folders = (file.parent for file in files if model_kind(file.parent))
-    return next((folder.relative_to(path).as_posix() for folder in folders), None)
+def project_above(path: Path) -> Path | None:
+    """The COLMAP project that a folder is a part of."""
+    above = path.resolve().parents[:FAR_UP]
+    return next((folder for folder in above if _is_colmap(folder)), None)
 
 
 def _no_periods(path: Path) -> SceneError:
@@ -135,7 +132,8 @@ def _no_periods(path: Path) -> SceneError:
         path,
         expected=f"periods of the images: folders in {images}/, or sparse/split.txt",
         found=f"neither beside the COLMAP model in {model or 'this folder'}",
-        todo=f"{NAME_PERIODS}, or write sparse/split.txt as DATASET.md says",
+        todo=f"{NAME_PERIODS}, in chronoscene convert or in this command; or write "
+        "sparse/split.txt as DATASET.md says",
     )
 
 

@@ -84,8 +84,9 @@ def _read_model(path: Path) -> Model:
         raise SceneError(
             path / MODEL,
             expected="the COLMAP model",
-            found=f"one in {found[0] or 'the scene folder'} instead",
-            todo=f"move its files to {MODEL}",
+            found=f"one in {found[0] or 'the scene folder'}, of the images in {found[1]}",
+            todo=f"move its files to {MODEL}"
+            + (", and the images to images" * (found[1] != "images")),
         )
     return read_model(path / MODEL)
 

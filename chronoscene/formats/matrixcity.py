@@ -122,8 +122,8 @@ def _check_same(path: Path, first: Shot, second: Shot) -> None:
         raise SceneError(
             path / first.name,
             expected="the same pose in all pose files",
-            found="two different poses",
-            todo="remove the files that are wrong",
+            found="two poses that differ by more than 0.01 m or 0.01 in the rotation",
+            todo="remove the pose file that is wrong",
         )
 
 

@@ -223,7 +223,7 @@ def _group(
                 grouping.OPTION,
                 expected="times that the frames of a period share",
                 found=f"{distinct} times of {len(times)} frames in {place}",
-                todo="group them with count:N or gap:X",
+                todo="group them: --period-by count:N or gap:X",
             )
         return grouping.group_times(times, f"count:{distinct}" if by == "time" else by)
     raise grouping.rule_error(by, PERIOD_BY)

@@ -65,7 +65,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
             path / "dense/images",
             expected="images with a date in their names",
             found="none after train.txt and trash.txt",
-            todo="see DATASET.md, Other formats",
+            todo="name images with their dates in train.txt, and not in trash.txt",
         )
     dated = [name for name in used if name in dates]
     return colmap_layout.make_scene(

@@ -119,7 +119,9 @@ def _one_camera(scene: Scene, out: Path) -> Camera:
             expected=f"one camera for all images, and of {', '.join(READ_MODELS)}, as the loader "
             "of CLNeRF takes camera 1 for all",
             found=f"{len(cameras) + 1} cameras" if cameras else camera.model,
-            todo="choose another format, or undistort the images to one camera",
+            todo="choose another format with --to"
+            if cameras
+            else "run chronoscene undistort first",
         )
     return camera
 

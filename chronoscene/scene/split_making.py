@@ -106,9 +106,9 @@ def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
         settings = replace(settings, seed=0)
     tests = STRATEGIES[settings.strategy](scene, settings)
     if len(tests) == len(scene.frames):
-        raise ConfigError(
-            "split", expected="training images", found="none left", todo="hold out fewer images"
-        )
+        single = len(scene.frames) == scene.num_periods  # no share of one image is less than it
+        todo = "hold out whole periods (--strategy periods)" if single else "hold out fewer images"
+        raise ConfigError("split", expected="training images", found="none left", todo=todo)
     frames = [replace(f, split=split_of(f.name, tests)) for f in scene.frames]
     new = replace(scene.with_frames(frames), split_rule=f"{settings.strategy} split")
     return NewSplit(

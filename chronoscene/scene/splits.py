@@ -85,10 +85,15 @@ def read_text(path: Path) -> str:
     try:
         return decode_text(path.read_bytes())
     except UnicodeDecodeError:
-        found = "bytes that are not UTF-8"
+        found, todo = "bytes that are not UTF-8", "save it as UTF-8"
+    except FileNotFoundError:
+        found, todo = "nothing", "check the path"
+    except IsADirectoryError:
+        found, todo = "a folder", "name a file"
     except OSError as error:
         found = error.strerror or "a file that cannot be read"
-    raise SceneError(path, expected="a text file", found=found, todo="save it as UTF-8")
+        todo = "make it readable, or check the path"
+    raise SceneError(path, expected="a text file", found=found, todo=todo)
 
 
 def decode_text(data: bytes) -> str:
@@ -207,7 +212,13 @@ def assign_periods(
     placed = [_place(entry, index.find(entry.name), periods, lines) for entry in entries]
     problems = [problem for problem in placed if problem is not None]
     problems += [
-        Problem("missing", None, f"a period for every registered image, {name!r} too", "none")
+        Problem(
+            "missing",
+            None,
+            f"a period for every registered image, {name!r} too",
+            "none",
+            "add a line for it",
+        )
         for name in names
         if name not in periods
     ]

@@ -81,16 +81,19 @@ def find_folders(path: Path) -> list[Path]:
         raise SceneError(path, expected="a folder", found=found, todo=todo) from error
     if inside:
         return inside
-    raise SceneError(
-        path,
-        expected="a scene (a folder with images/ and sparse/) or a folder of scenes",
-        found="neither",
-        todo="give the folder of one scene; DATASET.md describes its files",
-    )
+    found, todo = "neither", "give the folder of one scene; DATASET.md describes its files"
+    if project := formats.project_above(path):
+        found, todo = "a part of one", f"give the folder of the whole project, {project}"
+    expected = "a scene (a folder with images/ and sparse/) or a folder of scenes"
+    raise SceneError(path, expected=expected, found=found, todo=todo)
 
 
 def _looks_like_scene(path: Path) -> bool:
-    ours = any((path / name).is_dir() for name in ("sparse", "images")) or bool(model_files(path))
+    if (path / "images").is_dir():
+        return True
+    if formats.project_above(path) is not None:
+        return False  # a part of it
+    ours = (path / "sparse").is_dir() or bool(model_files(path))
     return ours or other_format(path) is not None
 
 

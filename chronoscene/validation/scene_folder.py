@@ -138,8 +138,16 @@ class RawScene:
     @cached_property
     def model_place(self) -> str | None:
         """Where the model is, relative to the scene folder; None if there is none."""
-        found = raw_model.find_model(self.root)
-        return found[0] if found else None
+        return None if self._found is None else self._found[0]
+
+    @cached_property
+    def _found(self) -> tuple[str, str] | None:
+        return raw_model.find_model(self.root)
+
+    @property
+    def model_images(self) -> str:
+        """Where the images are that a model in a wrong place is of."""
+        return "images" if self._found is None else self._found[1]
 
     @cached_property
     def model(self) -> RawModel | None:

@@ -432,5 +432,7 @@ def test_wrong_head() -> None:
 def test_wrong_visible(indices: list[int]) -> None:
     problem = make_problem()
     problem.fixed["visible"] = torch.tensor(indices)
-    with pytest.raises(ShapeError, match="visible: expected ascending indices of 30 anchors"):
+    with pytest.raises(
+        ShapeError, match=r"visible: expected ascending indices of 30 anchors, found \[.*\], at m"
+    ):
         problem.run(decode)

@@ -325,7 +325,7 @@ def test_errors_name_what_was_looked_for(make_scene_folder, tmp_path):
 def test_split_file_that_is_not_text(make_scene_folder):
     folder = make_scene_folder()
     (folder / "sparse/split.txt").write_bytes(b"\xe9\x80 0\n")
-    with pytest.raises(ChronoSceneError, match="expected a text file"):
+    with pytest.raises(ChronoSceneError, match="found bytes that are not UTF-8; save it as UTF-8"):
         read_scene(folder)
 
 

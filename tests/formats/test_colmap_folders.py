@@ -71,8 +71,11 @@ def test_periods_from_a_table(colmap_folder, tmp_path):
     [
         ("file,date\na.png,1\n", "expected the columns file and period"),
         ("", "expected the columns file and period"),
-        ("file,period\na.png,1\n", "a period of every image, 'b.png' too"),
-        ("file,period\na.png,1\nb.png,2\na,2\n", r"periods.csv:4: expected one period of 'a'"),
+        ("file,period\na.png,1\n", "a period of every image, found none of 1 of 2: 'b.png'; add"),
+        (
+            "file,period\na.png,1\nb.png,2\na,2\n",
+            r"periods.csv:4: expected one period of 'a', found '1' and '2'; keep one",
+        ),
     ],
 )
 def test_tables_that_are_refused(colmap_folder, tmp_path, text, message):
@@ -80,6 +83,13 @@ def test_tables_that_are_refused(colmap_folder, tmp_path, text, message):
     table.write_text(text)
     with pytest.raises(SceneError, match=message):
         read_scene(folder, format="colmap-folders", period_by=f"table:{table}")
+
+
+def test_a_table_that_is_not_there(colmap_folder, tmp_path):
+    folder = colmap_folder(["a.png", "b.png"])
+    for name, found in (("nope.csv", "nothing; check the path"), ("", "a folder; name a file")):
+        with pytest.raises(SceneError, match=f"{name}: expected a text file, found {found}$"):
+            read_scene(folder, period_by=f"table:{tmp_path / name}")
 
 
 def test_unknown_grouping_names_those_that_there_are(colmap_folder):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from chronoscene.errors import ConfigError, SceneError
+from chronoscene.formats.chronoscene import read
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.split_making import (
@@ -232,3 +233,10 @@ def test_every_period_keeps_training_images(pairs, wanted, seed):
     chosen = choose_blocks(block, periods, wanted, seed)
     is_test = np.isin(block, list(chosen))
     assert set(periods[~is_test]) == set(periods)
+
+
+def test_periods_of_one_image_can_only_be_held_out_whole(make_scene_folder):
+    scene = read(make_scene_folder({"a.png": 0, "b.png": 1}))
+    with pytest.raises(ConfigError, match=r"found none left; hold out whole periods \(--strat"):
+        make_split(scene, SplitSettings())
+    assert make_split(scene, SplitSettings("periods", periods=(1,))).hash

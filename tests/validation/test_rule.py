@@ -79,9 +79,16 @@ def test_ignore_alone():
     assert not [c for c in codes(choose_rules([], ["CS7"])) if c.startswith("CS7")]
 
 
-@pytest.mark.parametrize("text", ["CS999", "nonsense", "", "2", "CS2x"])
+@pytest.mark.parametrize("text", ["CS999", "CS800", "nonsense", "", "2"])
 def test_unknown_code(text):
-    with pytest.raises(ConfigError, match="--select: expected rule codes"):
+    todo = r"; choose from CS0 \(Folder\), CS1 \(COLMAP model\), .* CS7 \(Released"
+    with pytest.raises(ConfigError, match=f"--select: expected rule codes.*{todo}"):
+        choose_rules([text])
+
+
+@pytest.mark.parametrize(("text", "near"), [("CS299", "CS2"), ("cs2x", "CS2"), ("CS0091", "CS009")])
+def test_unknown_code_of_a_family(text, near):
+    with pytest.raises(ConfigError, match=f"; did you mean {near}"):
         choose_rules([text])
 
 

@@ -183,7 +183,7 @@ def _check(x: DecodeInputs) -> None:
         raise ShapeError(
             "visible",
             expected=f"ascending indices of {rows} anchors",
-            found="others",
+            found=f"{visible[:8].tolist()}, at most {int(visible.max())}",
             todo="pass indices of rows that exist, sorted, each once",
         )
 

@@ -108,7 +108,10 @@ def read_images(path: Path) -> tuple[Model, Path]:
     model = read_model(folder)
     if not model.images:
         raise SceneError(
-            folder, expected="registered images", found="none", todo="register the images"
+            folder,
+            expected="registered images",
+            found="none",
+            todo="register the photos (chronoscene register)",
         )
     for image in model.images:
         our_format.check_image(folder, image)
@@ -174,13 +177,15 @@ def write_renamed(
     Raises:
         SceneError: If ``out`` is in use, an image is missing, or two new names are equal.
     """
-    if len(set(names.values())) < len(names):
-        raise SceneError(
-            out,
-            expected="image names that remain distinct when / becomes _",
-            found="duplicates",
-            todo="rename the images",
-        )
+    olds: dict[str, str] = {}
+    for old, name in names.items():
+        if (other := olds.setdefault(name, old)) != old:
+            raise SceneError(
+                out,
+                expected="image names that remain distinct when / becomes _",
+                found=f"{other!r} and {old!r}, both {name!r}",
+                todo="rename one of the images, in images/ and in the model",
+            )
     new = _renamed(scene, names)
     for frame in new.frames:
         our_format.check_writable_name(out, frame)

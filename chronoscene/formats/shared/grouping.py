@@ -17,6 +17,7 @@ from pathlib import Path
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.shared.json_values import is_iso_date
+from chronoscene.io.wording import shown
 from chronoscene.scene import Period
 from chronoscene.scene.splits import NameIndex, read_text
 
@@ -129,16 +130,22 @@ def group_by_table(names: Sequence[str], path: Path) -> Grouped:
     for place, name, label in read_table(path):
         found = index.find(name)
         if len(found) > 1:
-            raise _table_error(place, "a name that matches one image", repr(name))
-        if found and label and labels.setdefault(found[0], label) != label:
-            raise _table_error(place, f"one period of {name!r}", "two")
+            several = f"{name!r}, which matches {shown(found)}"
+            todo = "write the full names below images/"
+            raise _table_error(place, "a name that matches one image", several, todo)
+        if found and label and (first := labels.setdefault(found[0], label)) != label:
+            both = f"{first!r} and {label!r}"
+            raise _table_error(place, f"one period of {name!r}", both, "keep one of the two")
     if lost := [name for name in names if name not in labels]:
-        raise _table_error(path, f"a period of every image, {lost[0]!r} too", "none")
+        missing = f"none of {len(lost)} of {len(names)}: {shown(lost)}"
+        raise _table_error(path, "a period of every image", missing, "add rows for them")
     return group_labels(labels, sorted(set(labels.values()), key=natural_key))
 
 
-def _table_error(place: object, expected: str, found: str) -> SceneError:
-    return SceneError(place, expected=expected, found=found, todo="correct the table")
+def _table_error(
+    place: object, expected: str, found: str, todo: str = "correct the table"
+) -> SceneError:
+    return SceneError(place, expected=expected, found=found, todo=todo)
 
 
 def rule_error(by: str, rules: Iterable[str]) -> ConfigError:

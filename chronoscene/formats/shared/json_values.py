@@ -47,7 +47,7 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def json_error(
-    place: object, expected: str, found: str, todo: str = "see DATASET.md"
+    place: object, expected: str, found: str, todo: str = "correct the file"
 ) -> SceneError:
     """Something wrong in a JSON file."""
     return SceneError(place, expected=expected, found=found, todo=todo)
@@ -74,8 +74,11 @@ def parse_periods(place: Path, items: list[Any], count: int) -> tuple[Period, ..
     Raises:
         SceneError: If they are damaged, or their ids are not 0 to ``count - 1``.
     """
-    if [item.get("id") if isinstance(item, dict) else None for item in items] != [*range(count)]:
-        raise json_error(place, f"objects with ids 0..{count - 1} in order", "other ids")
+    ids = [item.get("id") if isinstance(item, dict) else None for item in items]
+    if ids != [*range(count)]:
+        found = ", ".join(str(i)[:40] for i in ids[:8]) + (", ..." if len(ids) > 8 else "")
+        expected = f"objects with the ids 0..{count - 1} in order, one for each period"
+        raise json_error(place, expected, found or "none")
     return tuple(_parse_period(place, item) for item in items)
 
 

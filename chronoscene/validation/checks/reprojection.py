@@ -30,7 +30,6 @@ pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
 MAX_DEPTHS = 500  # Depths sampled from an image: enough for a percentile over a period
 MIN_IMAGES = 3  # Images with an error from which the median of a period is meaningful
 
-
 MAX_RAYS = 20_000  # Observations sampled from a period
 MIN_POINTS = 10  # Points that the cameras of a period must triangulate alone
 

@@ -78,7 +78,7 @@ class _Fix:
     def _model(self) -> None:
         """Write the model into ``sparse/0/`` if anything in it is corrected."""
         model, place = self._scene.model, self._scene.model_place
-        if model is None or place is None or model.damages:
+        if model is None or place is None or model.damages or self._scene.model_images != "images":
             return
         if model.cameras is None or model.images is None or model.points is None:
             return

@@ -25,6 +25,8 @@ from chronoscene.validation.rules import (  # noqa: F401  (importing them regist
     cs7_released_code,
 )
 
+NEAR = 0.8  # Likeness of a name from which it may be meant
+
 
 def all_rules() -> tuple[Rule, ...]:
     """Every rule, sorted by code."""
@@ -58,11 +60,13 @@ def _matching(place: str, text: str, rules: tuple[Rule, ...]) -> set[str]:
         codes |= {r.code for r in rules if r.code.startswith(key.upper())}
     if codes:
         return codes
-    known = [r.code for r in rules] + [r.name for r in rules]
-    close = get_close_matches(key, known, n=1)
+    family = [r.code for r in rules if r.code.startswith(key[:3].upper())]  # or none, such as CS9
+    close = get_close_matches(key.upper(), family, n=1)
+    close = close or get_close_matches(key.lower(), [r.name for r in rules], n=1, cutoff=NEAR)
+    families = ", ".join(f"{prefix} ({about})" for prefix, about in GROUPS.items())
     raise ConfigError(
         place,
-        expected=f"rule codes, prefixes of codes ({', '.join(GROUPS)}) or rule names",
+        expected="rule codes, prefixes of codes or rule names",
         found=repr(text),
-        todo=f"did you mean {close[0]}?" if close else "--explain CS lists all rules",
+        todo=f"did you mean {close[0]}?" if close else f"choose from {families}",
     )

@@ -41,7 +41,11 @@ def model_misplaced(scene: RawScene) -> Iterator[Hit]:
     place = scene.model_place
     if place is not None and place != our_format.MODEL and not scene.is_project:
         found = f"a model in {place}/" if place else "a model at the top of the folder"
-        yield Hit(our_format.MODEL, "the COLMAP model", found)
+        remedy = None
+        if scene.model_images != "images":
+            found += f", of the images in {scene.model_images}/"
+            remedy = "move the model files to sparse/0/, and these images to images/"
+        yield Hit(our_format.MODEL, "the COLMAP model", found, remedy)
 
 
 @rule.warning(

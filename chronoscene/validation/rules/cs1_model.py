@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from chronoscene.colmap.raw_model import MODEL_FILES, RawImages, RawModel
+from chronoscene.colmap.raw_model import MODEL_FILES, RawImages, RawModel, find_stray_model
 from chronoscene.formats.chronoscene import MODEL
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
@@ -29,7 +29,9 @@ MAX_ID = 2**31 - 2  # Largest id in COLMAP's databases
 def model_absent(scene: RawScene) -> Iterator[Hit]:
     """There is no COLMAP model."""
     if scene.model_place is None:
-        yield Hit(MODEL, "a COLMAP model", "none")
+        stray = find_stray_model(scene.root)
+        remedy = f"copy the model in {stray} to {MODEL}" if stray else None
+        yield Hit(MODEL, "a COLMAP model", f"one in {stray}" if stray else "none", remedy)
 
 
 @rule.error(

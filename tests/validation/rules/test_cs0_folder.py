@@ -9,6 +9,25 @@ from chronoscene.formats import chronoscene as our_format
 from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.run import Reading, find_folders, other_format, validate_scene
 
+ALONE = {"CS321", "CS706"}  # What is said of a scene without sparse/0/test.txt
+
+
+def test_a_model_where_nobody_looks(scene):
+    scene.path("out").mkdir()
+    scene.path("sparse/0").rename(scene.path("out/model"))
+    (finding,) = [f for f in scene.validate().findings if f.code == "CS101"]
+    assert (finding.found, finding.remedy) == (
+        "one in out/model",
+        "copy the model in out/model to sparse/0",
+    )
+
+
+def test_a_part_of_a_project(project):
+    for part in ("sparse/0", "sparse", "images", "images/2016"):
+        todo = f"give the folder of the whole project, {project.root}$"
+        with pytest.raises(SceneError, match=f"found a part of one; {todo}"):
+            find_folders(project.path(part))
+
 
 def test_no_images_folder(scene):
     scene.path("images").rename(scene.path("photos"))
@@ -25,6 +44,19 @@ def test_misplaced_model_is_read_all_the_same(scene):
     scene.expect("CS002", place="sparse/0", found="a model in sparse/", also=also)
 
 
+def test_a_misplaced_model_of_other_images(scene, tmp_path):
+    scene.path("distorted/sparse").mkdir(parents=True)
+    scene.path("sparse/0").rename(scene.path("distorted/sparse/0"))
+    shutil.copytree(scene.path("images"), scene.path("input"))
+    report = scene.expect("CS002", found="distorted/sparse/0/, of the images in input/", also=ALONE)
+    (finding,) = [f for f in report.findings if f.code == "CS002"]
+    assert finding.remedy == "move the model files to sparse/0/, and these images to images/"
+    assert fix_scene(scene.root, tmp_path / "fixed") == []  # it would go with the wrong images
+    message = r"sparse/0: expected the COLMAP model, found one in distorted/.*and the images to im"
+    with pytest.raises(SceneError, match=message):
+        our_format.read(scene.root)
+
+
 def test_several_models(scene):
     shutil.copytree(scene.path("sparse/0"), scene.path("sparse/1"))
     scene.expect("CS003", place="sparse", found="also 'sparse/1'")
@@ -37,7 +69,7 @@ def test_empty_folders_beside_the_model_are_nothing(scene):
 
 def test_bad_periods_json(scene):
     scene.write("sparse/periods.json", '[{"id": 0}, {"id": 2}]')
-    scene.expect("CS004", place="sparse/periods.json", found="other ids")
+    scene.expect("CS004", place="sparse/periods.json", found="0, 2")
 
 
 def test_good_side_files_are_silent(scene):
