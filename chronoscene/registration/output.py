@@ -38,9 +38,7 @@ CERTIFICATE = "registration.json"
 PAGE = "registration.html"
 
 SAME_PIXELS = 1.0  # Observations in one image that are nearer to each other can be of one point
-SAME_ERROR = (
-    4.0  # Pixels: they are if it projects into the new images this near to where they see it
-)
+SAME_ERROR = 4.0  # Pixels: they are if it projects this near to where the new images see it
 
 
 def as_scene(registered: Registered, name: str) -> Scene:
