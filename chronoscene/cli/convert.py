@@ -12,7 +12,7 @@ import click
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.convert import convert
-from chronoscene.formats import format_names, load_format, writable_formats
+from chronoscene.formats import format_names, load_format, model_notes, read_scene, writable_formats
 from chronoscene.images.store import ImageSource
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
@@ -82,7 +82,20 @@ def command(
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")
     emit("\n".join(lines) + "\n", None)
     for warning in done.warnings:
-        click.secho(f"note: {warning}", fg="yellow", err=True)
+        say_note(warning)
+
+
+def read_and_note(source: Path, dataset_format: str | None, period_by: str | None) -> Scene:
+    """Read a scene; a model in an unusual place is said."""
+    scene = read_scene(source, format=dataset_format, period_by=period_by)
+    for note in model_notes(source, scene.format):
+        say_note(note)
+    return scene
+
+
+def say_note(note: str) -> None:
+    """One line on standard error."""
+    click.secho(f"note: {note}", fg="yellow", err=True)
 
 
 def describe(scene: Scene) -> str:

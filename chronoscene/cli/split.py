@@ -9,12 +9,11 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.convert import describe_period, reading_options
+from chronoscene.cli.convert import describe_period, read_and_note, reading_options
 from chronoscene.cli.output import check_place, emit, writing_to
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside, write_text_atomic
 from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, SplitSettings, make_split
 
@@ -81,7 +80,7 @@ def command(
     SCENE is not changed: --scene-out writes a copy with the new split.
     """
     _check_targets(source, out, scene_out)
-    scene = read_scene(source, format=dataset_format, period_by=period_by)
+    scene = read_and_note(source, dataset_format, period_by)
     split = make_split(scene, SplitSettings(fraction=_fraction(fraction, every), **options))
     for frame in split.scene.frames:
         our_format.check_writable_name(source, frame)

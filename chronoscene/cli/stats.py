@@ -16,7 +16,7 @@ from chronoscene.cli.convert import reading_options
 from chronoscene.cli.output import check_file, check_place, emit, writing_to
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats import find_scenes, read_scene
+from chronoscene.formats import find_scenes, model_notes, read_scene
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.tables import FORMATS
@@ -159,7 +159,8 @@ def command(
             path = request.figures / f"counts.{request.figure_format}"
             with writing_to("--figures", path):
                 draw_bars(counts, path)
-    for remark in [*unseen(counts), *against_paper(counts)]:
+    notes = (f"{s.name}: {n}" for s in counts for n in model_notes(Path(s.path), s.format))
+    for remark in [*notes, *unseen(counts), *against_paper(counts)]:
         click.echo(printable(remark), err=True)
     for scene in unreadable:
         click.secho(printable(f"error: {scene.error}"), fg="red", err=True)

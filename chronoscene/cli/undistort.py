@@ -7,10 +7,9 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.convert import LINKS, describe, reading_options
+from chronoscene.cli.convert import LINKS, describe, read_and_note, reading_options
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
-from chronoscene.formats import read_scene
 from chronoscene.images.undistortion import CameraChange
 from chronoscene.io.staging import check_outside
 from chronoscene.scene.splits import split_hash
@@ -52,7 +51,7 @@ def command(
     check_outside(out, [source])
     with progress_bar() as bar:
         done = undistort(
-            read_scene(source, format=dataset_format, period_by=period_by),
+            read_and_note(source, dataset_format, period_by),
             out,
             center=center,
             threads=threads,

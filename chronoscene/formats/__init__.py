@@ -32,6 +32,8 @@ FORMATS = {
 }
 """Format name to the module that reads it."""
 
+USUAL = ("sparse/0", "sparse")  # Where everybody looks for a COLMAP model
+
 COLMAP = "colmap-folders"
 """What a COLMAP project is read as where ``--period-by`` says what its periods are."""
 
@@ -80,6 +82,13 @@ def detect_format(path: Path, *, period_by: str | None = None) -> str:
         )
     if _is_colmap(path):
         raise _no_periods(path)
+    if project := project_above(path):
+        raise SceneError(
+            path,
+            expected="the folder of a scene",
+            found="a part of one",
+            todo=f"give the folder of the whole project, {project}",
+        )
     looked_for = "; ".join(f"{name}: {module.MARKS}" for name, module in modules.items())
     content = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
     raise SceneError(
@@ -104,8 +113,6 @@ def _is_colmap(path: Path) -> bool:
 
 def _advice(path: Path) -> str:
     """What to do about a folder that no format matches."""
-    if project := project_above(path):
-        return f"give the folder of the whole project, {project}"
     if model := find_model(path):
         place = f"in {model[0]}" if model[0] else "here"
         return f"copy the images of the COLMAP model {place} to {model[1]}/ in this folder"
@@ -116,6 +123,14 @@ def _advice(path: Path) -> str:
         if not (path / "sparse").exists():
             return f"register these photos (chronoscene register), or {advice}"
     return advice
+
+
+def model_notes(path: Path, format: str) -> list[str]:
+    """Where the COLMAP model is that is read, if not where everybody would look for it."""
+    found = find_model(path) if hasattr(load_format(format), "assign") else None
+    if found is None or found[0] in USUAL:
+        return []
+    return [f"the model is read from {found[0] or 'the folder itself'}, the images from {found[1]}"]
 
 
 def project_above(path: Path) -> Path | None:

@@ -140,9 +140,7 @@ def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list
 
 def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
-    if not (path / TRAIN).exists():
-        return colmap_layout.remarks(path)
-    if not (path / POINTS).exists():
+    if _is_level(path) and not (path / POINTS).exists():
         return [f"the level has no {POINTS}: the scene has no points"]
     return []
 

@@ -107,9 +107,6 @@ def _dates(images: Path, names: list[str]) -> dict[str, date]:
     return {name: time.date() for name, time in times.items() if time is not None}
 
 
-remarks = colmap_layout.remarks
-
-
 def write(
     scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:

@@ -81,9 +81,6 @@ def _task(images: Path, name: str) -> str:
     return folder
 
 
-remarks = colmap_layout.remarks
-
-
 def write(
     scene: Scene, out: Path, *, image_source: ImageSource = "copy", progress: Progress | None = None
 ) -> Path:

@@ -120,15 +120,14 @@ def is_project(path: Path, format: str) -> bool:
 
 def _project(scene: RawScene, format: str, reading: Reading) -> Origin:
     """A COLMAP project, with its periods as its format sees them."""
-    module = load_format(format)
+    notes = formats.model_notes(scene.root, format)
     read = partial(formats.read_scene, scene.root, format=format, period_by=reading.period_by)
     options = formats.period_options(format, reading.period_by)
-    remarks = tuple(module.remarks(scene.root))
     try:
-        assigned = module.assign(scene.root / "images", scene.names, **options)
+        assigned = load_format(format).assign(scene.root / "images", scene.names, **options)
     except SceneError as error:
-        return Origin(format, error, remarks, read)
-    return Origin(format, None, remarks, read, assigned if scene.names else None)
+        return Origin(format, error, notes, read=read)
+    return Origin(format, None, notes, read=read, assigned=assigned if scene.names else None)
 
 
 @contextmanager
@@ -144,7 +143,8 @@ def in_our_format(path: Path, format: str, reading: Reading) -> Iterator[tuple[P
                 source = scene.image_path(frame)
                 if source.is_file():
                     place_image(source, ours / "images" / frame.name, "symlink")
-            origin = Origin(format, remarks=tuple(remarks_on(scene)))
+            notes = formats.model_notes(path, format)
+            origin = Origin(format, None, notes, tuple(remarks_on(scene)))
         except SceneError as error:
             origin = Origin(format, error)
         yield path if origin.error else ours, origin

@@ -74,6 +74,8 @@ class Origin:
     """Name in `chronoscene.formats`."""
     error: ChronoSceneError | None = None
     """Why the scene, or of a project the periods, cannot be read."""
+    notes: list[str] = field(default_factory=list)
+    """Where its model was found, if not in the usual place."""
     remarks: tuple[str, ...] = ()
     """What the conversion leaves out."""
     read: Callable[[], Scene] | None = None

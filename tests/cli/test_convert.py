@@ -91,3 +91,23 @@ def test_labels_that_the_output_cannot_encode(make_scene_folder, tmp_path):
     (folder / "sparse/periods.json").write_text('[{"id": 0, "label": "früher"}, {"id": 1}]')
     result = CliRunner(charset="ascii").invoke(cli, ["convert", str(folder), str(tmp_path / "o")])
     assert result.exit_code == 0 and "fr\\xfcher" in result.stdout
+
+
+@pytest.mark.parametrize("command", ["convert", "split", "stats", "undistort", "validate"])
+def test_every_command_reads_colmap_projects_alike(make_scene_folder, tmp_path, command):
+    """With the model where nerfstudio leaves it, and periods that a table names."""
+    folder = make_scene_folder({"a.png": 0, "b.png": 0, "c.png": 0, "d.png": 0})
+    (folder / "sparse/split.txt").unlink()
+    (folder / "sparse").rename(tmp_path / "sparse")
+    (folder / "colmap").mkdir()
+    (tmp_path / "sparse").rename(folder / "colmap/sparse")
+    table = tmp_path / "periods.csv"
+    table.write_text("file,period\na.png,2016\nb.png,2023\nc.png,2016\nd.png,2023\n")
+    out = [] if command in ("stats", "validate") else [str(tmp_path / "out")]
+    result = CliRunner().invoke(cli, [command, str(folder), *out])
+    assert result.exit_code != 0
+    assert "--period-by year, month or day" in f"{result.output}{result.exception}"
+    rule = ["--dataset-format", "colmap-folders", "--period-by", f"table:{table}"]
+    result = CliRunner().invoke(cli, [command, str(folder), *out, *rule])
+    assert result.exit_code == 0, result.output
+    assert "the model is read from colmap/sparse/0, the images from images" in result.output

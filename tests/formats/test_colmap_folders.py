@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from chronoscene.convert import remarks_on
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats import colmap_folders, detect_format, find_scenes, read_scene
+from chronoscene.formats import colmap_folders, detect_format, find_scenes, model_notes, read_scene
 from chronoscene.formats.shared.colmap_layout import period_folders
 from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.scene import Period
@@ -229,12 +228,13 @@ def move_model(folder, place, images="images"):
 def test_models_are_found_where_programs_leave_them(colmap_folder, place, images):
     folder = colmap_folder(DATED)
     old = read_scene(folder)
-    assert remarks_on(old) == []
+    assert model_notes(folder, old.format) == []
     move_model(folder, place, images)
     scene = read_scene(folder)
     assert scene.format == "colmap-folders" and scene.periods == old.periods
     assert scene.image_path(scene.frames[0]).is_file()
-    assert remarks_on(scene) == [f"the model is read from {place}, the images from {images}"]
+    said = f"the model is read from {place}, the images from {images}"
+    assert model_notes(folder, scene.format) == [said]
     assert find_scenes(folder.parent) == [folder]
 
 

@@ -25,8 +25,6 @@ from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Period, Scene, WorldFrame
 from chronoscene.scene.splits import IMAGE_SUFFIXES
 
-USUAL = ("sparse/0", "sparse")  # Where everybody looks for a model
-
 
 @dataclass(frozen=True, slots=True)
 class Assigned:
@@ -100,7 +98,7 @@ def read_images(path: Path) -> tuple[Model, Path]:
         images = "images" if found is None else found[1].relative_to(path).as_posix()
         raise SceneError(
             path,
-            expected=f"{images}/ and a COLMAP model, in {USUAL[0]} for example",
+            expected=f"{images}/ and a COLMAP model, in {our_format.MODEL} for example",
             found="no model" if found is None else f"no folder {images}/",
             todo="copy what is missing there",
         )
@@ -116,14 +114,6 @@ def read_images(path: Path) -> tuple[Model, Path]:
     for image in model.images:
         our_format.check_image(folder, image)
     return model, images_root
-
-
-def remarks(path: Path) -> list[str]:
-    """Where the model is that is read, if not where it would be looked for."""
-    found = raw_model.find_model(path)
-    if found is None or found[0] in USUAL:
-        return []
-    return [f"the model is read from {found[0] or 'the folder itself'}, the images from {found[1]}"]
 
 
 def keep_images(model: Model, names: Collection[str]) -> Model:

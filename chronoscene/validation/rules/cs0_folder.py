@@ -104,7 +104,7 @@ def other_format(scene: RawScene) -> Iterator[Hit]:
         found = f"a scene in {origin.format}"
         if origin.assigned is not None:
             found += f", with the periods {shown(p.label for p in origin.assigned.grouped[1])}"
-        yield Hit(".", "a scene in the ChronoScene format", found)
+        yield Hit(".", "a scene in the ChronoScene format", "; ".join([found, *origin.notes]))
 
 
 @rule.error("CS007", bad="a `transforms.json` without poses", remedy="correct the file named here")
