@@ -10,18 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import registration_outcomes as shared
 from numpy.typing import NDArray
 from PIL import Image, ImageEnhance
-from registration_outcomes import (
-    ROUTES,
-    Outcome,
-    cpu_seconds,
-    judged,
-    options_for,
-    print_outcome,
-    refused,
-    work_folder,
-)
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
@@ -81,11 +72,11 @@ CASES = (
 )
 
 
-def run_images(options: argparse.Namespace) -> list[Outcome]:
+def run_images(options: argparse.Namespace) -> list[shared.Outcome]:
     """Render, register and judge the cases, with the options of `benchmarks/registration.py`."""
     outcomes = []
-    routes = ROUTES if options.route == "all" else (options.route,)
-    with work_folder(options.work) as work:
+    routes = shared.ROUTES if options.route == "all" else (options.route,)
+    with shared.work_folder(options.work) as work:
         for case in [c for c in CASES if options.only in c.name][: options.cases]:
             folder = work / case.name.replace(", ", "-").replace(" ", "_")
             truth = _photos(case, folder)
@@ -95,28 +86,30 @@ def run_images(options: argparse.Namespace) -> list[Outcome]:
 
 def _run_case(
     case: ImageCase, folder: Path, truth: dict[str, NDArray[np.float64]], route: str
-) -> Outcome:
+) -> shared.Outcome:
     found: list[Inspection] = []
-    start, cpu = time.perf_counter(), cpu_seconds()
+    start, cpu = time.perf_counter(), shared.cpu_seconds()
     try:
         if route == "frozen":
             model = _frozen(folder, found)
         else:
             out = folder / f"registered-{route}"
-            options = options_for(folder / "work", None if route == "auto" else route)
+            options = shared.options_for(folder / "work", None if route == "auto" else route)
             model = run(read_captures(folder / "photos"), out, options, inspected=found.append)
     except ChronoSceneError as error:
         print(f"{case.name}, {route}: refused: {error}", flush=True)
-        return refused(case.name, route, case.periods, cpu_seconds() - cpu)
+        return shared.refused(case.name, route, case.periods, shared.cpu_seconds() - cpu)
     poses = np.stack([truth[Path(name).name] for name in model.names])
-    outcome = judged(case.name, route, model, poses, found[-1].verdict, cpu_seconds() - cpu)
+    outcome = shared.judged(
+        case.name, route, model, poses, found[-1].verdict, shared.cpu_seconds() - cpu
+    )
     print(
         f"{case.name}, {route}: route {model.route}, {len(model.names)} of "
         f"{len(model.names) + len(model.unregistered)} photos, "
         f"{time.perf_counter() - start:.0f} s",
         flush=True,
     )
-    print_outcome(outcome, found[-1])
+    shared.print_outcome(outcome, found[-1])
     return outcome
 
 
@@ -128,9 +121,9 @@ def _frozen(folder: Path, found: list[Inspection]) -> Registered:
     for label in periods[:-1]:
         shutil.copytree(folder / "photos" / label, old / label)
     base = folder / "registered-old"
-    run(read_captures(old), base, options_for(folder / "work-old", None))
+    run(read_captures(old), base, shared.options_for(folder / "work-old", None))
     captures = read_captures(folder / "photos" / periods[-1])
-    options = options_for(folder / "work-frozen", None)
+    options = shared.options_for(folder / "work-frozen", None)
     out = folder / "registered-frozen"
     return run(captures, out, options, into=read_scene(base), inspected=found.append)
 

@@ -15,18 +15,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+import registration_outcomes as shared
 from generated_registrations import pose_errors
 from numpy.typing import NDArray
-from registration_outcomes import (
-    ROUTES,
-    Outcome,
-    cpu_seconds,
-    judged,
-    options_for,
-    print_outcome,
-    refused,
-    work_folder,
-)
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
@@ -44,11 +35,11 @@ LEAST_COMMON = 3
 """Images of the first period in both models: fewer define no frame."""
 
 
-def run_photos(options: argparse.Namespace) -> list[Outcome]:
+def run_photos(options: argparse.Namespace) -> list[shared.Outcome]:
     """Register every folder by every route, with the options of `benchmarks/registration.py`."""
     outcomes = []
-    routes = ROUTES if options.route == "all" else (options.route,)
-    with work_folder(options.work) as work:
+    routes = shared.ROUTES if options.route == "all" else (options.route,)
+    with shared.work_folder(options.work) as work:
         for source in options.folders:
             folder = work / source.name
             periods = read_periods(source)
@@ -91,9 +82,9 @@ def _compare(
     periods: dict[str, str],
     reference: dict[str, NDArray[np.float64]],
     route: str,
-) -> Outcome:
+) -> shared.Outcome:
     found: list[Inspection] = []
-    start, cpu, count = time.perf_counter(), cpu_seconds(), len(set(periods.values()))
+    start, cpu, count = time.perf_counter(), shared.cpu_seconds(), len(set(periods.values()))
     try:
         if route == "frozen":
             model = _frozen(source, folder, periods, found)
@@ -102,22 +93,22 @@ def _compare(
             model = _run(source, folder, route, periods, chosen, found)
     except ChronoSceneError as error:
         print(f"{source.name}, {route}: refused: {error}", flush=True)
-        return refused(source.name, route, count, cpu_seconds() - cpu)
-    seconds, cpu = time.perf_counter() - start, cpu_seconds() - cpu
+        return shared.refused(source.name, route, count, shared.cpu_seconds() - cpu)
+    seconds, cpu = time.perf_counter() - start, shared.cpu_seconds() - cpu
     common = np.array([Path(name).name in reference for name in model.names])
     if (common & (model.periods == 0)).sum() < LEAST_COMMON:
         print(f"{source.name}, {route}: too few photos in common with the single model")
-        return refused(source.name, route, count, cpu)
+        return shared.refused(source.name, route, count, cpu)
     poses = np.stack([reference.get(Path(name).name, np.eye(4)) for name in model.names])
     verdict = found[-1].verdict
-    outcome = judged(source.name, route, model, poses, verdict, cpu, where=common)
+    outcome = shared.judged(source.name, route, model, poses, verdict, cpu, where=common)
     print(
         f"{source.name}, {route}: route {model.route}, {len(model.names)} of {len(periods)} "
         f"photos, {seconds:.0f} s",
         flush=True,
     )
     _print_first(model, poses, common & (model.periods == 0))
-    print_outcome(outcome, found[-1])
+    shared.print_outcome(outcome, found[-1])
     return outcome
 
 
@@ -145,7 +136,7 @@ def _run(
     rows = "".join(f"{file},{label}\n" for file, label in sorted(periods.items()))
     table.write_text(f"image,period\n{rows}", encoding="utf-8")
     captures = read_captures(source / "images", table=table)
-    options = options_for(folder / f"work-{name}", route)
+    options = shared.options_for(folder / f"work-{name}", route)
     return run(captures, folder / name, options, inspected=found.append)
 
 
@@ -162,7 +153,7 @@ def _frozen(
     for name, label in periods.items():
         if label == last:
             shutil.copyfile(source / "images" / name, new / name)
-    options = options_for(folder / "work-frozen", None)
+    options = shared.options_for(folder / "work-frozen", None)
     scene = read_scene(folder / "old")
     return run(read_captures(new), folder / "frozen", options, into=scene, inspected=found.append)
 

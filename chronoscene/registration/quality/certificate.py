@@ -189,9 +189,7 @@ def _pair(
     if good.any():
         figures = _held_out(moved, good, (placed_a, placed_b), _epipolar(model, evidence, periods))
         measured = measure(moved, placed_a, placed_b, centres)
-        misalignment = measured or (
-            f"{figures.tracks} held-out tracks are too few, or too close together"
-        )
+        misalignment = measured or "held-out tracks are too few, or too close together"
     by_all = measure(*_all_transfers(model, evidence, a, b), centres)
     of_a, of_b = (evidence.ties.where(model.periods[evidence.ties.image] == p) for p in periods)
     sigma = by_all.shift.high / 1.96 if by_all is not None else 0.0
