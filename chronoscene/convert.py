@@ -114,6 +114,11 @@ def obstacles(scene: Scene) -> list[str]:
             "no point is observed in an image, and methods are initialised from observed points "
             "only; colmap point_triangulator triangulates points for known poses"
         )
+    if not scene.select(split="train"):
+        found.append(
+            "there are no training images; chronoscene split chooses fewer test images, or holds "
+            "out whole periods (--strategy periods) where each has a single image"
+        )
     if not scene.select(split="test"):
         found.append("there are no test images; chronoscene split chooses some")
     return found

@@ -244,3 +244,8 @@ def test_a_link_to_an_empty_folder_may_be_written_to(make_scene_folder, tmp_path
     convert(make_scene_folder(), tmp_path / "link")
     assert (tmp_path / "link").is_symlink()
     assert len(read_scene(tmp_path / "disk").frames) == 4
+
+
+def test_a_scene_without_training_images_is_said(make_scene_folder):
+    (said,) = obstacles(read_scene(make_scene_folder({"a.png": 0, "b.png": 1})))
+    assert said.startswith("there are no training images; chronoscene split")

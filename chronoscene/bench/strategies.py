@@ -94,17 +94,17 @@ def check_scene(scene: Scene) -> None:
                 found=frame.camera.model,
                 todo=f"run 'chronoscene undistort {scene.root} OUT' and use OUT",
             )
+    new = f"(chronoscene split {scene.root} --scene-out NEW"
     for split, todo in (
-        ("train", "register more images of each period, or hold out some periods: --strategy "
-         "periods --period ID of chronoscene split"),
-        ("test", "choose some: chronoscene split"),
-    ):  # fmt: skip
+        ("train", f"hold out whole periods {new} --strategy periods --period ID), and use NEW"),
+        ("test", f"choose some {new}), and use NEW"),
+    ):
         if not any(f.split == split for f in scene.frames):
             raise SceneError(
                 scene.root,
                 expected=f"at least one {split} image",
                 found=f"none ({scene.split_rule})",
-                todo=f"{todo} {scene.root} --scene-out NEW, and use NEW",
+                todo=todo,
             )
 
 

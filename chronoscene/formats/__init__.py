@@ -70,7 +70,7 @@ def detect_format(path: Path, *, period_by: str | None = None) -> str:
         found = "a file" if path.exists() else "nothing"
         raise SceneError(path, expected="a scene folder", found=found, todo="check the path")
     modules = {name: load_format(name) for name in format_names()}
-    matching = _matching(path, period_by)
+    matching = matching_formats(path, period_by)
     if len(matching) == 1:
         return matching[0]
     if matching:
@@ -99,8 +99,8 @@ def detect_format(path: Path, *, period_by: str | None = None) -> str:
     )
 
 
-def _matching(path: Path, period_by: str | None) -> list[str]:
-    """Names of the formats whose marks a folder has."""
+def matching_formats(path: Path, period_by: str | None) -> list[str]:
+    """Names of the formats whose marks a folder has; see `detect_format`."""
     matching = [name for name in format_names() if load_format(name).matches(path)]
     return matching or ([COLMAP] if period_by is not None and _is_colmap(path) else [])
 
@@ -162,7 +162,7 @@ def find_scenes(
     """
 
     def is_scene(folder: Path) -> bool:
-        matching = _matching(folder, period_by)
+        matching = matching_formats(folder, period_by)
         return bool(matching) if format is None else format in matching
 
     if path.is_dir() and not is_scene(path):

@@ -211,7 +211,7 @@ def blocked(scene: Scene, fraction: float, blocks: int | None, seed: int) -> set
             "--blocks",
             expected=f"at most one block for each of {len(centres)} images",
             found=str(count),
-            todo="ask for fewer blocks",
+            todo="ask for fewer blocks (--blocks)",
         )
     block = cut_into_blocks(centres, count)
     wanted = max(1, round(fraction * count))

@@ -16,7 +16,7 @@ import numpy as np
 from chronoscene import formats
 from chronoscene.colmap.raw_model import find_model, model_files
 from chronoscene.convert import remarks_on
-from chronoscene.errors import ChronoSceneError, SceneError
+from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import load_format
 from chronoscene.images.store import place_image
@@ -100,15 +100,16 @@ def _looks_like_scene(path: Path) -> bool:
 def other_format(path: Path, reading: Reading = AS_DETECTED) -> str | None:
     """The format of a folder that is not in the ChronoScene format, not even with faults.
 
-    A ``split.txt`` in a wrong place says that it is meant to be.
+    A ``split.txt`` in a wrong place says that it is meant to be. Of several formats the first: that
+    there are several is found when it is read.
     """
     if reading.format is not None:
         return None if reading.format == our_format.NAME else reading.format
     if our_format.matches(path) or any((path / place).is_file() for place in SPLIT_ELSEWHERE):
         return None
     try:
-        return formats.detect_format(path, period_by=reading.period_by)
-    except (ChronoSceneError, OSError):
+        return next(iter(formats.matching_formats(path, reading.period_by)), None)
+    except OSError:
         return None
 
 
@@ -124,6 +125,8 @@ def _project(scene: RawScene, format: str, reading: Reading) -> Origin:
     read = partial(formats.read_scene, scene.root, format=format, period_by=reading.period_by)
     options = formats.period_options(format, reading.period_by)
     try:
+        if reading.format is None:
+            formats.detect_format(scene.root, period_by=reading.period_by)
         assigned = load_format(format).assign(scene.root / "images", scene.names, **options)
     except SceneError as error:
         return Origin(format, error, notes, read=read)
@@ -136,7 +139,7 @@ def in_our_format(path: Path, format: str, reading: Reading) -> Iterator[tuple[P
     with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
         ours = Path(temporary) / "scene"
         try:
-            scene = formats.read_scene(path, format=format, period_by=reading.period_by)
+            scene = formats.read_scene(path, format=reading.format, period_by=reading.period_by)
             our_format.write(scene, ours, image_source="none")
             (ours / "images").mkdir(exist_ok=True)
             for frame in scene.frames:

@@ -254,6 +254,19 @@ def test_projects_whose_test_images_their_format_chooses(project, tmp_path):
     assert codes(validate_scene(street)) == {"CS006", "CS507"}
 
 
+def test_a_project_of_two_formats(project, tmp_path):
+    (project.path("images/2016")).rename(project.path("images/t10"))
+    (project.path("images/2023")).rename(project.path("images/t2"))
+    for old, new in (("2016/", "t10/"), ("2023/", "t2/")):
+        project.replace("sparse/0/images.txt", old, new)
+    street = project.root.rename(tmp_path / "street")
+    (said,) = [f for f in validate_scene(street).findings if f.code in ("CS007", "CS301")]
+    assert (said.code, said.found) == ("CS007", "marks of colmap-folders and wat")
+    for format, labels in (("wat", "'t10', 't2'"), ("colmap-folders", "'t2', 't10'")):
+        report = validate_scene(street, reading=Reading(format))
+        assert labels in next(f.found for f in report.findings if f.code == "CS006")
+
+
 def test_what_the_user_says_of_a_project(scene, tmp_path):
     """Flat folders have the periods that a table names; and a format has only its own rules."""
     scene.path("sparse/split.txt").unlink()
