@@ -5,7 +5,9 @@ Defaults are those of the 2023 release of 3D Gaussian Splatting (Kerbl et al.).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import ClassVar
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
@@ -74,6 +76,23 @@ class GaussianConfig(SplattingConfig):
     """No opacity is above it after a reset."""
     max_gaussians: int = 0
     """No round grows the set beyond this; the largest gradients come first. 0: no limit."""
+    grow_below: int = 0
+    """Rounds grow only sets that are smaller than this. 0: all."""
+    prune_above: int = 0
+    """Rounds prune only sets that are larger than this."""
+
+    minima: ClassVar[Mapping[str, int]] = dict.fromkeys(
+        (
+            "iterations",
+            "schedule_length",
+            "sh_interval",
+            "densify_interval",
+            "reset_interval",
+            "split_factor",
+        ),
+        1,
+    )
+    """Smallest value of options, where it is not 0."""
 
     def __post_init__(self) -> None:
         check_choice("sh_degree", str(self.sh_degree), ("0", "1", "2", "3"))
@@ -81,18 +100,8 @@ class GaussianConfig(SplattingConfig):
         for name, value in asdict(self).items():
             if isinstance(value, str):
                 continue
-            low = 1 if name in _AT_LEAST_ONE else 0
+            low = self.minima.get(name, 0)
             if not value >= low:
                 raise ConfigError(
                     name, expected=f"at least {low}", found=str(value), todo="correct the value"
                 )
-
-
-_AT_LEAST_ONE = (
-    "iterations",
-    "schedule_length",
-    "sh_interval",
-    "densify_interval",
-    "reset_interval",
-    "split_factor",
-)

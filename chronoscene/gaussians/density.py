@@ -74,6 +74,8 @@ def choose_growth(
         config: Thresholds and limit of the number.
     """
     grow = gradient >= config.gradient_threshold
+    if config.grow_below and len(gradient) >= config.grow_below:
+        grow = torch.zeros_like(grow)
     # Cloned or split, a row adds one Gaussian.
     room = max(config.max_gaussians - len(gradient), 0) if config.max_gaussians else len(gradient)
     if int(grow.sum()) > room:
@@ -106,6 +108,8 @@ def densify(
     clone, split = choose_growth(gradient, largest, extent, config)
     parts = _split({name: rows[split] for name, rows in parameters.items()}, config, generator)
     new = {name: torch.cat([rows[clone], parts[name]]) for name, rows in parameters.items()}
+    if int((~split).sum()) + len(new["means"]) <= config.prune_above:
+        return Round(~split, new)
     keep = ~split & ~_useless(parameters, extent, prune_large, config)
     keep_new = ~_useless(new, extent, prune_large, config)
     return Round(keep, {name: rows[keep_new] for name, rows in new.items()})

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -50,11 +51,15 @@ class Timeline:
         self.last_moment = 0
         """Of the latest step; 0 before the first."""
 
-    def at(self, index: int, progress: float) -> Due:
-        """What is due at a step; arguments as `chronoscene.methods.Method.step`."""
+    def moment(self, progress: float) -> int:
+        """Iteration of the schedule, from 1."""
         config = self.config
         length = config.schedule_length if config.stretch else config.iterations
-        moment = round(progress * length) + 1
+        return round(progress * length) + 1
+
+    def at(self, index: int, progress: float) -> Due:
+        """What is due at a step; arguments as `chronoscene.methods.Method.step`."""
+        config, moment = self.config, self.moment(progress)
         # A squeezed schedule jumps over moments, so what counts is that a multiple was passed.
         passed_reset = moment // config.reset_interval > self.last_moment // config.reset_interval
         round_is_due = (index + 1) % config.densify_interval == 0
@@ -88,9 +93,15 @@ class GaussianTrainer:
     learning_rates: Callable[[Due], Mapping[str, float]]
     """Gives the learning rate of each tensor of the model at a step."""
 
+    timeline_class: ClassVar[type[Timeline]] = Timeline
+
     def __post_init__(self) -> None:
-        self.timeline = Timeline(self.config)
+        self.timeline = self.timeline_class(self.config)
         self.sampler = ViewSampler(len(self.train.views), self.seed)
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget the moments of the optimiser and the gradients seen for densification."""
         self.optimizer = Adam({n: t.requires_grad_() for n, t in self.model.tensors().items()})
         self.statistics = GradientStatistics(len(self.model), self.background.device)
 

@@ -125,3 +125,21 @@ def test_reset_leaves_no_opacity_above_the_limit():
     after = reset_opacities(logits, 0.01)
     assert (opacities_of(after) <= 0.01 * (1 + 1e-6)).all()
     assert after[1:].tolist() == logits[1:].tolist()
+
+
+def test_rounds_grow_small_sets_and_prune_large_ones_where_limits_say_so():
+    """Row 0 is to be cloned, row 1 to be pruned."""
+    parameters = rows(4)
+    parameters["logit_opacities"][1] = logit(0.001)
+    gradient = torch.tensor([3e-4, 0.0, 0.0, 0.0])
+    sizes = {}
+    for limits in (
+        {},
+        {"grow_below": 5},
+        {"grow_below": 4},
+        {"prune_above": 4},
+        {"prune_above": 5},
+    ):
+        result = run_round(parameters, gradient, config=GaussianConfig(**limits))
+        sizes[tuple(limits.items())] = len(result.new["means"]), int(result.keep.sum())
+    assert list(sizes.values()) == [(1, 3), (1, 3), (0, 3), (1, 3), (1, 4)]

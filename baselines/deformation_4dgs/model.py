@@ -1,0 +1,73 @@
+"""Gaussians with a deformation field, and where the field starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass
+from math import sqrt
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from baselines.deformation_4dgs.field import Corner, Field, deform
+from chronoscene.gaussians.model import GaussianModel
+
+_SPACE_START = (0.1, 0.5)  # Numbers in planes without time, at first
+_STREAM = 2  # Keeps the field apart from other draws of the same seed
+
+
+@dataclass(eq=False)
+class DeformedModel(GaussianModel):
+    """Canonical Gaussians in `parameters`, the tensors of a field in `shared`."""
+
+    _: KW_ONLY
+    field: Field
+    times: tuple[float, ...]
+    """Place of each period on the time axis of the planes, 0..1."""
+    is_deforming: bool = False
+    """False in the first stage, which leaves the field alone."""
+
+    def at_period(self, period: float) -> Mapping[str, Tensor]:
+        """What the field makes of the Gaussians; between periods at a time between theirs."""
+        if not self.is_deforming:
+            return self.parameters
+        time = float(np.interp(period, range(len(self.times)), self.times))
+        return self.parameters | deform(self.parameters, self.shared, self.field, time)
+
+
+def find_box(points: NDArray[np.floating], quantile: float) -> tuple[Corner, Corner]:
+    """Low and high corner of a box that leaves out this share of points at each side. [P, 3]"""
+    low, high = np.quantile(points, (quantile, 1 - quantile), axis=0).astype(np.float32)
+    return tuple(low.tolist()), tuple(high.tolist())
+
+
+def start_field(field: Field, seed: int, *, zero_outputs: bool) -> dict[str, Tensor]:
+    """Tensors of a field before training, float32 on the CPU.
+
+    Planes with time are ones, the others uniform 0.1..0.5; weights uniform after Glorot and Bengio,
+    biases uniform up to 1 / sqrt(inputs).
+
+    Args:
+        seed: All of them follow from it.
+        zero_outputs: Whether the output layers are zero, so that nothing is deformed.
+    """
+    generator = np.random.default_rng((seed, _STREAM))
+
+    def uniform(low: float, high: float, shape: tuple[int, ...]) -> Tensor:
+        return torch.from_numpy(generator.uniform(low, high, shape).astype(np.float32))
+
+    tensors = {}
+    shapes = field.shapes()
+    for name, shape in shapes.items():
+        if name.startswith("planes."):
+            ones = name.endswith("t")
+            tensors[name] = torch.ones(shape) if ones else uniform(*_SPACE_START, shape)
+        elif zero_outputs and ".output." in name:
+            tensors[name] = torch.zeros(shape)
+        else:
+            inputs = shapes[name.replace(".bias", ".weight")][1]
+            bound = sqrt(6 / sum(shape)) if name.endswith(".weight") else 1 / sqrt(inputs)
+            tensors[name] = uniform(-bound, bound, shape)
+    return tensors
