@@ -274,6 +274,22 @@ def test_white_is_drawn_behind_everything_where_asked(tmp_path: Path) -> None:
     assert (method.render(away, 0).rgb == 1).all()
 
 
+def test_what_a_gpu_runs_trains_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The plain torch form of the field and of its smoothness, here on a CPU in float32."""
+    scene, found = moving_scene(arc), []
+    for compiled in (True, False):
+        if not compiled:
+            for module in ("field", "field.smoothness"):
+                name = f"baselines.deformation_4dgs.{module}.is_cpu_float32"
+                monkeypatch.setattr(name, lambda tensor: False)
+        method = Deformation4DGS(config(coarse_until=0))
+        method.setup(scene, seed=0, device="cpu")
+        losses = [method.step(index, 0.1).loss for index in range(8)]
+        found.append((losses, method.render(scene.views[0], 1.5).rgb))
+    np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-4)
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-3)
+
+
 @pytest.mark.parametrize("preset", SPEC.presets)
 def test_caps_of_the_released_code_are_in_the_preset_paper_alone(preset: str) -> None:
     made = build_config(SPEC, preset=preset)

@@ -1,0 +1,124 @@
+"""Milliseconds of a training step of 4DGS beside one of 3DGS on the same Gaussians.
+
+    python benchmarks/deformation_step.py [--gaussians 60000] [--size 320 240] [--steps 100]
+
+Both methods train on the same generated surfaces and photos, in turns, in the second stage of 4DGS
+and with all colours; no round of density control falls into what is timed. Prints median and
+minimum of the wall time, the median of the processor time of all threads, and the ratio of each to
+that of 3DGS. On a machine with other work look at the minimum and the processor time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+# Before torch: it says how idle threads wait.
+import chronoscene  # noqa: F401
+
+# isort: split
+import numpy as np
+import torch
+from scenes import surfaces
+
+from chronoscene.bench.provenance import code_version, processor_name
+from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
+from chronoscene.methods import (
+    Method,
+    TrainingSet,
+    TrainingView,
+    build_config,
+    import_object,
+    load_spec,
+)
+from chronoscene.scene.similarity import Sim3
+
+PLAIN = {"deform_opacity": False, "deform_color": False}
+CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "3dgs": ("3dgs", "balanced", {}),
+    "4dgs fast": ("4dgs", "fast", {}),
+    "4dgs balanced": ("4dgs", "balanced", {}),
+    "4dgs balanced, shape only": ("4dgs", "balanced", PLAIN),
+}
+"""Name: method, preset, options."""
+PERIODS = 3
+
+
+def training_set(count: int, width: int, height: int) -> TrainingSet:
+    """Points on spheres, seen by a few cameras side by side in each period."""
+    scene, generator = surfaces(count, width, height), np.random.default_rng(0)
+    means, colors = (scene.gaussians[i].detach().numpy() for i in (0, 4))
+    views = []
+    for number in range(4 * PERIODS):
+        pose = scene.viewmats[0].double().numpy().copy()
+        pose[:3, 3] += generator.normal(0, 0.2, 3)
+        K = scene.Ks[0].double().numpy()
+        views.append(TrainingView(K, width, height, pose, f"{number}.png", number % PERIODS))
+    images = generator.integers(0, 256, (len(views), height, width, 3), np.uint8)
+    return TrainingSet(
+        views=tuple(views),
+        num_periods=PERIODS,
+        points=means.astype(np.float32),
+        colors=(255 * colors).astype(np.uint8),
+        point_periods=np.ones((count, PERIODS), bool),
+        training_from_world=Sim3.identity(),
+        camera_extent=1.1,
+        background=np.zeros(3, np.float32),
+        load_image=lambda index: images[index],
+    )
+
+
+def make(train: TrainingSet, name: str, preset: str, options: dict[str, Any]) -> Method:
+    """A method at the beginning of a training, without density control."""
+    spec = load_spec(name)
+    still = {"densify_interval": 10**9, "reset_interval": 10**9, "initial_opacity": 0.5}
+    config = build_config(spec, preset=preset, overrides={**still, **options})
+    method: Method = import_object(spec.method)(config)
+    method.setup(train, seed=0, device="cpu")
+    return method
+
+
+def measure(methods: dict[str, Method], steps: int) -> dict[str, list[tuple[float, float]]]:
+    """Wall and processor milliseconds of each step, the methods in turns."""
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in methods}
+    for index in range(steps):
+        for name, method in methods.items():
+            wall, processor = time.perf_counter(), time.process_time()
+            # Late enough for all colours and the second stage, and statistics are collected.
+            method.step(index, 0.3 + 0.1 * index / steps)
+            spent = time.perf_counter() - wall, time.process_time() - processor
+            found[name].append((1e3 * spent[0], 1e3 * spent[1]))
+    return found
+
+
+def main() -> None:
+    """Time all cases, with one thread and with all."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--gaussians", type=int, default=60_000)
+    parser.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("W", "H"))
+    parser.add_argument("--steps", type=int, default=100, help="timed steps of each method")
+    args = parser.parse_args()
+    keep_freed_memory()
+    train = training_set(args.gaussians, *args.size)
+    methods = {name: make(train, *case) for name, case in CASES.items()}
+    print(f"{processor_name()}, torch {torch.__version__}, commit {code_version()}")
+    width, height = args.size
+    print(f"{args.gaussians} Gaussians, {width}x{height}")
+    for threads in sorted({1, available_threads()}):
+        set_threads(threads)
+        measure(methods, 5)  # Compile, touch memory.
+        found = measure(methods, args.steps)
+        head = f"{threads} thread(s), ms per step"
+        print(f"\n{head:<30}{'median':>9}{'min':>9}{'cpu':>9}{'beside 3dgs':>24}")
+        base = [0.0]
+        for name, spent in found.items():
+            wall, processor = np.array(spent).T
+            row = [np.median(wall), wall.min(), np.median(processor)]
+            base = row if name == "3dgs" else base
+            ratios = "".join(f"{a / b:8.2f}" for a, b in zip(row, base, strict=True))
+            print(f"{name:<30}" + "".join(f"{value:9.1f}" for value in row) + ratios)
+
+
+if __name__ == "__main__":
+    main()
