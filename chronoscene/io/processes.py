@@ -92,6 +92,7 @@ def run_worker(
     report: Report | None = None,
     log: IO[bytes] | None = None,
     inherited: Sequence[int] = (),
+    environment: Mapping[str, str] | None = None,
 ) -> Outcome:
     """Call a function in a process of its own and wait for its end.
 
@@ -104,12 +105,21 @@ def run_worker(
         report: Called with the progress that the worker reports.
         log: File for everything that the worker and its libraries print; None for our stderr.
         inherited: File descriptors that stay open in the worker.
+        environment: Variables that the worker has besides ours.
     """
     from subprocess import PIPE, Popen
 
     # -P: a file in the current folder must not shadow a module of the standard library.
     command = [sys.executable, "-P", "-m", "chronoscene.io.processes", function, str(os.getpid())]
-    process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=log, text=True, pass_fds=inherited)
+    process = Popen(
+        command,
+        stdin=PIPE,
+        stdout=PIPE,
+        stderr=log,
+        text=True,
+        pass_fds=inherited,
+        env={**os.environ, **(environment or {})},
+    )
     try:
         assert process.stdin is not None
         with suppress(BrokenPipeError):  # it died already

@@ -161,6 +161,9 @@ STEPS = {
 """Name of a step to ``module:function``, which takes a dictionary and a `Report` and returns what
 JSON can hold."""
 
+ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+"""Steps start their own threads; those of a matrix library would wait spinning beside them."""
+
 LOG_LINES = 4  # Lines of the step's own output in a message
 
 
@@ -186,7 +189,14 @@ def run_step(
         ChronoSceneError: What the step raised, as a `RegistrationError` with the same words.
     """
     with log.open("ab") as file:
-        outcome = run_worker(STEPS[step], arguments, report=report, log=file, inherited=inherited)
+        outcome = run_worker(
+            STEPS[step],
+            arguments,
+            report=report,
+            log=file,
+            inherited=inherited,
+            environment=ENVIRONMENT,
+        )
     if outcome.message is None:
         said = _end_of(log)
         raise RegistrationError(

@@ -90,6 +90,9 @@ def sleeps(job, report):
         file.write(str(os.getpid()))
     time.sleep(60)
 
+def variables(job, report):
+    return [os.environ.get(name) for name in job]
+
 def refuses(job, report):
     from chronoscene.errors import SceneError
     raise SceneError("here", expected="this", found="that", todo="do it")
@@ -111,6 +114,13 @@ def test_a_worker_returns_its_result_and_reports_progress(jobs, tmp_path):
     assert outcome == Outcome(0, {"result": 42})
     assert told == [("counting", 1, 2)]
     assert (tmp_path / "log").read_text() == "a library prints this\n"
+
+
+def test_a_worker_has_its_own_variables_besides_ours(jobs, monkeypatch):
+    monkeypatch.setenv("OURS", "a")
+    found = run_worker("some_jobs:variables", ["OURS", "ITS"], environment={"ITS": "b"})
+    assert found.message == {"result": ["a", "b"]}
+    assert "ITS" not in os.environ
 
 
 @pytest.mark.parametrize(

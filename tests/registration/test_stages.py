@@ -93,6 +93,9 @@ def refuses(arguments, report):
 def breaks(arguments, report):
     raise ZeroDivisionError("a mistake of ours")
 
+def threads(arguments, report):
+    return os.environ["OPENBLAS_NUM_THREADS"]
+
 def sleeps(arguments, report):
     with open(arguments["mark"], "w") as file:
         file.write(str(os.getpid()))
@@ -105,7 +108,7 @@ def odd_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps that only this test has, in a module that the child process finds."""
     (tmp_path / "odd_steps.py").write_text(STEPS)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    for name in ("good", "aborts", "refuses", "breaks", "sleeps"):
+    for name in ("good", "aborts", "refuses", "breaks", "threads", "sleeps"):
         monkeypatch.setitem(stages.STEPS, name, f"odd_steps:{name}")
 
 
@@ -117,6 +120,10 @@ def test_a_step_gives_its_result_and_tells_its_progress(tmp_path: Path) -> None:
     assert result == {"twice": 42}
     assert told == [("counting", 1, 2)]
     assert "noise of a library" in (tmp_path / "log").read_text()
+
+
+def test_the_matrix_library_of_a_step_starts_no_threads(tmp_path: Path) -> None:
+    assert stages.run_step("threads", {}, log=tmp_path / "log") == "1"
 
 
 @pytest.mark.parametrize(

@@ -1,27 +1,40 @@
 """Features and matches in a COLMAP database. Worker process only.
 
-Images enter the database in the order of the photos, so ids are the same in every run. Both steps
-go in small batches: what a batch has stored is not done again. Features and matches of the same
-photos in an earlier database are copied; see `feature_reuse`.
+Images enter the database in the order of the photos, so ids are the same in every run. What is
+stored is not done again: features of each photo, matches of a batch of pairs. Features and matches
+of the same photos in an earlier database are copied; see `feature_reuse`. Features and matches are
+ours (`sift`, `nearest`); COLMAP verifies the matches by geometry.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.features import feature_reuse
+from chronoscene.registration.features.nearest import Descriptors, mutual_matches, subspace
+from chronoscene.registration.features.sift import Features, photos_at_once, sift_features
 
-FEATURE_BATCH = 8
-MATCH_BATCH = 64
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+BATCH = 64  # Photos or pairs
 
 SEED = 0
+
+INLIER_SHARES = ((45, 1 / 4), (30, 1 / 3), (20, 1 / 2), (0, 3 / 4))
+"""From so many matches on, the share that must be inliers for COLMAP to draw enough samples. A pair
+needs 15 inliers, which of fewer matches are a larger share: most pairs of photos without overlap
+are done ten times as soon."""
 
 
 def quiet() -> None:
@@ -49,15 +62,16 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     names = sorted(name for group in arguments["groups"] for name in group["names"])
     left = [name for name, count in keypoint_counts(database).items() if count == 0]
     left = sorted(set(left) & set(names))
-    options = pycolmap.FeatureExtractionOptions()
-    options.use_gpu = False
-    options.num_threads = arguments["threads"]
-    options.max_image_size = arguments["max_image_size"]
-    options.sift.max_num_features = arguments["max_features"]
-    for first in range(0, len(left), FEATURE_BATCH):
-        report("features", len(names) - len(left) + first, len(names))
-        batch = left[first : first + FEATURE_BATCH]
-        pycolmap.extract_features(database, photos, batch, extraction_options=options)
+    size, most, threads = (arguments[k] for k in ("max_image_size", "max_features", "threads"))
+
+    def features_of(name: str) -> Features:
+        return sift_features(Path(photos, name), size, most)
+
+    cv2.setNumThreads(1)  # each photo is the work of one thread
+    found = _in_order(features_of, left, photos_at_once(size, threads))
+    for done, (name, features) in enumerate(zip(left, found, strict=True), len(names) - len(left)):
+        report("features", done, len(names))
+        _store(database, name, features)
     report("features", len(names), len(names))
     with pycolmap.Database.open(database) as opened:
         known = {c.camera_id: bool(c.has_prior_focal_length) for c in opened.read_all_cameras()}
@@ -67,6 +81,29 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         "focal_known": known,
         "carried": reused,
     }
+
+
+def _store(database: str, name: str, features: Features) -> None:
+    """Store the features of an image; the keypoints last, by which it counts as done."""
+    keypoints, descriptors = features
+    with pycolmap.Database.open(database) as opened:
+        image = opened.read_image_with_name(name)
+        assert image is not None
+        image_id = image.image_id
+        if not opened.exists_descriptors(image_id):
+            kind = pycolmap.FeatureExtractorType.SIFT
+            opened.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, descriptors))
+        if not opened.exists_keypoints(image_id):
+            opened.write_keypoints(image_id, keypoints)
+
+
+def _in_order(
+    function: Callable[[Item], Result], items: Sequence[Item], workers: int
+) -> Iterator[Result]:
+    """Results in the order of the items, from threads that are never far ahead of the caller."""
+    with ThreadPoolExecutor(workers) as pool:
+        for first in range(0, len(items), BATCH):
+            yield from pool.map(function, items[first : first + BATCH])
 
 
 def keypoint_counts(database: str | Path) -> dict[str, int]:
@@ -113,15 +150,20 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     left = _unmatched(database, pairs)
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
-    options.num_threads = arguments["threads"]
+    options.num_threads = threads = arguments["threads"]
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     listed = Path(arguments["scratch"]) / "batch.txt"
-    for first in range(0, len(left), MATCH_BATCH):
+    for first in range(0, len(left), BATCH):
         report("pairs", len(pairs) - len(left) + first, len(pairs))
-        write_pairs(listed, left[first : first + MATCH_BATCH])
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
-        pycolmap.match_image_pairs(database, options, pairing, verification)
+        found = _match_descriptors(database, left[first : first + BATCH], threads)
+        for least, share in INLIER_SHARES:
+            write_pairs(listed, [pair for pair, count in found.items() if count >= least])
+            found = {pair: count for pair, count in found.items() if count < least}
+            verification.ransac.min_inlier_ratio = share
+            pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
+            # COLMAP takes the matches that are in the database, and verifies them.
+            pycolmap.match_image_pairs(database, options, pairing, verification)
     listed.unlink(missing_ok=True)
     report("pairs", len(pairs), len(pairs))
     with pycolmap.Database.open(database) as opened:
@@ -133,6 +175,28 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         "inliers": sum(counts),
         "carried": reused,
     }
+
+
+def _match_descriptors(
+    database: str, pairs: Sequence[tuple[str, str]], threads: int
+) -> dict[tuple[str, str], int]:
+    """Store matches of pairs of images, in the order of their ids; the number of each pair."""
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): int(image.image_id) for image in opened.read_all_images()}
+        wanted = [(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in pairs]
+        used = sorted({i for pair in wanted for i in pair})
+        values = {i: np.asarray(opened.read_descriptors(i).data) for i in used}
+        basis = subspace(max(values.values(), key=len))
+        descriptors = {i: Descriptors.of(v, basis) for i, v in values.items()}
+
+        def matches_of(pair: tuple[int, int]) -> NDArray[np.uint32]:
+            return mutual_matches(descriptors[pair[0]], descriptors[pair[1]])
+
+        counts = []
+        for pair, found in zip(wanted, _in_order(matches_of, wanted, threads), strict=True):
+            opened.write_matches(*pair, found)
+            counts.append(len(found))
+    return dict(zip(pairs, counts, strict=True))
 
 
 def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:

@@ -16,13 +16,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import write_text_atomic
+from chronoscene.registration.features import METHOD
 from chronoscene.registration.photos.photo import sha256_of
 from chronoscene.registration.stages import read_record
-
-METHOD = 1
-"""Version of extraction and matching; raise it when they change in a way no setting shows."""
 
 Record = dict[str, Any]
 """``settings`` that all features depend on, ``groups`` of photos with one camera, and ``photos``:
@@ -36,8 +36,9 @@ def record_of(arguments: Mapping[str, Any]) -> Record:
     with ThreadPoolExecutor(arguments["threads"]) as pool:
         digests = list(pool.map(sha256_of, (folder / name for name in names)))
     settings = {key: arguments[key] for key in ("max_image_size", "max_features")}
+    made_by = {"method": METHOD, "pycolmap": pycolmap.__version__, "opencv": cv2.__version__}
     return {
-        "settings": settings | {"method": METHOD, "pycolmap": pycolmap.__version__},
+        "settings": settings | made_by,
         "groups": groups,
         "photos": dict(zip(names, digests, strict=True)),
     }
@@ -93,9 +94,9 @@ def reuse_features(database: Path) -> int:
 def reuse_matches(database: Path, pairs: Sequence[tuple[str, str]]) -> int:
     """Copy matches and geometries of pairs whose photos and cameras are the same; their number.
 
-    COLMAP matches in the order of the names and verifies in the order of the ids, and neither is
-    symmetric to the last bit. Where an order is reversed, the pair is matched again, so that the
-    database is the same as one from scratch.
+    Matches are sorted and verified in the order of the ids, and verification is not symmetric to
+    the last bit. Where an order is reversed, the pair is matched again, so that the database is the
+    same as one from scratch.
     """
     reused = 0
     with _both(database) as (old, new, sources):

@@ -8,6 +8,7 @@ from datetime import datetime, timedelta
 from typing import Any
 
 from chronoscene.registration.context import Calibration, Context
+from chronoscene.registration.features import METHOD
 from chronoscene.registration.photos.inputs import Inputs
 from chronoscene.registration.photos.photo import Capture
 from chronoscene.scene import Frame, Scene
@@ -53,6 +54,7 @@ def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
     if inputs.scene is not None:
         groups = scene_groups(inputs.scene) + groups
     settings = {
+        "method": METHOD,
         "groups": groups,
         "max_image_size": options.max_image_size,
         "max_features": options.max_features,

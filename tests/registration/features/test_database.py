@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import chronoscene.colmap.model  # noqa: F401  # loads pycolmap safely
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features.database import _unmatched
+from chronoscene.registration.features.database import INLIER_SHARES, _unmatched
 
 
 def test_matches_that_a_killed_run_left_are_dropped(tmp_path: Path) -> None:
@@ -26,3 +26,14 @@ def test_matches_that_a_killed_run_left_are_dropped(tmp_path: Path) -> None:
     with pycolmap.Database.open(path) as database:
         left = [pair for pair in pairs if database.exists_matches(*(ids[n] for n in pair))]
     assert left == [pair for pair in pairs if pair != broken]
+
+
+def test_no_pair_that_could_be_verified_gets_too_few_samples() -> None:
+    """COLMAP draws samples for a share of inliers, and accepts pairs with 15 of them."""
+    needed = pycolmap.TwoViewGeometryOptions()
+    bounds = [least for least, _ in INLIER_SHARES]
+    assert bounds == sorted(bounds, reverse=True)
+    assert bounds[-1] == 0
+    assert INLIER_SHARES[0][1] == needed.ransac.min_inlier_ratio
+    for (above, _), (_, share) in pairwise(INLIER_SHARES):
+        assert share <= needed.min_num_inliers / (above - 1)

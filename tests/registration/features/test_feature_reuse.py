@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import signal
 import subprocess
@@ -19,7 +20,7 @@ from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration import stages
 from chronoscene.registration.context import Context, Options
-from chronoscene.registration.features import feature_reuse
+from chronoscene.registration.features import feature_reuse, matching
 from chronoscene.registration.features.database import extract, match, write_pairs
 from chronoscene.registration.features.matching import Matched, find_matches
 from chronoscene.registration.photos.captures import read_captures
@@ -53,6 +54,7 @@ class Work:
 
     folder: Path
     photos: Path
+    threads: int = 1
 
     @property
     def database(self) -> Path:
@@ -69,7 +71,7 @@ class Work:
             ],
             "max_image_size": 1600,
             "max_features": max_features,
-            "threads": 1,
+            "threads": self.threads,
         }
         return int(extract(arguments, ran.report)["carried"])
 
@@ -79,7 +81,7 @@ class Work:
             "database": str(self.database),
             "pairs": str(self.folder / "pairs.txt"),
             "scratch": str(self.folder),
-            "threads": 1,
+            "threads": self.threads,
         }
         return int(match(arguments, ran.report)["carried"])
 
@@ -189,6 +191,36 @@ def check(photos: Path, tmp_path: Path, from_scratch: Callable[..., Any]) -> Cal
         assert left == ["features.db", "features.json", "pairs.txt"]
 
     return same_as_from_scratch
+
+
+def test_the_number_of_threads_changes_nothing(
+    photos: Path, tmp_path: Path, check: Callable[..., None]
+) -> None:
+    work = Work(tmp_path / "work", photos, threads=3)
+    work.run(ALL)
+    check(work, ALL)
+
+
+def test_nothing_of_another_extractor_is_reused(
+    photos: Path, tmp_path: Path, check: Callable[..., None]
+) -> None:
+    """A work folder of an earlier version, which had COLMAP's features, is continued with ours."""
+    work = Work(tmp_path / "work", photos)
+    work.extract([ALL[:4]], Ran())
+    record = json.loads((work.folder / "features.json").read_text())
+    record["settings"]["method"] = 1
+    del record["settings"]["opencv"]
+    (work.folder / "features.json").write_text(json.dumps(record))
+    work.database.unlink()
+    pycolmap.Database.open(work.database).close()
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu, options.num_threads = False, 1
+    pycolmap.extract_features(work.database, photos, ALL[:4], extraction_options=options)
+    matches = pycolmap.FeatureMatchingOptions()
+    matches.use_gpu, matches.num_threads = False, 1
+    pycolmap.match_exhaustive(work.database, matches)
+    assert work.run(ALL) == Ran((0, 0), {"features": 6, "pairs": 15})
+    check(work, ALL)
 
 
 @pytest.mark.parametrize("added", ["0.jpg", "3.jpg"])
@@ -508,6 +540,16 @@ def matched(captures: Path, seed: int = 0) -> tuple[Matched, dict[str, list[str]
             gather(read_captures(captures / "periods.csv"), None, context), context
         )
     return found, {entry["stage"]: entry["remarks"] for entry in context.stages.log}, ran
+
+
+def test_another_way_to_compute_features_does_the_stage_again(
+    captures: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_table(captures, "2016", "2016", "2023", "2023")
+    assert "features" in matched(captures)[2].computed
+    assert "features" not in matched(captures)[2].computed
+    monkeypatch.setattr(matching, "METHOD", "another")
+    assert "features" in matched(captures)[2].computed
 
 
 def test_the_command_goes_on_from_the_run_before(
