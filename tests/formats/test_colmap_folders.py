@@ -320,3 +320,10 @@ def test_photos_without_a_date_are_named(colmap_folder):
     (folder / "images/5.jpg").unlink()
     with pytest.raises(SceneError, match=r"expected a file of every image.*none of '5.jpg'; copy"):
         read_scene(folder, period_by="year")
+
+
+def test_a_format_that_is_named_counts_more_than_marks(make_scene_folder):
+    folder = make_scene_folder({"2016/a.png": 0, "2016/b.png": 1, "2023/a.png": 1})
+    assert [f.period for f in read_scene(folder).frames] == [0, 1, 1]
+    scene = read_scene(folder, format="colmap-folders")
+    assert [f.period for f in scene.frames] == [0, 0, 1]

@@ -93,16 +93,16 @@ def read_images(path: Path) -> tuple[Model, Path]:
     Raises:
         SceneError: If it is missing or empty, or has an unusable name, pose or camera.
     """
-    found = find_model(path)
-    if found is None or not found[1].is_dir():
-        images = "images" if found is None else found[1].relative_to(path).as_posix()
+    found = raw_model.find_model(path)
+    images = "images" if found is None else found[1]
+    if found is None or not (path / images).is_dir():
         raise SceneError(
             path,
             expected=f"{images}/ and a COLMAP model, in {our_format.MODEL} for example",
             found="no model" if found is None else f"no folder {images}/",
             todo="copy what is missing there",
         )
-    folder, images_root = found
+    folder = path / found[0]
     model = read_model(folder)
     if not model.images:
         raise SceneError(
@@ -113,7 +113,7 @@ def read_images(path: Path) -> tuple[Model, Path]:
         )
     for image in model.images:
         our_format.check_image(folder, image)
-    return model, images_root
+    return model, path / images
 
 
 def keep_images(model: Model, names: Collection[str]) -> Model:
