@@ -12,8 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.geodesy import Georeference
 from chronoscene.registration.quality.misalignment import measure, transfers
 from chronoscene.registration.quality.rays import Rays, place, rays_at
@@ -23,10 +23,6 @@ from chronoscene.scene import Camera
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.similarity import Sim3, fit_robustly
 from chronoscene.scene.tracks import track_owners
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 SIDE = 120.0
 """Edge of the city, metres."""

@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.scene import Camera
 from chronoscene.scene.geometry import pose_from_rotation_translation
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 EXTENT = 200.0
 """Edge of the place in metres."""
@@ -35,7 +32,7 @@ class Houses:
     """Half of the edges. [H, 2]"""
     height: Array
     """[H]"""
-    built: NDArray[np.bool_]
+    built: Mask
     """Whether the house stands in a period. [T, H]"""
 
 
@@ -47,10 +44,10 @@ class Surface:
     """[n, 3]"""
     rgb: Array
     """0..255. [n, 3]"""
-    house: Index
+    house: Ints
     """House that the point is on, or `NO_HOUSE`. [n]"""
 
-    def __getitem__(self, rows: NDArray[np.int64]) -> Surface:
+    def __getitem__(self, rows: Ints) -> Surface:
         return Surface(self.xyz[rows], self.rgb[rows], self.house[rows])
 
     @classmethod

@@ -9,14 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.scene import Camera
 from skeletons.geometry import NO_HOUSE, Houses, Surface, sample_surface
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 NEAREST = 8
 """Cameras per point that may observe it."""
@@ -48,8 +45,8 @@ class Flight:
 class Tracks:
     """Observations (M of them), without order."""
 
-    point: Index
-    image: Index
+    point: Ints
+    image: Ints
     """Index among the images of all periods."""
     exact: Array
     """Where the point projects to, in pixels. [M, 2]"""
@@ -143,7 +140,7 @@ def _shared(
     return found
 
 
-def _project_nearest(flight: Flight, xyz: Array) -> tuple[Index, Array, NDArray[np.bool_]]:
+def _project_nearest(flight: Flight, xyz: Array) -> tuple[Ints, Array, Mask]:
     """Project points into the cameras that look nearest to them.
 
     Returns:
@@ -167,7 +164,7 @@ def _project_nearest(flight: Flight, xyz: Array) -> tuple[Index, Array, NDArray[
 
 
 def _choose(
-    images: Index, exact: Array, visible: NDArray[np.bool_], wanted: Index, rng: np.random.Generator
+    images: Ints, exact: Array, visible: Mask, wanted: Ints, rng: np.random.Generator
 ) -> Tracks:
     """A random choice of at most so many visible cameras of each point."""
     keys = np.where(visible, rng.random(visible.shape), 2.0)

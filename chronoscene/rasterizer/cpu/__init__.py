@@ -18,7 +18,7 @@ from torch.nn.functional import pad
 from chronoscene.errors import BackendError
 from chronoscene.rasterizer import RasterInfo, Rasterization
 from chronoscene.rasterizer.constants import VALUE_MAX
-from chronoscene.rasterizer.cpu.layout import LANES, Array, View, make_view
+from chronoscene.rasterizer.cpu.layout import LANES, AnyArray, View, make_view
 from chronoscene.rasterizer.cpu.passes import Gaussians, Rendering
 from chronoscene.rasterizer.cpu.project import set_colors
 from chronoscene.rasterizer.inputs import Inputs, recentred
@@ -111,7 +111,7 @@ def _prepare(
     return tuple(x.float().contiguous() for x in (means, quats, scales, opacities, colors))
 
 
-def _flat(info: RasterInfo, c: int) -> tuple[Array, Array, Array]:
+def _flat(info: RasterInfo, c: int) -> tuple[AnyArray, AnyArray, AnyArray]:
     """Flat arrays of one camera for the kernel, which writes integers as float bits."""
     radii = info.radii[c].view(torch.float32)
     return (info.means2d[c].numpy().reshape(-1), radii.numpy().reshape(-1), info.depths[c].numpy())
@@ -122,7 +122,7 @@ class Request:
     """What to render besides the tensors, and where to put what the projection finds."""
 
     view: View
-    visible: tuple[Array, Array, Array]
+    visible: tuple[AnyArray, AnyArray, AnyArray]
     render_depth: bool
 
 
@@ -170,7 +170,7 @@ class Render(torch.autograd.Function):
         return (*gaussian_grads, means2d_grad.reshape(ctx.slot), background_grad, None)
 
 
-def _background_gradient(image_grad: Tensor, light: Array) -> Tensor:
+def _background_gradient(image_grad: Tensor, light: AnyArray) -> Tensor:
     """Summed by numpy, whose order does not depend on the number of threads. [D]"""
     passed = image_grad.numpy() * light[..., None]
     return torch.from_numpy(passed.sum(axis=(0, 1), dtype=np.float64).astype(np.float32))
@@ -240,7 +240,7 @@ class _Job:
 
     def _sum_groups(
         self, rendering: Rendering, image_grad: Tensor, alpha_grad: Tensor | None
-    ) -> tuple[Array, Array]:
+    ) -> tuple[AnyArray, AnyArray]:
         """16 sums of each Gaussian over all groups, and the gradients of all channels."""
         sums = np.zeros((self.count, 16), np.float32)
         values = np.zeros((self.count, 3 * self.groups), np.float32)
@@ -257,12 +257,12 @@ class _Job:
 
     def _sum_pixels(
         self, rendering: Rendering, group: int, image_grad: Tensor, alpha_grad: Tensor | None
-    ) -> tuple[Array, Array]:
+    ) -> tuple[AnyArray, AnyArray]:
         alpha = torch.empty(0) if alpha_grad is None else alpha_grad
         grads = (x.contiguous().numpy().reshape(-1) for x in (image_grad, alpha))
         return rendering.composite_backward(self._background(group), *grads)
 
-    def _background(self, group: int) -> Array:
+    def _background(self, group: int) -> AnyArray:
         return self.background[3 * group : 3 * group + 3]
 
     def _gaussians(self) -> Gaussians:

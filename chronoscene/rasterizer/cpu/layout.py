@@ -16,7 +16,7 @@ from chronoscene.kernels import memory, transposes, vectors
 from chronoscene.rasterizer.constants import ALPHA_MIN, CLAMP_MARGIN
 from chronoscene.rasterizer.inputs import Inputs
 
-Array = NDArray[Any]
+AnyArray = NDArray[Any]
 
 # An image is cut into tiles of 32 x 32 pixels, a tile into 64 blocks of 4 x 4, so that the blocks
 # of a tile which a Gaussian touches are the bits of one 64-bit number. Planes in memory are
@@ -70,7 +70,7 @@ CHUNK = 1024  # Gaussians that a thread takes at a time
 class View:
     """Where one image is taken from."""
 
-    camera: Array
+    camera: AnyArray
     """`CAMERA` numbers, float32."""
     width: int
     height: int
@@ -84,7 +84,7 @@ class View:
         return self.tiles_x * -(-self.height // TILE)
 
 
-def make_view(viewmat: Array, K: Array, inputs: Inputs) -> View:
+def make_view(viewmat: AnyArray, K: AnyArray, inputs: Inputs) -> View:
     """Numbers of one camera of the inputs as the kernels want them, from its float64 matrices."""
     width, height = inputs.width, inputs.height
     fx, fy, cx, cy = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
@@ -105,7 +105,7 @@ def make_view(viewmat: Array, K: Array, inputs: Inputs) -> View:
     return View(camera, width, height)
 
 
-def _centre(viewmat: Array) -> Array:
+def _centre(viewmat: AnyArray) -> AnyArray:
     """Where the camera stands, also if rounding has left the rotation not quite one."""
     try:
         return -np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3])

@@ -15,11 +15,11 @@ from chronoscene.kernels.thread_pool import launch, num_workers
 from chronoscene.rasterizer.cpu import bins, layout
 from chronoscene.rasterizer.cpu.composite import FORWARD_NUMBERS, composite
 from chronoscene.rasterizer.cpu.composite_backward import BACKWARD_NUMBERS, composite_backward
-from chronoscene.rasterizer.cpu.layout import LANES, Array, View
+from chronoscene.rasterizer.cpu.layout import LANES, AnyArray, View
 from chronoscene.rasterizer.cpu.project_backward import add_rows, project_backward
 from chronoscene.rasterizer.cpu.sort import DIGIT_BITS
 
-Gaussians = tuple[Array, Array, Array, Array, Array]
+Gaussians = tuple[AnyArray, AnyArray, AnyArray, AnyArray, AnyArray]
 """Means, quats, scales, opacities and colors of `layout.LANES` Gaussians or more, flat float32."""
 
 _GROWTH = 1.25
@@ -41,12 +41,12 @@ class Workspace:
     """Named arrays of one rendering, forward and backward. They only grow."""
 
     def __init__(self) -> None:
-        self._arrays: dict[str, Array] = {}
+        self._arrays: dict[str, AnyArray] = {}
         self.max_pairs = 0
         """Most (Gaussian, tile) pairs that an image has needed room for in one part of its list."""
 
-    def array(self, name: str, size: int, dtype: type) -> Array:
-        """Array of ``size`` elements with any content."""
+    def array(self, name: str, size: int, dtype: type) -> AnyArray:
+        """AnyArray of ``size`` elements with any content."""
         have = self._arrays.get(name)
         if have is None or have.size < size:
             capacity = size if have is None else max(size, int(have.size * _GROWTH))
@@ -54,7 +54,7 @@ class Workspace:
         return have[:size]
 
 
-def _aligned(size: int, dtype: type) -> Array:
+def _aligned(size: int, dtype: type) -> AnyArray:
     """Uninitialised array that begins on a cache line, so that no vector straddles two."""
     count = size * np.dtype(dtype).itemsize
     raw = np.empty(count + _CACHE_LINE, np.uint8)
@@ -75,17 +75,17 @@ class Rendering:
     free ones when this is dropped.
     """
 
-    keys: Array
-    records: Array
-    numbering: tuple[Array, Array]
+    keys: AnyArray
+    records: AnyArray
+    numbering: tuple[AnyArray, AnyArray]
     """First row of each Gaussian in its chunk, first row of each chunk and the end of all."""
-    tiles: tuple[Array, Array, Array]
+    tiles: tuple[AnyArray, AnyArray, AnyArray]
     """First entry of each tile and the end of all, where its compositing stopped, and the order in
     which to take tiles."""
-    entries: tuple[Array, Array, Array]
+    entries: tuple[AnyArray, AnyArray, AnyArray]
     """Gaussian, blocks and row of each (Gaussian, tile) pair, by tile, then by depth; with room
     beyond the last."""
-    planes: tuple[Array, Array]
+    planes: tuple[AnyArray, AnyArray]
     """Transmittance, and the end of the entries that count, of each pixel, by tile."""
 
     def __init__(self, view: View) -> None:
@@ -98,7 +98,9 @@ class Rendering:
             if len(_free) < _MAX_FREE_WORKSPACES:
                 _free.append(self.workspace)
 
-    def bin_gaussians(self, gaussians: Gaussians, visible: tuple[Array, Array, Array]) -> None:
+    def bin_gaussians(
+        self, gaussians: Gaussians, visible: tuple[AnyArray, AnyArray, AnyArray]
+    ) -> None:
         """Project, sort and list by tile; ``visible`` receives means2d, radii (as bits), depths."""
         n, view, w = gaussians[3].size, self.view, self.workspace.array
         # Several parts for each worker, so that one who comes late or has the hard ones holds up
@@ -152,7 +154,7 @@ class Rendering:
         pixels = view.tiles * layout.TILE_PIXELS
         self.planes = (w("transmittance", pixels, np.float32), w("last", pixels, np.int32))
 
-    def _make_lists(self, room: int) -> tuple[Array, Array, Array, Array]:
+    def _make_lists(self, room: int) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
         """Memory for (Gaussian, tile) pairs by part, which is returned, and by tile."""
         w = self.workspace.array
         self.entries = (
@@ -175,13 +177,13 @@ class Rendering:
         frame = (size, self.tiles, self.entries, self.records, self.planes)
         launch(kernel, self.view.tiles, *frame, states, *args)
 
-    def composite(self, background: Array, image: Array, alphas: Array) -> None:
+    def composite(self, background: AnyArray, image: AnyArray, alphas: AnyArray) -> None:
         """Composite the three channels in the records."""
         self._launch_tiles(composite, ("forward", FORWARD_NUMBERS), background, image, alphas)
 
     def composite_backward(
-        self, background: Array, image_grad: Array, alpha_grad: Array
-    ) -> tuple[Array, Array]:
+        self, background: AnyArray, image_grad: AnyArray, alpha_grad: AnyArray
+    ) -> tuple[AnyArray, AnyArray]:
         """Sums over pixels by entry: (touched, rows)."""
         count = int(self.numbering[1][-1])
         # One more than there are: `project_backward` may read the row after the last.
@@ -193,7 +195,7 @@ class Rendering:
         self._launch_tiles(composite_backward, scratch, background, grads, out)
         return touched, rows
 
-    def transmittance(self) -> Array:
+    def transmittance(self) -> AnyArray:
         """What light is left at each pixel, with more digits than 1 - opacity has. [H, W]"""
         tiles_x, tiles_y = self.view.tiles_x, self.view.tiles // self.view.tiles_x
         # By tile, block, row and column.
@@ -202,16 +204,16 @@ class Rendering:
         rows = rows.reshape(tiles_y * layout.TILE, tiles_x * layout.TILE)
         return rows[: self.view.height, : self.view.width]
 
-    def sum_rows(self, touched: Array, rows: Array, sums: Array) -> None:
+    def sum_rows(self, touched: AnyArray, rows: AnyArray, sums: AnyArray) -> None:
         """Add the rows to 16 numbers of each Gaussian."""
         launch(add_rows, self.numbering[1].size - 1, self.numbering, touched, rows, sums)
 
     def gaussian_gradients(
         self,
         gaussians: Gaussians,
-        summed: tuple[Array, Array] | Array,
-        depth_gradients: Array,
-        grads: tuple[Array, ...],
+        summed: tuple[AnyArray, AnyArray] | AnyArray,
+        depth_gradients: AnyArray,
+        grads: tuple[AnyArray, ...],
     ) -> None:
         """Gradients of the inputs, written to ``grads``, from what was summed over pixels.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import WORLD, read_world
 from chronoscene.scene.tracks import common_view
@@ -16,9 +16,6 @@ from chronoscene.validation.checks.reprojection import depth_percentiles, own_fr
 from chronoscene.validation.rule import NOTHING, Hit
 from chronoscene.validation.rules.cs1_cameras import pose_matrices
 from chronoscene.validation.scene_folder import RawScene, derived
-
-Table = NDArray[np.bool_]
-"""Whether a point is seen in a period. [P, T]"""
 
 MIN_SHARED = 10  # Shared points from which a similarity between two periods can be told from chance
 MAX_BLOCK = 10_000_000  # Points times periods that are counted at a time
@@ -42,7 +39,7 @@ REACH = 3.0  # How far a camera sees, in units of the 95th percentile of the dep
     bad="points of period 0 only; the images of period 1 were added later",
     remedy="triangulate points with the images of this period",
 )
-def period_without_points(scene: RawScene, point_periods: Table) -> Iterator[Hit]:
+def period_without_points(scene: RawScene, point_periods: Mask) -> Iterator[Hit]:
     """No point is seen in any image of a period."""
     if not point_periods.any():
         return  # no tracks at all, or no points: CS501, CS514
@@ -53,7 +50,7 @@ def period_without_points(scene: RawScene, point_periods: Table) -> Iterator[Hit
 
 
 @rule.info("CS507", bad="(for information only)", remedy=NOTHING)
-def points_of_one_period(scene: RawScene, point_periods: Table) -> Iterator[Hit]:
+def points_of_one_period(scene: RawScene, point_periods: Mask) -> Iterator[Hit]:
     """Number of points seen in a single period, and in several."""
     total = len(point_periods)
     if not total or point_periods.shape[1] < 2:
@@ -71,7 +68,7 @@ def points_of_one_period(scene: RawScene, point_periods: Table) -> Iterator[Hit]
     bad="two models merged by hand; periods 0 and 1 share points, 2 and 3 do, 1 and 2 do not",
     remedy="match images across the periods; if they were aligned by other means, ignore this rule",
 )
-def period_unconnected(scene: RawScene, point_periods: Table) -> Iterator[Hit]:
+def period_unconnected(scene: RawScene, point_periods: Mask) -> Iterator[Hit]:
     points = point_periods.sum(axis=0)
     groups = connected(common_points(point_periods), MIN_SHARED)
     groups = [group for group in groups if points[group].any()]  # others have their own rule
@@ -85,7 +82,7 @@ def period_unconnected(scene: RawScene, point_periods: Table) -> Iterator[Hit]:
         yield Hit(place, expected, f"{shared} of {np.count_nonzero(own)}")
 
 
-def common_points(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+def common_points(seen: Mask) -> Ints:
     """Number of points seen in both of two periods; zero on the diagonal. [P, T] -> [T, T]"""
     seen = seen[seen.sum(axis=1) > 1]
     rows = max(1, MAX_BLOCK // max(1, seen.shape[1]))
@@ -97,7 +94,7 @@ def common_points(seen: NDArray[np.bool_]) -> NDArray[np.int64]:
     return common
 
 
-def connected(common: NDArray[np.int64], minimum: int) -> list[NDArray[np.int64]]:
+def connected(common: Ints, minimum: int) -> list[Ints]:
     """Groups of periods linked by chains of at least ``minimum`` common points, as indices."""
     reach = (common >= minimum) | np.eye(len(common), dtype=bool)
     for _ in range(len(common).bit_length()):  # doubles the steps each time
@@ -192,7 +189,7 @@ def period_apart(scene: RawScene) -> Iterator[Hit]:
             yield Hit(f"period {period}", "views of the place that the others show", found)
 
 
-def _views(scene: RawScene) -> NDArray[np.float64]:
+def _views(scene: RawScene) -> Array:
     """Share of the points of a period (columns) in the view of a camera of another (rows). [T, T]
 
     Points and images are sampled. NaN for periods without points or without cameras.
@@ -216,7 +213,7 @@ def _views(scene: RawScene) -> NDArray[np.float64]:
     return common_view(xyz, owner, views, reach).T
 
 
-def _sample(mask: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
+def _sample(mask: Mask, count: int) -> Ints:
     """Indices where a mask is true, about ``count`` of them, evenly spread."""
     index = np.flatnonzero(mask)
     return index[:: len(index) // max(1, count) + 1]
