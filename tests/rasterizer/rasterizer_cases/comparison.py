@@ -100,10 +100,20 @@ class Comparison:
         return np.where(length > 0, stretching / np.maximum(length, 1e-37), 0.0)
 
 
+def counted_pixels(scene: SmallScene, steady: torch.Tensor) -> torch.Tensor:
+    """Steady pixels; with depth only those where the reference shows something, as the depth of
+    what is hardly there is not well defined. Both sides of a comparison count the same ones: an
+    opacity may be the limit itself. [C, H, W, 1]"""
+    if not scene.render_depth:
+        return steady
+    with torch.no_grad():
+        return steady & (scene.render("reference", torch.float64)[0].alphas > 0.1)
+
+
 def run(
-    scene: SmallScene, backend: str, dtype: torch.dtype, device: str, steady: torch.Tensor
+    scene: SmallScene, backend: str, dtype: torch.dtype, device: str, counted: torch.Tensor
 ) -> dict[str, np.ndarray]:
-    """Outputs and gradients of a loss that weighs every steady pixel at random.
+    """Outputs and gradients of a loss that weighs every counted pixel at random.
 
     Depths count in units of the largest: in the gradient of an expected depth everything cancels
     but differences of depth, so that its rounding is relative to depth itself.
@@ -114,9 +124,7 @@ def run(
     if result.depths is not None:
         outputs["depths"] = result.depths
     loss = torch.zeros((), dtype=dtype, device=device)
-    weights = steady.to(dtype)
-    if result.depths is not None:  # the depth of what is hardly there is not well defined
-        weights = weights * (result.alphas.detach().cpu() > 0.1)
+    weights = counted.to(dtype)
     units = {"depths": _largest_depth(scene)}
     for name, output in outputs.items():
         draw = _loss_weights(output.shape, generator).to(dtype)
@@ -170,11 +178,12 @@ def compare(
     """
     truth = truth or scene
     steady = steady_pixels(truth, band)
+    counted = counted_pixels(truth, steady)
     dtype = torch.float64 if scene.means.dtype == np.float64 else torch.float32
     return Comparison(
         truth,
-        got=run(scene, backend, dtype, device, steady),
-        expected=run(truth, "reference", torch.float64, "cpu", steady),
+        got=run(scene, backend, dtype, device, counted),
+        expected=run(truth, "reference", torch.float64, "cpu", counted),
         steady=steady.numpy(),
     )
 
@@ -200,10 +209,11 @@ def rounding(scene: SmallScene, *, fixed: bool = False) -> Comparison:
     """
     scene = at_camera(scene)
     steady = steady_pixels(scene, 1e-4)
-    expected = run(scene, "reference", torch.float64, "cpu", steady)
+    counted = counted_pixels(scene, steady)
+    expected = run(scene, "reference", torch.float64, "cpu", counted)
     worst = dict(expected)
     for seed in range(4):
-        other = run(_moved(scene, seed, fixed), "reference", torch.float64, "cpu", steady)
+        other = run(_moved(scene, seed, fixed), "reference", torch.float64, "cpu", counted)
         for name, base in expected.items():
             if base.size and np.abs(other[name] - base).max() > np.abs(worst[name] - base).max():
                 worst[name] = other[name]

@@ -3,7 +3,8 @@
 In most of them the CPU backend once lost digits that the inputs have: along an ellipse that the
 image cuts short, in the rounding of a unit quaternion, in what light is left. Three are
 mostly rounding: there the inputs themselves have few digits for a radius or a gradient. In the last
-one the loss of the tests lost the digits; see `comparison._loss_weights`.
+two the tests were wrong: their loss lost the digits (`comparison._loss_weights`), or the two sides
+counted other pixels (`comparison.counted_pixels`).
 """
 
 from __future__ import annotations
@@ -234,6 +235,13 @@ FOUND: dict[str, SmallScene] = {
         (10000.0, 10000.0, 0.0, 0.0),
         (0.0, 0.5, 0.5),
         ((-0.002, -0.0111432, 10.0), (1.0, 0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0, (0.0, 0.0, 0.0)),
+        render_depth=True,
+    ),
+    "a wall as opaque as depth must be to be compared": _mixture(
+        (5, 4),
+        (30.0, 30.0, 2.0, 2.0),
+        (0.3, 0.5, 0.7),
+        ((0.0, 0.0, 3.0), (1.0, 0.0, 0.0, 0.0), (1000.0, 1000.0, 1.0), 0.1, (0.9, 0.2, 0.4)),
         render_depth=True,
     ),
 }

@@ -183,7 +183,7 @@ def extreme_scenes(draw: st.DrawFn) -> SmallScene:
     pixels = array((n, 2), -0.5, 1.5) * np.array([width, height], np.float32)
     pixels[0] = np.clip(pixels[0], 0, [width, height])
     sideways = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]] * z[:, None]
-    seen = st.one_of(_floats(0.15, 1.0), st.sampled_from([1.0, 0.99, 0.999, 5.0]))
+    seen = st.one_of(_floats(0.1, 1.0), st.sampled_from([1.0, 0.99, 0.999, 5.0]))
     opacities = st.one_of(
         _floats(0.005, 1.0), st.sampled_from([0.0, -0.0, 1.0, 1e-40, 0.99, 0.999, 5.0])
     )
