@@ -4,6 +4,9 @@ import struct
 import numpy as np
 import pytest
 
+from chronoscene.formats import read_scene
+from chronoscene.scene.geometry import camera_centre
+
 IMAGES, POINTS = "sparse/0/images.txt", "sparse/0/points3D.txt"
 
 
@@ -154,3 +157,17 @@ def test_far_points(scene):
 def test_far_points_of_absurd_size(scene):
     scene.edit_fields(POINTS, 5, {2: "1e300"})
     scene.expect("CS518", place=POINTS, found="(ids 6)")
+
+
+@pytest.mark.parametrize(("times", "far"), [(99.9, False), (100.1, True)])
+def test_far_is_a_hundred_times_the_usual_distance(scene, times, far):
+    """Here the cameras are farther from the middle than the points."""
+    scene.edit_fields(POINTS, 5, {2: "4e4"})  # medians do not depend on how far
+    model = read_scene(scene.root)
+    middle = np.median(model.points.xyz, axis=0)
+    centres = camera_centre(np.stack([f.cam_from_world for f in model.frames]))
+    usual = np.median(np.linalg.norm(centres - middle, axis=1))
+    sideways = np.linalg.norm((model.points.xyz[5] - middle)[[0, 2]])
+    y = middle[1] + np.sqrt((times * usual) ** 2 - sideways**2)
+    scene.edit_fields(POINTS, 5, {2: f"{y:.17g}"})
+    assert ("CS518" in {f.code for f in scene.validate().findings}) == far

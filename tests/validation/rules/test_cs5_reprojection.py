@@ -23,6 +23,15 @@ def test_opengl_poses(scene):
     scene.expect("CS512", place=IMAGES, found="560 of 560 observations behind")
 
 
+def test_more_than_half_of_the_observations_must_be_behind(scene):
+    flip = np.diag([1.0, -1.0, -1.0])
+    scene.change_poses(lambda r, t: (flip @ r, flip @ t), range(7))
+    assert "CS512" not in {f.code for f in scene.validate().findings}  # 280 of 560
+    scene.set_track(0, [(i, 0) for i in range(1, 14)])  # not in the last image, which is right
+    found = [f.found for f in scene.validate().findings if f.code == "CS512"]
+    assert found == ["280 of 559 observations behind the camera"]
+
+
 def test_camera_to_world_pose_of_one_image(scene):
     scene.change_poses(lambda r, t: (r.T, -r.T @ t), [4])
     report = scene.validate()
