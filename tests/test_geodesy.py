@@ -58,4 +58,5 @@ def test_the_frame_is_read_back_from_its_text() -> None:
 
 def test_median_longitude_across_the_antimeridian() -> None:
     assert median_longitude(np.array([179.9, -179.9, 179.8])) == pytest.approx(179.9)
+    assert median_longitude(np.array([179.9, -179.9, -179.8])) == pytest.approx(-179.9)
     assert median_longitude(np.array([10.0, 12.0, 11.0])) == pytest.approx(11.0)

@@ -40,11 +40,19 @@ def test_changes_of_a_frame_change_the_hash(scene, field):
     assert provenance.scene_hash(changed) != provenance.scene_hash(scene)
 
 
-def test_changes_of_points_and_pixels_change_the_hash(scene):
+@pytest.mark.parametrize(
+    ("field", "at", "change"),
+    [("xyz", (0, 0), 1e-3), ("rgb", (0, 0), 1), ("track_start", 1, -1), ("track_frame", 0, 1)],
+)
+def test_changes_of_points_change_the_hash(scene, field, at, change):
+    values = getattr(scene.points, field).copy()
+    values[at] += change
+    changed = replace(scene, points=replace(scene.points, **{field: values}))
+    assert provenance.scene_hash(changed) != provenance.scene_hash(scene)
+
+
+def test_changes_of_pixels_change_the_hash(scene):
     before = provenance.scene_hash(scene)
-    xyz = scene.points.xyz.copy()
-    xyz[0, 0] += 1e-3
-    assert provenance.scene_hash(replace(scene, points=replace(scene.points, xyz=xyz))) != before
     path = scene.image_path(scene.frames[0])
     data = bytearray(path.read_bytes())
     data[-1] ^= 1

@@ -93,6 +93,15 @@ def test_a_metric_that_one_view_does_not_allow_is_absent_with_a_reason(tmp_path)
     assert "b.png" in scores.skipped["ssim_valid"] and "11 x 11" in scores.skipped["ssim_valid"]
 
 
+def test_an_image_of_another_period_is_no_prediction_of_a_photo(tmp_path):
+    truth = write(tmp_path / "t", {"a.png": noise(0)})
+    writer = ImageWriter(tmp_path / "p")
+    writer.add("a.png", noise(0), camera_period=0, rendered_period=1)
+    writer.close(kind="predictions", scene="s", scene_hash="h", details={})
+    with pytest.raises(CheckpointError, match=r"a difference at 'a\.png'"):
+        score_folder(tmp_path / "p", truth, make_scorers(["psnr"]))
+
+
 @pytest.mark.parametrize(
     ("guess", "scene_hash", "message"),
     [

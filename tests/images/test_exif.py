@@ -61,6 +61,12 @@ def test_all_tags(form):
     assert data.drone is None
 
 
+@pytest.mark.parametrize(("reference", "sign"), [(0, 1), (1, -1), (2, 1), (3, -1)])
+def test_altitudes_below_the_sea_and_below_the_ellipsoid(reference, sign):
+    gps = FULL["gps"] | {5: bytes([reference])}
+    assert read(photo(gps=gps)).altitude == sign * 12.5
+
+
 def test_tags_of_a_tiff():
     data = read(photo("TIFF", main=FULL["main"]))
     assert (data.make, data.model, data.orientation) == ("Maker", "Model X", 6)
@@ -199,7 +205,7 @@ def test_upright(order, is_long):
         data = data[:at] + long + data[at + 12 :]
         assert exif_of(Image.open(io.BytesIO(data))).orientation == 6
     new = Image.open(io.BytesIO(set_upright(data)))
-    assert exif_of(new).orientation == 1 and exif_of(new).make == "Maker"
+    assert new.getexif()[0x0112] == 1 and exif_of(new).make == "Maker"
     assert set_upright(set_upright(data)) is None
 
 

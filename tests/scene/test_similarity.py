@@ -12,7 +12,7 @@ from chronoscene.scene.geometry import (
     pose_from_rotation_translation,
     rotation_from_quaternion,
 )
-from chronoscene.scene.similarity import Sim3, fit_few, fit_robustly
+from chronoscene.scene.similarity import Sim3, fit, fit_few, fit_robustly
 
 unit = st.floats(-1, 1, allow_subnormal=False)
 rotations = (
@@ -118,3 +118,34 @@ def test_robust_fit_with_outliers():
 def test_points_on_a_line_fix_nothing():
     line = np.linspace(0, 1, 20)[:, None] * [1.0, 2.0, 3.0]
     assert fit_robustly(line, line) is None
+
+
+def test_the_scale_is_the_best_one_also_where_a_reflection_would_fit_better():
+    source = np.random.default_rng(3).normal(size=(20, 3))
+    found = fit(source, 2.0 * source * [1, 1, -1])
+    assert not found.mirrored
+    a = (source - source.mean(axis=0)) @ (found.matrix / found.scale).T
+    b = 2.0 * (source - source.mean(axis=0)) * [1, 1, -1]
+    assert found.scale == pytest.approx((a * b).sum() / (a * a).sum())
+
+
+def test_few_points_are_judged_by_most_of_the_others():
+    """Three points on a line and a wrong one fit exactly if the rest is turned around the line."""
+    line, others = [[0, 0, 0], [10, 0, 0], [20, 0, 0]], [[12, 6, 3], [3, -7, 2], [15, 5, -6]]
+    source = np.array([*line, [5, 8, 0], *others], float)
+    target = source.copy()
+    target[3] = [5, 0, 8]
+    target[4:] += np.random.default_rng(0).normal(0, 0.02, (3, 3))
+    sim, used = fit_few(source, target)
+    assert used.tolist() == [True, True, True, False, True, True, True]
+    np.testing.assert_allclose(sim.apply(source)[used], target[used], atol=0.1)
+
+
+def test_along_two_axes_a_wrong_height_is_no_distance():
+    rng = np.random.default_rng(4)
+    source = rng.uniform(-50, 50, (60, 3))
+    target = source + rng.normal(0, 0.01, (60, 3))
+    target[0, 2] += 5
+    for axes, expected in ((3, 5.0), (2, 0.0)):
+        _, distances = fit_robustly(source, target, axes=axes)
+        assert distances[0] == pytest.approx(expected, abs=0.3)
