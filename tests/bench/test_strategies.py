@@ -68,6 +68,9 @@ def test_separate_gives_each_model_its_period_alone(make_scene):
         world_points(second), scene.points.xyz[[4, 5, 6, 7, 8, 11]], atol=1e-6
     )
     for part, tests in ((first, ["a/2.png"]), (second, ["b/1.png", "b/2.png"])):
+        centres = camera_centre(np.stack([v.cam_from_world for v in part.train.views]))
+        radius = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+        assert part.train.camera_extent == pytest.approx(1.1 * radius)
         assert part.train.num_periods == 1
         assert {v.period for v in part.train.views} == {0}
         assert [f.name for f in part.test] == tests

@@ -133,7 +133,8 @@ def plain_inputs(model: AnchorModel, period: int, head: str, *, full: bool) -> t
         direction = direction / direction.norm(dim=1, keepdim=True)
     direction = direction[:, : 3 if head in layout.direction_heads else 0]
     if layout.fusion == "sum":
-        return torch.cat([base + own + table, direction], dim=1)
+        added = sum(part for part in (base, own, table) if part.shape[1])
+        return torch.cat([added, direction], dim=1)
     table = table if head in layout.global_heads else table[:, :0]
     return torch.cat([base, own, direction, table], dim=1)
 
@@ -145,6 +146,7 @@ def plain_inputs(model: AnchorModel, period: int, head: str, *, full: bool) -> t
         {"direction": "full"},
         {"fusion": "sum", "global_dim": 16},
         {"fusion": "sum", "global_dim": 16, "direction": "full"},
+        {"fusion": "sum", "global_dim": 16, "base_dim": 0},
         {"direction_heads": ("color",), "global_heads": ("color",)},
         {"direction_heads": (), "direction": "full"},
         {"direction_heads": (), "global_heads": ("opacity",)},

@@ -107,6 +107,10 @@ def test_faint_and_later_large_gaussians_go():
     ]
     # New rows are judged as the old ones are.
     assert len(run_round(parameters, torch.tensor([0, 1.0, 0, 0])).new["means"]) == 0
+    parameters["log_scales"][3] = float(np.log(0.111 * 1.6 + 0.001))
+    large = torch.tensor([0, 0, 0, 1.0])
+    assert len(run_round(parameters, large).new["means"]) == 2
+    assert len(run_round(parameters, large, prune_large=True).new["means"]) == 0
 
 
 def test_the_limit_takes_the_largest_gradients():

@@ -2,7 +2,8 @@
 
 import pytest
 
-from chronoscene.io.staging import replacing, write_text_atomic
+from chronoscene.errors import ConfigError
+from chronoscene.io.staging import check_outside, replacing, write_text_atomic
 
 
 def test_text_is_utf8_with_plain_line_ends(tmp_path):
@@ -33,3 +34,14 @@ def test_a_file_that_cannot_be_put_in_place_leaves_nothing(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
     with pytest.raises(FileNotFoundError):
         write_text_atomic(tmp_path / "absent" / "a.txt", "text")
+
+
+def test_what_a_scene_links_to_is_inside_of_it(tmp_path):
+    scene, photos = tmp_path / "scene", tmp_path / "photos"
+    scene.mkdir()
+    photos.mkdir()
+    (scene / "images").symlink_to(photos)
+    check_outside(tmp_path / "out", [scene])
+    for place in (scene, scene / "out", photos, photos / "new" / "out"):
+        with pytest.raises(ConfigError, match="expected a place outside the scene, found one in"):
+            check_outside(place, [scene])

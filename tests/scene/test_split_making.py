@@ -144,6 +144,14 @@ def put_images(root, taken):
         Image.new("RGB", (4, 4)).save(root / name, exif=exif)
 
 
+def test_of_two_days_as_near_to_the_fraction_the_later_one_begins_the_test(tmp_path):
+    days = (1, 2, 2, 3)
+    taken = {f"{i}.jpg": datetime(2020, 1, day, 8 + i) for i, day in enumerate(days)}
+    put_images(tmp_path, taken)
+    scene = make_scene([0] * 4, root=tmp_path, names=list(taken))
+    assert latest(scene, 0.5) == {"3.jpg"}
+
+
 def test_last_hours_of_a_day(tmp_path):
     taken = {f"{i}.jpg": datetime(2020, 1, 1, 20 - i) for i in range(8)}
     put_images(tmp_path, taken)

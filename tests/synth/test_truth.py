@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from chronoscene.synth.city.buildings import SLAB
+from chronoscene.synth.render.renderer import PixelMaps
 from chronoscene.synth.truth import APPEARANCE, GEOMETRY, UNCHANGED, change_mask
 
 
@@ -114,6 +115,15 @@ def test_mask_of_a_period_with_itself_is_empty(made, renderers) -> None:  # type
     frame = made.scene.frames[0]
     maps = renderers[0].maps(frame.camera, frame.cam_from_world)
     assert not change_mask(maps, maps).any()
+
+
+def test_depth_changes_by_a_thousandth_of_the_larger_one() -> None:
+    near = np.full((1, 3), 100.0, np.float32)
+    far = near * np.array([[1.00095, 1.0010005, 1.00105]])
+    element, albedo = np.zeros((1, 3), np.int32), np.zeros((1, 3, 3))
+    here, there = (PixelMaps(depth, element, albedo) for depth in (near, far))
+    for mask in (change_mask(here, there), change_mask(there, here)):
+        assert mask.tolist() == [[UNCHANGED, UNCHANGED, GEOMETRY]]
 
 
 def test_edits_tell_every_difference(made, world) -> None:  # type: ignore[no-untyped-def]

@@ -1,10 +1,19 @@
 """Models against GPS: robust similarity, lines of cameras, the horizon."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from chronoscene.registration.reconstruct.gps_alignment import align_to_gps, upright_direction
+from chronoscene.colmap.model import read_reconstruction
+from chronoscene.registration.reconstruct.gps_alignment import (
+    Priors,
+    align_to_gps,
+    to_gps_frame,
+    upright_direction,
+)
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3
 from chronoscene.synth.flights import look_at
@@ -90,3 +99,27 @@ def test_up_of_photos_that_look_straight_down() -> None:
         ]
     )
     assert upright_direction(poses)[2] > 0.9
+
+
+def test_up_is_not_down_when_the_world_is_turned_over() -> None:
+    turned = np.diag([1.0, -1.0, -1.0])
+    poses = circle(12)
+    assert upright_direction(poses)[2] > 0.999
+    poses[:, :3, :3] = poses[:, :3, :3] @ turned
+    assert upright_direction(poses)[2] < -0.999
+
+
+def test_priors_are_as_uncertain_along_each_axis_as_their_residuals(
+    make_scene_folder: Callable[..., Path],
+) -> None:
+    names = [f"{i:02d}.png" for i in range(40)]
+    folder = make_scene_folder(dict.fromkeys(names, 0), tests=[])
+    model = read_reconstruction(folder / "sparse" / "0")
+    noise = np.random.default_rng(10).normal(0, 0.5, (40, 3))
+    enu = {
+        str(image.name): (100 * np.asarray(image.projection_center()) + noise[i]).tolist()
+        for i, image in enumerate(model.images.values())
+    }
+    moved, priors = to_gps_frame(model, Priors(enu, dict.fromkeys(names, [0.01] * 3)), [])
+    assert moved and len(priors.sigma) > 35
+    np.testing.assert_allclose(list(priors.sigma.values()), 0.5, rtol=0.25)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from chronoscene.scene.similarity import Sim3
+from chronoscene.validation.rules.cs5_across_periods import connected
 
 IMAGES, POINTS, WORLD = "sparse/0/images.txt", "sparse/0/points3D.txt", "sparse/world.json"
 PERIOD_1 = range(7, 14)
@@ -197,3 +198,10 @@ def test_periods_connected_by_a_chain(scene):
     scene.keep_images(range(20), range(1, 11))
     scene.keep_images(range(20, 40), range(6, 15))
     assert "CS508" not in {f.code for f in scene.validate().findings}
+
+
+def test_a_chain_of_any_length_is_one_group():
+    links = np.diag([10] * 8, 1)
+    assert [g.tolist() for g in connected(links + links.T, 10)] == [list(range(9))]
+    links[4, 5] = 9
+    assert [g.tolist() for g in connected(links + links.T, 10)] == [[0, 1, 2, 3, 4], [5, 6, 7, 8]]
