@@ -1,11 +1,22 @@
 """Budgets are parsed, progress never leaves 0..1, shares add up."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.bench.job import StopRule, parse_duration
+from chronoscene.bench.job import Job, StopRule, parse_duration
 from chronoscene.errors import ConfigError
+from chronoscene.methods import load_spec
+
+JOB = Job(
+    scene_root="/scene", scene_format="chronoscene", scene="scene", scene_hash="1", split_hash="2",
+    method="toy_methods:MEAN", method_name="mean", strategy="separate", preset="balanced",
+    overrides={}, iterations=9,
+    budget_seconds=None, separate_iterations="total", seed=0, max_width=1600, threads=None,
+    device="cpu", runs="/runs", lpips_weights=None, commit="3",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -59,3 +70,23 @@ def test_time_left_follows_the_pace():
     assert StopRule(100, None).seconds_left(25, 5.0) == pytest.approx(15.0)
     assert StopRule(None, 60.0).seconds_left(3, 20.0) == pytest.approx(40.0)
     assert StopRule(100, None).seconds_left(0, 0.0) is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"scene_hash": "4"}, {"strategy": "joint"}, {"overrides": {"rate": "0.25"}}, {"seed": 1},
+        {"iterations": 10}, {"budget_seconds": 60.0}, {"separate_iterations": "each"},
+        {"max_width": 800}, {"device": "auto"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_decides_the_result_is_compared(change):
+    spec = load_spec("toy_methods:MEAN")
+    assert replace(JOB, **change).document(spec) != JOB.document(spec)
+
+
+def test_where_and_how_fast_it_runs_is_not_compared():
+    spec = load_spec("toy_methods:MEAN")
+    other = replace(JOB, runs="/other", threads=3, commit="5", scene_root="/copy")
+    assert other.document(spec) == JOB.document(spec)
