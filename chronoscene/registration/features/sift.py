@@ -62,14 +62,14 @@ def sift_features(path: Path, max_image_size: int, max_features: int) -> Feature
         edgeThreshold=EDGE_THRESHOLD,
         enable_precise_upscale=True,  # otherwise, positions are off by a quarter of a pixel
     )
-    # Descriptors of all take less time than another pyramid for those that are kept.
-    found, histograms = sift.detectAndCompute(grey, None)
-    if not found:
-        return np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8)
+    found = sift.detect(grey, None)
     kept = np.argsort([-k.size for k in found], kind="stable")[:max_features]
+    if not len(kept):
+        return np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8)
+    # Another pyramid takes less time than descriptors of all that detailed photos have.
+    found, histograms = sift.compute(grey, [found[i] for i in kept])
     zoom = width / grey.shape[1], height / grey.shape[0]
-    values = root_sift(np.asarray(histograms, np.float32)[kept])
-    return _in_colmap([found[i] for i in kept], zoom), values
+    return _in_colmap(found, zoom), root_sift(np.asarray(histograms, np.float32))
 
 
 def _in_colmap(found: Sequence[cv2.KeyPoint], zoom: tuple[float, float]) -> NDArray[np.float32]:

@@ -110,7 +110,9 @@ def test_the_largest_are_kept(texture: Path) -> None:
     few, fewer_descriptors = sift_features(texture, 1600, 50)
     assert len(every) > len(few) == 50
     np.testing.assert_array_equal(few, every[:50])
-    np.testing.assert_array_equal(fewer_descriptors, descriptors[:50])
+    # Without small ones, OpenCV does not enlarge the photo, so the last bits may differ.
+    apart = np.linalg.norm(fewer_descriptors.astype(float) - descriptors[:50], axis=1)
+    assert apart.max() < 0.05 * 512
     assert (np.diff(np.hypot(every[:, 2], every[:, 4])) < 1e-4).all()
 
 
