@@ -39,6 +39,9 @@ PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 NOT_FINITE_LIMIT = 50
 """Steps in a row without a finite loss and finite gradients that end a training."""
 
+Clock = Callable[[], float]
+"""Seconds from some moment on."""
+
 
 class TrainingError(ChronoSceneError):
     """A training that cannot continue: numbers that are not finite, or an invalid image."""
@@ -64,16 +67,17 @@ class CurvePoint:
 class Stopwatch:
     """Adds up the time spent inside ``with``: training runs inside, evaluation outside."""
 
-    def __init__(self) -> None:
+    def __init__(self, now: Clock = time.perf_counter) -> None:
         self.seconds = 0.0
+        self._now = now
         self._started = 0.0
 
     def __enter__(self) -> Stopwatch:
-        self._started = time.perf_counter()
+        self._started = self._now()
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.seconds += time.perf_counter() - self._started
+        self.seconds += self._now() - self._started
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +125,7 @@ def train(
     seed: int,
     device: str,
     observer: Observer,
+    now: Clock = time.perf_counter,
 ) -> Trained:
     """Train one model. Probes and the observer run off the clock.
 
@@ -132,13 +137,14 @@ def train(
         seed: For the global generators and the method.
         device: ``cpu`` or ``cuda``.
         observer: Shows the progress.
+        now: The clock.
 
     Raises:
         DivergedError: If the method skipped too many steps in a row.
         TrainingError: If it took as many with a loss that is not finite.
     """
     seed_everything(seed)
-    clock = Stopwatch()
+    clock = Stopwatch(now)
     with clock:
         method.setup(part.train, seed=seed, device=device)
     setup_seconds = clock.seconds
@@ -214,7 +220,14 @@ WARM_UP_STEPS = 120  # Enough for the first rounds of densification of the metho
 WARM_UP_SECONDS = 3.0  # Limit on the time for the steps after the first three
 
 
-def warm_up(spec: MethodSpec, config: Any, *, num_periods: int, device: str) -> str | None:
+def warm_up(
+    spec: MethodSpec,
+    config: Any,
+    *,
+    num_periods: int,
+    device: str,
+    now: Clock = time.perf_counter,
+) -> str | None:
     """Train a few steps and render once on made-up images; returns what went wrong, if anything.
 
     Kernels are compiled, or loaded from their cache, at first use. On the training clock that
@@ -225,12 +238,12 @@ def warm_up(spec: MethodSpec, config: Any, *, num_periods: int, device: str) -> 
         method: Method = import_object(spec.method)(config)
         train = made_up_set(num_periods)
         method.setup(train, seed=0, device=device)
-        started = time.perf_counter()
+        started = now()
         for index in range(WARM_UP_STEPS):
             method.step(index, index / WARM_UP_STEPS)
             if index < 2:
-                started = time.perf_counter()
-            elif time.perf_counter() - started > WARM_UP_SECONDS:
+                started = now()
+            elif now() - started > WARM_UP_SECONDS:
                 break
         method.render(train.views[0], 0.0)
     except Exception as error:  # the run itself will report it; here it only costs time

@@ -24,8 +24,7 @@ run_bench(
         runs=Path(sys.argv[2]),
         threads=1,
         seeds=(0, 1),
-        overrides={"sleep": sys.argv[3]},
-        iterations=int(sys.argv[4]),
+        iterations=20,
         overwrite=True,
     ),
     lambda line: print(line, flush=True),
@@ -48,9 +47,11 @@ def workers_of(pid):
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
-def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_path):
-    runs = tmp_path / "runs"
-    command = [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs), "0.01", "150"]
+def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_path, monkeypatch):
+    runs, hold = tmp_path / "runs", tmp_path / "hold"
+    hold.touch()
+    monkeypatch.setenv("TOY_HOLD", f"1:{hold}")
+    command = [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs)]
     done = runs / "ring/mean-joint-balanced/seed0/run.json"
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -62,8 +63,9 @@ def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_pat
         process.send_signal(signal.SIGKILL)
         process.wait()
     # The worker notices that its bench is gone; it must not write into the next one's folder.
-    wait_for(lambda: not Path(f"/proc/{worker}").exists(), 30)
+    wait_for(lambda: not Path(f"/proc/{worker}").exists())
     assert half_done[0].parent.exists()
+    hold.unlink()
     again = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "1 of 2 runs are finished and kept" in again.stdout
     assert done.read_bytes() == before
@@ -75,9 +77,12 @@ def test_a_killed_bench_keeps_what_is_finished_and_goes_on(scene_folder, tmp_pat
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_bench_leaves_no_process_and_no_half_run(number, scene_folder, tmp_path):
+def test_an_interrupted_bench_leaves_no_process_and_no_half_run(
+    number, scene_folder, tmp_path, monkeypatch
+):
     runs = tmp_path / "runs"
-    command = [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs), "0.01", "100000"]
+    monkeypatch.setenv("TOY_HOLD", f"0:{scene_folder}")  # for ever
+    command = [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs)]
     process = subprocess.Popen(
         command,
         stdout=subprocess.PIPE,
@@ -93,7 +98,7 @@ def test_an_interrupted_bench_leaves_no_process_and_no_half_run(number, scene_fo
         os.killpg(process.pid, number)  # what Ctrl-C does
     else:
         process.send_signal(number)  # what a batch system does
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode != 0
     assert "stack trace" not in errors
     assert not Path(f"/proc/{worker}").exists()

@@ -158,7 +158,7 @@ def test_seeds_overrides_and_budgets(bench):
     (folder,) = outcome.finished
     record = read_run(folder)
     assert folder.name == "seed3" and record.seed == 3
-    assert 0.4 <= record.seconds < 0.6 and 5 < record.iterations < 45
+    assert record.seconds >= 0.4 and 1 <= record.iterations <= 40  # each takes 0.01 or more
     config = json.loads((folder / "config.json").read_text())["config"]
     assert config["method_config"]["rate"] == 0.25
     assert config["stop"] == {"iterations": None, "seconds": 0.4}

@@ -2,7 +2,6 @@
 
 import math
 import random
-import time
 
 import numpy as np
 import pytest
@@ -41,9 +40,33 @@ def toy(name="MeanColour", **options):
     return import_object(f"toy_methods:{name}")(config)
 
 
-def run(method, part, stop, observer=lambda *step: None):
+class FakeClock:
+    """Stands still but for what the test says."""
+
+    def __init__(self):
+        self.seconds = 100.0
+
+    def __call__(self):
+        return self.seconds
+
+    def takes(self, seconds, function):
+        """The function, which takes this long."""
+
+        def timed(*args, **kwargs):
+            self.seconds += seconds
+            return function(*args, **kwargs)
+
+        return timed
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
+
+
+def run(method, part, stop, observer=lambda *step: None, **changes):
     truth = {f.name: part.store.load(f) for f in part.test}
-    return train(method, part, stop, truth, seed=0, device="cpu", observer=observer)
+    return train(method, part, stop, truth, seed=0, device="cpu", observer=observer, **changes)
 
 
 def test_iterations_and_progress(part):
@@ -87,34 +110,42 @@ def test_probe_values_are_psnr_of_one_view_per_period(part):
     assert trained.curve[-1].psnr == pytest.approx(np.mean(values), abs=1e-12)
 
 
-def test_budgets_stop_by_the_clock(part):
-    started = time.perf_counter()
-    trained = run(toy(sleep=0.01), part, StopRule(None, 0.3))
-    assert 0.3 <= trained.seconds < 0.4
-    assert 10 <= trained.iterations <= 31
-    assert time.perf_counter() - started >= trained.seconds
-
-
-def test_progress_follows_the_clock(part):
-    progress = []
-    method = toy(sleep=0.01)
-    original = method.step
-    method.step = lambda i, p: (progress.append(p), original(i, p))[1]
-    run(method, part, StopRule(None, 0.2))
-    assert progress == sorted(progress) and progress[-1] > 0.8 and max(progress) < 1
-
-
-def test_probes_observers_and_rendering_are_off_the_clock(part):
+def test_budgets_stop_by_the_clock(part, clock):
     method = toy()
-    original = method.render
-    method.render = lambda view, period: (time.sleep(0.05), original(view, period))[1]
-    trained = run(method, part, StopRule(10, None), observer=lambda *step: time.sleep(0.02))
-    assert trained.seconds < 0.05
+    method.setup = clock.takes(2.0, method.setup)
+    method.step = clock.takes(0.25, method.step)
+    trained = run(method, part, StopRule(None, 4.9), now=clock)
+    assert (trained.setup_seconds, trained.seconds, trained.iterations) == (2.0, 5.0, 12)
 
 
-def test_whichever_limit_is_first(part):
-    assert run(toy(), part, StopRule(5, 60.0)).iterations == 5
-    assert run(toy(sleep=0.02), part, StopRule(10**6, 0.1)).iterations < 10
+def test_progress_follows_the_clock(part, clock):
+    progress = []
+    method = toy()
+    step = clock.takes(0.25, method.step)
+    method.step = lambda i, p: (progress.append(p), step(i, p))[1]
+    run(method, part, StopRule(None, 2.0), now=clock)
+    assert progress == [i / 8 for i in range(8)]
+
+
+def test_probes_observers_and_rendering_are_off_the_clock(part, clock):
+    method = toy()
+    method.step = clock.takes(0.25, method.step)
+    method.render = clock.takes(50.0, method.render)
+    observer = clock.takes(20.0, lambda *step: None)
+    trained = run(method, part, StopRule(10, None), observer, now=clock)
+    assert trained.seconds == 2.5 and clock.seconds > 700
+
+
+def test_the_clock_is_that_of_the_machine(part):
+    trained = run(toy(sleep=0.01), part, StopRule(None, 0.05))
+    assert trained.seconds >= 0.05 and 1 <= trained.iterations <= 5
+
+
+def test_whichever_limit_is_first(part, clock):
+    method = toy()
+    method.step = clock.takes(0.25, method.step)
+    assert run(method, part, StopRule(5, 60.0), now=clock).iterations == 5
+    assert run(method, part, StopRule(10**6, 1.0), now=clock).iterations == 4
 
 
 def reporting(skipped_at, loss=math.nan, skipped="not finite"):
@@ -188,26 +219,27 @@ def test_the_toys_are_specs():
     assert load_spec("toy_methods:MEAN").period_input == "label"
 
 
-def test_a_method_is_set_up_stepped_and_rendered(monkeypatch):
+def test_a_method_is_set_up_stepped_and_rendered(monkeypatch, clock):
     calls = []
     cls = import_object("toy_methods:MeanColour")
     step, render = cls.step, cls.render
     monkeypatch.setattr(cls, "step", lambda *a: (calls.append(a[1]), step(*a))[1])
     monkeypatch.setattr(cls, "render", lambda *a: (calls.append("render"), render(*a))[1])
     config = import_object("toy_methods:Config")()
-    assert warm_up(load_spec("toy_methods:MEAN"), config, num_periods=3, device="cpu") is None
+    spec = load_spec("toy_methods:MEAN")
+    assert warm_up(spec, config, num_periods=3, device="cpu", now=clock) is None
     assert calls == [*range(WARM_UP_STEPS), "render"]
 
 
-def test_slow_methods_are_cut_short(monkeypatch):
-    monkeypatch.setattr("chronoscene.bench.training_loop.WARM_UP_SECONDS", 0.05)
+def test_slow_methods_are_cut_short(monkeypatch, clock):
     steps = []
     cls = import_object("toy_methods:MeanColour")
-    step = cls.step
+    step = clock.takes(1.25, cls.step)
     monkeypatch.setattr(cls, "step", lambda *a: (steps.append(1), step(*a))[1])
-    config = import_object("toy_methods:Config")(sleep=0.03)
-    assert warm_up(load_spec("toy_methods:MEAN"), config, num_periods=1, device="cpu") is None
-    assert 3 <= len(steps) <= 6
+    config = import_object("toy_methods:Config")()
+    spec = load_spec("toy_methods:MEAN")
+    assert warm_up(spec, config, num_periods=1, device="cpu", now=clock) is None
+    assert len(steps) == 5  # two that may compile, then three until more than three seconds passed
 
 
 def test_what_goes_wrong_is_a_notice():
@@ -229,11 +261,11 @@ def test_the_made_up_set_is_a_training_set(periods):
         assert inside[:, 2].min() > 0.5
 
 
-def test_the_stopwatch_counts_inside_only():
-    watch = Stopwatch()
+def test_the_stopwatch_counts_inside_only(clock):
+    watch = Stopwatch(clock)
     with watch:
-        time.sleep(0.02)
-    time.sleep(0.05)
+        clock.seconds += 2
+    clock.seconds += 5
     with watch:
-        time.sleep(0.02)
-    assert 0.04 <= watch.seconds < 0.065
+        clock.seconds += 3
+    assert watch.seconds == 5

@@ -22,7 +22,11 @@ class Config:
 
 
 class MeanColour:
-    """One colour per period, moved towards the mean of one image after another."""
+    """One colour per period, moved towards the mean of one image after another.
+
+    With the environment variable ``TOY_HOLD=SEED:FILE``, trainings of that seed go no further while
+    the file is there.
+    """
 
     def __init__(self, config):
         self.config = config
@@ -31,9 +35,13 @@ class MeanColour:
         self.train = train
         self.colors = np.full((train.num_periods, 3), 0.5)
         self.ballast = np.ones(self.config.ballast, np.uint8)
+        held, _, file = os.environ.get("TOY_HOLD", "").partition(":")
+        self.hold = file if held == str(seed) else ""
 
     def step(self, index, progress):
         time.sleep(self.config.sleep)
+        while self.hold and os.path.exists(self.hold):
+            time.sleep(0.01)
         i = index % len(self.train.views)
         target = self.train.load_image(i).reshape(-1, 3).mean(axis=0) / 255.0
         color = self.colors[self.train.views[i].period]
