@@ -45,6 +45,14 @@ class ProgressDisplay:
     def __exit__(self, *error: object) -> None:
         self._bar.stop()
 
+    def wait(self, step: str) -> None:
+        """Show what the run does before and after its trainings."""
+        if self._task is not None:
+            self._bar.remove_task(self._task)
+        self._task = self._bar.add_task(step, total=None, status="")
+        if not self._live:
+            self._print(f"{self.label}: {step}")
+
     def begin(self, part: str, stop: StopRule) -> None:
         """Start over for the next model."""
         self._name = self.label if part == "all" else f"{self.label} {part}"
@@ -54,6 +62,8 @@ class ProgressDisplay:
         # The runner has named the run already, and a terminal may be 80 columns wide.
         shown = "" if part == "all" else part
         self._task = self._bar.add_task(shown, total=1.0, status="setup")
+        if not self._live:
+            self._print(f"{self._name}: training")
 
     def update(
         self, iteration: int, seconds: float, report: StepReport, psnr: float | None
@@ -69,9 +79,11 @@ class ProgressDisplay:
             self._bar.update(self._task, completed=progress, status=status)
         elif not self._live and psnr is not None and psnr != self._psnr:
             status = self.status(iteration, seconds, psnr)
-            line = f"{self._name}: {progress:4.0%} {status}, {report.primitives} primitives"
-            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+            self._print(f"{self._name}: {progress:4.0%} {status}, {report.primitives} primitives")
         self._psnr = psnr
+
+    def _print(self, line: str) -> None:
+        self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def status(self, iteration: int, seconds: float, psnr: float | None) -> str:
         """The state of the training in one line."""

@@ -14,7 +14,7 @@ from chronoscene.bench.predictions import safe_name
 from chronoscene.bench.provenance import config_hash
 from chronoscene.bench.results import Failure
 from chronoscene.checks import check_choice
-from chronoscene.errors import ConfigError
+from chronoscene.errors import BackendError, ConfigError
 from chronoscene.methods import MethodSpec, build_config
 
 _UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
@@ -167,6 +167,25 @@ class Job:
             "seed": self.seed,
             "device": self.device,
         }
+
+
+def check_device(device: str) -> None:
+    """Check on the machine that will train that it has the device.
+
+    Raises:
+        BackendError: If a GPU is asked for that is not there.
+    """
+    if device != "cuda":
+        return
+    import torch
+
+    if not torch.cuda.is_available():
+        raise BackendError(
+            "--device cuda",
+            expected="a CUDA device and a torch build for it",
+            found=f"torch {torch.__version__} without one",
+            todo="use --device cpu",
+        )
 
 
 def check_job(job: Job, spec: MethodSpec) -> None:

@@ -57,13 +57,17 @@ def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]
     split_overrides(settings, [spec for _, spec in specs])
     if settings.lpips_weights is not None:
         check_available(settings.lpips_weights)
-    scenes = [read_scene(path, format=settings.dataset_format) for path in settings.scenes]
+    scenes = []
+    for path in settings.scenes:
+        say(f"read {path}")
+        scenes.append(read_scene(path, format=settings.dataset_format))
     _check_names(scenes)
     commit = code_version()
     plan: dict[Path, tuple[Job, MethodSpec]] = {}
     notices: dict[str, None] = {}
     for scene in scenes:
         check_scene(scene)
+        say(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
         for job, spec in _scene_jobs(settings, scene, commit, specs):
             check_job(job, spec)
             plan.setdefault(job.folder, (job, spec))

@@ -221,12 +221,7 @@ WARM_UP_SECONDS = 3.0  # Limit on the time for the steps after the first three
 
 
 def warm_up(
-    spec: MethodSpec,
-    config: Any,
-    *,
-    num_periods: int,
-    device: str,
-    now: Clock = time.perf_counter,
+    spec: MethodSpec, config: Any, *, num_periods: int, device: str, now: Clock = time.perf_counter
 ) -> str | None:
     """Train a few steps and render once on made-up images; returns what went wrong, if anything.
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from chronoscene.bench import results
 from chronoscene.bench.display import ProgressDisplay
-from chronoscene.bench.job import Job, StopRule
+from chronoscene.bench.job import Job, StopRule, check_device
 from chronoscene.bench.opening import write_source
 from chronoscene.bench.predictions import (
     ImageWriter,
@@ -45,7 +45,7 @@ from chronoscene.bench.training_loop import (
     train,
     warm_up,
 )
-from chronoscene.errors import BackendError, ChronoSceneError
+from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
 from chronoscene.io.processes import Report
@@ -86,14 +86,15 @@ def run_job(job: Job) -> None:
     parts = make_parts(scene, ImageStore(scene, max_width=job.max_width), job.strategy)
     write_source(job, scene, parts[0].train.training_from_world)
     writer = ImageWriter(staging / results.PREDICTIONS)
-    before = time.perf_counter()
-    periods = parts[0].train.num_periods
-    config = job.method_config(spec)
-    notice = warm_up(spec, config, num_periods=periods, device=machine.device)
-    forget_peak_memory()
-    warmup_seconds = time.perf_counter() - before
     outcomes = []
     with ProgressDisplay(job.label) as display:
+        display.wait("warm-up: kernels compile at first use, for a minute or more")
+        before = time.perf_counter()
+        periods = parts[0].train.num_periods
+        config = job.method_config(spec)
+        notice = warm_up(spec, config, num_periods=periods, device=machine.device)
+        forget_peak_memory()
+        warmup_seconds = time.perf_counter() - before
         for part, stop in zip(parts, job.stop_rules(spec, len(parts)), strict=True):
             display.begin(part.name, stop)
             outcomes.append(_run_part(job, spec, part, stop, machine, writer, display))
@@ -107,9 +108,12 @@ def run_job(job: Job) -> None:
     columns = [f.name for f in fields(CurvePoint)]
     points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
     write_text_atomic(staging / results.CURVE_FILE, csv_text(columns, points))
-    scorers = make_scorers(lpips_weights=Path(job.lpips_weights) if job.lpips_weights else None)
     truth = ground_truth_folder(Path(job.runs), scene.name)
-    scores = score_folder(staging / results.PREDICTIONS, truth, scorers)
+    with ProgressDisplay(job.label) as display:
+        display.wait("scores")
+        weights = Path(job.lpips_weights) if job.lpips_weights else None
+        scorers = make_scorers(lpips_weights=weights)
+        scores = score_folder(staging / results.PREDICTIONS, truth, scorers)
     record = _record(job, spec, scene, machine, outcomes, peaks, started)
     record.aggregates, record.periods = aggregate(scores.rows)
     record.skipped = scores.skipped
@@ -124,19 +128,12 @@ def pick_device(wanted: str, spec: MethodSpec) -> str:
     Raises:
         BackendError: If a GPU is asked for that is not there.
     """
-    import torch
-
-    usable = torch.cuda.is_available()
-    if wanted == "cuda" and not usable:
-        raise BackendError(
-            "--device cuda",
-            expected="a CUDA device and a torch build for it",
-            found=f"torch {torch.__version__} without one",
-            todo="use --device cpu",
-        )
+    check_device(wanted)
     if wanted != "auto":
         return wanted
-    ready = usable and find_spec("gsplat") is not None
+    import torch
+
+    ready = torch.cuda.is_available() and find_spec("gsplat") is not None
     return "cuda" if "cuda" in spec.devices and (ready or "cpu" not in spec.devices) else "cpu"
 
 
@@ -165,6 +162,7 @@ def _run_part(
     except DivergedError:
         _save(method, checkpoint, part)  # as the last good step left it
         raise
+    display.wait(f"{len(part.test)} test views")
     _save(method, checkpoint, part)
     before = time.perf_counter()
     for frame in part.test:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from chronoscene.bench.job import parse_duration
+from chronoscene.bench.job import check_device, parse_duration
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.strategies import STRATEGIES
 from chronoscene.checks import check_choice
@@ -118,6 +118,7 @@ def command(
         seeds=tuple(range(seed, seed + seeds)),
         **options,
     )
+    check_device(settings.device)
     outcome = run_bench(settings, lambda line: click.echo(line, err=True))
     report(outcome, out)
 

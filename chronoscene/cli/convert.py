@@ -61,12 +61,12 @@ def command(
     target: str,
     link: str | None,
 ) -> None:
-    """Convert the scene SRC from any supported format and write it to the new folder OUT.
+    """Write the scene SRC in another format to the new folder OUT.
 
-    SRC is not changed. OUT appears complete or not at all. Notes say what the target format cannot
-    hold. DATASET.md describes the formats.
+    SRC may have any supported format, and is not changed. OUT appears complete or not at all. Notes
+    say what the target format cannot hold. DATASET.md describes the formats.
     """
-    with progress_bar() as bar:
+    with progress_bar(f"read {source}") as bar:
         done = convert(
             source,
             out,

@@ -14,12 +14,13 @@ import click
 
 from chronoscene.errors import ConfigError
 from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.wording import printable
 
 FILE = "a file that can be written"
 
 
 def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
-    """Print a text, or write it to a file, without colours.
+    """Print a text; or write it to a file, without colours, and say so on standard error.
 
     What the terminal's encoding lacks is printed as an escape sequence.
 
@@ -38,6 +39,13 @@ def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
     whole = click.unstyle(text).encode("utf-8", "backslashreplace").decode()  # names may be bytes
     with writing_to(option, out, expected=FILE):
         write_text_atomic(out, whole)
+    tell_written(out)
+
+
+def tell_written(*places: Path) -> None:
+    """Name files that were written, on standard error: standard output is for results."""
+    for place in places:
+        click.echo(printable(f"wrote {place}"), err=True)
 
 
 @contextmanager

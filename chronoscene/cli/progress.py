@@ -1,4 +1,4 @@
-"""Progress of long commands: one bar on stderr, or lines in a log.
+"""Progress of long commands: one bar on a terminal, else a plain line for each step, on stderr.
 
 `chronoscene bench` has a bar of its own for trainings, `chronoscene.bench.display`: it shows the
 loss, and trainings may end by the clock.
@@ -7,6 +7,7 @@ loss, and trainings may end by the clock.
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
 from typing import TypeVar
@@ -18,24 +19,34 @@ from chronoscene.io.processes import Report
 T = TypeVar("T")
 BAR_WIDTH = 20
 """Characters: with the names of our steps, the rest of a line of 80 is for the numbers."""
+BETWEEN_LINES = 30.0  # Seconds after which a step that goes on is told again without a terminal
 MEMORY = 300.0  # Seconds over which the rate is a mean; a step may be a scene, which takes a minute
 
 
 @contextmanager
-def progress_bar(*, log: bool = False) -> Iterator[Report]:
+def progress_bar(first: str = "") -> Iterator[Report]:
     """A function that reports progress.
 
     On a terminal it draws a bar with counts, rate, elapsed and remaining time, which disappears
-    when the block ends. Pass ``partial(report, "images")`` to what counts only images.
+    when the block ends. Elsewhere it prints a line when a step begins, and its counts twice a
+    minute. Pass ``partial(report, "images")`` to what counts only images.
 
     Args:
-        log: Print a line whenever a step begins if there is no terminal; otherwise print nothing.
+        first: The first step, which has no counts.
     """
     if sys.stderr.isatty():
-        with _bar() as report:
+        with _bar(first) as report:
             yield report
     else:
-        yield _print_steps() if log else lambda what, done, total: None
+        report = _print_steps()
+        if first:
+            report(first, 0, 1)
+        yield report
+
+
+def announce(step: str) -> None:
+    """Say that a step begins whose progress cannot be counted."""
+    click.echo(step, err=True)
 
 
 def tracked(items: Iterable[T], what: str, *, total: int | None = None) -> Iterator[T]:
@@ -57,7 +68,7 @@ def tracked(items: Iterable[T], what: str, *, total: int | None = None) -> Itera
 
 
 @contextmanager
-def _bar() -> Iterator[Report]:
+def _bar(first: str = "") -> Iterator[Report]:
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -81,7 +92,7 @@ def _bar() -> Iterator[Report]:
     with Progress(
         *columns, console=console, transient=True, speed_estimate_period=MEMORY
     ) as progress:
-        bar = progress.add_task("", total=None, rate="")
+        bar = progress.add_task(first, total=None, rate="")
 
         def report(what: str, done: int, total: int) -> None:
             task = progress.tasks[0]
@@ -95,13 +106,14 @@ def _bar() -> Iterator[Report]:
 
 
 def _print_steps() -> Report:
-    last = ""
+    last, told = "", 0.0
 
     def report(what: str, done: int, total: int) -> None:
-        nonlocal last
-        if what != last:
-            click.echo(f"{what} ({total})", err=True)
-            last = what
+        nonlocal last, told
+        now = time.monotonic()
+        if what != last or (now - told >= BETWEEN_LINES and done < total):
+            click.echo(f"{what}: {done} of {total}" if total > 1 else what, err=True)
+            last, told = what, now
 
     return report
 

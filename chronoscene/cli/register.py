@@ -126,7 +126,7 @@ def command(
     scene: Path | None,
     **settings: Any,
 ) -> None:
-    """Register photos of several dates in one frame and write the scene OUT.
+    """Register photos of several dates in one frame as scene OUT.
 
     CAPTURES is a folder with a subfolder of photos for each period; or a folder of photos, whose
     periods are proposed from their dates; or a CSV of image and period. A run that was stopped
@@ -143,7 +143,7 @@ def command(
     found = read_captures(folder, table=table)
     inspections: list[Inspection] = []
     try:
-        with progress_bar(log=True) as report:
+        with progress_bar(f"read {captures}") as report:
             registered = run(
                 found,
                 out,

@@ -26,12 +26,12 @@ SOME_FAILED = 1  # Exit status when a run could not be scored
     help="Folder or file with the weights of LPIPS.",
 )
 def score(runs: Path, lpips_weights: Path | None) -> None:
-    """Score all finished runs in the folder RUNS again and print what changed.
+    """Score the finished runs in RUNS again and print what changed.
 
     Only the predictions of each run and the frozen ground truth are read; their hashes are checked.
     """
-    scorers = make_scorers(lpips_weights=lpips_weights)
-    with progress_bar() as bar:
+    with progress_bar("load the metrics") as bar:
+        scorers = make_scorers(lpips_weights=lpips_weights)
         outcomes = rescore(runs, scorers, progress=partial(bar, "runs"))
     for outcome in outcomes:
         name = outcome.folder.relative_to(runs)

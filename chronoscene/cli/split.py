@@ -11,7 +11,7 @@ import click
 
 from chronoscene.cli.convert import describe_period, read_and_note, reading_options
 from chronoscene.cli.output import check_place, emit, writing_to
-from chronoscene.cli.progress import progress_bar
+from chronoscene.cli.progress import announce, progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.io.staging import check_outside, write_text_atomic
@@ -74,12 +74,13 @@ def command(
     period_by: str | None,
     **options: Any,
 ) -> None:
-    """Choose new test images of SCENE and write their names to the file OUT.
+    """Choose new test images of SCENE and write their names to OUT.
 
-    OUT is a test.txt as described in DATASET.md; a JSON file beside it records how it was made.
-    SCENE is not changed: --scene-out writes a copy with the new split.
+    OUT is a file, a test.txt as described in DATASET.md; a JSON file beside it records how it was
+    made. SCENE is not changed: --scene-out writes a copy with the new split.
     """
     _check_targets(source, out, scene_out)
+    announce(f"read {source}")
     scene = read_and_note(source, dataset_format, period_by)
     split = make_split(scene, SplitSettings(fraction=_fraction(fraction, every), **options))
     for frame in split.scene.frames:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import click
 
 from chronoscene.cli.convert import reading_options
-from chronoscene.cli.output import check_file, check_place, emit, writing_to
+from chronoscene.cli.output import check_file, check_place, emit, tell_written, writing_to
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import find_scenes, model_notes, read_scene
@@ -56,6 +56,14 @@ class Request:
     figure_format: str
     cameras: bool
     pages: Path | None
+
+    def figure(self, name: str) -> Path | None:
+        """Where the figure of a name goes, if figures are asked for."""
+        return self.figures and self.figures / f"{name}.{self.figure_format}"
+
+    def page(self, name: str) -> Path | None:
+        """Likewise for pages."""
+        return self.pages and self.pages / f"{name}.html"
 
 
 @click.command("stats")
@@ -117,10 +125,10 @@ def command(
     out: Path | None,
     **options: object,
 ) -> None:
-    """Print what a scene contains, by period: images, points, tracks, error, overlap, coverage.
+    """Print what a scene contains, by period.
 
-    DIR is a scene or a folder of scenes. Periods are numbered from 0; "-" means that there is
-    nothing to measure.
+    That is images, points, tracks, error, overlap and coverage. DIR is a scene or a folder of
+    scenes. Periods are numbered from 0; "-" means that there is nothing to measure.
 
     All periods of a scene share one point cloud, and the paper does not say how its table splits
     it. Since its periods add up to the total, each point is counted once, in the period with the
@@ -142,7 +150,7 @@ def command(
     _check_places(request, out, paths)
     items = list(zip(paths, _file_names(paths), strict=True))
     work = map_parallel(partial(examine, request), items, lost=_lost)
-    results = list(tracked(work, "scenes", total=len(items)))
+    results = list(tracked(work, "measure scenes", total=len(items)))
     unreadable = [r for r in results if isinstance(r, Unreadable)]
     full = [r for r in results if isinstance(r, SceneStatistics)]
     counts = [s.counts for s in full] or [r for r in results if isinstance(r, SceneCount)]
@@ -153,12 +161,17 @@ def command(
         else:
             text = format_counts(counts, output_format, **extra)
         emit(text, out)
-        if request.figures is not None:
+        written = []
+        if (bars := request.figure("counts")) is not None:
             from chronoscene.figures.bars import draw_bars
 
-            path = request.figures / f"counts.{request.figure_format}"
-            with writing_to("--figures", path):
-                draw_bars(counts, path)
+            with writing_to("--figures", bars):
+                draw_bars(counts, bars)
+            written = [bars]
+        for (_, name), result in zip(items, results, strict=True):
+            if not isinstance(result, Unreadable):
+                written += filter(None, (request.figure(f"{name}_points"), request.page(name)))
+        tell_written(*written)
     notes = (f"{s.name}: {n}" for s in counts for n in model_notes(Path(s.path), s.format))
     for remark in [*notes, *unseen(counts), *against_paper(counts)]:
         click.echo(printable(remark), err=True)
@@ -183,17 +196,15 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
         return Unreadable(str(path), str(error))
     except OSError as error:
         return Unreadable(str(path), f"{error.filename or path}: {error.strerror or error}")
-    if request.figures is not None:
+    if (figure := request.figure(f"{name}_points")) is not None:
         from chronoscene.figures.cloud import cloud_of
         from chronoscene.figures.projections import draw_cloud
 
-        target = request.figures / f"{name}_points.{request.figure_format}"
-        with writing_to("--figures", target):
-            draw_cloud(cloud_of(scene), target, cameras=request.cameras)
-    if request.pages is not None:
+        with writing_to("--figures", figure):
+            draw_cloud(cloud_of(scene), figure, cameras=request.cameras)
+    if (page := request.page(name)) is not None:
         from chronoscene.figures.viewer import write_page
 
-        page = request.pages / f"{name}.html"
         with writing_to("--pages", page):
             write_page(scene, page)
     if request.layout == "paper":

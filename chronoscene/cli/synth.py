@@ -30,7 +30,7 @@ from chronoscene.synth.settings import KINDS
 @click.option("--off-centre/--centred", "off_centre", default=None,
               help="Principal point away from the image centre, or in it.")  # fmt: skip
 def command(out: Path, name: str, size: str | None, **changes: Any) -> None:
-    """Make a city photographed at several dates, in the new folder OUT.
+    """Make a city photographed at several dates, in the folder OUT.
 
     The scene is in the ChronoScene format; OUT/gt holds depth, change masks and the test views
     at every other date. The same options give the same bytes.

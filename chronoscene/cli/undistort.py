@@ -42,14 +42,14 @@ def command(
     dataset_format: str | None,
     period_by: str | None,
 ) -> None:
-    """Undistort the images of SCENE and write it with PINHOLE cameras to the new folder OUT.
+    """Write SCENE with undistorted images to the new folder OUT.
 
-    Observations of points move with the images; poses, periods and split do not change. Images of
-    cameras without distortion are copied; others become 8-bit RGB, black where they were
-    transparent. SCENE is not changed. OUT is in the ChronoScene format.
+    All its cameras become PINHOLE. Observations of points move with the images; poses, periods and
+    split do not change. Images of cameras without distortion are copied; others become 8-bit RGB,
+    black where they were transparent. SCENE is not changed. OUT is in the ChronoScene format.
     """
     check_outside(out, [source])
-    with progress_bar() as bar:
+    with progress_bar(f"read {source}") as bar:
         done = undistort(
             read_and_note(source, dataset_format, period_by),
             out,

@@ -10,7 +10,7 @@ import click
 
 from chronoscene.cli.convert import reading_options
 from chronoscene.cli.output import check_file, check_place, emit
-from chronoscene.cli.progress import tracked
+from chronoscene.cli.progress import announce, tracked
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted, printable
@@ -102,7 +102,7 @@ def command(
     decode: bool,
     fix: Path | None,
 ) -> None:
-    """Check a scene, or every scene in a folder, and report all problems.
+    """Check a scene or a folder of scenes and report all problems.
 
     The scene itself is never changed. With --fix, the report and the exit status are those of the
     corrected copy. --explain CS lists all rules.
@@ -123,10 +123,11 @@ def command(
         check_place("--fix", fix)
         folders = _fix(folder, folders, fix, reading)
     if len(folders) == 1:
+        announce(f"check {folders[0]}")
         reports = [check(folders[0], track=tracked)]
     else:
         done = map_parallel(check, folders, lost=lost_report)
-        reports = list(tracked(done, "validate scenes", total=len(folders)))
+        reports = list(tracked(done, "check scenes", total=len(folders)))
     emit(WRITERS[output_format](reports, strict=strict), out)
     for option, file, write in (("--sarif", sarif, write_sarif), ("--html", html, write_html)):
         if file is not None:
@@ -155,6 +156,7 @@ def _fix(folder: Path, scenes: Sequence[Path], out: Path, reading: Reading) -> l
     copies = []
     for scene in scenes:
         copy = out if scene == folder else out / scene.name
+        announce(f"correct {scene}")
         repairs = fix_scene(scene, copy, reading)
         click.echo(printable(f"{copy}: {counted(len(repairs), 'correction')}"), err=True)
         for repair in repairs:

@@ -29,12 +29,14 @@ FIRST_YEAR = 2016
 
 def run(out: Path, settings: SynthSettings, progress: Progress | None = None) -> None:
     """Generate a scene; see `chronoscene.synth.generate`. Either all of it appears or nothing."""
+    progress = progress or (lambda done, total, what: None)
+    progress(0, 1, "city")
     load_open3d()
     with warnings.catch_warnings(), staged_folder(out) as staged:
         # open3d loads a TBB that is too old for Numba, which warns and uses another layer.
         warnings.filterwarnings("ignore", message="The TBB threading layer")
         raw = staged.parent / "raw"
-        scene = _make(raw, settings, progress or (lambda done, total, what: None), out.name)
+        scene = _make(raw, settings, progress, out.name)
         scene_format.write(scene, staged, image_source="link")
         (raw / "gt").rename(staged / "gt")
 
@@ -68,8 +70,10 @@ def _make(raw: Path, settings: SynthSettings, progress: Progress, name: str) -> 
         image = renderers[frame.period].image(frame.camera, frame.cam_from_world)
         save_image(scene.image_path(frame), image)
         advance("photos")
+    progress(done, total, "points")
     points = make_points(settings, scene, renderers)
     advance("points")
+    progress(done, total, "ground truth")
     write_truth(raw / "gt", scene, world, renderers, advance)
     return replace(scene, points=points)
 

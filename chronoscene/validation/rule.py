@@ -172,6 +172,13 @@ class PeriodSummary:
     test: int | None
     reprojection_px: float | None = None
     """Median over its images of their median reprojection errors, if a rule needed it."""
+    label: str | None = None
+    """None if it has no other than its id."""
+
+    @property
+    def title(self) -> str:
+        """Id, and label in parentheses."""
+        return f"{self.id}" if self.label is None else f"{self.id} ({self.label})"
 
 
 @dataclass(frozen=True, slots=True)

@@ -265,11 +265,14 @@ def _summarise(scene: RawScene) -> Summary:
     # Medians are shown, but not computed, if no rule has needed the reprojections.
     reprojected = "reprojections" in vars(scene) and scene.reprojections is not None
     medians = period_errors(scene) if reprojected else {}
+    labels = _labels(scene)
     in_periods = []
     for period in scene.period_ids:
         total, test = images[period], tests[period] if scene.tests is not None else None
         train = None if test is None else total - test
-        in_periods.append(PeriodSummary(period, total, train, test, medians.get(period)))
+        in_periods.append(
+            PeriodSummary(period, total, train, test, medians.get(period), labels.get(period))
+        )
     return Summary(
         images=None if scene.images is None else len(scene.images),
         cameras=None if scene.cameras is None else len(scene.cameras),
@@ -278,3 +281,12 @@ def _summarise(scene: RawScene) -> Summary:
         image_files=len(scene.files),
         periods=tuple(in_periods),
     )
+
+
+def _labels(scene: RawScene) -> dict[int, str]:
+    """Labels of the periods that are more than their ids; none if they cannot be read."""
+    try:
+        periods = our_format.read_periods(scene.root, len(scene.period_ids))
+    except ChronoSceneError:  # a rule says so
+        return {}
+    return {p.id: printable(p.label) for p in periods if p.label != str(p.id)}

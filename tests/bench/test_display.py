@@ -14,6 +14,7 @@ def shown(live, width=200):
     buffer = io.StringIO()
     console = Console(file=buffer, force_terminal=live, width=width, color_system=None)
     with ProgressDisplay("plaza: toy [x]", console) as display:
+        display.wait("warm-up")
         display.begin("all", StopRule(100, None))
         for i, psnr in enumerate([None, 20.0, 20.0, 21.0], start=1):
             display.update(25 * i, 5.0 * i, StepReport(0.5, 1234), psnr)
@@ -24,9 +25,12 @@ def shown(live, width=200):
 
 def test_without_a_terminal_each_probe_is_a_line():
     assert shown(False).splitlines() == [
+        "plaza: toy [x]: warm-up",
+        "plaza: toy [x]: training",
         "plaza: toy [x]:  50% iteration 50, loss 0.5000, 20.00 dB, 5.0 it/s, 0:10 left, "
         "1234 primitives",
         "plaza: toy [x]: 100% iteration 100, loss 0.5000, 21.00 dB, 5.0 it/s, 1234 primitives",
+        "plaza: toy [x] period-1: training",
         "plaza: toy [x] period-1:  10% iteration 12345, loss 0.2500, 30.00 dB, 2057.5 it/s, "
         "0:54 left, 7 primitives",
     ]

@@ -13,7 +13,7 @@ import chronoscene.cli.bench as bench_module
 from chronoscene.bench.results import Failure
 from chronoscene.bench.runner import BenchOutcome
 from chronoscene.cli import cli
-from chronoscene.errors import ConfigError
+from chronoscene.errors import BackendError, ConfigError
 
 PLUGINS = Path(__file__).parents[1] / "bench" / "plugins"
 IMAGES = {f"{folder}/{i}.png": period for period, folder in enumerate("ab") for i in range(3)}
@@ -103,6 +103,21 @@ def settings(monkeypatch):
         return seen[-1]
 
     return invoke
+
+
+def test_a_device_that_is_not_there_is_refused_before_anything_is_read(
+    make_scene_folder, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("chronoscene.bench.plan.read_scene", lambda path: pytest.fail("read"))
+    command = ["bench", str(make_scene_folder()), "--method", "3dgs", "--out", str(tmp_path / "r")]
+    result = CliRunner().invoke(cli, [*command, "--device", "cuda"])
+    assert isinstance(result.exception, BackendError)
+    assert str(result.exception).startswith("--device cuda: expected a CUDA device")
+    assert not (tmp_path / "r").exists()
+    result = CliRunner().invoke(cli, [*command, "--device", "cuda:3"])
+    assert result.exit_code == 2 and "'cuda:3' is not one of 'auto', 'cpu', 'cuda'" in result.stderr
+    assert not (tmp_path / "r").exists()
 
 
 def test_defaults(settings):

@@ -23,6 +23,20 @@ def test_help_lists_every_command():
         assert name in result.output
 
 
+def test_summaries_are_whole_sentences():
+    known = CliRunner().invoke(cli, ["--help"], terminal_width=80).output
+    summaries = known.partition("Commands:\n")[2].splitlines()
+    assert len(summaries) == len(COMMANDS)
+    for line in summaries:
+        assert line.endswith(".") and not line.endswith("..")
+
+
+def test_the_package_can_be_run():
+    command = [sys.executable, "-m", "chronoscene", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.stdout.startswith("chronoscene, version "), done.stderr
+
+
 def test_unknown_command_is_a_usage_error():
     result = CliRunner().invoke(cli, ["frobnicate"])
     assert result.exit_code == 2

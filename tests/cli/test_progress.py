@@ -1,4 +1,4 @@
-"""The bar of all long commands: what it shows on a terminal, and the lines in a log."""
+"""The progress of all long commands: a bar on a terminal, and plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -97,19 +97,53 @@ def test_what_an_earlier_run_did_makes_nothing_faster(terminal: Terminal, clock:
     assert " 930/1000 1/s 0:00:30 < 0:01:10" in terminal.frames()[-1]
 
 
-def test_in_a_log_each_step_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress_bar(log=True) as bar:
+def test_in_a_log_each_step_is_a_line(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: 100.0))
+    with progress_bar("read scene") as bar:
         for what, total in (("features", 3), ("pairs", 123)):
-            for done in range(3):
-                bar(what, done, total)
-    assert capsys.readouterr() == ("", "features (3)\npairs (123)\n")
+            for done in range(total + 1):
+                partial(bar, what)(done, total)
+    assert list(tracked([1], "scenes")) == [1]
+    lines = ["read scene", "features: 0 of 3", "pairs: 0 of 123", "scenes"]
+    assert capfd.readouterr() == ("", "".join(f"{line}\n" for line in lines))
 
 
-def test_other_commands_leave_logs_alone(capfd: pytest.CaptureFixture[str]) -> None:
-    with progress_bar() as bar:
-        partial(bar, "images")(1, 2)
-    assert list(tracked([1, 2], "scenes")) == [1, 2]
-    assert capfd.readouterr() == ("", "")
+def test_in_a_log_a_long_step_is_told_twice_a_minute(
+    capfd: pytest.CaptureFixture[str], clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=clock))
+    for _ in tracked(range(12), "images"):
+        clock.now += 10
+    lines = [f"images: {done} of 12" for done in (0, 3, 6, 9)]
+    assert capfd.readouterr() == ("", "".join(f"{line}\n" for line in lines))
+
+
+@pytest.mark.parametrize(
+    ("words", "begins"),
+    [
+        ("convert {scene} {out}", ["read {scene}", "images: 1 of 4"]),
+        ("undistort {scene} {out}", ["read {scene}", "images: 1 of 4"]),
+        ("split {scene} --scene-out {out}", ["read {scene}", "images: 1 of 4"]),
+        ("validate {scene} --decode", ["check {scene}", "decode images: 0 of 4"]),
+        ("validate {scene} --fix {out}", ["correct {scene}", "check {out}"]),
+        ("stats {scene}", ["measure scenes"]),
+        (
+            "synth {out} --preset tiny --views 4 --size 32x24",
+            ["city", "photos: 2 of 12", "points: 9 of 12", "ground truth: 10 of 12"],
+        ),
+    ],
+)
+def test_without_a_terminal_commands_say_what_they_begin(
+    make_scene_folder: Callable[[], Path], tmp_path: Path, words: str, begins: list[str]
+) -> None:
+    places = {"scene": make_scene_folder(), "out": tmp_path / "out"}
+    done = CliRunner().invoke(cli, words.format(**places).split(), catch_exceptions=False)
+    lines = done.stderr.splitlines()
+    expected = [line.format(**places) for line in begins]
+    assert [line for line in lines if line in expected] == expected
+    assert not re.search(r"[\r\x1b]", done.stderr) and len(lines) <= 8
 
 
 def test_tracked_items_are_counted_when_they_are_done_with(
@@ -144,7 +178,7 @@ def test_rate(speed: float | None, text: str) -> None:
         ("undistort {scene} {out}", ("images", 4, 4)),
         ("split {scene} --scene-out {out}", ("images", 4, 4)),
         ("validate {scene} --decode", ("decode images", 4, 4)),
-        ("stats {scene}", ("scenes", 1, 1)),
+        ("stats {scene}", ("measure scenes", 1, 1)),
         ("synth {out} --preset tiny --views 4 --size 32x24", ("ground truth", 12, 12)),
     ],
 )
@@ -158,7 +192,7 @@ def test_commands_tell_their_progress(
     told: list[tuple[str, int, int]] = []
 
     @contextmanager
-    def bar() -> Iterator[progress.Report]:
+    def bar(first: str) -> Iterator[progress.Report]:
         yield lambda *call: told.append(call)
 
     terminal = SimpleNamespace(stderr=SimpleNamespace(isatty=lambda: True))

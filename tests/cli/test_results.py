@@ -64,7 +64,7 @@ def runs(tmp_path):
 def table(*arguments):
     result = CliRunner().invoke(cli, ["table", *map(str, arguments)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
-    return result.output
+    return result.stdout
 
 
 def test_the_terminal_table(runs):
@@ -136,7 +136,7 @@ def test_changes_are_told(score, tmp_path):
         skipped={"lpips_vgg": "no weights"},
     )
     assert result.exit_code == 0
-    assert result.output.splitlines() == [
+    assert result.stdout.splitlines() == [
         "s/m/seed0: unchanged",
         "s/m/seed1: psnr 20 -> 21 (macro); lpips_vgg new: 0.1",
         "s/m/seed2: unchanged",

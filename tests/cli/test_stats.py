@@ -28,7 +28,7 @@ def run(*args: object):
 def test_a_scene(make_scene_folder):
     result = run(make_scene_folder(), "--layout", "paper")
     assert result.exit_code == 0, result.output
-    (row,) = [line for line in result.output.splitlines() if line.lstrip().startswith("scene ")]
+    (row,) = [line for line in result.stdout.splitlines() if line.lstrip().startswith("scene ")]
     images_0, points_0, images_1, points_1, images, points = map(int, row.split()[1:])
     assert (images_0, images_1, images, points) == (2, 2, 4, 30)
     assert points_0 + points_1 == 30
@@ -39,7 +39,7 @@ def test_a_folder_of_scenes_and_several_folders(make_scene_folder, tmp_path):
     make_scene_folder({"1.png": 0, "2.png": 1, "3.png": 2}, name="set/a")
     single = make_scene_folder(name="single")
     result = run(tmp_path / "set", single, "--layout", "paper", "--format", "csv")
-    rows = list(csv.DictReader(io.StringIO(result.output)))
+    rows = list(csv.DictReader(io.StringIO(result.stdout)))
     assert [row["scene"] for row in rows] == ["a", "b", "single", "Total"]
     assert [row["period_2_images"] for row in rows] == ["1", "", "", "1"]
     assert [row["total_images"] for row in rows] == ["3", "4", "4", "11"]
@@ -53,8 +53,9 @@ def test_out_holds_what_would_be_printed(make_scene_folder, tmp_path, output_for
     printed = run(folder, *options)
     out = tmp_path / "counts"
     written = run(folder, *options, "--out", out)
-    assert (written.exit_code, written.output) == (0, "")
-    assert out.read_text(encoding="utf-8") == printed.output
+    assert (written.exit_code, written.stdout) == (0, "")
+    assert written.stderr == f"measure scenes\nwrote {out}\n"
+    assert out.read_text(encoding="utf-8") == printed.stdout
     assert sorted(p.name for p in tmp_path.iterdir()) == ["counts", "scene"]
 
 
@@ -62,7 +63,7 @@ def test_seen_counts_more(make_scene_folder):
     folder = make_scene_folder()
 
     def points(*args: object) -> list[int]:
-        data = json.loads(run(folder, "--format", "json", *args).output)
+        data = json.loads(run(folder, "--format", "json", *args).stdout)
         return [p["points"] for p in data["scenes"][0]["periods"]]
 
     assert sum(points()) == 30
@@ -151,7 +152,10 @@ def test_a_scene_that_cannot_be_read_does_not_cost_the_others(make_scene_folder,
     done = shell(tmp_path / "set", *options, "--format", "json")
     assert done.returncode == 1
     place = folders[1] / "sparse/split.txt"
-    (line,) = done.stderr.splitlines()
+    begin, *wrote, line = done.stderr.splitlines()
+    assert begin == "measure scenes: 0 of 3"
+    names = ("counts", "0_points", "2_points")
+    assert wrote == [f"wrote {out / name}.png" for name in names]
     assert line.startswith(f"error: {place}:1: expected")
     data = json.loads(done.stdout)
     assert [s["name"] for s in data["scenes"]] == ["0", "2"]
@@ -162,7 +166,7 @@ def test_a_scene_that_cannot_be_read_does_not_cost_the_others(make_scene_folder,
         (folder / "sparse/split.txt").write_text("a/0001.png\n")
     done = shell(tmp_path / "set", *options)
     assert (done.returncode, done.stdout) == (2, "")
-    assert len(done.stderr.splitlines()) == 3
+    assert len(done.stderr.splitlines()) == 4
 
 
 def test_a_scene_that_is_not_known_as_one_is_not_left_out_in_silence(make_scene_folder, tmp_path):
@@ -175,7 +179,7 @@ def test_a_scene_that_is_not_known_as_one_is_not_left_out_in_silence(make_scene_
     data = json.loads(result.stdout)
     assert [s["name"] for s in data["scenes"]] == ["a", "c"]
     assert [u["path"] for u in data["unreadable"]] == [str(tmp_path / "set/b")]
-    assert "split.txt" in result.stderr and len(result.stderr.splitlines()) == 1
+    assert "split.txt" in result.stderr and len(result.stderr.splitlines()) == 2
 
 
 def test_out_is_looked_at_before_the_work(make_scene_folder, tmp_path, monkeypatch):
@@ -190,7 +194,7 @@ def test_counts_are_compared_with_those_of_the_paper(tmp_path):
     write_skeleton(tmp_path / "lawncourt", [(a, b // 100) for a, b in paper])
     write_skeleton(tmp_path / "other", [(3, 10)])
     result = run(tmp_path / "other", tmp_path / "lawncourt", "--layout", "paper")
-    (line,) = result.stderr.splitlines()
+    _, line = result.stderr.splitlines()
     assert line.startswith("lawncourt: the paper has 234 + 193 + 277 images and 85,655 + 57,884")
     data = json.loads(run(tmp_path / "lawncourt", "--format", "json").stdout)
     found = data["scenes"][0]["paper"]

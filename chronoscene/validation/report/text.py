@@ -97,7 +97,7 @@ def _summary(summary: Summary) -> str:
     parts = [f"{w}s unknown" if n is None else counted(n, w) for w, n in numbers.items()]
     if summary.periods:
         each = ", ".join(
-            f"{p.id}: {p.images}" if p.test is None else f"{p.id}: {p.train} + {p.test} test"
+            f"{p.title}: {p.images}" if p.test is None else f"{p.title}: {p.train} + {p.test} test"
             for p in summary.periods
         )
         parts.append(f"{counted(len(summary.periods), 'period')} ({each})")

@@ -1,6 +1,9 @@
 """The HTML report: complete, escaped, self-contained, and no picture from elsewhere."""
 
 import re
+import shutil
+import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
@@ -109,3 +112,34 @@ def test_each_of_several_remedies_stands_with_its_finding(scene):
     page = write_html([scene.validate()])
     rows = [row for row in page.split("<li>") if "cameras.txt (camera" in row and "px" in row]
     assert ["chronoscene undistort" in row for row in rows] == [True, False]
+
+
+PHONE = """<iframe src="page.html" width="360" height="800" style="border: 0"></iframe>
+<script>onload = () => {
+  const page = frames[0].document, boxes = [page.scrollingElement, ...page.querySelectorAll("div")];
+  document.body.dataset.wide = boxes.map(box => box.scrollWidth - box.clientWidth);
+}</script>
+"""
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium on this machine")
+def test_the_page_fits_a_phone(bad, tmp_path):
+    """Nothing needs scrolling sideways. A frame, since headless windows are wider than phones."""
+    bad.write("sparse/periods.json", '[{"id": 0, "label": "%s"}, {"id": 1}]' % ("unbroken" * 20))
+    bad.write("sparse/split.txt", [*bad.lines("sparse/split.txt"), f"{'x' * 200}.png 0"])
+    report = bad.validate()
+    assert report.summary.periods[0].label == "unbroken" * 20
+    long = replace(report, name="w" * 150)
+    (tmp_path / "page.html").write_text(write_html([report, long]))
+    (tmp_path / "phone.html").write_text(PHONE)
+    command = [
+        "chromium", "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
+        "--no-first-run", "--disable-background-networking", "--disable-component-update",
+        "--disable-sync", f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom",
+        "--allow-file-access-from-files", f"file://{tmp_path / 'phone.html'}",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    found = re.search(r'data-wide="([-0-9,]+)"', done.stdout)
+    assert found is not None, done.stderr[-500:]
+    wider = [int(pixels) for pixels in found[1].split(",")]
+    assert len(wider) > 10 and max(wider) <= 0

@@ -25,7 +25,7 @@ def finding(i=0, *, code="CS201", severity="error", found="nothing", remedy="cop
 
 
 def report(*findings, name="scene", skipped=()):
-    periods = (PeriodSummary(0, 7, 6, 1), PeriodSummary(1, 7, None, None))
+    periods = (PeriodSummary(0, 7, 6, 1), PeriodSummary(1, 7, None, None, label="autumn"))
     summary = Summary(14, 1, None, None, 15, periods)
     return SceneReport(name, Path("data") / name, summary, tuple(findings), tuple(skipped))
 
@@ -38,7 +38,7 @@ def test_text_of_a_scene():
     skipped = [Skipped("CS206", "why not"), Skipped("CS604", "why not")]
     remark = finding(3, code="CS507", severity="info", remedy="nothing to do")
     assert text_of(report(finding(), remark, skipped=skipped)).splitlines() == [
-        "scene: 14 images, 1 camera, points unknown, 2 periods (0: 6 + 1 test, 1: 7)",
+        "scene: 14 images, 1 camera, points unknown, 2 periods (0: 6 + 1 test, 1 (autumn): 7)",
         "  error CS201 image-missing: The file of a registered image is missing.",
         "    images/0.jpg: expected an image, found nothing",
         "    to do: copy it",
@@ -112,6 +112,7 @@ def test_json_has_every_finding():
         "train": 6,
         "test": 1,
         "reprojection_px": None,
+        "label": None,
     }
 
 
