@@ -21,6 +21,8 @@ from chronoscene.metrics.lpips_weights import check_available
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
 
+BUDGET_NOTICE = "--budget: schedules follow the clock, and equal seeds do not give equal models"
+
 Say = Callable[[str], None]
 """Takes one line for the user."""
 
@@ -121,6 +123,7 @@ def _scene_jobs(
     """Every method, strategy and seed on one scene."""
     overrides = split_overrides(settings, [spec for _, spec in specs])
     digest, split = scene_hash(scene), split_hash(scene)
+    budget = settings.budget_seconds
     for (reference, spec), wanted, seed in product(specs, settings.strategies, settings.seeds):
         strategy, notice = effective_strategy(spec, wanted)
         job = Job(
@@ -135,7 +138,7 @@ def _scene_jobs(
             preset=settings.preset,
             overrides=overrides[spec.name],
             iterations=settings.iterations,
-            budget_seconds=settings.budget_seconds,
+            budget_seconds=budget,
             separate_iterations=settings.separate_iterations,
             seed=seed,
             max_width=settings.max_width,
@@ -144,7 +147,7 @@ def _scene_jobs(
             runs=str(settings.runs.resolve()),
             lpips_weights=str(settings.lpips_weights.resolve()) if settings.lpips_weights else None,
             commit=commit,
-            notices=[notice] if notice else [],
+            notices=[*filter(None, [notice]), *([] if budget is None else [BUDGET_NOTICE])],
             plugin_path=str(Path.cwd()) if ":" in reference else None,
         )
         yield job, spec

@@ -40,7 +40,9 @@ EXISTING = click.Path(path_type=Path, exists=True)
 @format_option("the scenes")
 @click.option("--preset", default="balanced", show_default=True, help="Preset of the methods.")
 @click.option(
-    "--budget", help="Stop after this time on the training clock, such as 90s, 5m or 1h30m."
+    "--budget",
+    help="Stop after this time on the training clock, such as 90s, 5m or 1h30m. Schedules follow "
+    "the clock then, and equal seeds do not give equal models.",
 )
 @click.option("--iterations", type=click.IntRange(min=1), help="Stop after this many iterations.")
 @click.option(
@@ -54,7 +56,11 @@ EXISTING = click.Path(path_type=Path, exists=True)
     "--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Number of seeds."
 )
 @click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="First seed."
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="First seed. Equal seeds give equal models on one machine's CPU, but not with --budget.",
 )
 @click.option(
     "--set",

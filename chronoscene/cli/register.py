@@ -140,12 +140,11 @@ def command(
     for option, place in (("OUT", out), ("--work", options.work_folder(out))):
         check_outside(place, [folder, *([] if scene is None else [scene])], option=option)
         check_place(option, place)
-    found = read_captures(folder, table=table)
     inspections: list[Inspection] = []
     try:
         with progress_bar(f"read {captures}") as report:
             registered = run(
-                found,
+                read_captures(folder, table=table),
                 out,
                 options,
                 into=None if scene is None else read_scene(scene),

@@ -11,6 +11,7 @@ import pytest
 from chronoscene.bench import results
 from chronoscene.bench.predictions import read_manifest
 from chronoscene.bench.results import read_rows, read_run, run_folders
+from chronoscene.bench.tables import format_runs
 from chronoscene.errors import ConfigError, MetricUnavailableError, SceneError
 
 FIELDS = {
@@ -154,11 +155,14 @@ def test_other_settings_are_refused_or_replace(bench, runs):
 
 def test_seeds_overrides_and_budgets(bench):
     overrides = {"sleep": "0.01", "mean.rate": "0.25"}
-    outcome, _ = bench("MEAN", budget_seconds=0.4, seeds=(3,), overrides=overrides)
+    outcome, said = bench("MEAN", budget_seconds=0.4, seeds=(3,), overrides=overrides)
     (folder,) = outcome.finished
     record = read_run(folder)
     assert folder.name == "seed3" and record.seed == 3
     assert record.seconds >= 0.4 and 1 <= record.iterations <= 40  # each takes 0.01 or more
+    (notice,) = record.notices
+    assert "equal seeds do not give equal models" in notice and f"note: {notice}" in said
+    assert notice in format_runs([record], [], "table")
     config = json.loads((folder / "config.json").read_text())["config"]
     assert config["method_config"]["rate"] == 0.25
     assert config["stop"] == {"iterations": None, "seconds": 0.4}

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 from click.testing import CliRunner
 
@@ -118,6 +119,12 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_read(
     result = CliRunner().invoke(cli, [*command, "--device", "cuda:3"])
     assert result.exit_code == 2 and "'cuda:3' is not one of 'auto', 'cpu', 'cuda'" in result.stderr
     assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize("option", ["--budget", "--seed"])
+def test_help_does_not_promise_equal_models_of_budgets(option):
+    found = {o.opts[0]: o.help for o in bench_module.command.params if isinstance(o, click.Option)}
+    assert "qual seeds" in found[option] and "not" in found[option]
 
 
 def test_defaults(settings):

@@ -59,6 +59,48 @@ def test_the_option_is_named(
     assert not (places / "new").exists()
 
 
+@pytest.mark.parametrize("place", ["scene/x", "link/x", "figures/../scene/x", "linked/x"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "bench scene --method 3dgs --out",
+        "convert scene",
+        "register photos",
+        "register photos new --work",
+        "register photos --into scene",
+        "register photos new --into scene --work",
+        "split scene",
+        "split scene --scene-out",
+        "stats scene --out",
+        "stats scene --figures",
+        "stats scene --pages",
+        "undistort scene",
+        "validate scene --out",
+        "validate scene --sarif",
+        "validate scene --html",
+        "validate scene --fix",
+    ],
+)
+def test_nothing_is_written_into_a_dataset(
+    places: Path, monkeypatch: pytest.MonkeyPatch, words: str, place: str
+) -> None:
+    """Not by its name, nor through a link to it, nor into a folder that it links to."""
+    monkeypatch.chdir(places)
+    (places / "scene/images").rename(places / "linked")
+    (places / "scene/images").symlink_to(places / "linked")
+    (places / "link").symlink_to("scene")
+    if "register" in words and "--into" not in words:
+        place = place.replace("scene", "photos").replace("linked", "photos/a")
+        (places / "link").unlink()
+        (places / "link").symlink_to("photos")
+    before = sorted(places.rglob("*"))
+    result = CliRunner().invoke(cli, [*words.split(), place])
+    assert isinstance(result.exception, ConfigError), result.exception
+    assert place in result.exception.place
+    assert result.exception.expected == "a place outside the scene"
+    assert sorted(places.rglob("*")) == before
+
+
 def test_a_table(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(results, "read_runs", lambda folders: ([], []))
     monkeypatch.setattr(results, "format_runs", lambda *_: "no runs\n")
