@@ -58,6 +58,10 @@ class ImageError(SceneError):
     """An image that is missing, damaged or of an unsupported kind."""
 
 
+class DiskFullError(ChronoSceneError):
+    """A disk without space for what is to be written; nothing half written is left."""
+
+
 class RegistrationError(ChronoSceneError):
     """Photos that cannot be registered, or a step that failed; what was computed is kept."""
 

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from chronoscene.bench.results import GROUND_TRUTH
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.images.store import ImageStore
-from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.staging import needing_space, replacing, write_text_atomic
 from chronoscene.scene import Scene
 
 MANIFEST = "manifest.json"
@@ -119,7 +119,8 @@ class ImageWriter:
         file = image_file(view)
         target = self.folder / file
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(data)
+        with replacing(target) as partial:
+            partial.write_bytes(data)
         self._entries.append(
             ImageEntry(
                 view=view,
@@ -242,15 +243,18 @@ def _write_ground_truth(
 ) -> None:
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
-        writer = ImageWriter(partial)
-        for frame in scene.select(split="test"):
-            writer.add(
-                frame.name,
-                store.load(frame),
-                camera_period=frame.period,
-                rendered_period=frame.period,
+        with needing_space(folder):
+            writer = ImageWriter(partial)
+            for frame in scene.select(split="test"):
+                writer.add(
+                    frame.name,
+                    store.load(frame),
+                    camera_period=frame.period,
+                    rendered_period=frame.period,
+                )
+            writer.close(
+                kind="ground truth", scene=scene.name, scene_hash=scene_hash, details=details
             )
-        writer.close(kind="ground truth", scene=scene.name, scene_hash=scene_hash, details=details)
         if not folder.exists():  # another bench may have written it meanwhile
             os.replace(partial, folder)
     finally:

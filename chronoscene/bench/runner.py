@@ -11,6 +11,7 @@ from pathlib import Path
 from chronoscene.bench import results
 from chronoscene.bench.job import Job
 from chronoscene.bench.plan import BenchSettings, Say, is_finished, plan_jobs
+from chronoscene.errors import DiskFullError
 from chronoscene.io.processes import run_worker, stoppable
 
 Execute = Callable[[Job], results.Failure | None]
@@ -70,6 +71,8 @@ def run_in_process(job: Job) -> results.Failure | None:
         outcome = run_worker(
             "chronoscene.bench.worker:execute", asdict(replace(job, staging=str(staging)))
         )
+        if outcome.message is not None and "error" in outcome.message:
+            raise DiskFullError(**outcome.message["error"])
     except BaseException:
         shutil.rmtree(staging, ignore_errors=True)
         raise

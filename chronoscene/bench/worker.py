@@ -45,11 +45,11 @@ from chronoscene.bench.training_loop import (
     train,
     warm_up,
 )
-from chronoscene.errors import ChronoSceneError
+from chronoscene.errors import ChronoSceneError, DiskFullError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
 from chronoscene.io.processes import Report
-from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
@@ -262,10 +262,13 @@ def execute(document: dict[str, Any], _: Report) -> None:
     if job.plugin_path is not None:
         sys.path.append(job.plugin_path)
     try:
-        run_job(job)
+        with needing_space(job.folder):
+            run_job(job)
+    except DiskFullError:  # nothing can be recorded, and the other runs would fail as well
+        raise
     except ChronoSceneError as error:
         results.write_failure(staging, job.failure(str(error)))
     except Exception as error:  # a fault in a method must not end the other runs
-        (staging / "error.log").write_text(traceback.format_exc(), encoding="utf-8")
+        write_text_atomic(staging / "error.log", traceback.format_exc())
         reason = f"{type(error).__name__}: {error} (see error.log)"
         results.write_failure(staging, job.failure(reason))

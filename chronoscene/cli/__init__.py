@@ -10,6 +10,7 @@ import click
 from chronoscene import __version__
 from chronoscene.errors import ChronoSceneError
 from chronoscene.io.processes import stoppable
+from chronoscene.io.staging import disk_full
 
 COMMANDS = {
     "bench": "chronoscene.cli.bench:command",
@@ -60,6 +61,8 @@ def main() -> None:
     except ChronoSceneError as error:
         _end(str(error))
     except OSError as error:  # a full disk, a place that went away
+        if (full := disk_full(error, error.filename or "output")) is not None:
+            _end(str(full))
         place = f"{error.filename}: " if error.filename else ""
         _end(f"{place}{error.strerror or error}; what was finished before is kept")
 

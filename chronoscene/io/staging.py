@@ -2,13 +2,45 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from chronoscene.errors import ConfigError, SceneError
+from chronoscene.errors import ConfigError, DiskFullError, SceneError
+
+_FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}  # Windows has no quotas of this kind
+
+
+def disk_full(error: OSError, place: object) -> DiskFullError | None:
+    """The error that names the place if there is no space left on its disk; None for others."""
+    if error.errno not in _FULL:
+        return None
+    return DiskFullError(
+        place,
+        expected="space for what is written there",
+        found=error.strerror or str(error),
+        todo="make room on this disk, or choose a place on another one",
+    )
+
+
+@contextmanager
+def needing_space(place: Path) -> Iterator[None]:
+    """Name the place if the block finds its disk full; of several around a block, the outermost.
+
+    Raises:
+        DiskFullError: Instead of an OSError that says so.
+    """
+    try:
+        yield
+    except DiskFullError as error:
+        raise DiskFullError(**{**error.fields, "place": str(place)}) from error
+    except OSError as error:
+        if (full := disk_full(error, place)) is None:
+            raise
+        raise full from error
 
 
 @contextmanager
@@ -17,11 +49,15 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Args:
         path: The file to write; its folder must exist. Another file of this name is replaced.
+
+    Raises:
+        DiskFullError: If there is no space for it.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        yield partial
-        partial.replace(path)
+        with needing_space(path):
+            yield partial
+            partial.replace(path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
@@ -39,6 +75,7 @@ def staged_folder(out: Path) -> Iterator[Path]:
 
     Raises:
         SceneError: If ``out`` is a file or has content, or the disk refuses.
+        DiskFullError: If there is no space for it.
     """
     try:
         check_not_current(out)
@@ -51,7 +88,10 @@ def staged_folder(out: Path) -> Iterator[Path]:
                 todo="choose another folder",
             )
         out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary:
+        with (
+            needing_space(out),
+            tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as temporary,
+        ):
             staged = Path(temporary) / "scene"
             staged.mkdir()
             yield staged
@@ -63,7 +103,7 @@ def staged_folder(out: Path) -> Iterator[Path]:
             error.filename or out,
             expected="a place that can be written to",
             found=error.strerror or str(error),
-            todo="choose another folder, or make room",
+            todo="choose another folder",
         ) from error
 
 

@@ -17,7 +17,7 @@ from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images.store import Progress
-from chronoscene.io.staging import check_not_current, write_text_atomic
+from chronoscene.io.staging import check_not_current, needing_space, write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, certify
 from chronoscene.registration.quality.certificate_json import to_json
 from chronoscene.registration.quality.verdict import Verdict, judge
@@ -144,7 +144,7 @@ def publish(staged: Path, out: Path) -> None:
     out.parent.mkdir(parents=True, exist_ok=True)
     if staged.stat().st_dev != out.parent.stat().st_dev:
         near = out.with_name(f".{out.name}.{os.getpid()}.partial")
-        shutil.copytree(staged, near)
+        _copy(staged, near, out)
         shutil.rmtree(staged)
         staged = near
     old = out.with_name(f".{out.name}.{os.getpid()}.old")
@@ -152,6 +152,20 @@ def publish(staged: Path, out: Path) -> None:
         out.rename(old)
     staged.rename(out)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _copy(source: Path, near: Path, out: Path) -> None:
+    """Copy a folder to a temporary place beside ``out``, whole or not at all."""
+
+    def copy(file: str, target: str) -> None:
+        with needing_space(out):
+            shutil.copy2(file, target)
+
+    try:
+        shutil.copytree(source, near, copy_function=copy)
+    except BaseException:
+        shutil.rmtree(near, ignore_errors=True)
+        raise
 
 
 def add_period(scene: Scene, registered: Registered, name: str) -> Scene:

@@ -34,7 +34,10 @@ def save_image(path: Path, image: NDArray[np.uint8]) -> None:
     """Write an RGB or grey image; JPEG has quality 95 and no chroma subsampling."""
     path.parent.mkdir(parents=True, exist_ok=True)
     image = np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image
-    assert cv2.imwrite(str(path), image, JPEG_FLAGS if path.suffix == ".jpg" else [])
+    # Not cv2.imwrite, which does not say why it failed.
+    done, data = cv2.imencode(path.suffix, image, JPEG_FLAGS if path.suffix == ".jpg" else [])
+    assert done
+    path.write_bytes(data.tobytes())
 
 
 def change_mask(here: PixelMaps, there: PixelMaps) -> NDArray[np.uint8]:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,8 +61,10 @@ def save_tensors(
     with replacing(folder / f"{stem}.safetensors") as partial:
         try:
             save_file(stored, partial)
-        except SafetensorError as error:  # how it reports a full disk
-            raise OSError(str(error)) from error
+        except SafetensorError as error:  # it wraps the errors of the system
+            if (number := re.search(r"\(os error (\d+)\)", str(error))) is None:
+                raise
+            raise OSError(int(number[1]), os.strerror(int(number[1])), str(folder)) from error
         digest = _sha256(partial)
     document = {**meta, "format_version": FORMAT_VERSION, "tensors_sha256": digest}
     text = json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n"

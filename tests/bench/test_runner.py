@@ -12,7 +12,7 @@ from chronoscene.bench import results
 from chronoscene.bench.predictions import read_manifest
 from chronoscene.bench.results import read_rows, read_run, run_folders
 from chronoscene.bench.tables import format_runs
-from chronoscene.errors import ConfigError, MetricUnavailableError, SceneError
+from chronoscene.errors import ConfigError, DiskFullError, MetricUnavailableError, SceneError
 
 FIELDS = {
     "method",
@@ -56,6 +56,7 @@ def test_runs_lie_where_they_should(finished_bench):
         "predictions/manifest.json",
         "rows.csv",
         "run.json",
+        "source.json",
     ]
     separate = runs / "ring/mean-separate-balanced/seed0/checkpoint"
     assert sorted(p.name for p in separate.iterdir()) == ["period-0", "period-1"]
@@ -166,6 +167,15 @@ def test_seeds_overrides_and_budgets(bench):
     config = json.loads((folder / "config.json").read_text())["config"]
     assert config["method_config"]["rate"] == 0.25
     assert config["stop"] == {"iterations": None, "seconds": 0.4}
+
+
+def test_a_full_disk_ends_the_bench_and_leaves_nothing_half(bench, tmp_path):
+    with pytest.raises(DiskFullError, match=r"full-disk-joint-balanced/seed0: expected space for"):
+        bench("MEAN", "FULL_DISK", "BLIND", iterations=1)
+    runs = tmp_path / "runs"
+    assert names(runs) == ["ring/mean-joint-balanced/seed0"]
+    assert not list(runs.rglob("*.partial")) and not list(runs.rglob("seed0/failed.json"))
+    assert len(json.loads((runs / "results.json").read_text())) == 1
 
 
 def test_separate_models_share_or_repeat(bench):

@@ -1,9 +1,21 @@
 """Files appear complete or not at all."""
 
+import errno
+import os
+import re
+
 import pytest
 
-from chronoscene.errors import ConfigError
-from chronoscene.io.staging import check_outside, replacing, write_text_atomic
+from chronoscene.errors import ConfigError, DiskFullError, SceneError
+from chronoscene.io.staging import (
+    check_outside,
+    needing_space,
+    replacing,
+    staged_folder,
+    write_text_atomic,
+)
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # writes of a file do not name it
 
 
 def test_text_is_utf8_with_plain_line_ends(tmp_path):
@@ -45,3 +57,29 @@ def test_what_a_scene_links_to_is_inside_of_it(tmp_path):
     for place in (scene, scene / "out", photos, photos / "new" / "out"):
         with pytest.raises(ConfigError, match="expected a place outside the scene, found one in"):
             check_outside(place, [scene])
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+    path = tmp_path / "a.txt"
+    message = f"{path}: expected space for what is written there, found No space left on device;"
+    with pytest.raises(DiskFullError, match=re.escape(message)), replacing(path) as partial:
+        partial.write_text("half")
+        raise FULL
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_folder(tmp_path):
+    out = tmp_path / "out"
+    with pytest.raises(DiskFullError) as caught, staged_folder(out) as staged:
+        (staged / "half").touch()
+        with replacing(staged / "a.txt"):
+            raise FULL
+    assert caught.value.place == str(out)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_errors_of_the_system_are_no_full_disks(tmp_path):
+    with pytest.raises(PermissionError), needing_space(tmp_path):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    with pytest.raises(SceneError, match="Permission denied"), staged_folder(tmp_path / "out"):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))

@@ -1,5 +1,8 @@
 """A scene that gets a period: nothing of what was there changes."""
 
+import errno
+import os
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from chronoscene.errors import DiskFullError
 from chronoscene.formats import read_scene
+from chronoscene.registration import output
 from chronoscene.registration.output import extend_tracks
 from chronoscene.scene import Points, Scene
 
@@ -78,3 +83,18 @@ def test_a_point_that_moved_does_not_join_the_old_one(scene: Scene) -> None:
     assert len(grown) == 31
     names = [f.name for f in scene.frames]
     assert tracks(grown, names)[int(old.points.ids[4])] == set(names[:2])
+
+
+def test_a_copy_to_a_full_disk_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(source: str, target: str) -> None:
+        Path(target).touch()
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    (tmp_path / "staged").mkdir()
+    (tmp_path / "staged/a.txt").touch()
+    monkeypatch.setattr(shutil, "copy2", full)
+    with pytest.raises(DiskFullError, match="out: expected space"):
+        output._copy(tmp_path / "staged", tmp_path / ".out.partial", tmp_path / "out")
+    assert [p.name for p in tmp_path.iterdir()] == ["staged"]

@@ -12,7 +12,7 @@ import pytest
 
 from chronoscene.synth.city.buildings import SLAB
 from chronoscene.synth.render.renderer import PixelMaps
-from chronoscene.synth.truth import APPEARANCE, GEOMETRY, UNCHANGED, change_mask
+from chronoscene.synth.truth import APPEARANCE, GEOMETRY, UNCHANGED, change_mask, save_image
 
 
 def stem(name: str) -> str:
@@ -155,3 +155,9 @@ def test_depth_files_are_plain_float32(made, part: str) -> None:  # type: ignore
     for path in (made.folder / "gt" / part).iterdir():
         depth = depth_of(path)
         assert depth.dtype == np.float32 and np.isfinite(depth).all() and (depth >= 0).all()
+
+
+def test_a_picture_that_cannot_be_written_says_why(tmp_path: Path) -> None:
+    (tmp_path / "a.png").mkdir()
+    with pytest.raises(IsADirectoryError):
+        save_image(tmp_path / "a.png", np.zeros((2, 2), np.uint8))

@@ -5,8 +5,9 @@ import json
 import numpy as np
 import pytest
 import torch
+from safetensors import SafetensorError
 
-from chronoscene.errors import CheckpointError
+from chronoscene.errors import CheckpointError, DiskFullError
 from chronoscene.scene.similarity import Sim3
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE, load_tensors, save_tensors
 
@@ -112,3 +113,16 @@ def test_nan_in_the_description_is_refused_before_it_is_written(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
         save_tensors(tmp_path, tensors, {**meta, "loss": float("nan")})
     assert not (tmp_path / META_FILE).exists()
+
+
+def test_a_full_disk_is_told_as_such(tmp_path, monkeypatch):
+    def full(tensors, path):
+        path.write_bytes(b"half")
+        raise SafetensorError(
+            "Error while serializing: I/O error: No space left on device (os error 28)"
+        )
+
+    monkeypatch.setattr("chronoscene.training.checkpoint.save_file", full)
+    with pytest.raises(DiskFullError, match=r"model\.safetensors: expected space for what is"):
+        save_tensors(tmp_path, {"a": torch.zeros(1)}, {})
+    assert list(tmp_path.iterdir()) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
@@ -85,6 +86,12 @@ class BadImage(MeanColour):
         return Prediction(np.full((view.height, view.width, 3), np.nan, np.float32))
 
 
+class FullDisk(MeanColour):
+    def save(self, folder):
+        super().save(folder)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 class Killed(MeanColour):
     def step(self, index, progress):
         os.kill(os.getpid(), signal.SIGKILL)
@@ -113,4 +120,5 @@ NOT_FINITE = replace(
     spec("not-finite", NotFinite), presets={"balanced": {"iterations": 60}, "short": {}}
 )
 BAD_IMAGE = spec("bad-image", BadImage)
+FULL_DISK = spec("full-disk", FullDisk)
 KILLED = spec("killed", Killed)
