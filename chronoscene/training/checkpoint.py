@@ -54,7 +54,7 @@ def save_tensors(
         stem: Of the names of the files.
 
     Raises:
-        OSError: If the disk refuses.
+        DiskFullError: If there is no space for them.
     """
     # Copies, since views that share memory cannot be told apart in the file.
     stored = {k: tensors[k].detach().cpu().contiguous().clone() for k in sorted(tensors)}
