@@ -116,8 +116,8 @@ def processor_name() -> str:
     return platform.processor() or platform.machine()
 
 
-def peak_memory_bytes() -> int:
-    """Largest resident memory of this process so far.
+def peak_memory_bytes() -> int | None:
+    """Largest resident memory of this process so far; None where the system does not tell.
 
     Linux carries ``ru_maxrss`` over from the parent across ``exec``, so a small worker of a big
     parent would report the parent; VmHWM belongs to this program alone.
@@ -128,7 +128,9 @@ def peak_memory_bytes() -> int:
                 return int(line.split()[1]) * 1024
     except OSError:
         pass
-    import resource  # not on every system
-
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024

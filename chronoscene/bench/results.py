@@ -54,7 +54,8 @@ class RunRecord(BaseModel):
     iterations: int
     primitives: int
     checkpoint_bytes: int
-    peak_memory_bytes: int
+    peak_memory_bytes: int | None
+    """None where the system does not tell."""
     """Largest resident memory of the process from the start of training to the end of rendering."""
     device: str
     commit: str

@@ -202,7 +202,7 @@ def _record(
     scene: Scene,
     machine: Machine,
     outcomes: list[PartOutcome],
-    peaks: tuple[int, int | None],
+    peaks: tuple[int | None, int | None],
     started: str,
 ) -> results.RunRecord:
     """The record of the run, without its scores."""

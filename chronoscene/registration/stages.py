@@ -12,9 +12,9 @@ stored stays.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,6 +25,11 @@ from typing import Any
 from chronoscene.errors import RegistrationError
 from chronoscene.io.processes import Report, run_worker
 from chronoscene.io.staging import write_text_atomic
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 VERSION = 1  # Version of what stages store; other versions are not read
 PATIENCE = 5.0  # Seconds; a step ends within one second after its command was killed
@@ -116,8 +121,15 @@ def work_folder(path: Path, patience: float = PATIENCE) -> Iterator[int]:
         those of a killed command end before the next command begins.
 
     Raises:
-        RegistrationError: If another process works in it.
+        RegistrationError: If another process works in it, or the system has no locks of this kind.
     """
+    if fcntl is None:
+        raise RegistrationError(
+            "register",
+            expected="Linux or macOS, whose file locks keep two runs apart",
+            found=sys.platform,
+            todo="run it in the Windows Subsystem for Linux (WSL)",
+        )
     path.mkdir(parents=True, exist_ok=True)
     with (path / "lock").open("w") as lock:
         end = time.monotonic() + patience

@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,3 +124,9 @@ def test_peak_memory_follows_allocations():
     block = np.ones(before + 200_000_000, np.uint8)
     assert provenance.peak_memory_bytes() > before + 150_000_000
     del block
+
+
+def test_a_system_that_does_not_tell_its_memory(monkeypatch):
+    monkeypatch.setattr(provenance, "Path", lambda place: Path("/absent"))
+    monkeypatch.setitem(sys.modules, "resource", None)
+    assert provenance.peak_memory_bytes() is None

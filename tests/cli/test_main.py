@@ -90,6 +90,31 @@ def test_a_command_that_is_asked_to_end_leaves_nothing_behind(tmp_path):
     assert not [p for p in tmp_path.rglob("*") if p.is_file()]
 
 
+def test_dataset_commands_work_without_what_windows_lacks(make_scene_folder, tmp_path):
+    scene = make_scene_folder()
+    code = """
+import os, signal, sys
+sys.modules.update(dict.fromkeys(("fcntl", "grp", "pwd", "resource", "termios")))
+for module, names in (
+    (os, ("fork", "killpg", "register_at_fork", "sched_getaffinity", "setsid")),
+    (signal, ("SIGKILL", "SIGHUP", "pthread_sigmask")),
+):
+    for name in names:
+        delattr(module, name)
+from importlib import import_module
+from chronoscene.cli import COMMANDS, cli
+for place in COMMANDS.values():
+    import_module(place.partition(":")[0])
+scene, out = sys.argv[1:]
+for words in (["validate", scene], ["stats", scene], ["convert", scene, out]):
+    cli.main(words, standalone_mode=False)
+"""
+    command = [sys.executable, "-c", code, str(scene), str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out/sparse/split.txt").is_file()
+
+
 def test_help_imports_nothing_heavy():
     code = (
         "import sys; from chronoscene.cli import cli\n"

@@ -73,6 +73,14 @@ def test_two_runs_do_not_share_a_work_folder(tmp_path: Path) -> None:
         pass
 
 
+def test_a_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stages, "fcntl", None)
+    message = "register: expected Linux or macOS, .* found .*; run it in the Windows Subsystem"
+    with pytest.raises(RegistrationError, match=message), work_folder(tmp_path / "work"):
+        pass
+    assert not (tmp_path / "work").exists()
+
+
 STEPS = """
 import os, sys, time
 from chronoscene.errors import RegistrationError
