@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.colmap.model import read_raw_model
-from chronoscene.errors import ChronoSceneError, SceneError
+from chronoscene.errors import ChronoSceneError, DiskFullError
 from chronoscene.formats import read_scene
 from chronoscene.io.processes import stoppable
 from chronoscene.validation.repair.fix import fix_scene
@@ -303,7 +303,7 @@ def test_nothing_is_left_behind_by_a_failure(scene, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("chronoscene.validation.repair.fix._link", full)
-    with pytest.raises(SceneError, match="No space left"):
+    with pytest.raises(DiskFullError, match="No space left"):
         fix_scene(scene.root, tmp_path / "fixed")
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
