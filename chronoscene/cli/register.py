@@ -137,7 +137,7 @@ def command(
     """
     folder, table = find_captures(captures, table)
     options = Options(**settings)
-    for option, place in (("OUT", out), ("--work", options.work_folder(out))):
+    for option, place in (("OUT", out), ("--work", options.work or options.work_folder(out))):
         check_outside(place, [folder, *([] if scene is None else [scene])], option=option)
         check_place(option, place)
     inspections: list[Inspection] = []

@@ -16,7 +16,7 @@ import numpy as np
 from chronoscene import formats
 from chronoscene.colmap.raw_model import find_model, model_files
 from chronoscene.convert import remarks_on
-from chronoscene.errors import SceneError
+from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import load_format
 from chronoscene.images.store import place_image
