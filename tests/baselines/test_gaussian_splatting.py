@@ -10,6 +10,7 @@ from baselines.gaussian_splatting import SPEC
 from baselines.gaussian_splatting.config import GaussianSplattingConfig
 from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.errors import ConfigError
+from chronoscene.gaussians.trainer import Timeline
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object
 
@@ -68,11 +69,35 @@ def test_equal_seeds_give_equal_bytes_for_any_number_of_threads(tmp_path):
     assert contents[3] != contents[0]
 
 
-@pytest.mark.parametrize("preset", ["paper", "balanced", "fast"])
+@pytest.mark.parametrize("preset", ["paper", "accurate", "balanced", "fast"])
 def test_presets_are_configurations(preset):
     config = build_config(SPEC, preset=preset)
     assert isinstance(config, GaussianSplattingConfig)
     assert (config == GaussianSplattingConfig()) == (preset == "paper")
+    assert config.max_gaussians == 0
+
+
+@pytest.mark.parametrize(
+    ("preset", "resets", "rounds"), [("accurate", 1, 39), ("balanced", 1, 15), ("fast", 0, 5)]
+)
+def test_short_presets_reset_while_there_is_time_to_recover(preset, resets, rounds):
+    config = build_config(SPEC, preset=preset)
+    timeline = Timeline(config)
+    due = [timeline.at(i, i / config.iterations) for i in range(config.iterations)]
+    found = [i for i, d in enumerate(due) if d.reset]
+    assert len(found) == resets and sum(d.densify for d in due) == rounds
+    for i in found:
+        # As published, a reset follows a round, so that the next one prunes 100 steps later; and
+        # nearly as many steps are left in which the set grows as there were before.
+        assert due[i - 1].densify and due[2 * i - 200].collect
+
+
+def test_iterations_are_those_of_the_other_methods():
+    from baselines.scaffold_gs import SPEC as ANCHORS
+
+    for preset in ("accurate", "balanced"):
+        ours, theirs = (build_config(spec, preset=preset) for spec in (SPEC, ANCHORS))
+        assert ours.iterations == theirs.iterations
 
 
 def test_the_class_is_found():
