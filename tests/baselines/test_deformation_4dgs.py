@@ -158,6 +158,19 @@ def test_the_schedule_of_the_released_configuration() -> None:
     assert degrees[-1] == 3 and due[3_000].position_lr == due[0].position_lr
 
 
+def test_the_released_configuration_trains_in_both_stages() -> None:
+    scene = moving_scene(arc)
+    method = Deformation4DGS(Deformation4DGSConfig())
+    method.setup(scene, seed=0, device="cpu")
+    # 62 numbers of each Gaussian are stored there, three of them normals.
+    assert sum(t[0].numel() for t in method.model.parameters.values()) == 62 - 3
+    planes = [t.numel() for n, t in method.model.shared.items() if n.startswith("planes.")]
+    assert sum(planes) == sum(3 * 16 * (s * s + 150 * s) for s in (64, 128))
+    reports = [method.step(index, 0.4 * index) for index in range(3)]
+    assert all(np.isfinite(report.loss) for report in reports)
+    assert not np.array_equal(*(method.render(scene.views[0], p).rgb for p in (0, PERIODS - 1)))
+
+
 def test_the_second_stage_begins_with_a_new_optimiser_and_new_statistics() -> None:
     method = Deformation4DGS(config(densify_interval=1_000))
     method.setup(toy_scene(), seed=0, device="cpu")

@@ -163,15 +163,17 @@ def _spread_line(memory, at, right, fx, grad):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _slope_x(memory, at, right, down, fy):  # type: ignore[no-untyped-def]
-    """Derivative of `bilinear` along a row, per cell."""
-    top = load(memory, at + right) - load(memory, at)
-    return top + fy * (load(memory, at + down + right) - load(memory, at + down) - top)
+def _slope(memory, at, right):  # type: ignore[no-untyped-def]
+    """Derivative of `between`, per cell."""
+    return load(memory, at + right) - load(memory, at)
 
 
 @inlined
-def _slope(memory, at, right):  # type: ignore[no-untyped-def]
-    return load(memory, at + right) - load(memory, at)
+def _slope_along(memory, at, along, across, share):  # type: ignore[no-untyped-def]
+    """Derivative of `bilinear` per cell along one axis, with the share of the next cell on the
+    other; the distances of the next cells on both."""
+    near = _slope(memory, at, along)
+    return near + share * (_slope(memory, at + across, along) - near)
 
 
 @inner
@@ -214,14 +216,14 @@ def _plane_gradients(layout, planes, means, n, slot, d_x, partial, out):  # type
             lines, patches = grad * x * y * z, grad * xy * xz * yz
             d_xy, d_xz, d_yz = lines * xz * yz, lines * xy * yz, lines * xy * xz
             d_x_line, d_y_line, d_z_line = patches * y * z, patches * x * z, patches * x * y
-            sx = sx + d_xy * _slope_x(values, at_xy, step, row, fy)
-            sx = sx + d_xz * _slope_x(values, at_xz, step, row, fz)
+            sx = sx + d_xy * _slope_along(values, at_xy, step, row, fy)
+            sx = sx + d_xz * _slope_along(values, at_xz, step, row, fz)
             sx = sx + d_x_line * _slope(values, at_x, step)
-            sy = sy + d_xy * _slope_x(values, at_xy, row, step, fx)
-            sy = sy + d_yz * _slope_x(values, at_yz, step, row, fz)
+            sy = sy + d_xy * _slope_along(values, at_xy, row, step, fx)
+            sy = sy + d_yz * _slope_along(values, at_yz, step, row, fz)
             sy = sy + d_y_line * _slope(values, at_y, step)
-            sz = sz + d_xz * _slope_x(values, at_xz, row, step, fx)
-            sz = sz + d_yz * _slope_x(values, at_yz, row, step, fy)
+            sz = sz + d_xz * _slope_along(values, at_xz, row, step, fx)
+            sz = sz + d_yz * _slope_along(values, at_yz, row, step, fy)
             sz = sz + d_z_line * _slope(values, at_z, step)
             _spread(grads, at_xy, step, row, fx, fy, d_xy)
             _spread(grads, at_xz, step, row, fx, fz, d_xz)
