@@ -65,6 +65,10 @@ class ProgressDisplay:
         if not self._live:
             self._print(f"{self._name}: training")
 
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        self.console.print(f"{self._name}: {line}", highlight=False, markup=False, soft_wrap=True)
+
     def update(
         self, iteration: int, seconds: float, report: StepReport, psnr: float | None
     ) -> None:

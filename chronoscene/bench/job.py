@@ -20,7 +20,7 @@ from chronoscene.methods import MethodSpec, build_config
 _UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
 
 
-def parse_duration(text: str) -> float:
+def parse_duration(text: str, option: str = "--budget") -> float:
     """Seconds of ``90s``, ``5m``, ``1.5h`` or ``1h30m``.
 
     Raises:
@@ -30,7 +30,7 @@ def parse_duration(text: str) -> float:
     seconds = sum(float(number) * _UNITS[unit] for number, unit in pieces)
     if "".join(number + unit for number, unit in pieces) != text or not seconds:
         raise ConfigError(
-            "--budget",
+            option,
             expected="a positive time such as 90s, 5m or 1h30m",
             found=repr(text),
             todo="write numbers with the units h, m or s",
@@ -103,6 +103,12 @@ class Job:
     notices: list[str] = field(default_factory=list)
     staging: str = ""
     """Where the worker writes; renamed to `folder` when it has ended."""
+    checkpoint_seconds: float = 300.0
+    """Time from one checkpoint of the training to the next."""
+    keep_training: bool = False
+    """Whether the finished run keeps what it takes to be trained further."""
+    continued_from: list[int] = field(default_factory=list)
+    """Iterations of the shorter trainings that this one began with."""
     plugin_path: str | None = None
     """Folder from which ``module:SPEC`` may be imported."""
 
@@ -113,9 +119,19 @@ class Job:
         return Path(self.runs) / safe_name(self.scene) / safe_name(name) / f"seed{self.seed}"
 
     @property
+    def training(self) -> Path:
+        """Where the checkpoints of the training are while the run is not finished."""
+        return self.folder.with_name(f".{self.folder.name}.training")
+
+    @property
     def label(self) -> str:
         """The run in words."""
         return f"{self.scene}: {self.method_name} {self.strategy} {self.preset} seed {self.seed}"
+
+    def shorter(self) -> Job:
+        """The run that this one continues."""
+        *earlier, last = self.continued_from
+        return replace(self, iterations=last, continued_from=earlier)
 
     def failure(self, reason: str) -> Failure:
         """The record of a run that has no result; the reason becomes one line."""
@@ -157,6 +173,7 @@ class Job:
             "stop": dataclasses.asdict(self.stop_rule(spec)),
             "separate_iterations": self.separate_iterations,
             "max_width": self.max_width,
+            **({"continued_from": self.continued_from} if self.continued_from else {}),
         }
         config = json.loads(json.dumps(config))
         return {
@@ -194,6 +211,13 @@ def check_job(job: Job, spec: MethodSpec) -> None:
     Raises:
         ConfigError: If a preset, key, value or device does not exist.
     """
+    if (job.keep_training or job.continued_from) and not spec.resumable:
+        raise ConfigError(
+            "--keep-training, --continue-to",
+            expected="methods that can be trained further",
+            found=spec.name,
+            todo="run this method without",
+        )
     check_choice("--separate-iterations", job.separate_iterations, SHARING)
     if job.device != "auto":
         check_choice(f"{spec.name} --device", job.device, spec.devices)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,12 @@ class BenchSettings:
     budget_seconds: float | None = None
     separate_iterations: str = "total"
     seeds: tuple[int, ...] = (0,)
+    continue_to: int | None = None
+    """Train finished runs further, up to so many iterations."""
+    checkpoint_seconds: float = 300.0
+    """Time from one checkpoint of a training to the next."""
+    keep_training: bool = False
+    """Whether finished runs keep what it takes to train them further."""
     max_width: int = MAX_WIDTH
     threads: int | None = None
     device: str = "auto"
@@ -71,6 +78,8 @@ def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]
         check_scene(scene)
         say(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
         for job, spec in _scene_jobs(settings, scene, commit, specs):
+            if settings.continue_to is not None:
+                job = continued(job, spec, settings.continue_to)
             check_job(job, spec)
             plan.setdefault(job.folder, (job, spec))
             notices.update(dict.fromkeys(job.notices))
@@ -142,6 +151,8 @@ def _scene_jobs(
             separate_iterations=settings.separate_iterations,
             seed=seed,
             max_width=settings.max_width,
+            checkpoint_seconds=settings.checkpoint_seconds,
+            keep_training=settings.keep_training or settings.continue_to is not None,
             threads=settings.threads,
             device=settings.device,
             runs=str(settings.runs.resolve()),
@@ -153,6 +164,43 @@ def _scene_jobs(
         yield job, spec
 
 
+def continued(job: Job, spec: MethodSpec, iterations: int) -> Job:
+    """The job that trains a finished run further.
+
+    Args:
+        job: With the settings of the finished run, apart from the number of iterations.
+        spec: Its method.
+        iterations: Of the whole training.
+
+    Raises:
+        ConfigError: If there is no such run, or nothing to train further or to go on from.
+    """
+    stop, earlier, found = {}, [], "none"
+    if (job.folder / results.RUN_FILE).is_file():
+        config = results.read_config(job.folder)["config"]
+        stop, earlier = config["stop"], config.get("continued_from", [])
+        found = "one with " + ", ".join(f"{k} {v}" for k, v in stop.items() if v is not None)
+    before = stop.get("iterations")
+    if before is None or before > iterations or stop["seconds"] is not None:
+        raise ConfigError(
+            job.folder,
+            expected=f"a finished run that ended after at most {iterations} iterations",
+            found=found,
+            todo="correct --continue-to, or train anew with --iterations",
+        )
+    if before == iterations:
+        return replace(job, iterations=before, continued_from=earlier)
+    longer = replace(job, iterations=iterations, continued_from=[*earlier, before])
+    if not is_finished(longer, spec) and not (job.folder / results.TRAINING).is_dir():
+        raise ConfigError(
+            job.folder,
+            expected="a run that kept its training",
+            found="its model alone",
+            todo="train anew with --keep-training; such a run can be trained further",
+        )
+    return longer
+
+
 def is_finished(job: Job, spec: MethodSpec, overwrite: bool = False) -> bool:
     """Whether the result is there already, made with the same settings from the same scene.
 
@@ -162,17 +210,40 @@ def is_finished(job: Job, spec: MethodSpec, overwrite: bool = False) -> bool:
     if not (job.folder / results.RUN_FILE).is_file():
         return False
     results.read_run(job.folder)
-    stored = results.read_config(job.folder)
-    wanted = job.document(spec)
+    stored, wanted = results.read_config(job.folder), job.document(spec)
     if stored == wanted:
         return True
-    if overwrite:
+    if job.continued_from:  # a shorter run is not finished, one with other settings is refused
+        wanted = job.shorter().document(spec)
+        if stored == wanted:
+            return False
+    elif overwrite:
         return False
+    raise _other_settings(job.folder, "a finished", stored, wanted)
+
+
+def check_unfinished(job: Job, spec: MethodSpec, overwrite: bool = False) -> None:
+    """Raise if there are checkpoints of a training with other settings; delete them if allowed.
+
+    Raises:
+        ConfigError: If there are.
+    """
+    if not (job.training / results.CONFIG_FILE).is_file():
+        return
+    stored, wanted = results.read_config(job.training), job.document(spec)
+    if stored == wanted:
+        return
+    if not overwrite:
+        raise _other_settings(job.training, "an unfinished", stored, wanted)
+    shutil.rmtree(job.training)
+
+
+def _other_settings(folder: Path, kind: str, stored: Any, wanted: Any) -> ConfigError:
     old, new = first_difference(stored, wanted)
-    raise ConfigError(
-        job.folder,
+    return ConfigError(
+        folder,
         expected=f"a run with {new}",
-        found=f"a finished one with {old}",
+        found=f"{kind} one with {old}",
         todo="choose another folder with --out, or pass --overwrite",
     )
 

@@ -27,6 +27,7 @@ ROWS_FILE = "rows.csv"
 CURVE_FILE = "curve.csv"
 RESULTS_FILE = "results.json"
 CHECKPOINT = "checkpoint"
+TRAINING = "training"
 PREDICTIONS = "predictions"
 GROUND_TRUTH = "ground_truth"
 FIGURES = "figures"
@@ -79,6 +80,8 @@ class RunRecord(BaseModel):
     """Steps whose view showed nothing of the model; nothing is learned from them."""
     skipped_steps: int = 0
     """Steps that changed nothing since their loss or a gradient was not finite."""
+    resumed: int = 0
+    """How often the training went on from a checkpoint."""
     setup_seconds: float
     """Share of `seconds` before the first step."""
     render_seconds: float

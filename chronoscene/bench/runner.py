@@ -10,7 +10,7 @@ from pathlib import Path
 
 from chronoscene.bench import results
 from chronoscene.bench.job import Job
-from chronoscene.bench.plan import BenchSettings, Say, is_finished, plan_jobs
+from chronoscene.bench.plan import BenchSettings, Say, check_unfinished, is_finished, plan_jobs
 from chronoscene.errors import DiskFullError
 from chronoscene.io.processes import run_worker, stoppable
 
@@ -46,6 +46,10 @@ def run_bench(settings: BenchSettings, say: Say, *, execute: Execute | None = No
     todo = [(job, spec) for job, spec in plan if not is_finished(job, spec, settings.overwrite)]
     if len(todo) < len(plan):
         say(f"{len(plan) - len(todo)} of {len(plan)} runs are finished and kept")
+    for job, spec in todo:
+        check_unfinished(job, spec, settings.overwrite)
+    for job, _ in plan:
+        settle_training(job)  # of a run that was killed between its end and this
     failures = []
     try:
         with stoppable():
@@ -80,10 +84,37 @@ def run_in_process(job: Job) -> results.Failure | None:
     if not finished and not (staging / results.FAILURE_FILE).is_file():
         (staging / results.RUN_FILE).unlink(missing_ok=True)
         results.write_failure(staging, job.failure(f"the process ended with {outcome.cause}"))
+    return put_in_place(job, staging)
+
+
+def put_in_place(job: Job, staging: Path) -> results.Failure | None:
+    """Give what a worker wrote its final name; returns why the run failed, if it did.
+
+    A finished run stays as it is if it could not be trained further.
+    """
+    failure = results.read_failure(staging)
+    if failure is not None and job.continued_from:
+        shutil.rmtree(staging)
+        return failure
     if job.folder.exists():
         shutil.rmtree(job.folder)
     os.replace(staging, job.folder)
-    return results.read_failure(job.folder)
+    settle_training(job)
+    return failure
+
+
+def settle_training(job: Job) -> None:
+    """Remove the checkpoints of a finished run, or keep them with it."""
+    finished = (job.folder / results.RUN_FILE).is_file()
+    if not finished or not (job.training / results.CONFIG_FILE).is_file():
+        return
+    if results.read_config(job.training) != results.read_config(job.folder):
+        return  # of a longer training that is under way
+    if job.keep_training:
+        shutil.rmtree(job.folder / results.TRAINING, ignore_errors=True)
+        os.replace(job.training, job.folder / results.TRAINING)
+    else:
+        shutil.rmtree(job.training)
 
 
 def _fresh_staging(folder: Path) -> Path:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 import random
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.bench.checkpoints import Checkpoints, CurvePoint, LoopState
 from chronoscene.bench.job import StopRule
 from chronoscene.bench.predictions import to_bytes
 from chronoscene.bench.strategies import Part
@@ -21,7 +20,6 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.methods import (
     Method,
     MethodSpec,
-    Skipped,
     StepReport,
     TrainingSet,
     TrainingView,
@@ -51,19 +49,6 @@ class DivergedError(TrainingError):
     """`NOT_FINITE_LIMIT` steps in a row were skipped; the model is as it was before them."""
 
 
-@dataclass(frozen=True, slots=True)
-class CurvePoint:
-    """One line of ``curve.csv``. Seconds and iterations are those of the model named."""
-
-    seconds: float
-    iteration: int
-    primitives: int
-    psnr: float
-    """Mean over the probe views, in dB."""
-    parameters: int
-    model: str
-
-
 class Stopwatch:
     """Adds up the time spent inside ``with``: training runs inside, evaluation outside."""
 
@@ -78,20 +63,6 @@ class Stopwatch:
 
     def __exit__(self, *error: object) -> None:
         self.seconds += self._now() - self._started
-
-
-@dataclass(frozen=True, slots=True)
-class Trained:
-    """How a training went."""
-
-    seconds: float
-    setup_seconds: float
-    iterations: int
-    empty_steps: int
-    """Whose view showed no primitive."""
-    skipped_steps: int
-    """Whose loss or gradients were not finite."""
-    curve: tuple[CurvePoint, ...]
 
 
 Observer = Callable[[int, float, StepReport, float | None], None]
@@ -126,8 +97,9 @@ def train(
     device: str,
     observer: Observer,
     now: Clock = time.perf_counter,
-) -> Trained:
-    """Train one model. Probes and the observer run off the clock.
+    checkpoints: Checkpoints | None = None,
+) -> LoopState:
+    """Train one model. Probes, checkpoints and the observer run off the clock.
 
     Args:
         method: An empty method.
@@ -138,62 +110,78 @@ def train(
         device: ``cpu`` or ``cuda``.
         observer: Shows the progress.
         now: The clock.
+        checkpoints: Where to go on from, and to keep what is done; None for a method that cannot
+            be resumed.
 
     Raises:
         DivergedError: If the method skipped too many steps in a row.
         TrainingError: If it took as many with a loss that is not finite.
+        CheckpointError: If all checkpoints are damaged.
     """
     seed_everything(seed)
     clock = Stopwatch(now)
     with clock:
         method.setup(part.train, seed=seed, device=device)
-    setup_seconds = clock.seconds
-    curve: list[CurvePoint] = []
-    due = list(PROBE_SHARES)
-    iteration, last_good = 0, 0
-    skips: Counter[Skipped | None] = Counter()
-    while (progress := stop.progress(iteration, clock.seconds)) < 1.0:
+    state = LoopState(seconds=clock.seconds, setup_seconds=clock.seconds)
+    if checkpoints is not None and (restored := checkpoints.restore(method)) is not None:
+        state, clock.seconds = restored, restored.seconds
+    done = stop.progress(state.iterations, state.seconds)
+    due = [share for share in PROBE_SHARES if share > done]
+    last_good = state.iterations
+    latest = None
+    while done < 1.0:
         with clock:
-            report = method.step(iteration, progress)
-        iteration += 1
-        skipped = report.skipped
-        if not math.isfinite(report.loss):
-            skipped = "not finite"
-        skips[skipped] += 1
-        if skipped != "not finite":
-            last_good = iteration
-        elif iteration - last_good == NOT_FINITE_LIMIT:
-            todo = "lower the learning rates, or report this with the scene"
-            if report.skipped:
-                todo = f"the model of iteration {last_good} is kept in checkpoint; {todo}"
-            raise (DivergedError if report.skipped else TrainingError)(
-                f"model {part.name}, iteration {iteration}",
-                expected="a finite loss and finite gradients",
-                found=f"{NOT_FINITE_LIMIT} steps in a row without",
-                todo=todo,
-            )
-        done = stop.progress(iteration, clock.seconds)
+            report = method.step(state.iterations, done)
+        state.iterations += 1
+        state.seconds = clock.seconds
+        done = stop.progress(state.iterations, state.seconds)
+        if _was_finite(report, state):
+            last_good = state.iterations
+        elif state.iterations - last_good == NOT_FINITE_LIMIT:
+            raise _diverged(report, part, last_good)
         if due and done >= due[0]:
             due = [share for share in due if share > done]
-            curve.append(_probe(method, part, truth, clock.seconds, iteration))
-        observer(iteration, clock.seconds, report, curve[-1].psnr if curve else None)
-    return Trained(
-        clock.seconds, setup_seconds, iteration, skips["empty"], skips["not finite"], tuple(curve)
+            state.curve.append(_probe(method, part, truth, state))
+            latest = state.curve[-1].psnr
+        observer(state.iterations, state.seconds, report, latest)
+        if checkpoints is not None and checkpoints.is_due and last_good == state.iterations:
+            checkpoints.write(method, state)
+    if checkpoints is not None:
+        checkpoints.finish(method, state)
+    return state
+
+
+def _was_finite(report: StepReport, state: LoopState) -> bool:
+    """Count a step that taught nothing; whether it was finite."""
+    if report.skipped == "not finite" or not math.isfinite(report.loss):
+        state.skipped_steps += 1
+        return False
+    state.empty_steps += report.skipped == "empty"
+    return True
+
+
+def _diverged(report: StepReport, part: Part, last_good: int) -> TrainingError:
+    todo = "lower the learning rates, or report this with the scene"
+    if report.skipped:
+        todo = f"the model of iteration {last_good} is kept in checkpoint; {todo}"
+    return (DivergedError if report.skipped else TrainingError)(
+        f"model {part.name}, iteration {last_good + NOT_FINITE_LIMIT}",
+        expected="a finite loss and finite gradients",
+        found=f"{NOT_FINITE_LIMIT} steps in a row without",
+        todo=todo,
     )
 
 
 def _probe(
-    method: Method,
-    part: Part,
-    truth: Mapping[str, NDArray[np.uint8]],
-    seconds: float,
-    iteration: int,
+    method: Method, part: Part, truth: Mapping[str, NDArray[np.uint8]], state: LoopState
 ) -> CurvePoint:
     frames = probe_frames(part)
     values = [psnr(render_bytes(method, part, f), truth[f.name]) for f in frames]
     size = method.size()
     mean = float(np.mean(values)) if values else math.nan
-    return CurvePoint(seconds, iteration, size.primitives, mean, size.parameters, part.name)
+    return CurvePoint(
+        state.seconds, state.iterations, size.primitives, mean, size.parameters, part.name
+    )
 
 
 def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:

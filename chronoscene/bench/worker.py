@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.bench import results
+from chronoscene.bench.checkpoints import Checkpoints, CurvePoint, LoopState
 from chronoscene.bench.display import ProgressDisplay
 from chronoscene.bench.job import Job, StopRule, check_device
 from chronoscene.bench.opening import write_source
@@ -36,9 +37,7 @@ from chronoscene.bench.provenance import (
 from chronoscene.bench.scoring import aggregate, score_folder
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.bench.training_loop import (
-    CurvePoint,
     DivergedError,
-    Trained,
     forget_peak_memory,
     probe_frames,
     render_bytes,
@@ -61,7 +60,7 @@ from chronoscene.scene import Scene
 class PartOutcome:
     """What training and rendering one model gave."""
 
-    trained: Trained
+    trained: LoopState
     size: MethodSize
     render_seconds: float
     """For all its test views together."""
@@ -97,8 +96,12 @@ def run_job(job: Job) -> None:
         warmup_seconds = time.perf_counter() - before
         for part, stop in zip(parts, job.stop_rules(spec, len(parts)), strict=True):
             display.begin(part.name, stop)
-            outcomes.append(_run_part(job, spec, part, stop, machine, writer, display))
-    peaks = peak_memory_bytes(), _peak_device_memory(machine.device)
+            checkpoints = None
+            if spec.resumable:
+                checkpoints = _checkpoints(job, spec, part, len(parts), display)
+            outcomes.append(_run_part(job, spec, part, stop, machine, writer, display, checkpoints))
+    earlier = max(outcome.trained.peak_memory_bytes for outcome in outcomes)
+    peaks = max(peak_memory_bytes(), earlier), _peak_device_memory(machine.device)
     writer.close(
         kind="predictions",
         scene=scene.name,
@@ -145,6 +148,7 @@ def _run_part(
     machine: Machine,
     writer: ImageWriter,
     display: ProgressDisplay,
+    checkpoints: Checkpoints | None,
 ) -> PartOutcome:
     """Train one model, save it, and render the test views that it answers for."""
     method: Method = import_object(spec.method)(job.method_config(spec))
@@ -158,6 +162,7 @@ def _run_part(
             seed=job.seed,
             device=machine.device,
             observer=display.update,
+            checkpoints=checkpoints,
         )
     except DivergedError:
         _save(method, checkpoint, part)  # as the last good step left it
@@ -169,6 +174,23 @@ def _run_part(
         image = render_bytes(method, part, frame)
         writer.add(frame.name, image, camera_period=frame.period, rendered_period=frame.period)
     return PartOutcome(trained, method.size(), time.perf_counter() - before)
+
+
+def _checkpoints(
+    job: Job, spec: MethodSpec, part: Part, parts: int, display: ProgressDisplay
+) -> Checkpoints:
+    """Those of one model of the run."""
+    finished = job.folder / results.TRAINING / part.name
+    return Checkpoints(
+        folder=job.training / part.name,
+        settings=job.document(spec),
+        commit=job.commit,
+        every=job.checkpoint_seconds,
+        # With several models, those that are done must not be trained again.
+        keep_last=job.keep_training or parts > 1,
+        start=finished if job.continued_from else None,
+        say=display.say,
+    )
 
 
 def _probe_truth(job: Job, part: Part) -> dict[str, Any]:
@@ -207,6 +229,7 @@ def _record(
 ) -> results.RunRecord:
     """The record of the run, without its scores."""
     tests = len(scene.select(split="test"))
+    code = [commit for outcome in outcomes for commit in outcome.trained.commits]
     saved = (Path(job.staging) / results.CHECKPOINT).rglob("*")
     return results.RunRecord(
         method=spec.name,
@@ -219,11 +242,12 @@ def _record(
         iterations=sum(o.trained.iterations for o in outcomes),
         empty_steps=sum(o.trained.empty_steps for o in outcomes),
         skipped_steps=sum(o.trained.skipped_steps for o in outcomes),
+        resumed=max(o.trained.resumed for o in outcomes),
         primitives=sum(o.size.primitives for o in outcomes),
         checkpoint_bytes=sum(path.stat().st_size for path in saved if path.is_file()),
         peak_memory_bytes=peaks[0],
         device=describe_device(machine.device, machine.threads),
-        commit=job.commit,
+        commit="; ".join(dict.fromkeys([*code, job.commit])),
         skipped={},
         title=spec.title,
         preset=job.preset,

@@ -46,6 +46,22 @@ EXISTING = click.Path(path_type=Path, exists=True)
 )
 @click.option("--iterations", type=click.IntRange(min=1), help="Stop after this many iterations.")
 @click.option(
+    "--continue-to",
+    type=click.IntRange(min=1),
+    help="Train finished runs that kept their training further, up to this many iterations.",
+)
+@click.option(
+    "--checkpoint-every",
+    default="5m",
+    show_default=True,
+    help="Time between checkpoints, from which a run that was stopped goes on.",
+)
+@click.option(
+    "--keep-training",
+    is_flag=True,
+    help="Keep the last checkpoint of finished runs, for --continue-to.",
+)
+@click.option(
     "--separate-iterations",
     type=click.Choice(["total", "each"]),
     default="total",
@@ -96,6 +112,7 @@ def command(
     methods: str,
     strategies: str,
     budget: str | None,
+    checkpoint_every: str,
     seeds: int,
     seed: int,
     assignments: tuple[str, ...],
@@ -108,6 +125,13 @@ def command(
     predictions and scores. Finished runs are kept, so the same command resumes after an
     interruption. docs/benchmark.md describes strategies, budget, seeds and files.
     """
+    if options["continue_to"] and (budget or options["iterations"]):
+        raise ConfigError(
+            "--continue-to",
+            expected="no --iterations and no --budget beside it",
+            found="both",
+            todo="leave them out: the finished run says where to begin",
+        )
     check_outside(out, options["scenes"], option="--out")
     check_place("--out", out)
     names = split_list("--method", methods)
@@ -121,6 +145,7 @@ def command(
         ),
         overrides=parse_assignments(assignments),
         budget_seconds=None if budget is None else parse_duration(budget),
+        checkpoint_seconds=parse_duration(checkpoint_every, "--checkpoint-every"),
         seeds=tuple(range(seed, seed + seeds)),
         **options,
     )

@@ -6,14 +6,19 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
+from chronoscene.bench.job import Job
+from chronoscene.bench.results import Failure
+from chronoscene.bench.runner import BenchOutcome, BenchSettings, put_in_place, run_bench
+from chronoscene.bench.worker import execute
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 
@@ -144,6 +149,28 @@ def bench(scene_folder: Path, tmp_path: Path) -> Bench:
         }
         outcome = run_bench(BenchSettings(**{**fields, **changes}), said.append)
         return outcome, said
+
+    return run
+
+
+def execute_here(job: Job) -> Failure | None:
+    """A job in this process, which costs no time to start."""
+    staging = Path(mkdtemp(dir=job.runs))
+    execute(asdict(replace(job, staging=str(staging))), lambda *progress: None)
+    job.folder.parent.mkdir(parents=True, exist_ok=True)
+    return put_in_place(job, staging)
+
+
+@pytest.fixture
+def bench_here(scene_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    """The same of any method in this process, not warmed up."""
+    monkeypatch.setattr("chronoscene.bench.worker.warm_up", lambda *args, **options: None)
+
+    def run(*methods: str, **changes: Any) -> tuple[BenchOutcome, list[str]]:
+        said: list[str] = []
+        fields = {"scenes": (scene_folder,), "methods": methods, "runs": tmp_path / "runs"}
+        settings = BenchSettings(**{**fields, **changes})
+        return run_bench(settings, said.append, execute=execute_here), said
 
     return run
 

@@ -1,53 +1,26 @@
 """Runs of real methods through the harness, in this process."""
 
-import os
-import shutil
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from chronoscene.bench.plan import BenchSettings
-from chronoscene.bench.results import read_failure, read_run
-from chronoscene.bench.runner import run_bench
+from chronoscene.bench.results import read_run
 from chronoscene.bench.tables import format_runs, read_runs
-from chronoscene.bench.worker import execute
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.methods import method_names
 from chronoscene.training import losses
 from chronoscene.training.checkpoint import load_tensors
 
 
-@pytest.fixture(autouse=True)
-def no_warm_up(monkeypatch):
-    monkeypatch.setattr("chronoscene.bench.worker.warm_up", lambda *args, **options: None)
-
-
-def execute_here(job):
-    """A job without the time that a process takes to start."""
-    staging = Path(job.runs) / "staging"
-    staging.mkdir()
-    execute(asdict(replace(job, staging=str(staging))), lambda *progress: None)
-    shutil.rmtree(job.folder, ignore_errors=True)
-    job.folder.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(staging, job.folder)
-    return read_failure(job.folder)
-
-
-def bench_here(scene, runs, method, **changes):
-    settings = BenchSettings((scene,), (method,), runs, preset="fast", **changes)
-    return run_bench(settings, lambda line: None, execute=execute_here)
-
-
 @pytest.mark.parametrize("method", method_names())
-def test_a_photo_that_shows_nothing_is_an_empty_step(make_scene, tmp_path, method):
+def test_a_photo_that_shows_nothing_is_an_empty_step(make_scene, tmp_path, bench_here, method):
     scene = make_scene()
     blind = next(frame for frame in scene.frames if frame.split == "train")
     turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ blind.cam_from_world
     frames = tuple(replace(f, cam_from_world=turned) if f is blind else f for f in scene.frames)
     folder = scene_format.write(replace(scene, frames=frames), tmp_path / "ring")
-    outcome = bench_here(folder, tmp_path / "runs", method, iterations=15)
+    outcome, _ = bench_here(method, scenes=(folder,), preset="fast", iterations=15)
     assert outcome.failures == ()
     record = read_run(outcome.finished[0])
     assert (record.iterations, record.empty_steps, record.skipped_steps) == (15, 3, 0)
@@ -69,19 +42,17 @@ def poison(monkeypatch, numbers):
 
 
 @pytest.mark.parametrize("method", method_names())
-def test_gradients_that_are_not_finite_cost_their_step_alone(
-    scene_folder, tmp_path, monkeypatch, method
-):
+def test_gradients_that_are_not_finite_cost_their_step_alone(bench_here, monkeypatch, method):
     poison(monkeypatch, (4, 5, 9))
-    outcome = bench_here(scene_folder, tmp_path / "runs", method, iterations=15)
+    outcome, _ = bench_here(method, preset="fast", iterations=15)
     record = read_run(outcome.finished[0])
     assert (record.iterations, record.empty_steps, record.skipped_steps) == (15, 0, 3)
     assert "3 of 15 steps skipped: their loss or gradients" in " ".join(record.notices)
 
 
-def test_a_training_that_diverges_keeps_its_last_good_model(scene_folder, tmp_path, monkeypatch):
+def test_a_training_that_diverges_keeps_its_last_good_model(tmp_path, bench_here, monkeypatch):
     poison(monkeypatch, range(8, 100))
-    outcome = bench_here(scene_folder, tmp_path / "runs", "3dgs", iterations=100)
+    outcome, _ = bench_here("3dgs", preset="fast", iterations=100)
     assert "the model of iteration 7 is kept in checkpoint" in outcome.failures[0].reason
     (kept,) = (tmp_path / "runs").rglob("checkpoint")
     assert all(tensor.isfinite().all() for tensor in load_tensors(kept)[0].values())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import random
 import signal
 import time
 from dataclasses import dataclass, replace
@@ -64,6 +65,21 @@ class MeanColour:
     def size(self):
         return MethodSize(len(self.colors), self.colors.size)
 
+    def save_training(self, folder):
+        self.save(folder)
+
+    def load_training(self, folder):
+        self.load(folder, device="cpu")
+
+
+class Drawing(MeanColour):
+    """Learns with random rates, from the global generators."""
+
+    def step(self, index, progress):
+        report = super().step(index, progress)
+        self.colors += 0.01 * random.random() + 0.01 * np.random.normal()
+        return report
+
 
 class Raises(MeanColour):
     def step(self, index, progress):
@@ -110,10 +126,12 @@ def spec(name, cls, period_input="label"):
         method=f"toy_methods:{cls.__name__}",
         config="toy_methods:Config",
         presets={"balanced": {}, "slow": {"iterations": 100_000, "sleep": 0.01}},
+        resumable=True,
     )
 
 
 MEAN = spec("mean", MeanColour)
+DRAWING = spec("drawing", Drawing)
 BLIND = spec("blind", MeanColour, period_input="none")
 RAISES = spec("raises", Raises)
 NOT_FINITE = replace(

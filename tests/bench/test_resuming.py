@@ -1,0 +1,166 @@
+"""Benches that are killed go on where they were; finished runs are trained further."""
+
+import csv
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from chronoscene.bench.checkpoints import Checkpoints
+from chronoscene.bench.results import read_run
+from chronoscene.errors import ConfigError
+from chronoscene.methods import method_names
+
+TOY = "toy_methods:DRAWING"
+SCRIPT = """
+import sys
+from pathlib import Path
+from chronoscene.bench.runner import BenchSettings, run_bench
+run_bench(
+    BenchSettings(
+        scenes=(Path(sys.argv[1]),),
+        methods=(sys.argv[2],),
+        runs=Path(sys.argv[3]),
+        threads=1,
+        iterations=int(sys.argv[4]),
+        preset=sys.argv[5],
+        checkpoint_seconds=0.03,
+    ),
+    lambda line: print(line, flush=True),
+)
+"""
+
+
+def start(scene, method, runs, iterations, preset="balanced"):
+    arguments = [str(scene), method, str(runs), str(iterations), preset]
+    return subprocess.Popen([sys.executable, "-c", SCRIPT, *arguments], stderr=subprocess.PIPE)
+
+
+def run_of(runs):
+    (folder,) = (path.parent for path in runs.glob("ring/*/seed0/run.json"))
+    return folder
+
+
+def outcome(runs):
+    """Everything of a run that does not depend on the time that it took."""
+    folder = run_of(runs)
+    found = {}
+    for name in ("checkpoint", "predictions"):
+        for path in sorted((folder / name).rglob("*")):
+            found[str(path.relative_to(folder))] = path.read_bytes() if path.is_file() else None
+    with (folder / "curve.csv").open(newline="") as file:
+        found["curve"] = [{**line, "seconds": ""} for line in csv.DictReader(file)]
+    found["scores"] = read_run(folder).aggregates
+    return found
+
+
+def checkpoint_of(runs):
+    """Iterations of the newest checkpoint; 0 before the first."""
+    found = [int(p.name) for p in runs.glob("ring/*/.seed0.training/all/*") if p.name.isdigit()]
+    return max(found, default=0)
+
+
+def kill_later(process, runs, seconds):
+    """Kill a bench, some time after the next checkpoint; whether it was still running."""
+    before = checkpoint_of(runs)
+    while checkpoint_of(runs) in (0, before) and process.poll() is None:
+        time.sleep(0.01)
+    time.sleep(seconds)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()  # ends with the worker, which holds the pipe
+    return process.returncode == -signal.SIGKILL
+
+
+def test_a_killed_training_ends_as_an_undisturbed_one(bench, scene_folder, tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    bench("DRAWING", runs=whole, iterations=150)
+    process = start(scene_folder, TOY, killed, 150, "slow")
+    assert kill_later(process, killed, random.Random(1).uniform(0, 0.3))
+    assert 0 < checkpoint_of(killed) < 150
+    bench("DRAWING", runs=killed, iterations=150, preset="slow")
+    assert outcome(killed) == outcome(whole)
+    record = read_run(run_of(killed))
+    assert (record.resumed, record.iterations) == (1, 150)
+    assert not list(killed.glob("ring/*/.*"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", method_names())
+def test_a_training_that_is_killed_again_and_again(scene_folder, tmp_path, method):
+    generator = random.Random(2)
+    assert start(scene_folder, method, tmp_path / "whole", 400, "fast").communicate()
+    runs, kills = tmp_path / "killed", 0
+    while kill_later(
+        start(scene_folder, method, runs, 400, "fast"), runs, generator.uniform(0, 0.5)
+    ):
+        kills += 1
+    print(f"{method}: {kills} kills")
+    assert kills >= 3
+    assert outcome(runs) == outcome(tmp_path / "whole")
+
+
+def test_an_unfinished_training_is_not_given_up_for_other_settings(
+    bench_here, tmp_path, monkeypatch
+):
+    runs = tmp_path / "runs"
+    options = {"iterations": 20, "preset": "slow", "checkpoint_seconds": 0.0}
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoints, "finish", dying)
+        with pytest.raises(SystemExit):
+            bench_here(TOY, **options)
+    with pytest.raises(ConfigError, match="with iterations 9, found an unfinished"):
+        bench_here(TOY, iterations=9, preset="slow")
+    assert checkpoint_of(runs)
+    bench_here(TOY, iterations=9, preset="slow", overwrite=True)
+    assert read_run(run_of(runs)).resumed == 0
+    assert not list(runs.glob("ring/*/.*"))
+
+
+def dying(*args):
+    raise SystemExit
+
+
+@pytest.mark.parametrize("strategy", ["joint", "separate"])
+def test_finished_runs_are_trained_further(bench_here, tmp_path, strategy):
+    whole, runs = tmp_path / "whole", tmp_path / "runs"
+    options = {"strategies": (strategy,)}
+    bench_here(TOY, runs=whole, iterations=42, **options)
+    with pytest.raises(ConfigError, match=r"finished run that ended .* at most 42 .*, found none"):
+        bench_here(TOY, runs=runs, continue_to=42, **options)
+    bench_here(TOY, runs=runs, iterations=20, keep_training=True, **options)
+    kept = run_of(runs) / "training"
+    parts = ["all"] if strategy == "joint" else ["period-0", "period-1"]
+    assert sorted(p.name for p in kept.iterdir() if p.is_dir()) == parts
+    for iterations in (30, 42):
+        further, _ = bench_here(TOY, runs=runs, continue_to=iterations, **options)
+        assert further.failures == () and read_run(run_of(runs)).iterations == iterations
+    ours, theirs = outcome(runs), outcome(whole)
+    del ours["curve"], theirs["curve"]  # probes are at shares of the length
+    assert ours == theirs
+    config = json.loads((run_of(runs) / "config.json").read_text())["config"]
+    assert config["continued_from"] == [20, 30]
+    again, _ = bench_here(TOY, runs=runs, continue_to=42, **options)
+    assert again.skipped == 1
+    with pytest.raises(ConfigError, match=r"rate 0[.]25, found a finished one"):
+        bench_here(TOY, runs=runs, continue_to=50, overrides={"rate": "0.25"}, **options)
+    with pytest.raises(ConfigError, match="at most 41 iterations, found one with"):
+        bench_here(TOY, runs=runs, continue_to=41, **options)
+    shutil.rmtree(kept)
+    with pytest.raises(ConfigError, match="that kept its training, found its model alone"):
+        bench_here(TOY, runs=runs, continue_to=50, **options)
+
+
+def test_a_run_that_cannot_be_trained_further_stays_as_it_is(bench_here, tmp_path):
+    runs = tmp_path / "runs"
+    bench_here(TOY, iterations=20, keep_training=True)
+    before = outcome(runs)
+    for path in (run_of(runs) / "training/all").glob("*/model.json"):
+        path.write_text("{}")
+    failed, _ = bench_here(TOY, continue_to=30)
+    assert "expected a checkpoint to go on from" in failed.failures[0].reason
+    assert outcome(runs) == before
