@@ -155,6 +155,17 @@ def test_finished_runs_are_trained_further(bench_here, tmp_path, strategy):
         bench_here(TOY, runs=runs, continue_to=50, **options)
 
 
+@pytest.mark.parametrize(("preset", "is_same"), [("paper", True), ("fast", False)])
+def test_a_schedule_that_ignores_the_length_ends_alike(bench_here, tmp_path, preset, is_same):
+    """Unlike one that is stretched to the length of the training."""
+    whole, runs = tmp_path / "whole", tmp_path / "runs"
+    bench_here("3dgs", runs=whole, preset=preset, iterations=16)
+    bench_here("3dgs", runs=runs, preset=preset, iterations=8, keep_training=True)
+    bench_here("3dgs", runs=runs, preset=preset, continue_to=16)
+    name = "checkpoint/model.safetensors"
+    assert (outcome(runs)[name] == outcome(whole)[name]) is is_same
+
+
 def test_a_run_that_cannot_be_trained_further_stays_as_it_is(bench_here, tmp_path):
     runs = tmp_path / "runs"
     bench_here(TOY, iterations=20, keep_training=True)
