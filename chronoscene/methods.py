@@ -176,7 +176,7 @@ class Method(Protocol):
         where the spec says ``resumable``.
 
         Raises:
-            OSError: If the disk refuses.
+            OSError, DiskFullError: If the disk refuses.
         """
 
     def load_training(self, folder: Path) -> None:

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from chronoscene.bench.provenance import peak_memory_bytes
 from chronoscene.bench.results import CONFIG_FILE
-from chronoscene.errors import CheckpointError
+from chronoscene.errors import CheckpointError, DiskFullError
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.methods import Method
 
@@ -65,7 +65,7 @@ class LoopState(BaseModel):
     commits: list[str] = []
     """Code that trained up to a checkpoint, each once."""
     peak_memory_bytes: int = 0
-    """Of the processes so far."""
+    """Of the processes so far; 0 where the system does not tell."""
     random_state: dict[str, Any] = {}
     """Of the global generators."""
     files: dict[str, str] = {}
@@ -142,7 +142,7 @@ class Checkpoints:
     def write(self, method: Method, state: LoopState, *, keep: int = 2) -> None:
         """Write a checkpoint; the training goes on without it if the disk refuses."""
         state.random_state = _random_state()
-        state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes())
+        state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes() or 0)
         if self.commit not in state.commits:
             state.commits.append(self.commit)
         partial = self.folder / f".{state.iterations}.partial"
@@ -158,10 +158,9 @@ class Checkpoints:
             shutil.rmtree(final, ignore_errors=True)  # damaged, else this training began with it
             os.replace(partial, final)
             _flush(self.folder)
-        except OSError as error:
+        except (OSError, DiskFullError) as error:
             shutil.rmtree(partial, ignore_errors=True)
-            reason = error.strerror or error
-            self.say(f"note: no checkpoint of iteration {state.iterations}: {reason}")
+            self.say(f"note: no checkpoint of iteration {state.iterations}: {error}")
         else:
             for old in _checkpoints(self.folder)[keep:]:
                 shutil.rmtree(old, ignore_errors=True)

@@ -100,8 +100,8 @@ def run_job(job: Job) -> None:
             if spec.resumable:
                 checkpoints = _checkpoints(job, spec, part, len(parts), display)
             outcomes.append(_run_part(job, spec, part, stop, machine, writer, display, checkpoints))
-    earlier = max(outcome.trained.peak_memory_bytes for outcome in outcomes)
-    peaks = max(peak_memory_bytes(), earlier), _peak_device_memory(machine.device)
+    found = (peak_memory_bytes() or 0, *(o.trained.peak_memory_bytes for o in outcomes))
+    peaks = max(found) or None, _peak_device_memory(machine.device)
     writer.close(
         kind="predictions",
         scene=scene.name,

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import random
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from chronoscene.bench.strategies import make_parts
 from chronoscene.bench.training_loop import seed_everything, train
 from chronoscene.errors import CheckpointError
 from chronoscene.images.store import ImageStore
+from chronoscene.io.staging import needing_space
 from chronoscene.methods import import_object
 
 
@@ -145,18 +147,21 @@ def test_a_kill_at_any_moment_leaves_a_whole_one(make, monkeypatch):
     assert number > 8
 
 
-def test_a_full_disk_costs_one_checkpoint_and_not_the_training(make, monkeypatch):
+@pytest.mark.parametrize("named", [True, False])
+def test_a_full_disk_costs_one_checkpoint_and_not_the_training(make, monkeypatch, named):
     checkpoints = make()
     write(checkpoints, 1)
 
     def full(self, folder):
         (folder / "numbers.json").write_text("[")
-        raise OSError(errno.ENOSPC, "No space left on device")
+        with needing_space(folder) if named else nullcontext():
+            raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(Numbers, "save_training", full)
         write(checkpoints, 2)
-    assert make.said == ["note: no checkpoint of iteration 2: No space left on device"]
+    (said,) = make.said
+    assert said.startswith("note: no checkpoint of iteration 2: ") and "No space left" in said
     assert [p.name for p in checkpoints.folder.iterdir()] == ["1"]
     write(checkpoints, 3)
     assert restored(make()) == 3
