@@ -79,6 +79,10 @@ class TrainingView(View):
     period: int
 
 
+def no_mask(index: int) -> None:
+    """`TrainingSet.load_mask` of sets whose images count everywhere."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingSet:
     """Everything that a method may learn from, in the normalised training frame.
@@ -104,6 +108,9 @@ class TrainingSet:
     """Colour behind everything, 0..1. [3]"""
     load_image: Callable[[int], NDArray[np.uint8]]
     """Image of ``views[i]``, decoded lazily and cached. [H, W, 3]"""
+    load_mask: Callable[[int], NDArray[np.bool_] | None] = no_mask
+    """Where the image of ``views[i]`` counts; None where all of it does. What the others show must
+    not change the model. [H, W]"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +134,8 @@ class StepReport:
     """Gaussians or anchors held now."""
     skipped: Skipped | None = None
     """Why nothing was learned, so that no parameter and no moment of the optimiser changed:
-    ``empty``, the view shows no primitive; ``not finite``, the loss or a gradient was not."""
+    ``empty``, the view shows no primitive, or its mask ignores all of the image; ``not finite``,
+    the loss or a gradient was not."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -135,6 +135,7 @@ class DensityStatistics:
         means2d_grad: Float,
         width: int,
         height: int,
+        counted: NDArray[np.bool_] | None = None,
     ) -> None:
         """Add one training view.
 
@@ -142,13 +143,16 @@ class DensityStatistics:
             visible: Anchors that were decoded. [M]
             positions: Which of their M * k Gaussians are switched on, ascending. [L]
             opacities: Opacities of those. [L]
-            radii: 0 where a Gaussian was culled. [L, 2]
+            radii: 0 where a Gaussian was culled, or does not count. [L, 2]
             means2d_grad: d loss / d centre in pixels. [L, 2]
             width: Image width in pixels: gradients count in units of half an image.
             height: Image height in pixels.
+            counted: Anchors for which the view counts as a visit; None for all. [M]
         """
+        if counted is None:
+            counted = np.ones(len(visible), np.bool_)
         _accumulate(
-            visible, positions, opacities, radii, means2d_grad, 0.5 * width, 0.5 * height,
+            visible, counted, positions, opacities, radii, means2d_grad, 0.5 * width, 0.5 * height,
             self.opacity_sum, self.visits, self.motion, self.grad_sum, self.hits,
         )  # fmt: skip
 
@@ -170,7 +174,7 @@ _CHUNK = 512  # Anchors whose Gaussians one task looks up together
 
 @kernel(parallel=True)
 def _accumulate(  # type: ignore[no-untyped-def]
-    visible, positions, opacities, radii, grad, half_width, half_height,
+    visible, counted, positions, opacities, radii, grad, half_width, half_height,
     opacity_sum, visits, motion, grad_sum, hits,
 ):  # fmt: skip
     # Anchors are visible once, so no two rows write to the same place.
@@ -192,9 +196,10 @@ def _accumulate(  # type: ignore[no-untyped-def]
                     grad_sum[a, j] += norm
                     hits[a, j] += np.float32(1.0)
                 row += 1
-            opacity_sum[a] += total
-            motion[a] += moved
-            visits[a] += np.float32(1.0)
+            if counted[m]:
+                opacity_sum[a] += total
+                motion[a] += moved
+                visits[a] += np.float32(1.0)
 
 
 class AnchorRows(NamedTuple):

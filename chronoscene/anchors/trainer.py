@@ -18,15 +18,23 @@ from torch import Tensor
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import COUNTERS, AnchorRows, DensityStatistics, grow, prune_mask
 from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
+from chronoscene.anchors.visibility import projected_centres
 from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.adam import Adam, DenseTable
 from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.losses import mean_volume, photometric_loss
 from chronoscene.training.row_adam import make_table
-from chronoscene.training.schedule import ViewSampler, downscale_image, downscale_view, log_linear
+from chronoscene.training.schedule import (
+    ViewSampler,
+    downscale_image,
+    downscale_mask,
+    downscale_view,
+    log_linear,
+)
 from chronoscene.training.splatting import (
     camera_centre_tensor,
+    centres_count,
     collect_gradients,
     draw,
     finite_rows,
@@ -88,11 +96,13 @@ class AnchorTrainer:
         done = self._progress_after(index, progress)
         position = self.sampler.next()
         view = self.train.views[position]
-        photo = self.train.load_image(position)
+        photo, mask = self.train.load_image(position), self.train.load_mask(position)
         if done <= self.config.coarse_until:
             factor = self.config.coarse_factor
             view, photo = downscale_view(view, factor), downscale_image(photo, factor)
-        loss, skipped = self._learn(view, photo, int(self.feature_rows[position]), done)
+            mask = None if mask is None else downscale_mask(mask, factor)
+        row = int(self.feature_rows[position])
+        loss, skipped = self._learn(view, photo, mask, row, done)
         resized = self._densify_if_due(index, done)
         if skipped is None:
             self._update(done, resized=resized)
@@ -104,7 +114,12 @@ class AnchorTrainer:
         return progress * (index + 1) / index if index > 0 else 1.0 / self.config.iterations
 
     def _learn(
-        self, view: TrainingView, photo: NDArray[np.uint8], row: int, done: float
+        self,
+        view: TrainingView,
+        photo: NDArray[np.uint8],
+        mask: NDArray[np.bool_] | None,
+        row: int,
+        done: float,
     ) -> tuple[float, Skipped | None]:
         """Loss, and why the step must be skipped, if it must."""
         visible = self.model.visible(view)
@@ -115,16 +130,19 @@ class AnchorTrainer:
         near_plane = self.model.layout.near_plane
         raster = draw(splats, view, self.background, near_plane=near_plane, check_finite=False)
         target = torch.from_numpy(photo).to(self.model.device)
-        loss = photometric_loss(raster.image[0], target, ssim_weight=self.config.ssim_weight)
+        counts = None if mask is None else torch.tensor(mask, device=self.model.device)
+        weight = self.config.ssim_weight
+        loss = photometric_loss(raster.image[0], target, ssim_weight=weight, mask=counts)
         if self.config.scale_weight:
             volume = mean_volume(splats.scales, splats.opacities)
             loss = loss + self.config.scale_weight * volume
-        skipped = collect_gradients(loss, raster.info, [self.optimizer, *self.tables.values()])
+        optimizers = [self.optimizer, *self.tables.values()]
+        skipped = collect_gradients(loss, raster.info, optimizers, counts)
         collects = (
             self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN
         )
         if collects and skipped is None:
-            self._collect(view, visible, positions, splats.opacities, raster.info)
+            self._collect(view, visible, positions, splats.opacities, raster.info, counts)
         return float(loss.detach()), skipped
 
     def _seen(self, visible: np.ndarray, row: int) -> AnchorModel:
@@ -200,13 +218,21 @@ class AnchorTrainer:
         positions: Tensor,
         opacities: Tensor,
         info: RasterInfo,
+        mask: Tensor | None,
     ) -> None:
         assert info.means2d.grad is not None
         if self.statistics is None:
             self.statistics = DensityStatistics(len(self.model), self.model.layout.offsets)
-        tensors = (positions, opacities, info.radii[0], info.means2d.grad[0])
+        radii, counted = info.radii[0], None
+        if mask is not None:
+            radii = radii * centres_count(info.means2d[0].detach(), mask)[:, None]
+            anchors = self.model.anchors.cpu().numpy()[visible]
+            centres = torch.from_numpy(projected_centres(anchors, view)).to(mask.device)
+            counted = centres_count(centres, mask).cpu().numpy()
+        tensors = (positions, opacities, radii, info.means2d.grad[0])
         at, alphas, radii, grads = (tensor.detach().cpu().numpy() for tensor in tensors)
-        self.statistics.update(visible, at, alphas, radii, grads, view.width, view.height)
+        size = view.width, view.height
+        self.statistics.update(visible, at, alphas, radii, grads, *size, counted)
 
     def _densify_if_due(self, index: int, done: float) -> bool:
         """Grow and prune; whether the rows of the anchors changed."""

@@ -48,6 +48,14 @@ def visible_anchors(
     return np.flatnonzero(mask)
 
 
+def projected_centres(anchors: NDArray[np.float32], view: View) -> NDArray[np.float64]:
+    """Pixel positions of anchors in front of a camera. [M, 3] -> [M, 2]"""
+    pose = view.cam_from_world
+    rays = np.einsum("ij,mj->mi", pose[:3, :3], anchors.astype(np.float64)) + pose[:3, 3]
+    pixels = np.einsum("ij,mj->mi", view.K, rays)
+    return np.asarray(pixels[:, :2] / pixels[:, 2:])
+
+
 @kernel(parallel=True, extras=[constants])
 def _mark(anchors, log_scales, pose, intrinsics, size, near, extent, mask):  # type: ignore[no-untyped-def]
     fx, fy, cx, cy = intrinsics

@@ -18,6 +18,7 @@ from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.model import logit, opacities_of, scales_of
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.training.splatting import centres_count
 
 PARTS = 2  # Gaussians that a split one becomes
 
@@ -31,19 +32,23 @@ class GradientStatistics:
         self.views = torch.zeros(count, device=device)
         """Number of views. [N]"""
 
-    def add(self, info: RasterInfo, width: int, height: int) -> None:
+    def add(self, info: RasterInfo, width: int, height: int, mask: Tensor | None = None) -> None:
         """Count one view whose ``backward`` is done.
 
         Args:
             info: Of a call with one camera.
             width: Of the image in pixels.
             height: The same.
+            mask: Where the photo counts: the view does not count for Gaussians whose centre is
+                elsewhere in it. bool [H, W]
         """
         assert info.means2d.grad is not None
         gradient = info.means2d.grad[0]
         # Norm of d loss / d (u, v), with u and v in half image sizes: no matter the resolution.
         x, y = gradient[:, 0] * (0.5 * width), gradient[:, 1] * (0.5 * height)
         seen = (info.radii[0] > 0).all(-1)
+        if mask is not None:
+            seen &= centres_count(info.means2d[0].detach(), mask)
         self.sums += torch.where(seen, (x * x + y * y).sqrt(), 0.0)
         self.views += seen
 

@@ -22,7 +22,7 @@ from chronoscene.training.adam import Adam
 from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.losses import photometric_loss
 from chronoscene.training.schedule import ViewSampler, log_linear
-from chronoscene.training.splatting import collect_gradients, draw
+from chronoscene.training.splatting import collect_gradients, draw, mask_tensor
 
 _SPLIT_STREAM = 1  # Keeps the samples of splits apart from other draws of the same seed
 
@@ -113,13 +113,14 @@ class GaussianTrainer:
         view = self.train.views[number]
         splats = self.model.splats(view, view.period)
         raster = draw(splats, view, self.background, near_plane=self.config.near_plane)
+        mask = mask_tensor(self.train, number, self.background.device)
         loss = self.loss(raster, number)
         self.optimizer.zero_grad()
-        skipped = collect_gradients(loss, raster.info, [self.optimizer])
+        skipped = collect_gradients(loss, raster.info, [self.optimizer], mask)
         if skipped:
             self.optimizer.zero_grad()
         elif due.collect:
-            self.statistics.add(raster.info, view.width, view.height)
+            self.statistics.add(raster.info, view.width, view.height, mask)
         if due.densify:
             self._densify(index, prune_large=due.prune_large)
         self._update(due)
@@ -159,7 +160,9 @@ class GaussianTrainer:
         """Photometric loss against the photo of view ``number``; methods may add terms."""
         # A copy, as cached images are not ours to write to, which torch cannot promise.
         photo = torch.from_numpy(self.train.load_image(number).copy()).to(raster.image.device)
-        return photometric_loss(raster.image[0], photo, ssim_weight=self.config.ssim_weight)
+        mask = mask_tensor(self.train, number, photo.device)
+        weight = self.config.ssim_weight
+        return photometric_loss(raster.image[0], photo, ssim_weight=weight, mask=mask)
 
     @torch.no_grad()
     def _densify(self, index: int, *, prune_large: bool) -> None:

@@ -6,6 +6,9 @@ The size of the model's camera decides; a file of a different size is resized to
 step. Intrinsics are scaled by the exact ratio of the sizes per axis.
 
 Orientation tags are not applied: COLMAP works on the pixels as stored, and so do the poses.
+
+Pixels that the mask of an image ignores, or whose alpha is below one half, do not count. Colours are
+those of the file: nothing is put behind transparent pixels.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from PIL import ExifTags, Image
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ImageError, SceneError
+from chronoscene.images.masks import FOLDER, MODES, mask_name, resize_mask
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.cameras import CAMERA_MODELS
 
@@ -124,30 +128,60 @@ def image_size(path: Path) -> tuple[int, int]:
         raise _image_error(path, error) from error
 
 
-def load_rgb(
-    path: Path,
-    *,
-    size: tuple[int, int] | None = None,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> NDArray[np.uint8]:
-    """Decode any image to RGB. [H, W, 3]
+def load_rgb(path: Path, *, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    """Decode any image to RGB; arguments and errors as for `load_photo`. [H, W, 3]"""
+    return load_photo(path, size=size)[0]
+
+
+def load_photo(
+    path: Path, mask_path: Path | None = None, *, size: tuple[int, int] | None = None
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+    """Decode any image to RGB, and find out which of its pixels count.
 
     Args:
-        path: The file.
+        path: The image.
+        mask_path: Its mask file, if it has one.
         size: Width and height to resize to; None to keep the file's.
-        background: Colour 0..1 behind transparent pixels.
+
+    Returns:
+        image: Colours of the file, also where it is transparent. [H, W, 3]
+        mask: Where the mask file and alpha allow it, by the rule of `resize_mask`; None where all
+            pixels count. [H, W]
 
     Raises:
-        ImageError: If the file is missing, damaged, or of a kind that has no plain colours.
+        ImageError: If a file is missing or damaged, the image of a kind that has no plain colours,
+            or the mask not of one channel, or not of the size of the image.
     """
     try:
         with Image.open(path) as image:
-            rgb = _to_rgb(_decode(image), background)
-            if size is not None and rgb.size != size:
-                rgb = rgb.resize(size, Image.Resampling.BICUBIC)
-            return np.array(rgb)
+            decoded = _decode(image)
+            rgb, mask = _to_rgb(decoded), _opaque(decoded)
     except _DECODE_ERRORS as error:
         raise _image_error(path, error) from error
+    if mask_path is not None:
+        allowed = _load_mask(mask_path, rgb.size)
+        mask = allowed if mask is None else mask & allowed
+    if size is not None and rgb.size != size:
+        rgb = rgb.resize(size, Image.Resampling.BICUBIC)
+        mask = mask if mask is None else resize_mask(mask, size)
+    return np.array(rgb), None if mask is None or mask.all() else mask
+
+
+def _load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Where a mask file is not 0. [H, W]"""
+    try:
+        with Image.open(path) as image:
+            found = f"{image.width} x {image.height} pixels of mode {image.mode}"
+            if image.size == size and image.mode in MODES:
+                return np.asarray(image) != 0
+    except _DECODE_ERRORS as error:
+        raise _image_error(path, error) from error
+    raise ImageError(
+        path,
+        expected=f"a mask of {size[0]} x {size[1]} pixels as its image, one channel of 8 bits",
+        found=found,
+        todo="save the mask again as a grey PNG at the size of the image",
+    )
 
 
 def _orientation(image: Image.Image) -> int:
@@ -164,16 +198,23 @@ def _decode(image: Image.Image) -> Image.Image:
     return image.transpose(_UNDO_ORIENTATION[orientation])
 
 
-def _to_rgb(image: Image.Image, background: tuple[float, float, float]) -> Image.Image:
+def _to_rgb(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I"):
         image = _from_16_bit(image)
     if image.mode == "F":
         raise ValueError("pixels that are floating point numbers")
-    if "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La"):
-        behind = tuple(round(255 * c) for c in background)
-        canvas = Image.new("RGBA", image.size, (behind[0], behind[1], behind[2], 255))
-        image = Image.alpha_composite(canvas, image.convert("RGBA"))
-    return image.convert("RGB")
+    return (image.convert("RGBA") if _is_transparent(image) else image).convert("RGB")
+
+
+def _is_transparent(image: Image.Image) -> bool:
+    return "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
+
+
+def _opaque(image: Image.Image) -> NDArray[np.bool_] | None:
+    """Where alpha is one half or more; None where there is none. [H, W]"""
+    if image.mode.startswith("I") or not _is_transparent(image):
+        return None
+    return np.asarray(image.convert("RGBA"))[..., 3] >= 128
 
 
 def _from_16_bit(image: Image.Image) -> Image.Image:
@@ -202,26 +243,19 @@ class ImageStore:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        *,
-        max_width: int = MAX_WIDTH,
-        memory_limit: int = 2 * 1024**3,
-        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        self, scene: Scene, *, max_width: int = MAX_WIDTH, memory_limit: int = 2 * 1024**3
     ) -> None:
         """Decode nothing yet.
 
         Args:
             scene: Where the images are.
             max_width: Limit of the resize rule in pixels.
-            memory_limit: Bytes that cached images may take; 0 for no cache.
-            background: Colour 0..1 behind transparent pixels.
+            memory_limit: Bytes that cached images and masks may take; 0 for no cache.
         """
         self._scene = scene
         self._max_width = max_width
         self._limit = memory_limit
-        self._background = background
-        self._cache: OrderedDict[str, NDArray[np.uint8]] = OrderedDict()
+        self._cache: OrderedDict[str, _Photo] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
 
@@ -241,29 +275,47 @@ class ImageStore:
             RGB. [H, W, 3]
 
         Raises:
-            ImageError: If the file is missing or damaged.
+            ImageError: If the file or its mask is missing or damaged.
         """
-        with self._lock:
-            image = self._cache.get(frame.name)
-            if image is not None:
-                self._cache.move_to_end(frame.name)
-                return image
-        size = evaluation_size(*frame.camera.size, self._max_width)
-        path = self._scene.image_path(frame)
-        return self._keep(frame.name, load_rgb(path, size=size, background=self._background))
+        return self._photo(frame)[0]
 
-    def _keep(self, name: str, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Put an image into the cache; another thread may have been faster."""
+    def load_mask(self, frame: Frame) -> NDArray[np.bool_] | None:
+        """Where the image of a frame counts, None where all of it does; otherwise as `load`.
+
+        A resized pixel counts if all pixels of the file count that its colour is made of. [H, W]
+        """
+        return self._photo(frame)[1]
+
+    def _photo(self, frame: Frame) -> _Photo:
+        with self._lock:
+            photo = self._cache.get(frame.name)
+            if photo is not None:
+                self._cache.move_to_end(frame.name)
+                return photo
+        size = evaluation_size(*frame.camera.size, self._max_width)
+        path, mask_path = self._scene.image_path(frame), self._scene.masks.get(frame.name)
+        return self._keep(frame.name, load_photo(path, mask_path, size=size))
+
+    def _keep(self, name: str, photo: _Photo) -> _Photo:
+        """Put a photo into the cache; another thread may have been faster."""
         with self._lock:
             if name in self._cache:
                 return self._cache[name]
-            if image.nbytes > self._limit:
-                return image
-            self._cache[name] = image
-            self._bytes += image.nbytes
+            if _bytes(photo) > self._limit:
+                return photo
+            self._cache[name] = photo
+            self._bytes += _bytes(photo)
             while self._bytes > self._limit:
-                self._bytes -= self._cache.popitem(last=False)[1].nbytes
-        return image
+                self._bytes -= _bytes(self._cache.popitem(last=False)[1])
+        return photo
+
+
+_Photo = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
+"""What `load_photo` gives."""
+
+
+def _bytes(photo: _Photo) -> int:
+    return sum(array.nbytes for array in photo if array is not None)
 
 
 def place_images(
@@ -276,6 +328,8 @@ def place_images(
 ) -> None:
     """Put the images of a scene below ``root``, under their names or the given new ones.
 
+    Mask files go to ``masks/`` beside ``root``, under the names that belong to those of the images.
+
     Raises:
         SceneError: If an image is missing.
         ConfigError: If the image source is unknown.
@@ -285,6 +339,8 @@ def place_images(
         if image_source != "none":
             name = names[frame.name] if names is not None else frame.name
             place_image(scene.image_path(frame), root / name, image_source)
+            if mask := scene.masks.get(frame.name):
+                place_image(mask, root.parent / FOLDER / mask_name(name), image_source)
         if progress is not None:
             progress(done, len(scene.frames))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal, Self
@@ -136,6 +136,8 @@ class Scene:
     """Origin of the split, in words: ``sparse/0/test.txt`` or the default rule."""
     format: str
     world: WorldFrame = field(default_factory=WorldFrame)
+    masks: Mapping[str, Path] = field(default_factory=dict)
+    """Mask files, by the names of the frames that have one."""
 
     @property
     def num_periods(self) -> int:

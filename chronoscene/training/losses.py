@@ -18,7 +18,9 @@ _CHUNK = 4096
 """Gaussians summed one after the other; fixed, so the sum does not depend on the threads."""
 
 
-def photometric_loss(image: Tensor, target: Tensor, *, ssim_weight: float = 0.2) -> Tensor:
+def photometric_loss(
+    image: Tensor, target: Tensor, *, ssim_weight: float = 0.2, mask: Tensor | None = None
+) -> Tensor:
     """L1 and structural dissimilarity, differentiable in the image.
 
         loss = (1 - w) mean|I - T| + w (1 - SSIM(I, T))
@@ -32,9 +34,12 @@ def photometric_loss(image: Tensor, target: Tensor, *, ssim_weight: float = 0.2)
         image: 0..1. float32 [H, W, 3]
         target: uint8 0..255, or float32 0..1. [H, W, 3]
         ssim_weight: w.
+        mask: Where the target counts; None for everywhere. bool [H, W]
 
     Returns:
-        A scalar.
+        A scalar. With a mask, both images are equal to `image` where it ignores, and the mean over
+        all pixels is divided by the share of those that count: ignored pixels get no gradient, and
+        the target makes no difference there. Nearly 0 where nothing counts.
 
     Raises:
         ShapeError: If the images differ in size, or have other types.
@@ -42,20 +47,39 @@ def photometric_loss(image: Tensor, target: Tensor, *, ssim_weight: float = 0.2)
     Source: Kerbl et al. 2023 (3D Gaussian Splatting); Wang et al. 2004 for SSIM.
     """
     _check_images(image, target)
+    if mask is not None:
+        image, target, share = _where_it_counts(image, target, mask)
+        return photometric_loss(image, target, ssim_weight=ssim_weight) / share
     if image.device.type != "cpu" or image.dtype != torch.float32:
         return photometric_loss_reference(image, target, ssim_weight=ssim_weight)
     return _PhotometricLoss.apply(image, target, ssim_weight)
 
 
 def photometric_loss_reference(
-    image: Tensor, target: Tensor, *, ssim_weight: float = 0.2
+    image: Tensor, target: Tensor, *, ssim_weight: float = 0.2, mask: Tensor | None = None
 ) -> Tensor:
     """The definition of `photometric_loss` in plain torch, in the type of ``image``."""
     _check_images(image, target)
+    if mask is not None:
+        image, target, share = _where_it_counts(image, target, mask)
+        return photometric_loss_reference(image, target, ssim_weight=ssim_weight) / share
     # In float32 as in the kernel, so that both agree on where the image equals the target.
-    truth = (target.float() / 255 if target.dtype == torch.uint8 else target).to(image)
+    truth = _unit_range(target).to(image)
     l1 = (image - truth).abs().mean()
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(image, truth).mean())
+
+
+def _unit_range(target: Tensor) -> Tensor:
+    return target.float() / 255 if target.dtype == torch.uint8 else target
+
+
+def _where_it_counts(image: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Both images with the same constants where the mask ignores, and the share that counts."""
+    check_shape("mask", mask, tuple(image.shape[:2]))
+    counts, fixed = mask[..., None], image.detach()
+    share = max(int(mask.sum()), 1) / mask.numel()
+    truth = _unit_range(target).to(image)
+    return torch.where(counts, image, fixed), torch.where(counts, truth, fixed), share
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:

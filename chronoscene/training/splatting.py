@@ -133,7 +133,10 @@ def draw(
 
 
 def collect_gradients(
-    loss: Tensor, info: RasterInfo, optimizers: Iterable[Adam | DenseTable | RowAdam]
+    loss: Tensor,
+    info: RasterInfo,
+    optimizers: Iterable[Adam | DenseTable | RowAdam],
+    mask: Tensor | None = None,
 ) -> Skipped | None:
     """The backward pass of a training step.
 
@@ -141,15 +144,35 @@ def collect_gradients(
         loss: What to minimise.
         info: Of the rasterization.
         optimizers: Those that step after it.
+        mask: Where the photo counts; None for everywhere. bool [H, W]
 
     Returns:
         Why the step must be skipped, if it must: the optimisers may not use what they have then.
     """
-    if not (info.radii > 0).any():
+    if not (info.radii > 0).any() or (mask is not None and not mask.any()):
         return "empty"
     loss.backward()
     gradients = (gradient for optimizer in optimizers for gradient in optimizer.gradients())
     return None if all_finite([loss]) and all_finite(gradients) else "not finite"
+
+
+def centres_count(means2d: Tensor, mask: Tensor) -> Tensor:
+    """Whether projected centres lie where a photo counts, or outside of it. [N, 2] -> [N]
+
+    Args:
+        means2d: Places in pixels; pixel (0, 0) is centred at (0.5, 0.5).
+        mask: Where the photo counts. bool [H, W]
+    """
+    size = means2d.new_tensor(mask.shape[::-1])
+    inside = ((means2d >= 0) & (means2d < size)).all(-1)
+    x, y = torch.where(inside[:, None], means2d, 0.0).long().unbind(-1)
+    return mask[y, x] | ~inside
+
+
+def mask_tensor(train: TrainingSet, index: int, device: str | torch.device) -> Tensor | None:
+    """Where the photo of a training view counts; None for everywhere. bool [H, W]"""
+    mask = train.load_mask(index)
+    return None if mask is None else torch.tensor(mask, device=device)
 
 
 def prediction_of(raster: Rasterization) -> Prediction:

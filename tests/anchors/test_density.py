@@ -161,6 +161,19 @@ def test_statistics_of_a_view() -> None:
     )
 
 
+def test_a_view_does_not_count_for_anchors_in_what_its_mask_ignores() -> None:
+    """No visit of the anchor; a Gaussian of it that lies elsewhere is hit all the same."""
+    statistics = DensityStatistics(2, 2)
+    positions, opacities = np.arange(4), np.full(4, 0.5, np.float32)
+    radii = np.array([[1, 1], [0, 0], [2, 2], [2, 2]], np.int32)
+    grads = np.full((4, 2), 1e-3, np.float32)
+    counted = np.array([False, True])
+    statistics.update(np.arange(2), positions, opacities, radii, grads, 2, 2, counted)
+    assert statistics.visits.tolist() == [0, 1] and statistics.opacity_sum.tolist() == [0, 1]
+    assert statistics.motion[0] == 0 and statistics.motion[1] > 0
+    assert statistics.hits.tolist() == [[1, 0], [1, 1]]
+
+
 def test_statistics_of_many_anchors() -> None:
     """As counted one by one, whatever the anchors that a task takes together."""
     rng = np.random.default_rng(0)

@@ -7,9 +7,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chronoscene.anchors.visibility import visible_anchors
+from chronoscene.anchors.visibility import projected_centres, visible_anchors
 from chronoscene.methods import View
 from chronoscene.rasterizer import NEAR_PLANE, rasterize
+from chronoscene.training.splatting import camera_tensors
 
 
 @settings(max_examples=20, deadline=None)
@@ -48,4 +49,20 @@ def test_the_frustum_rule_asks_for_the_centre() -> None:
     )
     np.testing.assert_array_equal(
         visible_anchors(anchors, log_scales, view, near_plane=NEAR_PLANE, by="frustum"), [0]
+    )
+
+
+def test_projected_centres_are_those_of_the_rasterizer() -> None:
+    angle = 0.3
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    pose[2, 3] = 2.0
+    view = View(np.array([[30.0, 0, 9], [0, 20.0, 8], [0, 0, 1]]), 20, 16, pose)
+    anchors = np.random.default_rng(0).uniform(-0.5, 0.5, (9, 3)).astype(np.float32)
+    count = len(anchors)
+    rotations = torch.tensor([[1.0, 0, 0, 0]]).expand(count, 4)
+    tensors = (rotations, torch.full((count, 3), 0.1), torch.ones(count), torch.ones(count, 3))
+    raster = rasterize(torch.from_numpy(anchors), *tensors, *camera_tensors(view), 20, 16)
+    np.testing.assert_allclose(
+        projected_centres(anchors, view), raster.info.means2d[0].numpy(), atol=1e-4
     )

@@ -54,6 +54,19 @@ def test_gradients_count_in_half_images_and_are_averaged_over_the_views():
     np.testing.assert_allclose(statistics.mean(), expected, rtol=1e-6)
 
 
+def test_views_do_not_count_for_gaussians_in_what_their_mask_ignores():
+    """Of four, one lies where the photo counts, one where it does not, two beside the photo."""
+    info = view_of([[1e-3, 0.0]] * 4, [[1, 1]] * 4)
+    with torch.no_grad():
+        info.means2d[0] = torch.tensor([[19.9, 0.1], [0.1, 39.9], [-0.1, 5.0], [5.0, 40.0]])
+    mask = torch.zeros(40, 20, dtype=torch.bool)
+    mask[0, 19] = True
+    statistics = GradientStatistics(4, "cpu")
+    statistics.add(info, 20, 40, mask)
+    assert statistics.views.tolist() == [1, 0, 1, 1]
+    np.testing.assert_allclose(statistics.sums, [0.01, 0, 0.01, 0.01], rtol=1e-6)
+
+
 def test_a_small_gaussian_is_copied():
     parameters = rows(4)
     result = run_round(parameters, torch.tensor([0.0, 3e-4, 1e-4, 2e-4]))

@@ -3,6 +3,7 @@
 import io
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from chronoscene.images.store import (
     ImageStore,
     evaluation_size,
     image_size,
+    load_photo,
     load_rgb,
     resize_camera,
 )
@@ -105,25 +107,48 @@ def test_lossless_formats(tmp_path, name):
     assert image_size(path) == (2, 2)
 
 
-def test_transparent_pixels_show_the_background(tmp_path):
-    rgba = np.dstack([RGB, np.array([[255, 0], [128, 255]], np.uint8)])
-    path = save(tmp_path, Image.fromarray(rgba), "a.png")
-    image = load_rgb(path, background=(1.0, 0.5, 0.0))
-    np.testing.assert_array_equal(image[0], [[255, 0, 0], [255, 128, 0]])
-    np.testing.assert_allclose(image[1, 0], [127, 64, 128], atol=1)
-    np.testing.assert_array_equal(load_rgb(path)[0, 1], [0, 0, 0])
+def test_transparent_pixels_keep_their_colour_and_do_not_count_below_one_half(tmp_path):
+    rgba = np.dstack([RGB, np.array([[255, 0], [128, 127]], np.uint8)])
+    image, mask = load_photo(save(tmp_path, Image.fromarray(rgba), "a.png"))
+    np.testing.assert_array_equal(image, RGB)
+    np.testing.assert_array_equal(mask, [[True, False], [True, False]])
 
 
 def test_transparent_palette_and_grey_with_alpha(tmp_path):
     palette = Image.fromarray(np.array([[0, 1]], np.uint8), mode="P")
     palette.putpalette([10, 20, 30, 40, 50, 60])
-    path = save(tmp_path, palette, "p.png", transparency=1)
-    np.testing.assert_array_equal(
-        load_rgb(path, background=(0, 0, 1)), [[[10, 20, 30], [0, 0, 255]]]
-    )
+    image, mask = load_photo(save(tmp_path, palette, "p.png", transparency=1))
+    np.testing.assert_array_equal(image, [[[10, 20, 30], [40, 50, 60]]])
+    np.testing.assert_array_equal(mask, [[True, False]])
     grey = Image.merge("LA", [Image.new("L", (1, 1), 200), Image.new("L", (1, 1), 0)])
-    path = save(tmp_path, grey, "la.png")
-    np.testing.assert_array_equal(load_rgb(path, background=(0, 1, 0)), [[[0, 255, 0]]])
+    image, mask = load_photo(save(tmp_path, grey, "la.png"))
+    assert image.tolist() == [[[200, 200, 200]]] and mask.tolist() == [[False]]
+
+
+def test_a_mask_file_and_alpha_both_have_to_allow_a_pixel(tmp_path):
+    alpha = np.array([[255, 0], [255, 255]], np.uint8)
+    path = save(tmp_path, Image.fromarray(np.dstack([RGB, alpha])), "a.png")
+    values = Image.fromarray(np.array([[0, 255], [1, 255]], np.uint8))
+    _, mask = load_photo(path, save(tmp_path, values, "mask.png"))
+    np.testing.assert_array_equal(mask, [[False, False], [True, True]])
+    _, mask = load_photo(path, save(tmp_path, values.convert("1", dither=0), "bits.png"))
+    np.testing.assert_array_equal(mask, [[False, False], [False, True]])
+
+
+def test_opaque_images_and_masks_that_allow_everything_are_no_masks(tmp_path):
+    rgba = np.dstack([RGB, np.full((2, 2), 255, np.uint8)])
+    path = save(tmp_path, Image.fromarray(rgba), "a.png")
+    assert load_photo(path, save(tmp_path, Image.new("L", (2, 2), 9), "mask.png"))[1] is None
+
+
+@pytest.mark.parametrize(
+    ("mode", "size", "found"),
+    [("L", (2, 3), "2 x 3 pixels of mode L"), ("RGB", (2, 2), "mode RGB")],
+)
+def test_masks_of_another_kind_or_size_are_refused(tmp_path, mode, size, found):
+    path = save(tmp_path, Image.fromarray(RGB), "a.png")
+    with pytest.raises(ImageError, match=rf"mask\.png: expected a mask of 2 x 2.*{found}"):
+        load_photo(path, save(tmp_path, Image.new(mode, size), "mask.png"))
 
 
 def test_grey_8_and_16_bit(tmp_path):
@@ -232,6 +257,22 @@ def test_store_gives_the_file(scene):
             np.testing.assert_array_equal(store.load(frame), np.array(image))
         assert store.camera(frame) is frame.camera
     assert store.cached_bytes == 6 * IMAGE_BYTES
+    assert store.load_mask(scene.frames[0]) is None
+
+
+def test_masks_are_cached_beside_the_images_at_their_size(scene, tmp_path):
+    values = np.full((48, 64), 255, np.uint8)
+    values[:24] = 0
+    Image.fromarray(values).save(tmp_path / "mask.png")
+    name = scene.frames[0].name
+    masked = replace(scene, masks={name: tmp_path / "mask.png"})
+    store = ImageStore(masked, max_width=32, memory_limit=IMAGE_BYTES // 4 + 32 * 24)
+    mask = store.load_mask(masked.frames[0])
+    assert mask.shape == (24, 32) and not mask[:14].any() and mask[14:].all()
+    assert store.load_mask(masked.frames[0]) is mask
+    assert store.cached_bytes == IMAGE_BYTES // 4 + 32 * 24
+    assert store.load_mask(masked.frames[1]) is None
+    assert store.cached_bytes == IMAGE_BYTES // 4
 
 
 def test_store_and_camera_agree_on_the_size(scene):

@@ -397,3 +397,44 @@ def test_one_period_is_enough(spec):
     method, reports = tiny_training.train(spec, data, steps=5)
     assert all(np.isfinite(report.loss) for report in reports)
     assert np.isfinite(method.render(data.views[0], 0.0).rgb).all()
+
+
+def hidden(data, seed):
+    """The set with a rectangle of noise in every photo, which the masks ignore as they ignore one
+    photo altogether."""
+    mask = np.ones((tiny_training.HEIGHT, tiny_training.WIDTH), bool)
+    mask[8:20, 5:18] = False
+    rng = np.random.default_rng(seed)
+    noise = rng.integers(0, 256, (len(data.views), *mask.shape, 3), np.uint8)
+    masks = [mask] * (len(data.views) - 1) + [np.zeros_like(mask)]
+    return dataclasses.replace(
+        data,
+        load_image=lambda i: np.where(masks[i][..., None], data.load_image(i), noise[i]),
+        load_mask=lambda i: masks[i],
+    )
+
+
+def test_what_masks_ignore_does_not_change_the_model(trained, tmp_path):
+    models = []
+    for seed in (0, 1):
+        data = hidden(trained.data, seed)
+        method, reports = tiny_training.train(trained.spec, data)
+        (tmp_path / str(seed)).mkdir()
+        method.save(tmp_path / str(seed))
+        models.append((contents(tmp_path / str(seed)), reports))
+    assert models[0] == models[1]
+    empty = sum(report.skipped == "empty" for report in models[0][1])
+    assert empty == tiny_training.STEPS // len(data.views)
+    errors = [
+        np.mean([squared_error(m, data, trained.data, i) for i in range(len(data.views) - 1)])
+        for m in (trained.method, method)
+    ]
+    assert errors[1] < 1.15 * errors[0]
+
+
+def squared_error(method, masked, clean, index):
+    """Of a training view, where its mask lets it count."""
+    view = clean.views[index]
+    image = method.render(view, float(view.period)).rgb
+    difference = image - clean.load_image(index) / 255.0
+    return (difference[masked.load_mask(index)] ** 2).mean()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numba
 import numpy as np
 import pytest
@@ -82,6 +84,61 @@ def test_definition_passes_gradcheck(weight: float) -> None:
     assert torch.autograd.gradcheck(
         lambda x: photometric_loss_reference(x, target, ssim_weight=weight), (image,)
     )
+
+
+def random_mask(height: int, width: int) -> torch.Tensor:
+    mask = torch.rand(height, width, generator=torch.Generator().manual_seed(3)) > 0.3
+    mask[height // 3 : height // 2 + 1, : width // 2] = False
+    return mask
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_ignored_pixels_are_equal_constants_and_the_loss_is_a_mean_over_the_others(
+    weight: float,
+) -> None:
+    """The sums written out, in float64: differences, and similarities of windows."""
+    image, target = random_images(19, 23)
+    mask = random_mask(19, 23)
+    leaf = image.double().requires_grad_()
+    counts = mask[..., None].double()
+    a = leaf * counts + image.double() * (1 - counts)
+    b = target.double() / 255 * counts + image.double() * (1 - counts)
+    l1, dissimilarity = (a - b).abs().sum(), (1 - ssim_map(a, b)).sum()
+    expected = ((1 - weight) * l1 + weight * dissimilarity) / (3 * mask.sum())
+    expected.backward()
+    truth = expected.item()
+    for loss in (photometric_loss, photometric_loss_reference):
+        ours = image.clone().requires_grad_()
+        value = loss(ours, target, ssim_weight=weight, mask=mask)
+        value.backward()
+        assert value.item() == pytest.approx(truth, abs=2 * VALUE_TOLERANCE)
+        assert not ours.grad[~mask].any()
+        scale = float(leaf.grad.abs().max())
+        assert float((ours.grad - leaf.grad).abs().max()) <= GRADIENT_TOLERANCE * scale
+
+
+def test_what_is_ignored_makes_no_difference() -> None:
+    image, target = random_images(19, 23)
+    mask = random_mask(19, 23)
+    other = torch.where(mask[..., None], target, 255 - target)
+    results = [value_and_gradient(masked(mask), image, t, 0.2) for t in (target, other)]
+    assert torch.equal(results[0][0], results[1][0]) and torch.equal(results[0][1], results[1][1])
+
+
+def test_masks_that_count_everything_or_nothing() -> None:
+    image, target = random_images(19, 23)
+    everything = torch.ones(19, 23, dtype=torch.bool)
+    plain, masks = (
+        value_and_gradient(loss, image, target, 0.2)
+        for loss in (photometric_loss, masked(everything))
+    )
+    assert torch.equal(plain[0], masks[0]) and torch.equal(plain[1], masks[1])
+    value, gradient = value_and_gradient(masked(~everything), image, target, 0.2)
+    assert value.isfinite() and not gradient.any()
+
+
+def masked(mask):  # type: ignore[no-untyped-def]
+    return partial(photometric_loss, mask=mask)
 
 
 @settings(max_examples=30, deadline=None)

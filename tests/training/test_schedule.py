@@ -6,7 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.methods import TrainingView
-from chronoscene.training.schedule import ViewSampler, downscale_image, downscale_view, log_linear
+from chronoscene.training.schedule import (
+    ViewSampler,
+    downscale_image,
+    downscale_mask,
+    downscale_view,
+    log_linear,
+)
 
 POSITIVE = st.floats(1e-8, 1e3)
 
@@ -95,3 +101,12 @@ def test_off_stays_off_and_a_zero_end_is_refused():
     assert log_linear(0.3, 0.0, 0.0) == 0.0
     with pytest.raises(ValueError, match="positive"):
         log_linear(0.3, 1.0, 0.0)
+
+
+def test_a_square_of_pixels_counts_if_all_of_it_does():
+    mask = np.ones((5, 7), bool)
+    mask[1, 2] = mask[4, 0] = mask[0, 6] = False
+    np.testing.assert_array_equal(
+        downscale_mask(mask, 2), [[True, False, True], [True, True, True]]
+    )
+    assert downscale_mask(np.ones((1, 3), bool), 4).shape == (1, 1)
