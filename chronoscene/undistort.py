@@ -17,7 +17,8 @@ from PIL import Image
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images import undistortion
-from chronoscene.images.store import ImageSource, Progress, load_rgb, place_image
+from chronoscene.images.masks import FOLDER, find_masks, mask_name
+from chronoscene.images.store import ImageSource, Progress, load_photo, place_image
 from chronoscene.io.staging import staged_folder
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.scene import Scene
@@ -60,7 +61,8 @@ def undistort(
     """Write a scene in the ChronoScene format whose cameras are all PINHOLE.
 
     Poses, periods and split stay. Where a file has another size than its camera, the camera is
-    scaled to the file first.
+    scaled to the file first. Masks are resampled with their images; what transparent pixels say
+    goes to the masks of images that change.
 
     Args:
         scene: Any scene.
@@ -87,9 +89,10 @@ def undistort(
     new, observations_lost, points_lost = undistortion.move_observations(scene, changes)
     with staged_folder(out) as staged:
         our_format.write_texts(new, staged)
-        _write_images(scene, staged / "images", changes, image_source, threads, progress)
+        _write_images(scene, staged, changes, image_source, threads, progress)
     distinct = tuple(dict.fromkeys(changes))
-    done = replace(new, root=out, images_root=out / "images", format=our_format.NAME)
+    masks = find_masks(out, [frame.name for frame in scene.frames])
+    done = replace(new, root=out, images_root=out / "images", format=our_format.NAME, masks=masks)
     return Undistortion(done, distinct, observations_lost, points_lost)
 
 
@@ -106,11 +109,15 @@ def _write_images(
     pool = ThreadPoolExecutor(threads or available_threads())
 
     def write(i: int) -> None:
-        source, target = scene.image_path(scene.frames[i]), root / scene.frames[i].name
-        if changes[i].is_copy:
-            place_image(source, target, image_source)
-        else:
-            _resample(source, target, changes[i])
+        name = scene.frames[i].name
+        source, target = scene.image_path(scene.frames[i]), root / "images" / name
+        mask, new_mask = scene.masks.get(name), root / FOLDER / mask_name(name)
+        if not changes[i].is_copy:
+            _resample((source, mask), (target, new_mask), changes[i])
+            return
+        place_image(source, target, image_source)
+        if mask is not None:
+            place_image(mask, new_mask, image_source)
 
     try:
         for done, _ in enumerate(pool.map(write, order), start=1):
@@ -121,8 +128,17 @@ def _write_images(
         undistortion.sampling_map.cache_clear()
 
 
-def _resample(source: Path, target: Path, change: undistortion.CameraChange) -> None:
-    pixels = undistortion.warp(load_rgb(source), *undistortion.sampling_map(change))
+def _resample(
+    sources: tuple[Path, Path | None], targets: tuple[Path, Path], change: undistortion.CameraChange
+) -> None:
+    """Resample an image, and its mask if something of it is ignored."""
+    (source, _), (target, new_mask) = sources, targets
+    image, mask = load_photo(*sources)
+    places = undistortion.sampling_map(change)
+    pixels = undistortion.warp(image, *places)
+    if mask is not None:
+        new_mask.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(undistortion.warp_mask(mask, *places)).convert("L").save(new_mask)
     target.parent.mkdir(parents=True, exist_ok=True)
     options: dict[str, Any] = {}
     suffix = target.suffix.lower()

@@ -42,6 +42,25 @@ def test_there_and_back(make_scene_folder, tmp_path):
     assert snapshot(folder) == before
 
 
+def test_masks_follow_their_images(make_scene_folder, tmp_path):
+    """Through the other formats, where images get other names; a stray mask stays behind."""
+    folder = make_scene_folder()
+    scene = read_scene(folder)
+    (folder / "masks/a").mkdir(parents=True)
+    (folder / "masks/a/0002.png.png").write_bytes(b"a mask")
+    (folder / "masks/stray.png").write_bytes(b"of no image")
+    assert read_scene(folder).masks == {"a/0002.png": folder / "masks/a/0002.png.png"}
+    assert "a/0002.png" in {f.name for f in scene.frames}
+    assert convert(folder, tmp_path / "studio", target="nerfstudio").warnings
+    convert(tmp_path / "studio", tmp_path / "plain", target="colmap-folders")
+    done = convert(tmp_path / "plain", tmp_path / "days", target="cl-splats")
+    assert "cl-splats cannot store masks, which its loader does not read" in done.warnings
+    again = read_scene(tmp_path / "days")
+    ((name, path),) = again.masks.items()
+    assert name.endswith("a_0002.png") and path.read_bytes() == b"a mask"
+    assert len(list(tmp_path.glob("plain/masks/**/*.png"))) == 1
+
+
 def test_labels_dates_and_world_are_kept(make_scene_folder, tmp_path):
     folder = make_scene_folder()
     (folder / "sparse/periods.json").write_text(

@@ -11,7 +11,7 @@ from PIL import Image
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
-from chronoscene.images.store import load_rgb
+from chronoscene.images.store import ImageStore, load_rgb
 from chronoscene.images.undistortion import (
     CameraChange,
     move_pixels,
@@ -508,3 +508,35 @@ def test_a_folder_in_use_is_refused_before_the_work(make_distorted, tmp_path):
     scene = make_distorted(Camera(1, "OPENCV", *SIZE, CAMERAS["OPENCV"]))
     with pytest.raises(SceneError, match="expected a new or empty folder"):
         undistort(scene, tmp_path)
+
+
+@pytest.mark.parametrize("distorted", [True, False])
+def test_masks_are_resampled_or_copied_with_their_images(make_distorted, tmp_path, distorted):
+    """One photo has a mask file, one has alpha, which only its own file can keep."""
+    params = CAMERAS["OPENCV"] if distorted else (*CAMERAS["OPENCV"][:4], 0.0, 0.0, 0.0, 0.0)
+    scene = make_distorted(Camera(1, "OPENCV", *SIZE, params))
+    values = np.full(SIZE[::-1], 255, np.uint8)
+    values[60:120, 80:160] = 0
+    (scene.root / "masks/a").mkdir(parents=True)
+    Image.fromarray(values).save(scene.root / "masks/a/0.png.png")
+    clear = scene.image_path(scene.frames[1])
+    pixels = np.array(Image.open(clear))
+    Image.fromarray(np.dstack([pixels, values])).save(clear)
+    scene = read_scene(scene.root)
+    new = undistort(scene, tmp_path / "out").scene
+    assert new.masks == read_scene(tmp_path / "out").masks
+    store = ImageStore(new)
+    masks = [store.load_mask(frame) for frame in new.frames]
+    np.testing.assert_array_equal(masks[0], masks[1])
+    assert masks[2] is None
+    if not distorted:
+        assert list(new.masks) == ["a/0.png"]
+        np.testing.assert_array_equal(masks[0], values != 0)
+        return
+    assert list(new.masks) == ["a/0.png", "a/1.png"]
+    assert Image.open(new.masks["a/0.png"]).mode == "L"
+    # Centres of what was ignored, and of what is by the places that the new pixels look at.
+    x, y = sampling_map(CameraChange(scene.frames[0].camera, new.frames[0].camera))
+    outside = (x < 77) | (x > 163) | (y < 57) | (y > 123)
+    inside = (x > 80) & (x < 160) & (y > 60) & (y < 120)
+    assert masks[0][outside].all() and not masks[0][inside].any()

@@ -18,6 +18,8 @@ from chronoscene.formats.shared.json_values import (
     read_json,
     world_item,
 )
+from chronoscene.images.masks import FOLDER as MASKS
+from chronoscene.images.masks import find_masks
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame, splits
@@ -74,6 +76,7 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
         split_rule=rule,
         format=NAME,
         world=read_world(path),
+        masks=find_masks(path, names),
     )
 
 
@@ -94,7 +97,7 @@ def _read_model(path: Path) -> Model:
 def remarks(path: Path) -> list[str]:
     """What of a folder is not part of the format."""
     names = {p.name + "/" * p.is_dir() for p in path.iterdir()}
-    others = sorted(names - {"images/", "sparse/"})
+    others = sorted(names - {"images/", "sparse/", f"{MASKS}/"})
     return [f"not part of the format, and not converted: {', '.join(others)}"] if others else []
 
 

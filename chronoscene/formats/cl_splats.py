@@ -189,6 +189,7 @@ def losses(scene: Scene) -> list[str]:
     return [
         *colmap_layout.lost_labels(scene, order),
         *colmap_layout.lost_names(names),
+        *colmap_layout.lost_masks(scene),
         *colmap_layout.lost_split(scene, {old[name] for name in sorted(old)[::TEST_EVERY]}, rule),
     ]
 

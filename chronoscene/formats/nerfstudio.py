@@ -9,6 +9,7 @@
   undone, so scenes are in the original world. ``ply_file_path`` is in the world of the file.
   Without the first, and with the model in ``colmap/sparse/0``, the axes were swapped as old
   versions did it.
+- The ``mask_path`` of a frame is its mask, black where pixels are ignored.
 - nerfstudio's own centring and scaling of poses are not applied: they belong to training.
 
 Source: the data parser of ``nerfstudio-project/nerfstudio``.
@@ -41,6 +42,8 @@ from chronoscene.formats.shared.json_values import (
 )
 from chronoscene.formats.shared.ply import read_points, write_points
 from chronoscene.formats.shared.transforms import CameraTable, Shot
+from chronoscene.images.masks import FOLDER as MASKS
+from chronoscene.images.masks import mask_name
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Points, Scene, WorldFrame
@@ -99,6 +102,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     return replace(
         _to_original(path, data, scene),
         world=parse_world(place, world) if isinstance(world, dict) else WorldFrame(),
+        masks=_find_masks(path, scene, named),
     )
 
 
@@ -106,11 +110,8 @@ def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
     data = read_json(path / FILE, dict)
     frames = transforms.read_frames(path / FILE, data)
-    found = [
-        f"{what} of {count} frames are not read"
-        for key, what in (("mask_path", "masks"), ("depth_file_path", "depth maps"))
-        if (count := sum(key in frame for frame in frames))
-    ]
+    depths = sum("depth_file_path" in frame for frame in frames)
+    found = [f"depth maps of {depths} frames are not read"] if depths else []
     if "fisheye_crop_radius" in data:
         found.append("fisheye_crop_radius is not read: the border of the images is kept")
     if (path / COLMAP).is_dir():
@@ -140,6 +141,22 @@ def _by_name(path: Path, frames: list[dict[str, Any]]) -> dict[str, tuple[str, d
             raise json_error(path / FILE, "each image once", f"{name!r} twice")
         named[name] = place, frame
     return named
+
+
+def _find_masks(
+    path: Path, scene: Scene, named: Mapping[str, tuple[str, dict[str, Any]]]
+) -> dict[str, Path]:
+    """The mask of each frame that names one."""
+    masks = {}
+    for frame in scene.frames:
+        place, keys = named[scene.image_path(frame).relative_to(path).as_posix()]
+        if "mask_path" in keys:
+            place = f"{place}: mask_path"
+            mask = path / transforms.file_name(place, "", keys["mask_path"])
+            if not mask.is_file():
+                raise SceneError(mask, expected="a mask", found="nothing", todo="copy it there")
+            masks[frame.name] = mask
+    return masks
 
 
 def _read_shots(
@@ -322,6 +339,8 @@ def losses(scene: Scene) -> list[str]:
         lost.append(f"{count} points that are not finite")
     if len({frame.camera.model == FISHEYE for frame in scene.frames}) > 1:
         lost.append(f"{FISHEYE} beside other cameras, as its loader uses one kind for all frames")
+    if 0 < len(scene.masks) < len(scene.frames):
+        lost.append("masks of some frames only, as its loader wants one for each or for none")
     return lost
 
 
@@ -349,10 +368,15 @@ def _to_json(scene: Scene) -> dict[str, Any]:
                 "period": frame.period,
                 "time": frame.period / max(1, scene.num_periods - 1),
                 **_camera_keys(frame.camera),
+                **_mask_key(scene, frame.name),
             }
             for frame in scene.frames
         ],
     }
+
+
+def _mask_key(scene: Scene, name: str) -> dict[str, str]:
+    return {"mask_path": f"{MASKS}/{mask_name(name)}"} if name in scene.masks else {}
 
 
 def _camera_keys(camera: Camera) -> dict[str, Any]:

@@ -131,6 +131,7 @@ def losses(scene: Scene) -> list[str]:
     lost = colmap_layout.lost_labels(scene, _folders(scene)) + colmap_layout.lost_names(names)
     tests = {old[name] for name in taken}
     lost += colmap_layout.lost_split(scene, tests, "images 0, 8, 16, ... of each task")
+    lost += colmap_layout.lost_masks(scene)
     if any(not frame.camera.is_pinhole for frame in scene.frames):
         lost.append("distortion, which its loader ignores: undistort first")
     files = [name.rpartition("/")[2] for name in old]

@@ -210,3 +210,23 @@ def warp(
     out = np.empty((*x.shape, image.shape[2]), np.uint8)
     _warp(np.ascontiguousarray(image), x, y, out)
     return out
+
+
+def warp_mask(
+    mask: NDArray[np.bool_], x: NDArray[np.float32], y: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Where an image counts after `warp`: where all sixteen pixels count that may be looked at.
+
+    Args:
+        mask: Where it counts before. [H, W]
+        x: As for `warp`. [H', W']
+        y: As for `warp`. [H', W']
+    """
+    import cv2
+
+    height, width = mask.shape
+    counts = cv2.erode(mask.astype(np.uint8), np.ones((4, 4), np.uint8), anchor=(1, 1)) != 0
+    finite = np.isfinite(x) & np.isfinite(y)
+    column, row = (np.floor(np.where(finite, p, 0.0) - 0.5) for p in (x, y))
+    column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
+    return np.asarray(counts[row.astype(int), column.astype(int)] & finite)

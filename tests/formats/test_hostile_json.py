@@ -62,6 +62,7 @@ def test_any_value_anywhere(nerfstudio_folder, raw_city, level, tmp_path, name):
     if name == "nerfstudio":
         for i, frame in enumerate(data["frames"]):
             frame |= {"time": i / 5, "colmap_im_id": i + 1, "mask_path": "m.png"}
+        (folder / "m.png").touch()
     rng, refused = random.Random(0), 0
     everywhere = list(places(data))
     keys = [p for p in everywhere if len(p) <= 1 or p[0] != "frames"]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import nerfstudio, read_scene
@@ -153,10 +154,21 @@ def test_lists_of_names(nerfstudio_folder):
     assert len(read_scene(folder).select(split="test")) == 2
 
 
-def test_masks_are_remarked_upon(nerfstudio_folder):
+def test_masks_are_those_that_the_frames_name(nerfstudio_folder):
     folder = nerfstudio_folder(NAMES)
-    edit_frames(folder, lambda i, frame: frame.update(mask_path="masks/x.png"))
-    assert nerfstudio.remarks(folder) == ["masks of 4 frames are not read"]
+    edit_frames(folder, lambda i, frame: frame.update({"mask_path": "cut/x.png"} if i < 3 else {}))
+    with pytest.raises(SceneError, match=r"cut/x\.png: expected a mask, found nothing"):
+        read_scene(folder)
+    (folder / "cut").mkdir()
+    Image.new("L", (64, 48)).save(folder / "cut/x.png")
+    scene = read_scene(folder)
+    assert scene.masks == dict.fromkeys(["1.png", "2.png", "3.png"], folder / "cut/x.png")
+    assert nerfstudio.remarks(folder) == []
+    (lost,) = [item for item in nerfstudio.losses(scene) if "masks" in item]
+    assert lost == "masks of some frames only, as its loader wants one for each or for none"
+    edit_frames(folder, lambda i, frame: frame.update(mask_path="../x.png"))
+    with pytest.raises(SceneError, match=r"frames\[3\]: mask_path: expected a file_path inside"):
+        read_scene(folder)
 
 
 def test_frames_without_image_are_left_out(nerfstudio_folder):

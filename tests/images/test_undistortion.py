@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.images.undistortion import warp
+from chronoscene.images.undistortion import warp, warp_mask
 
 
 def places(*values):
@@ -46,3 +46,18 @@ def test_overshoot_is_cut_off():
     )
     assert line.min() == 0 and line.max() == 255
     assert (np.diff(line[0, 10:21, 0].astype(int)) >= 0).all()
+
+
+def test_a_mask_lets_count_what_nothing_ignored_reaches():
+    rng = np.random.default_rng(0)
+    mask = rng.random((40, 50)) > 0.02
+    images = rng.integers(0, 256, (2, 40, 50, 3), np.uint8)
+    images[1][mask] = images[0][mask]
+    v, u = np.mgrid[:40, :50]
+    x = (1.06 * u - 0.11 * v + 1.3).astype(np.float32)
+    y = (0.93 * v + 0.08 * u - 0.4).astype(np.float32)
+    x[3, 4], y[5, 6] = np.nan, np.inf
+    new, warped = warp_mask(mask, x, y), [warp(image, x, y) for image in images]
+    np.testing.assert_array_equal(warped[0][new], warped[1][new])
+    assert not new[3, 4] and not new[5, 6] and new.mean() > 0.6
+    assert warp_mask(np.ones((40, 50), bool), x, y).sum() == 40 * 50 - 2

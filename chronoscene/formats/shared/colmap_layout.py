@@ -20,6 +20,7 @@ from chronoscene.colmap.model import Model, read_model, write_model
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared.grouping import Grouped, label_date, natural_key
+from chronoscene.images.masks import find_masks
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Period, Scene, WorldFrame
@@ -147,6 +148,7 @@ def make_scene(
         periods=table,
         split_rule=rule,
         format=format,
+        masks=find_masks(images.parent, periods),
     )
 
 
@@ -250,6 +252,11 @@ def lost_names(names: Mapping[str, str]) -> list[str]:
     if all(new == old for old, new in names.items()):
         return []
     return ["the image names, to which the period is added"]
+
+
+def lost_masks(scene: Scene) -> list[str]:
+    """Losses of a format whose loader reads no masks; they are written all the same."""
+    return ["masks, which its loader does not read"] if scene.masks else []
 
 
 def lost_split(scene: Scene, tests: set[str], rule: str) -> list[str]:

@@ -20,7 +20,7 @@ from PIL import Image
 from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.geodesy import Georeference, from_crs
 from chronoscene.images.exif import set_upright
-from chronoscene.images.store import image_size, load_rgb, place_image
+from chronoscene.images.store import image_size, load_photo, place_image
 from chronoscene.io.staging import replacing
 from chronoscene.registration.context import Context
 from chronoscene.registration.photos.captures import Captures
@@ -253,8 +253,11 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
         target.parent.mkdir(parents=True, exist_ok=True)
         if not _is_plain(capture.path):
             target = target.with_name(f"{target.name}.png")
+            image, mask = load_photo(capture.path)
+            if mask is not None:
+                image[~mask] = 0  # nothing is to be found in what is transparent
             with replacing(target) as partial:
-                Image.fromarray(load_rgb(capture.path)).save(partial, format="PNG")
+                Image.fromarray(image).save(partial, format="PNG")
             converted += 1
         elif capture.exif.orientation != 1 and capture.path.suffix.lower() in (".jpg", ".jpeg"):
             data = capture.path.read_bytes()

@@ -56,6 +56,18 @@ def test_files_without_plain_colours_become_png(folder: Path, tmp_path: Path) ->
     assert [c.name for c in inputs.renamed(captures, names)] == names
 
 
+def test_transparent_pixels_become_black_so_that_nothing_is_found_there(
+    folder: Path, tmp_path: Path
+) -> None:
+    folder.mkdir()
+    pixels = np.full((8, 8, 4), 200, np.uint8)
+    pixels[:4, :, 3] = 0
+    Image.fromarray(pixels).save(folder / "clear.png")
+    (name,), _ = inputs.place_photos(read_captures(folder).images, tmp_path / "photos")
+    with Image.open(tmp_path / "photos" / name) as image:
+        assert np.asarray(image)[:, 0, 0].tolist() == [0] * 4 + [200] * 4
+
+
 def test_blanks_in_names_are_replaced_and_names_stay_unique() -> None:
     names = ["t 1/a b.jpg", "t_1/a_b.jpg", "t 1/c.jpg"]
     assert inputs.plain_names(names) == ["t_1/a_b_2.jpg", "t_1/a_b.jpg", "t_1/c.jpg"]

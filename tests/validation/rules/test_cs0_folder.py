@@ -128,6 +128,14 @@ def test_scene_of_another_format(studio):
     assert sorted(studio.rglob("*")) == before
 
 
+def test_masks_of_a_scene_of_another_format(scene, tmp_path):
+    scene.path("masks").mkdir()
+    for name in scene.lines("sparse/0/test.txt"):
+        Image.new("L", (9, 9)).save(scene.path(f"masks/{name}.png"))
+    studio = convert(scene.root, tmp_path / "studio", target="nerfstudio").out
+    assert {"CS242", "CS244", "CS245"} <= codes(validate_scene(studio, decode=True))
+
+
 def test_faults_of_a_scene_of_another_format(studio):
     shutil.copy(studio / "images/a001.png", studio / "images/b002.png")
     found = {(f.code, f.place) for f in validate_scene(studio).findings if f.severity == "error"}
