@@ -45,6 +45,10 @@ class ImageEntry(BaseModel):
     sha256: str
     width: int
     height: int
+    mask_file: str | None = None
+    """Path below the folder of the mask of a photo, 0 where the photo does not count; None where
+    all of it does."""
+    mask_sha256: str | None = None
 
 
 class Manifest(BaseModel):
@@ -96,10 +100,12 @@ def to_bytes(rgb: ArrayLike) -> NDArray[np.uint8]:
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """PNG bytes of an RGB image. [H, W, 3]"""
+    """PNG bytes of an RGB image [H, W, 3], or of a grey one [H, W]."""
     import cv2
 
-    done, data = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]))
+    done, data = cv2.imencode(
+        ".png", np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image)
+    )
     assert done
     return data.tobytes()
 
@@ -112,26 +118,42 @@ class ImageWriter:
         self._entries: list[ImageEntry] = []
         folder.mkdir(parents=True, exist_ok=True)
 
-    def add(self, view: str, image: ArrayLike, *, camera_period: int, rendered_period: int) -> None:
-        """Write one image: uint8, or floats 0..1. [H, W, 3]"""
-        pixels = to_bytes(image)
-        data = encode_png(pixels)
-        file = image_file(view)
-        target = self.folder / file
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as partial:
-            partial.write_bytes(data)
+    def add(
+        self,
+        view: str,
+        image: ArrayLike,
+        *,
+        camera_period: int,
+        rendered_period: int,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Write one image: uint8, or floats 0..1 [H, W, 3], and where it counts [H, W]."""
+        pixels, file = to_bytes(image), image_file(view)
+        masked = {}
+        if mask is not None:
+            mask_file = image_file(f"{view}.mask")
+            masked = {"mask_file": mask_file}
+            masked["mask_sha256"] = self._write(mask_file, 255 * mask.astype(np.uint8))
         self._entries.append(
             ImageEntry(
                 view=view,
                 camera_period=camera_period,
                 rendered_period=rendered_period,
                 file=file,
-                sha256=hashlib.sha256(data).hexdigest(),
+                sha256=self._write(file, pixels),
                 width=pixels.shape[1],
                 height=pixels.shape[0],
+                **masked,
             )
         )
+
+    def _write(self, file: str, pixels: NDArray[np.uint8]) -> str:
+        """Write one PNG file; returns its SHA-256."""
+        target, data = self.folder / file, encode_png(pixels)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(target) as partial:
+            partial.write_bytes(data)
+        return hashlib.sha256(data).hexdigest()
 
     def close(
         self,
@@ -150,7 +172,8 @@ class ImageWriter:
             details=dict(details),
             images=tuple(sorted(self._entries, key=lambda e: e.view)),
         )
-        write_text_atomic(self.folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
+        text = manifest.model_dump_json(indent=1, exclude_none=True)
+        write_text_atomic(self.folder / MANIFEST, f"{text}\n")
         return manifest
 
 
@@ -176,6 +199,8 @@ def read_manifest(folder: Path) -> Manifest:
         raise _untrusted(path, "a view twice")
     for entry in manifest.images:
         _inside(entry.file)
+        if entry.mask_file is not None:
+            _inside(entry.mask_file)
     return manifest
 
 
@@ -185,25 +210,41 @@ def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
     Raises:
         CheckpointError: If the file is missing or not the one that the manifest lists.
     """
+    image = _load_png(folder, entry.file, entry.sha256, (entry.height, entry.width), 1)
+    return np.ascontiguousarray(image[..., ::-1])
+
+
+def load_mask(folder: Path, entry: ImageEntry) -> NDArray[np.bool_] | None:
+    """Where an image counts; None where all of it does. Errors as for `load_image`. [H, W]"""
+    if entry.mask_file is None or entry.mask_sha256 is None:
+        return None
+    size = entry.height, entry.width
+    return np.asarray(_load_png(folder, entry.mask_file, entry.mask_sha256, size, 0) != 0)
+
+
+def _load_png(
+    folder: Path, file: str, sha256: str, size: tuple[int, int], mode: int
+) -> NDArray[np.uint8]:
+    """Decode one listed file; modes and order of channels are those of OpenCV."""
     import cv2
 
-    path = folder / _inside(entry.file)
+    path = folder / _inside(file)
     if not path.resolve().is_relative_to(folder.resolve()) or not path.is_file():
         raise CheckpointError(
             path, expected="an image", found="no such file", todo="run bench again"
         )
     data = path.read_bytes()
-    if hashlib.sha256(data).hexdigest() != entry.sha256:
+    if hashlib.sha256(data).hexdigest() != sha256:
         raise CheckpointError(
             path,
-            expected=f"the file with SHA-256 {entry.sha256[:12]}... that {MANIFEST} lists",
+            expected=f"the file with SHA-256 {sha256[:12]}... that {MANIFEST} lists",
             found="another file",
             todo="the image was changed after rendering: delete the run and run bench again",
         )
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    if image is None or image.shape[:2] != (entry.height, entry.width):
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
+    if image is None or image.shape[:2] != size:
         raise _untrusted(path, "an image of another size" if image is not None else "no image")
-    return np.ascontiguousarray(image[..., ::-1])
+    return np.asarray(image, np.uint8)
 
 
 def _untrusted(path: Path, found: str) -> CheckpointError:
@@ -251,6 +292,7 @@ def _write_ground_truth(
                     store.load(frame),
                     camera_period=frame.period,
                     rendered_period=frame.period,
+                    mask=store.load_mask(frame),
                 )
             writer.close(
                 kind="ground truth", scene=scene.name, scene_hash=scene_hash, details=details

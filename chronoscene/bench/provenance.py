@@ -20,7 +20,7 @@ from chronoscene.scene import Scene
 
 
 def scene_hash(scene: Scene) -> str:
-    """SHA-256 over frames, cameras, poses, periods, split, points, tracks and image files.
+    """SHA-256 over frames, cameras, poses, periods, split, points, tracks, images and masks.
 
     Poses are rounded to nine digits: what pycolmap returns may differ in the last one.
     """
@@ -28,7 +28,10 @@ def scene_hash(scene: Scene) -> str:
     for frame in scene.frames:
         camera = frame.camera
         line = [frame.name, frame.period, frame.split, camera.model, camera.width, camera.height]
-        digest.update(json.dumps([*line, *camera.params, _file_hash(scene, frame.name)]).encode())
+        files = [_file_hash(scene.image_path(frame))]
+        if frame.name in scene.masks:
+            files.append(_file_hash(scene.masks[frame.name]))
+        digest.update(json.dumps([*line, *camera.params, *files]).encode())
         digest.update((np.round(frame.cam_from_world, 9) + 0.0).tobytes())
     points = scene.points
     for array in (points.xyz, points.rgb, points.track_start, points.track_frame):
@@ -36,8 +39,7 @@ def scene_hash(scene: Scene) -> str:
     return digest.hexdigest()
 
 
-def _file_hash(scene: Scene, name: str) -> str:
-    path = scene.images_root / name
+def _file_hash(path: Path) -> str:
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

@@ -15,6 +15,7 @@ from chronoscene.bench.predictions import (
     Manifest,
     ground_truth_folder,
     load_image,
+    load_mask,
     read_manifest,
 )
 from chronoscene.bench.results import (
@@ -39,6 +40,8 @@ class Scores:
     rows: tuple[Row, ...]
     skipped: dict[str, str]
     """Metric to the reason for its absence."""
+    unscored: tuple[str, ...] = ()
+    """Views whose masks ignore every pixel: they have no values."""
 
 
 def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Scores:
@@ -50,25 +53,47 @@ def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Sco
     predicted, truth = read_manifest(predictions), read_manifest(ground_truth)
     pairs = match_views(predictions, predicted, truth)
     rows: list[Row] = []
-    skipped = dict(scorers.skipped)
+    skipped, unscored = dict(scorers.skipped), []
     for entry, target in pairs:
         image, reference = load_image(predictions, entry), load_image(ground_truth, target)
-        values, refused = score_pair(image, reference, scorers)
+        mask = load_mask(ground_truth, target)
+        if mask is not None and not mask.any():
+            unscored.append(entry.view)
+            continue
+        values, refused = score_pair(image, reference, scorers, mask)
         skipped |= {name: f"{entry.view}: {reason}" for name, reason in refused.items()}
         periods = entry.camera_period, entry.rendered_period
         rows += [Row(entry.view, *periods, "all", name, value) for name, value in values.items()]
+    if pairs and len(unscored) == len(pairs):
+        skipped |= dict.fromkeys(
+            scorers.functions, "the masks of all test views ignore every pixel"
+        )
     # A metric that fails on one view has no mean over the test set.
-    return Scores(tuple(row for row in rows if row.metric not in skipped), skipped)
+    kept = tuple(row for row in rows if row.metric not in skipped)
+    return Scores(kept, skipped, tuple(unscored))
 
 
 def score_pair(
-    image: NDArray[np.uint8], reference: NDArray[np.uint8], scorers: Scorers
+    image: NDArray[np.uint8],
+    reference: NDArray[np.uint8],
+    scorers: Scorers,
+    mask: NDArray[np.bool_] | None = None,
 ) -> tuple[Values, dict[str, str]]:
-    """Values of one view, and the reasons for those that its size does not allow. [H, W, 3]"""
+    """Values of one view, and the reasons for those that its size or mask does not allow.
+
+    Args:
+        image: The prediction. [H, W, 3]
+        reference: The photo. [H, W, 3]
+        scorers: The metrics.
+        mask: Pixels that count. The others of the prediction become those of the photo, so that
+            windows that reach there see no difference. [H, W]
+    """
     values, refused = {}, {}
+    if mask is not None:
+        image = np.where(mask[..., None], image, reference)
     for name, function in scorers.functions.items():
         try:
-            values[name] = function(image, reference)
+            values[name] = function(image, reference, mask)
         except ShapeError as error:
             refused[name] = str(error)
     return values, refused
@@ -207,4 +232,4 @@ def keep_earlier(folder: Path, record: RunRecord, scores: Scores) -> tuple[list[
     earlier = tuple(row for row in read_rows(folder) if row.metric in kept)
     skipped = {name: reason for name, reason in scores.skipped.items() if name not in kept}
     rows = sorted(scores.rows + earlier, key=lambda row: row.view)
-    return kept, Scores(tuple(rows), skipped)
+    return kept, Scores(tuple(rows), skipped, scores.unscored)

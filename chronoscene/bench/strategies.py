@@ -159,6 +159,7 @@ def _training_set(
         camera_extent=_camera_extent(frames, to_training),
         background=np.zeros(3, np.float32),
         load_image=lambda i: store.load(frames[i]),
+        load_mask=lambda i: store.load_mask(frames[i]),
     )
 
 

@@ -65,6 +65,10 @@ class Stopwatch:
         self.seconds += self._now() - self._started
 
 
+Truth = Mapping[str, tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]
+"""Photos by name with what counts of them, None for everything; those of which nothing counts are
+left out. [H, W, 3], [H, W]"""
+
 Observer = Callable[[int, float, StepReport, float | None], None]
 """Called after each step with the number of iterations done, the seconds on the training clock,
 the step's report and the latest probe PSNR."""
@@ -91,7 +95,7 @@ def train(
     method: Method,
     part: Part,
     stop: StopRule,
-    truth: Mapping[str, NDArray[np.uint8]],
+    truth: Truth,
     *,
     seed: int,
     device: str,
@@ -105,7 +109,7 @@ def train(
         method: An empty method.
         part: What to train on and what to probe.
         stop: When to end.
-        truth: Ground truth of the probe views by name. [H, W, 3]
+        truth: Ground truth of the probe views.
         seed: For the global generators and the method.
         device: ``cpu`` or ``cuda``.
         observer: Shows the progress.
@@ -172,11 +176,9 @@ def _diverged(report: StepReport, part: Part, last_good: int) -> TrainingError:
     )
 
 
-def _probe(
-    method: Method, part: Part, truth: Mapping[str, NDArray[np.uint8]], state: LoopState
-) -> CurvePoint:
-    frames = probe_frames(part)
-    values = [psnr(render_bytes(method, part, f), truth[f.name]) for f in frames]
+def _probe(method: Method, part: Part, truth: Truth, state: LoopState) -> CurvePoint:
+    frames = [f for f in probe_frames(part) if f.name in truth]
+    values = [psnr(render_bytes(method, part, f), *truth[f.name]) for f in frames]
     size = method.size()
     mean = float(np.mean(values)) if values else math.nan
     return CurvePoint(

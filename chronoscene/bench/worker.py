@@ -26,6 +26,7 @@ from chronoscene.bench.predictions import (
     ImageWriter,
     ground_truth_folder,
     load_image,
+    load_mask,
     read_manifest,
 )
 from chronoscene.bench.provenance import (
@@ -38,6 +39,7 @@ from chronoscene.bench.scoring import aggregate, score_folder
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.bench.training_loop import (
     DivergedError,
+    Truth,
     forget_peak_memory,
     probe_frames,
     render_bytes,
@@ -50,6 +52,7 @@ from chronoscene.images.store import ImageStore
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
+from chronoscene.io.wording import shown
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
 from chronoscene.metrics.registry import make_scorers
@@ -122,6 +125,11 @@ def run_job(job: Job) -> None:
     record.skipped = scores.skipped
     record.warmup_seconds = warmup_seconds
     record.notices = [*job.notices, *([notice] if notice else []), *_skips(job, record)]
+    if scores.unscored:
+        views = shown(scores.unscored)
+        record.notices.append(
+            f"{job.label}: not scored, as their masks ignore every pixel: {views}"
+        )
     results.write_run(staging, record, scores.rows)
 
 
@@ -193,12 +201,15 @@ def _checkpoints(
     )
 
 
-def _probe_truth(job: Job, part: Part) -> dict[str, Any]:
+def _probe_truth(job: Job, part: Part) -> Truth:
     """Ground truth of the probe views, from the frozen images."""
     folder = ground_truth_folder(Path(job.runs), job.scene)
     names = {frame.name for frame in probe_frames(part)}
     entries = [e for e in read_manifest(folder).images if e.view in names]
-    return {entry.view: load_image(folder, entry) for entry in entries}
+    found = {e.view: (load_image(folder, e), load_mask(folder, e)) for e in entries}
+    return {
+        view: (photo, mask) for view, (photo, mask) in found.items() if mask is None or mask.any()
+    }
 
 
 def _save(method: Method, checkpoint: Path, part: Part) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -60,13 +61,23 @@ class Lpips:
                 total += float(weighted.mean())
         return total
 
-    def vgg(self, image: ArrayLike, reference: ArrayLike) -> float:
-        """``lpips_vgg``: inputs in [-1, 1], as the authors define it. [H, W, 3]"""
-        return self.distance(2 * self._tensor(image) - 1, 2 * self._tensor(reference) - 1)
+    def vgg(self, image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None) -> float:
+        """``lpips_vgg``: inputs in [-1, 1], as the authors define it.
 
-    def vgg_3dgs(self, image: ArrayLike, reference: ArrayLike) -> float:
-        """``lpips_vgg_3dgs``: inputs in [0, 1], comparable with 3DGS papers. [H, W, 3]"""
-        return self.distance(self._tensor(image), self._tensor(reference))
+        Args:
+            image: [H, W, 3]
+            reference: [H, W, 3]
+            mask: Pixels that count: the value is divided by their share. The images are to be equal
+                elsewhere. [H, W] bool
+        """
+        value = self.distance(2 * self._tensor(image) - 1, 2 * self._tensor(reference) - 1)
+        return value / _share(mask)
+
+    def vgg_3dgs(
+        self, image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None
+    ) -> float:
+        """``lpips_vgg_3dgs``: inputs in [0, 1], comparable with 3DGS papers; otherwise as `vgg`."""
+        return self.distance(self._tensor(image), self._tensor(reference)) / _share(mask)
 
     def _tensor(self, image: ArrayLike) -> Tensor:
         array = unit_float(image)
@@ -79,6 +90,10 @@ class Lpips:
             )
         tensor = torch.from_numpy(array).float().permute(2, 0, 1)[None]
         return tensor.to(self.shift.device)
+
+
+def _share(mask: ArrayLike | None) -> float:
+    return 1.0 if mask is None else float(np.asarray(mask, bool).mean())
 
 
 def unit_length(feature: Tensor) -> Tensor:

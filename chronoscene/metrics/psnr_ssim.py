@@ -3,6 +3,7 @@
 Images are [H, W, C], uint8 0..255 or float 0..1; the data range is 1 after division by 255. A mask
 [H, W] selects pixels of the error or similarity map, never of the input: zeroing the input would
 score the mask's own edges and the black around them. A masked metric is the mean over the mask.
+Windows of SSIM around pixels that count may reach beyond the mask, except those of `ssim_valid`.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def ssim(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None) 
 
 
 def ssim_valid(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None) -> float:
-    """Structural similarity over the pixels whose whole window lies inside the image.
+    """Structural similarity over the pixels whose whole window lies in the image and counts.
 
     Args:
         image: [H, W, C], at least 11 pixels per axis
@@ -78,7 +79,7 @@ def ssim_valid(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = 
         mask: Pixels that count. [H, W] bool
 
     Raises:
-        ShapeError: If the image is smaller than the window.
+        ShapeError: If the image is smaller than the window, or no window counts as a whole.
     """
     values = ssim_map(image, reference)
     if min(values.shape[:2]) < WINDOW:
@@ -89,8 +90,13 @@ def ssim_valid(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = 
             todo="use the metric ssim, or evaluate larger images",
         )
     inside = slice(WINDOW // 2, -(WINDOW // 2))
-    cropped = None if mask is None else _checked_mask(mask, values)[inside, inside]
-    return _masked_mean(values[inside, inside], cropped)
+    if mask is None:
+        return _masked_mean(values[inside, inside], None)
+    import cv2
+
+    counted = _checked_mask(mask, values).astype(np.uint8)
+    windows = cv2.erode(counted, np.ones((WINDOW, WINDOW), np.uint8))
+    return _masked_mean(values[inside, inside], windows[inside, inside])
 
 
 def ssim_map(image: ArrayLike, reference: ArrayLike) -> Array:

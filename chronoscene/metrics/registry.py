@@ -48,8 +48,8 @@ METRICS = {
         MetricInfo(
             "ssim_valid",
             "SSIM (valid)",
-            "as ssim, but only where the window lies inside the image: scikit-image with "
-            "gaussian_weights, sigma 1.5, use_sample_covariance False",
+            "as ssim, but only where all of the window lies inside the image and counts: "
+            "scikit-image with gaussian_weights, sigma 1.5, use_sample_covariance False",
             True,
             4,
         ),
@@ -87,7 +87,8 @@ class Scorers:
     """What can be computed, and why the rest cannot."""
 
     functions: dict[str, Callable[..., float]]
-    """Metric name to ``f(image, reference)`` with [H, W, 3] uint8 images."""
+    """Metric name to ``f(image, reference, mask)`` with [H, W, 3] uint8 images; the mask, bool
+    [H, W], is None where all pixels count. Where it ignores, the images are equal."""
     skipped: dict[str, str]
     """Metric name to the reason for its absence."""
 

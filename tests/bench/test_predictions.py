@@ -11,6 +11,7 @@ from chronoscene.bench.predictions import (
     ImageWriter,
     image_file,
     load_image,
+    load_mask,
     read_manifest,
     safe_name,
     to_bytes,
@@ -42,6 +43,23 @@ def test_what_is_written_is_read(folder):
     assert [e.file for e in manifest.images] == ["a.png.png", "b/2016/x.jpg.png"]
     np.testing.assert_array_equal(load_image(folder, manifest.images[0]), IMAGE[::-1])
     np.testing.assert_array_equal(load_image(folder, manifest.images[1]), IMAGE)
+
+
+def test_masks_lie_beside_their_photos_with_their_hash(tmp_path):
+    writer, mask = ImageWriter(tmp_path), IMAGE[..., 0] > 99
+    writer.add("b/x.jpg", IMAGE, camera_period=0, rendered_period=0, mask=mask)
+    writer.add("a.png", IMAGE, camera_period=0, rendered_period=0)
+    writer.close(kind="ground truth", scene="s", scene_hash="h", details={})
+    plain, masked = read_manifest(tmp_path).images
+    assert load_mask(tmp_path, plain) is None
+    np.testing.assert_array_equal(load_mask(tmp_path, masked), mask)
+    np.testing.assert_array_equal(load_image(tmp_path, masked), IMAGE)
+    (tmp_path / "b/x.jpg.mask.png").write_bytes((tmp_path / "a.png.png").read_bytes())
+    with pytest.raises(CheckpointError, match=r"mask\.png: .* found another file"):
+        load_mask(tmp_path, masked)
+    edit(tmp_path, lambda d: d["images"][1].update(mask_file="../x.png"))
+    with pytest.raises(CheckpointError, match="leads outside"):
+        read_manifest(tmp_path)
 
 
 def test_equal_images_give_equal_bytes(folder, tmp_path):

@@ -61,6 +61,17 @@ def test_changes_of_pixels_change_the_hash(scene):
     assert provenance.scene_hash(scene) != before
 
 
+def test_masks_change_the_hash(scene, tmp_path):
+    before, mask = provenance.scene_hash(scene), tmp_path / "mask.png"
+    mask.write_bytes(b"one")
+    masked = replace(scene, masks={scene.frames[0].name: mask})
+    hashes = {before, provenance.scene_hash(masked)}
+    mask.write_bytes(b"two")
+    hashes |= {provenance.scene_hash(masked)}
+    hashes |= {provenance.scene_hash(replace(scene, masks={scene.frames[1].name: mask}))}
+    assert len(hashes) == 4
+
+
 def test_the_last_digit_of_a_pose_does_not_count(scene):
     frame = scene.frames[0]
     pose = np.nextafter(frame.cam_from_world, 10.0)

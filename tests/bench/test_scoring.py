@@ -50,11 +50,12 @@ def test_parts_of_the_image_do_not_enter_the_means():
     assert aggregate([*rows("psnr", [(0, 9.0)]), part])[0]["micro"]["psnr"] == 9.0
 
 
-def write(folder, images, *, scene_hash="h", periods=None):
+def write(folder, images, *, scene_hash="h", periods=None, masks=None):
     writer = ImageWriter(folder)
     for view, image in images.items():
         period = (periods or {}).get(view, 0)
-        writer.add(view, image, camera_period=period, rendered_period=period)
+        mask = (masks or {}).get(view)
+        writer.add(view, image, camera_period=period, rendered_period=period, mask=mask)
     writer.close(kind="predictions", scene="s", scene_hash=scene_hash, details={})
     return folder
 
@@ -80,6 +81,40 @@ def test_scores_are_those_of_the_metrics(tmp_path):
         for name, function in scorers.functions.items()
     }
     assert {r.region for r in scores.rows} == {"all"} and scores.skipped == {}
+
+
+MASK = np.ones((12, 13), bool)
+MASK[:, 12] = False
+
+
+def test_what_a_mask_ignores_is_not_scored(tmp_path):
+    """Neither in the pixels that count nor in the windows around them."""
+    guess, photo, scores = {"a.png": noise(0), "b.png": noise(1)}, noise(2), []
+    masks = {"a.png": MASK}
+    truth = write(tmp_path / "t", {"a.png": photo, "b.png": photo}, masks=masks)
+    scorers = make_scorers(["psnr", "ssim", "ssim_valid"])
+    for k in range(2):
+        guess["a.png"][:, 12] = 255 * k
+        scores.append(score_folder(write(tmp_path / f"p{k}", guess), truth, scorers))
+    assert scores[0] == scores[1] and scores[0].unscored == ()
+    guess["a.png"][:, 12] = photo[:, 12]
+    found = {(r.view, r.metric): r.value for r in scores[0].rows}
+    for name, function in scorers.functions.items():
+        assert found["a.png", name] == function(guess["a.png"], photo, MASK)
+        assert found["b.png", name] == function(guess["b.png"], photo)
+
+
+def test_views_of_which_nothing_counts_have_no_values(tmp_path):
+    images, nothing = {"a.png": noise(0), "b.png": noise(1)}, np.zeros((12, 13), bool)
+    predictions, scorers = write(tmp_path / "p", images), make_scorers(["psnr", "ssim"])
+    truth = write(tmp_path / "t", images, masks={"a.png": nothing})
+    scores = score_folder(predictions, truth, scorers)
+    assert {r.view for r in scores.rows} == {"b.png"}
+    assert scores.unscored == ("a.png",) and scores.skipped == {}
+    truth = write(tmp_path / "u", images, masks=dict.fromkeys(images, nothing))
+    scores = score_folder(predictions, truth, scorers)
+    reason = "the masks of all test views ignore every pixel"
+    assert scores.rows == () and scores.skipped == {"psnr": reason, "ssim": reason}
 
 
 def test_a_metric_that_one_view_does_not_allow_is_absent_with_a_reason(tmp_path):
@@ -155,7 +190,7 @@ def test_scoring_again_changes_nothing(runs, scorers):
 
 def test_a_corrected_metric_is_told_and_written(runs):
     before = read_run(runs / JOINT).aggregates["macro"]["psnr"]
-    outcomes = rescore(runs, Scorers({"psnr": lambda image, reference: 12.5}, {}))
+    outcomes = rescore(runs, Scorers({"psnr": lambda image, reference, mask: 12.5}, {}))
     told = {str(o.folder.relative_to(runs)): o.changes for o in outcomes}
     assert told[JOINT][0] == f"psnr {before:.6g} -> 12.5 (macro)"
     assert any("ssim dropped" in change for change in told[JOINT])

@@ -65,7 +65,7 @@ def clock():
 
 
 def run(method, part, stop, observer=lambda *step: None, **changes):
-    truth = {f.name: part.store.load(f) for f in part.test}
+    truth = {f.name: (part.store.load(f), part.store.load_mask(f)) for f in part.test}
     return train(method, part, stop, truth, seed=0, device="cpu", observer=observer, **changes)
 
 
@@ -108,6 +108,19 @@ def test_probe_values_are_psnr_of_one_view_per_period(part):
     assert [f.name for f in frames] == ["a/2.png", "b/2.png"]
     values = [psnr(render_bytes(method, part, f), part.store.load(f)) for f in frames]
     assert trained.curve[-1].psnr == pytest.approx(np.mean(values), abs=1e-12)
+
+
+def test_probes_score_what_counts_of_a_view(part):
+    """Half of one view, nothing of the other: which the harness then leaves out."""
+    mask = np.zeros((16, 24), bool)
+    mask[:8] = True
+    frame = probe_frames(part)[0]
+    method, photo = toy(), part.store.load(frame)
+    truth = {frame.name: (photo, mask)}
+    stop = StopRule(40, None)
+    trained = train(method, part, stop, truth, seed=0, device="cpu", observer=lambda *step: None)
+    expected = psnr(render_bytes(method, part, frame), photo, mask)
+    assert trained.curve[-1].psnr == pytest.approx(expected, abs=1e-12)
 
 
 def test_budgets_stop_by_the_clock(part, clock):

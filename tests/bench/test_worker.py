@@ -1,9 +1,11 @@
 """Runs of real methods through the harness, in this process."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from chronoscene.bench.results import read_run
 from chronoscene.bench.tables import format_runs, read_runs
@@ -27,6 +29,35 @@ def test_a_photo_that_shows_nothing_is_an_empty_step(make_scene, tmp_path, bench
     assert np.isfinite(record.aggregates["macro"]["psnr"])
     tables = format_runs(*read_runs([tmp_path / "runs"]), "table")
     assert "3 of 15 steps empty: their photos show nothing of the model" in tables
+
+
+def test_a_scene_with_masks_is_trained_and_scored_by_what_counts(
+    scene_folder, tmp_path, bench_here
+):
+    """The runs of two scenes that differ only where masks ignore them are the same."""
+    mask = np.full((16, 24), 255, np.uint8)
+    mask[4:9, 3:20] = 0
+    results = []
+    for k in range(2):
+        folder = shutil.copytree(scene_folder, tmp_path / f"{k}/ring")
+        for path in sorted((folder / "images").rglob("*.png")):
+            pixels = np.array(Image.open(path))
+            pixels[mask == 0] = 200 * k
+            Image.fromarray(pixels).save(path)
+            target = folder / "masks" / path.relative_to(folder / "images").with_suffix(".png.png")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            values = np.zeros_like(mask) if path.name == "1.png" else mask
+            Image.fromarray(values).save(target)
+        options = {"preset": "fast", "iterations": 15, "runs": tmp_path / f"runs{k}"}
+        outcome, _ = bench_here("3dgs", scenes=(folder,), **options)
+        record = read_run(outcome.finished[0])
+        assert record.empty_steps > 0  # a/1 is a training image
+        assert any("not scored" in n and "'b/1.png'" in n for n in record.notices)
+        model = (outcome.finished[0] / "checkpoint/model.safetensors").read_bytes()
+        results.append((model, record.aggregates["micro"]["psnr"], record.scene_hash))
+        assert len(list((tmp_path / f"runs{k}/ground_truth").rglob("*.mask.png"))) == 3
+    assert results[0][0] == results[1][0]
+    assert results[0][1] == results[1][1] and results[0][2] != results[1][2]
 
 
 def poison(monkeypatch, numbers):

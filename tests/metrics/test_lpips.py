@@ -39,6 +39,9 @@ def test_values_are_those_of_the_authors_package(name, folder, random_lpips):
     scorers = make_scorers([name], lpips_weights=folder)
     assert scorers.functions[name](image, other) == pytest.approx(GOLDEN[name], rel=RELATIVE)
     assert scorers.functions[name](image, image) == 0.0
+    half = np.arange(image.shape[0] * image.shape[1]).reshape(image.shape[:2]) % 2 == 0
+    value = scorers.functions[name](image, other, half)
+    assert value == pytest.approx(GOLDEN[name] / half.mean(), rel=RELATIVE)
 
 
 @pytest.mark.skipif(find_spec("lpips") is None, reason="the lpips package is not installed")

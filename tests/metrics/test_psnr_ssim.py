@@ -120,7 +120,12 @@ def test_masks_select_from_the_map():
     error = ((image / 255.0 - reference / 255.0) ** 2)[mask].mean()
     assert psnr(image, reference, mask) == pytest.approx(-10 * np.log10(error), abs=1e-12)
     assert ssim(image, reference, mask) == ssim_map(image, reference)[mask].mean()
-    assert ssim_valid(image, reference, mask) == ssim(image, reference, mask)
+    # Windows of 11 x 11 pixels that lie in the mask as a whole are centred here.
+    inner = ssim_map(image, reference)[13:15, 15:25].mean()
+    assert ssim_valid(image, reference, mask) == pytest.approx(inner, abs=1e-12)
+    mask[8:11] = False
+    with pytest.raises(ShapeError, match="mask: expected at least one pixel"):
+        ssim_valid(image, reference, mask)
 
 
 def test_what_lies_outside_the_mask_does_not_count_for_psnr():
