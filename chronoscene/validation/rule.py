@@ -97,7 +97,7 @@ class Rule:
         return self.check(*(scene if p == "scene" else getattr(scene, p) for p in self.parameters))
 
 
-SOURCES = dict.fromkeys(("names", "headers", "readable", "centres"), "images")
+SOURCES = dict.fromkeys(("names", "headers", "readable", "mask_headers", "centres"), "images")
 SOURCES["usable_cameras"] = "cameras"
 """Attributes that are empty, not None, without the part that they are read from."""
 

@@ -22,6 +22,8 @@ from chronoscene.colmap.raw_model import RawImages, RawModel, RawPoints
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, read_periods
 from chronoscene.formats.shared.colmap_layout import Assigned
+from chronoscene.images.masks import FOLDER as MASKS
+from chronoscene.images.masks import mask_name
 from chronoscene.scene import Camera, Period, Scene, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.splits import NameEntry, Problem, SplitEntry
@@ -50,6 +52,7 @@ _REASONS = {
     "tests": f"{SPLIT}, test.txt or the images of the model cannot be read",
     "point_periods": "points or periods cannot be read, or there are too many periods",
     "pixels": "images are decoded only with --decode",
+    "mask_peaks": "masks are decoded only with --decode",
 }
 
 
@@ -327,16 +330,7 @@ class RawScene:
     @cached_property
     def files(self) -> list[str]:
         """Files below ``images/`` with an image extension, as relative names, sorted."""
-        found = []
-        top = self.root / "images"
-        for folder, _, files in os.walk(top):
-            below = Path(folder).relative_to(top)
-            found += [
-                (below / file).as_posix()
-                for file in files
-                if file.lower().endswith(splits.IMAGE_SUFFIXES) and not file.startswith("._")
-            ]
-        return sorted(found)
+        return _image_files(self.root / "images")
 
     def image_path(self, name: str) -> Path:
         return self.root / "images" / name
@@ -362,6 +356,27 @@ class RawScene:
         return pixels.hash_files(self.root / "images", self.present, self.track)
 
     @cached_property
+    def mask_files(self) -> list[str]:
+        """Files below ``masks/`` with an image extension, as relative names, sorted."""
+        return _image_files(self.root / MASKS)
+
+    @cached_property
+    def mask_headers(self) -> dict[str, Header]:
+        """Headers of the masks of present images, by the names of the images."""
+        masks = set(self.mask_files)
+        masked = {n: mask_name(n) for n in self.present if mask_name(n) in masks}
+        headers = pixels.read_headers(self.root / MASKS, list(masked.values()))
+        return {name: headers[mask] for name, mask in masked.items()}
+
+    @cached_property
+    def mask_peaks(self) -> dict[str, int | None] | None:
+        """Largest value of each readable mask, None where it is damaged, if they may be decoded."""
+        if not self.decode:
+            return None
+        readable = [name for name, header in self.mask_headers.items() if header.problem is None]
+        return {n: pixels.peak(self.root / MASKS / mask_name(n)) for n in readable}
+
+    @cached_property
     def pixels(self) -> dict[str, Pixels] | None:
         """Digests and thumbnails of the readable images, if they may be decoded."""
         if not self.decode:
@@ -379,6 +394,19 @@ def derived(compute: Callable[[RawScene], T]) -> Callable[[RawScene], T]:
         return cast(T, scene.memory[compute])
 
     return remembered
+
+
+def _image_files(top: Path) -> list[str]:
+    """Files below a folder with an image extension, as relative names, sorted."""
+    found = []
+    for folder, _, files in os.walk(top):
+        below = Path(folder).relative_to(top)
+        found += [
+            (below / file).as_posix()
+            for file in files
+            if file.lower().endswith(splits.IMAGE_SUFFIXES) and not file.startswith("._")
+        ]
+    return sorted(found)
 
 
 def read_text_file(path: Path) -> TextFile | None:

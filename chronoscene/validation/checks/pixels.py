@@ -114,6 +114,15 @@ def read_header(path: Path) -> Header:
         return Header(_problem(error))
 
 
+def peak(path: Path) -> int | None:
+    """Largest value in an image of one channel; None if it cannot be decoded."""
+    try:
+        with Image.open(path) as image:
+            return int(np.asarray(image).max())
+    except Exception:  # as above
+        return None
+
+
 def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
     exif, kind = exif_of(image), image.format or ""
     turned = kind == "TIFF" and exif.orientation >= 5  # Pillow gives the size after rotation

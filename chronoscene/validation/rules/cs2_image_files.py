@@ -215,8 +215,8 @@ def image_cmyk(readable: dict[str, Header]) -> Iterator[Hit]:
     remedy="nothing to do if this is intended; otherwise save the image without transparency",
 )
 def image_transparent(readable: dict[str, Header]) -> Iterator[Hit]:
-    """An image may have transparent pixels, which are filled with the background colour in training
-    and in testing."""
+    """An image may have transparent pixels: those whose alpha is below one half are ignored in
+    training and in testing."""
     for name, header in readable.items():
         if header.transparent:
             yield Hit(f"images/{name}", "opaque pixels", f"pixels of mode {header.mode}")

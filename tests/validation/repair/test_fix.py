@@ -231,11 +231,20 @@ def test_text_beside_binary(scene, fix):
     assert not (out / CAMERAS).exists()
 
 
-def test_misspelt_image(scene, fix):
+def test_misspelt_image(scene, fix, tmp_path):
+    """Its mask follows, and so do the masks that need not be renamed, and those that are links."""
+    scene.path("masks").mkdir()
+    for name in ("A000.PNG", *(f"a{i:03d}.png" for i in range(1, 7))):
+        Image.new("L", (64, 48), 255).save(scene.path(f"masks/{name}.png"))
+    scene.path("masks/a006.png.png").rename(tmp_path / "mask.png")
+    scene.path("masks/a006.png.png").symlink_to(tmp_path / "mask.png")
     scene.path("images/a000.png").rename(scene.path("images/A000.PNG"))
     fixed, after, out = fix()
     assert fixed == {"CS201"} and after == {"CS507"}
     assert not (out / "images/A000.PNG").exists()
+    assert sorted(p.name for p in (out / "masks").iterdir()) == [
+        f"a{i:03d}.png.png" for i in range(7)
+    ]
 
 
 def tagged(image, orientation, *, order="<"):
