@@ -223,13 +223,13 @@ class AnchorTrainer:
         assert info.means2d.grad is not None
         if self.statistics is None:
             self.statistics = DensityStatistics(len(self.model), self.model.layout.offsets)
-        radii, counted = info.radii[0], None
+        drawn, counted = info.radii[0], None
         if mask is not None:
-            radii = radii * centres_count(info.means2d[0].detach(), mask)[:, None]
+            drawn = drawn * centres_count(info.means2d[0].detach(), mask)[:, None]
             anchors = self.model.anchors.cpu().numpy()[visible]
             centres = torch.from_numpy(projected_centres(anchors, view)).to(mask.device)
             counted = centres_count(centres, mask).cpu().numpy()
-        tensors = (positions, opacities, radii, info.means2d.grad[0])
+        tensors = (positions, opacities, drawn, info.means2d.grad[0])
         at, alphas, radii, grads = (tensor.detach().cpu().numpy() for tensor in tensors)
         size = view.width, view.height
         self.statistics.update(visible, at, alphas, radii, grads, *size, counted)

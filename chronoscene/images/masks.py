@@ -1,7 +1,7 @@
 """Masks: which pixels of an image count.
 
-The mask of ``images/a/x.jpg`` is ``masks/a/x.jpg.png`` as for COLMAP, where 0 means ignore. Here are
-the names of the files, and what happens to masks when images are resized.
+The mask of ``images/a/x.jpg`` is ``masks/a/x.jpg.png`` as for COLMAP, where 0 means ignore. Here
+are the names of the files, and what happens to masks when images are resized.
 """
 
 from __future__ import annotations

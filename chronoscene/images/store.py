@@ -7,8 +7,8 @@ step. Intrinsics are scaled by the exact ratio of the sizes per axis.
 
 Orientation tags are not applied: COLMAP works on the pixels as stored, and so do the poses.
 
-Pixels that the mask of an image ignores, or whose alpha is below one half, do not count. Colours are
-those of the file: nothing is put behind transparent pixels.
+Pixels that the mask of an image ignores, or whose alpha is below one half, do not count. Colours
+are those of the file: nothing is put behind transparent pixels.
 """
 
 from __future__ import annotations

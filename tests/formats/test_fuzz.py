@@ -176,7 +176,7 @@ def variants(builders, colmap_folder, level, tmp_path):
         for i, frame in enumerate(data["frames"]):
             frame |= {"colmap_im_id": i + 1, "time": frame["period"] / 2, "mask_path": "m.png"}
         (root / "transforms.json").write_text(json.dumps(data))
-        (root / "m.png").touch()
+        Image.new("L", (64, 48), 255).save(root / "m.png")
         return root
 
     def of_pointz():

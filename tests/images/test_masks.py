@@ -17,10 +17,9 @@ def test_what_is_ignored_does_not_reach_pixels_that_count(size):
     assert small.shape == size[::-1] and small.flags.c_contiguous
     np.testing.assert_array_equal(resized[0][small], resized[1][small])
     # Not more is given up: two pixels of the coarser of both images at each side.
-    rows, columns = (
-        (np.arange(n) + 0.5) * m / n for n, m in zip(small.shape, (48, 64), strict=True)
-    )
-    reach_y, reach_x = (2 * max(m / n, 1) + 1 for n, m in zip(small.shape, (48, 64), strict=True))
+    scales = np.divide((48, 64), small.shape)
+    rows, columns = ((np.arange(n) + 0.5) * s for n, s in zip(small.shape, scales, strict=True))
+    reach_y, reach_x = 2 * np.maximum(scales, 1) + 1
     above_or_below = (rows < 20 - reach_y) | (rows > 31 + reach_y)
     beside = (columns < 13 - reach_x) | (columns > 24 + reach_x)
     assert small[above_or_below].all() and small[:, beside].all()

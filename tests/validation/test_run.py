@@ -26,7 +26,7 @@ def test_good_scene(scene):
     assert report.summary.images == 14
     assert report.summary.points == 40
     assert report.summary.observations == 560
-    assert [s.code for s in report.skipped] == ["CS206", "CS216", "CS231", "CS604"]
+    assert [s.code for s in report.skipped] == ["CS206", "CS216", "CS231", "CS244", "CS604"]
 
 
 def test_all_problems_are_collected(scene):

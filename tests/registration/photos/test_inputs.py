@@ -60,12 +60,12 @@ def test_transparent_pixels_become_black_so_that_nothing_is_found_there(
     folder: Path, tmp_path: Path
 ) -> None:
     folder.mkdir()
-    pixels = np.full((8, 8, 4), 200, np.uint8)
-    pixels[:4, :, 3] = 0
+    pixels = np.full((64, 64, 4), 200, np.uint8)
+    pixels[:40, :, 3] = 0
     Image.fromarray(pixels).save(folder / "clear.png")
     (name,), _ = inputs.place_photos(read_captures(folder).images, tmp_path / "photos")
     with Image.open(tmp_path / "photos" / name) as image:
-        assert np.asarray(image)[:, 0, 0].tolist() == [0] * 4 + [200] * 4
+        assert np.asarray(image)[:, 0, 0].tolist() == [0] * 40 + [200] * 24
 
 
 def test_blanks_in_names_are_replaced_and_names_stay_unique() -> None:
