@@ -146,13 +146,15 @@ class Checkpoints:
         if self.commit not in state.commits:
             state.commits.append(self.commit)
         partial = self.folder / f".{state.iterations}.partial"
+        settings = self.folder.parent / CONFIG_FILE
         try:
             partial.mkdir(parents=True, exist_ok=True)
-            write_text_atomic(self.folder.parent / CONFIG_FILE, dumps(self.settings))
+            if not settings.exists():
+                write_text_atomic(settings, dumps(self.settings))
             method.save_training(partial)
             state.files = {path.name: _sha256(path) for path in partial.iterdir()}
             (partial / LOOP_FILE).write_text(state.model_dump_json(), encoding="utf-8")
-            for path in (*partial.iterdir(), partial):
+            for path in (*partial.iterdir(), partial, settings, settings.parent):
                 _flush(path)
             final = self.folder / str(state.iterations)
             shutil.rmtree(final, ignore_errors=True)  # damaged, else this training began with it

@@ -110,6 +110,7 @@ def settle_training(job: Job) -> None:
         return
     if results.read_config(job.training) != results.read_config(job.folder):
         return  # of a longer training that is under way
+    os.sync()  # the result, before that from which it could be made again goes
     if job.keep_training:
         shutil.rmtree(job.folder / results.TRAINING, ignore_errors=True)
         os.replace(job.training, job.folder / results.TRAINING)
