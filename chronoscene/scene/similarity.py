@@ -169,7 +169,7 @@ def _distances(similarity: Similarity, source: Array, target: Array, axes: int) 
 def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | None:
     """Similarity of a few points, and which of them it uses; None if they do not determine one.
 
-    With five points or more, wrong ones are left out: of the similarities of all triples the one
+    With six points or more, wrong ones are left out: of the similarities of all triples the one
     with the smallest median distance is taken, then all points within three deviations of it.
 
     Args:
@@ -180,7 +180,7 @@ def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | No
     if count < 3 or _thickness(source) < MIN_THICKNESS or _thickness(target) < MIN_THICKNESS:
         return None
     used = np.ones(count, bool)
-    if count >= 5:
+    if count >= 6:  # of five, two beside the triple could agree by chance
         best, smallest = None, np.inf
         for triple in islice(combinations(range(count), 3), MAX_TRIPLES):
             rows = list(triple)
