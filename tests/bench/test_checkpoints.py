@@ -178,7 +178,7 @@ def test_a_start_is_used_until_there_is_something_newer(make, tmp_path):
 
 
 def run(method, part, stop, checkpoints=None):
-    truth = {f.name: part.store.load(f) for f in part.test}
+    truth = {f.name: (part.store.load(f), part.store.load_mask(f)) for f in part.test}
     options = {"seed": 0, "device": "cpu", "observer": lambda *step: None}
     return train(method, part, stop, truth, checkpoints=checkpoints, **options)
 
