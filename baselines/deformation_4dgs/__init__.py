@@ -22,6 +22,8 @@ _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousand
     "field_lr_final": 5e-4,
     "plane_lr_initial": 3e-2,
     "plane_lr_final": 3e-3,
+    "time_smoothness": 2e-5,
+    "time_sparsity": 2e-6,
 }
 
 _SMALL: dict[str, Any] = {"channels": 8, "plane_size": 16, "width": 32}

@@ -172,7 +172,7 @@ def test_the_released_configuration_trains_in_both_stages() -> None:
 
 
 def test_the_second_stage_begins_with_a_new_optimiser_and_new_statistics() -> None:
-    method = Deformation4DGS(config(densify_interval=1_000))
+    method = Deformation4DGS(config(densify_interval=1_000, coarse_until=3_000))
     method.setup(toy_scene(), seed=0, device="cpu")
     trainer = method.trainer
     assert trainer is not None
@@ -288,7 +288,11 @@ def test_white_is_drawn_behind_everything_where_asked(tmp_path: Path) -> None:
 
 
 def test_what_a_gpu_runs_trains_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plain torch form of the field and of its smoothness, here on a CPU in float32."""
+    """The plain torch form of the field and of its smoothness, here on a CPU in float32.
+
+    Few steps, since Adam makes whole steps of differences that are rounding: after three, images
+    differ by 5e-6; after eight, by 1e-3.
+    """
     scene, found = moving_scene(arc), []
     for compiled in (True, False):
         if not compiled:
@@ -297,10 +301,10 @@ def test_what_a_gpu_runs_trains_alike(monkeypatch: pytest.MonkeyPatch) -> None:
                 monkeypatch.setattr(name, lambda tensor: False)
         method = Deformation4DGS(config(coarse_until=0))
         method.setup(scene, seed=0, device="cpu")
-        losses = [method.step(index, 0.1).loss for index in range(8)]
+        losses = [method.step(index, 0.1).loss for index in range(3)]
         found.append((losses, method.render(scene.views[0], 1.5).rgb))
     np.testing.assert_allclose(found[0][0], found[1][0], rtol=1e-4)
-    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-3)
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-4)
 
 
 @pytest.mark.parametrize("preset", SPEC.presets)
