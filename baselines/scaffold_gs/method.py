@@ -17,8 +17,8 @@ from baselines.scaffold_gs.config import ScaffoldGSConfig
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.method import AnchorMethod
 from chronoscene.anchors.model import AnchorLayout, AnchorModel, draw_start
-from chronoscene.anchors.periods import period_weights
 from chronoscene.methods import TrainingSet
+from chronoscene.training.periods import period_weights
 
 
 class AppearanceModel(AnchorModel):

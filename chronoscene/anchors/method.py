@@ -14,12 +14,12 @@ from torch import Tensor
 from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.density import initial_anchors, resolve_voxel_size
 from chronoscene.anchors.model import LAYERS, AnchorLayout, AnchorModel
-from chronoscene.anchors.periods import period_weights
 from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
+from chronoscene.training.periods import period_weights
 from chronoscene.training.splatting import SplattingMethod, draw, finite_rows
 
 

@@ -23,6 +23,7 @@ from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.adam import Adam, DenseTable
 from chronoscene.training.checkpoint import TrainingState, parts
+from chronoscene.training.exposure import Exposure
 from chronoscene.training.losses import mean_volume, photometric_loss
 from chronoscene.training.row_adam import make_table
 from chronoscene.training.schedule import (
@@ -38,6 +39,7 @@ from chronoscene.training.splatting import (
     collect_gradients,
     draw,
     finite_rows,
+    step_background,
 )
 
 AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]
@@ -85,6 +87,7 @@ class AnchorTrainer:
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed)
+        self.exposure = Exposure(self.config.exposure, train, model.device)
         points = train.points[finite_rows(train.points)]
         self._middle = points.astype(np.float64).mean(axis=0)
         self.growth_generator = np.random.default_rng((seed, 1))
@@ -101,8 +104,7 @@ class AnchorTrainer:
             factor = self.config.coarse_factor
             view, photo = downscale_view(view, factor), downscale_image(photo, factor)
             mask = None if mask is None else downscale_mask(mask, factor)
-        row = int(self.feature_rows[position])
-        loss, skipped = self._learn(view, photo, mask, row, done)
+        loss, skipped = self._learn(view, photo, mask, position, done)
         resized = self._densify_if_due(index, done)
         if skipped is None:
             self._update(done, resized=resized)
@@ -118,25 +120,28 @@ class AnchorTrainer:
         view: TrainingView,
         photo: NDArray[np.uint8],
         mask: NDArray[np.bool_] | None,
-        row: int,
+        position: int,
         done: float,
     ) -> tuple[float, Skipped | None]:
         """Loss, and why the step must be skipped, if it must."""
-        visible = self.model.visible(view)
+        visible, row = self.model.visible(view), int(self.feature_rows[position])
         everything = torch.arange(len(visible), device=self.model.device)
         splats, positions = self._seen(visible, row).decode_active(
             self._one_period, self._seen_from(view), everything
         )
         near_plane = self.model.layout.near_plane
-        raster = draw(splats, view, self.background, near_plane=near_plane, check_finite=False)
+        background = step_background(
+            self.background, self.config, seed=self.seed, number=self.sampler.drawn
+        )
+        raster = draw(splats, view, background, near_plane=near_plane, check_finite=False)
         target = torch.from_numpy(photo).to(self.model.device)
         counts = None if mask is None else torch.tensor(mask, device=self.model.device)
-        weight = self.config.ssim_weight
-        loss = photometric_loss(raster.image[0], target, ssim_weight=weight, mask=counts)
+        image, weight = self.exposure.apply(raster.image[0], position), self.config.ssim_weight
+        loss = photometric_loss(image, target, ssim_weight=weight, mask=counts)
         if self.config.scale_weight:
             volume = mean_volume(splats.scales, splats.opacities)
             loss = loss + self.config.scale_weight * volume
-        optimizers = [self.optimizer, *self.tables.values()]
+        optimizers = [self.optimizer, *self.tables.values(), *self.exposure.tables]
         skipped = collect_gradients(loss, raster.info, optimizers, counts)
         collects = (
             self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN
@@ -164,6 +169,7 @@ class AnchorTrainer:
         tensors = {f"model.{n}": t for n, t in self.model.tensors().items() if n not in self.tables}
         sources = {f"table.{name}": table.state() for name, table in self.tables.items()}
         sources["adam"] = self.optimizer.state()
+        sources["exposure"] = self.exposure.state()
         if self.statistics is not None:
             counters = {n: torch.from_numpy(getattr(self.statistics, n)) for n in COUNTERS}
             sources["statistics"] = counters
@@ -187,6 +193,7 @@ class AnchorTrainer:
         for name, table in self.tables.items():
             setattr(model, name, table.load_state(parts(state.tensors, f"table.{name}")))
         self.optimizer.load_state(parts(state.tensors, "adam"))
+        self.exposure.load_state(parts(state.tensors, "exposure"))
         self.statistics = None
         if counters := parts(state.tensors, "statistics"):
             self.statistics = DensityStatistics(len(model), model.layout.offsets)
@@ -278,6 +285,7 @@ class AnchorTrainer:
         where the anchors then have new tensors without gradients."""
         rates = {name: log_linear(done, *rate) for name, rate in self.rates.items()}
         self.optimizer.step(rates)
+        self.exposure.step(done)
         if not resized:
             for name, table in self.tables.items():
                 if name in rates:

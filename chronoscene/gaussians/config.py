@@ -6,8 +6,8 @@ Defaults are those of the 2023 release of 3D Gaussian Splatting (Kerbl et al.).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import ClassVar
+from dataclasses import asdict, dataclass, replace
+from typing import ClassVar, Self
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
@@ -51,7 +51,15 @@ class GaussianConfig(SplattingConfig):
     """Of the quaternion."""
 
     # Densification
+    densification: str = "adaptive"
+    """``adaptive``: Gaussians with large gradients are cloned and split, faint ones pruned, and
+    opacities reset, as published. ``mcmc``: faint ones move to where others are, the set grows by
+    `mcmc_growth` in each round until it has `max_gaussians`, which must be given, and all
+    positions move at random: `chronoscene.gaussians.mcmc`. Its authors train so with
+    ``densify_until=25000``, ``initial_opacity=0.5`` and ``initial_scale=0.1``."""
     initial_opacity: float = 0.1
+    initial_scale: float = 1.0
+    """Times the distance of the points around it."""
     densify_from: int = 500
     """Moment after which Gaussians are added and pruned."""
     densify_until: int = 15_000
@@ -81,6 +89,17 @@ class GaussianConfig(SplattingConfig):
     prune_above: int = 0
     """Rounds prune only sets that are larger than this."""
 
+    # Densification of kind mcmc
+    mcmc_growth: float = 0.05
+    """Share of the set that a round adds."""
+    mcmc_noise: float = 5e5
+    """Of the random moves of positions, times their learning rate; one over `length_unit`
+    squared."""
+    mcmc_opacity_weight: float = 0.01
+    """In the loss, of the mean opacity."""
+    mcmc_scale_weight: float = 0.01
+    """In the loss, of the mean scale in `length_unit`."""
+
     minima: ClassVar[Mapping[str, int]] = dict.fromkeys(
         (
             "iterations",
@@ -96,6 +115,7 @@ class GaussianConfig(SplattingConfig):
 
     def __post_init__(self) -> None:
         check_choice("sh_degree", str(self.sh_degree), ("0", "1", "2", "3"))
+        check_choice("densification", self.densification, ("adaptive", "mcmc"))
         super().__post_init__()
         for name, value in asdict(self).items():
             if isinstance(value, str):
@@ -105,3 +125,21 @@ class GaussianConfig(SplattingConfig):
                 raise ConfigError(
                     name, expected=f"at least {low}", found=str(value), todo="correct the value"
                 )
+        if self.densification == "mcmc" and not self.max_gaussians:
+            raise ConfigError(
+                "max_gaussians",
+                expected="the number of Gaussians to grow to, as densification is mcmc",
+                found="0",
+                todo="give it, such as max_gaussians=100000",
+            )
+
+    def in_training_frame(self, training_from_world: float) -> Self:
+        config = super().in_training_frame(training_from_world)
+        if self.length_unit == "training":
+            return config
+        # A random move is a variance times a learning rate: a length to the third power.
+        return replace(
+            config,
+            mcmc_noise=self.mcmc_noise / training_from_world**2,
+            mcmc_scale_weight=self.mcmc_scale_weight / training_from_world,
+        )

@@ -56,7 +56,8 @@ class GaussianMethod(SplattingMethod):
         }
 
     def start(self, train: TrainingSet, *, seed: int, device: str) -> GaussianTrainer:
-        parameters = initialise(train, opacity=self.config.initial_opacity)
+        config = self.config
+        parameters = initialise(train, opacity=config.initial_opacity, scale=config.initial_scale)
         self.model = self.make_model({k: v.to(device) for k, v in parameters.items()}, train, seed)
         return self.trainer_class(
             self.config,

@@ -70,10 +70,10 @@ class GaussianModel:
         )
 
 
-def initialise(train: TrainingSet, *, opacity: float) -> dict[str, Tensor]:
+def initialise(train: TrainingSet, *, opacity: float, scale: float = 1.0) -> dict[str, Tensor]:
     """One round Gaussian per sparse point, as large as the points around it are far.
 
-    The scale is the root mean square distance to the three nearest points.
+    The scale is a multiple of the root mean square distance to the three nearest points.
 
     Returns:
         parameters: float32 on the CPU, as `SHAPES` says.
@@ -86,7 +86,7 @@ def initialise(train: TrainingSet, *, opacity: float) -> dict[str, Tensor]:
     rows = finite_rows(train.points)
     points, colors = train.points[rows], train.colors[rows]
     count = len(points)
-    scales = np.maximum(rms_spacing(points), MIN_SPACING)
+    scales = scale * np.maximum(rms_spacing(points), MIN_SPACING)
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1.0
     return {

@@ -15,16 +15,27 @@ from torch import Tensor
 
 from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.density import GradientStatistics, densify, reset_opacities
+from chronoscene.gaussians.mcmc import make_generator, noise, relocate
 from chronoscene.gaussians.model import GaussianModel
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.adam import Adam
 from chronoscene.training.checkpoint import TrainingState, parts
+from chronoscene.training.exposure import Exposure
 from chronoscene.training.losses import photometric_loss
 from chronoscene.training.schedule import ViewSampler, log_linear
-from chronoscene.training.splatting import collect_gradients, draw, mask_tensor
+from chronoscene.training.splatting import (
+    Splats,
+    collect_gradients,
+    draw,
+    mask_tensor,
+    step_background,
+)
 
-_SPLIT_STREAM = 1  # Keeps the samples of splits apart from other draws of the same seed
+# Keep random choices of a kind apart from those of others with the same seed
+_SPLIT_STREAM = 1
+_PLACE_STREAM = 4
+_NOISE_STREAM = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,16 +75,17 @@ class Timeline:
         passed_reset = moment // config.reset_interval > self.last_moment // config.reset_interval
         round_is_due = (index + 1) % config.densify_interval == 0
         growing = moment < config.densify_until
+        adaptive = config.densification == "adaptive"
         progress = moment / config.schedule_length
         self.last_moment = moment
         return Due(
             moment=moment,
             sh_degree=min(config.sh_degree, moment // config.sh_interval),
             position_lr=log_linear(progress, config.position_lr_initial, config.position_lr_final),
-            collect=growing,
+            collect=growing and adaptive,
             densify=growing and moment > config.densify_from and round_is_due,
             prune_large=moment > config.prune_large_from,
-            reset=growing and passed_reset,
+            reset=growing and adaptive and passed_reset,
         )
 
 
@@ -98,6 +110,7 @@ class GaussianTrainer:
     def __post_init__(self) -> None:
         self.timeline = self.timeline_class(self.config)
         self.sampler = ViewSampler(len(self.train.views), self.seed)
+        self.exposure = Exposure(self.config.exposure, self.train, self.background.device)
         self.begin()
 
     def begin(self) -> None:
@@ -112,24 +125,34 @@ class GaussianTrainer:
         number = self.sampler.next()
         view = self.train.views[number]
         splats = self.model.splats(view, view.period)
-        raster = draw(splats, view, self.background, near_plane=self.config.near_plane)
+        background = step_background(
+            self.background, self.config, seed=self.seed, number=self.sampler.drawn
+        )
+        raster = draw(splats, view, background, near_plane=self.config.near_plane)
         mask = mask_tensor(self.train, number, self.background.device)
-        loss = self.loss(raster, number)
+        loss = self.loss(raster, number) + self._regulariser(splats)
         self.optimizer.zero_grad()
-        skipped = collect_gradients(loss, raster.info, [self.optimizer], mask)
+        skipped = collect_gradients(
+            loss, raster.info, [self.optimizer, *self.exposure.tables], mask
+        )
         if skipped:
             self.optimizer.zero_grad()
-        elif due.collect:
+        else:
+            self.exposure.step(progress)
+        if due.collect and not skipped:
             self.statistics.add(raster.info, view.width, view.height, mask)
         if due.densify:
             self._densify(index, prune_large=due.prune_large)
         self._update(due)
+        if not skipped:
+            self._move_at_random(index, due)
         return StepReport(float(loss.detach()), len(self.model), skipped)
 
     def state(self) -> TrainingState:
         """Everything that the steps to come depend on; methods may add to it."""
         tensors = {f"model.{name}": tensor for name, tensor in self.model.tensors().items()}
         tensors |= {f"adam.{name}": tensor for name, tensor in self.optimizer.state().items()}
+        tensors |= {f"exposure.{name}": tensor for name, tensor in self.exposure.state().items()}
         tensors |= {"statistics.sums": self.statistics.sums}
         tensors |= {"statistics.views": self.statistics.views}
         values = {
@@ -150,6 +173,7 @@ class GaussianTrainer:
             tensor.copy_(stored[name])
         self.optimizer = Adam(model.tensors())
         self.optimizer.load_state(adam)
+        self.exposure.load_state(parts(state.tensors, "exposure"))
         statistics.sums = counts["sums"].to(statistics.sums)
         statistics.views = counts["views"].to(statistics.views)
         self.sampler.drawn = state.values["views_drawn"]
@@ -161,20 +185,41 @@ class GaussianTrainer:
         # A copy, as cached images are not ours to write to, which torch cannot promise.
         photo = torch.from_numpy(self.train.load_image(number).copy()).to(raster.image.device)
         mask = mask_tensor(self.train, number, photo.device)
-        weight = self.config.ssim_weight
-        return photometric_loss(raster.image[0], photo, ssim_weight=weight, mask=mask)
+        image, weight = self.exposure.apply(raster.image[0], number), self.config.ssim_weight
+        return photometric_loss(image, photo, ssim_weight=weight, mask=mask)
+
+    def _regulariser(self, splats: Splats) -> Tensor | float:
+        """What else keeps Gaussians faint and small, so that they can move elsewhere."""
+        config = self.config
+        if config.densification != "mcmc":
+            return 0.0
+        opacity, scale = splats.opacities.mean(), splats.scales.mean()
+        return config.mcmc_opacity_weight * opacity + config.mcmc_scale_weight * scale
+
+    @torch.no_grad()
+    def _move_at_random(self, index: int, due: Due) -> None:
+        """The random part of a step of the kind mcmc."""
+        if self.config.densification != "mcmc":
+            return
+        parameters, rate = self.model.parameters, self.learning_rates(due)["means"]
+        generator = make_generator(self.background.device, self.seed, _NOISE_STREAM, index)
+        parameters["means"].add_(noise(parameters, rate, self.config, generator))
 
     @torch.no_grad()
     def _densify(self, index: int, *, prune_large: bool) -> None:
         """Change the set of Gaussians; their gradients of this step are dropped."""
-        result = densify(
-            self.model.parameters,
-            self.statistics.mean(),
-            extent=self.train.camera_extent,
-            prune_large=prune_large,
-            config=self.config,
-            generator=np.random.default_rng((self.seed, _SPLIT_STREAM, index)),
-        )
+        if self.config.densification == "mcmc":
+            generator = make_generator(self.background.device, self.seed, _PLACE_STREAM, index)
+            result = relocate(self.model.parameters, self.config, generator)
+        else:
+            result = densify(
+                self.model.parameters,
+                self.statistics.mean(),
+                extent=self.train.camera_extent,
+                prune_large=prune_large,
+                config=self.config,
+                generator=np.random.default_rng((self.seed, _SPLIT_STREAM, index)),
+            )
         for name, rows in result.new.items():
             self.optimizer.keep(name, result.keep)
             self.model.parameters[name] = self.optimizer.extend(name, rows)

@@ -26,7 +26,11 @@ from chronoscene.rasterizer import NEAR_PLANE, RasterInfo, Rasterization, raster
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.adam import Adam, DenseTable, all_finite
 from chronoscene.training.checkpoint import TRAINING, TrainingState, load_tensors, save_tensors
+from chronoscene.training.exposure import KINDS, of_period, transformed
 from chronoscene.training.row_adam import RowAdam
+
+_EXPOSURE = "exposure"  # Name of the stored transforms
+_BACKGROUND_STREAM = 3  # Keeps the colours of `step_background` apart from other random choices
 
 
 def finite_rows(points: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -72,8 +76,15 @@ class SplattingConfig:
     official rasterizer of 3DGS has 0.2."""
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the loss; L1 gets the rest."""
+    random_background: bool = False
+    """Train with another colour behind everything in each step, so that no Gaussian is missing
+    where a photo shows that colour. Images are rendered with the usual background."""
+    exposure: str = "none"
+    """``image`` | ``period``: learn an affine transform of the colours for each training image, or
+    for each period. A rendered view has that of its period: `chronoscene.training.exposure`."""
 
     def __post_init__(self) -> None:
+        check_choice("exposure", self.exposure, KINDS)
         check_choice("length_unit", self.length_unit, ("world", "training"))
         if not self.near_plane >= 0.0:
             raise ConfigError(
@@ -132,6 +143,23 @@ def draw(
     )
 
 
+def step_background(
+    background: Tensor, config: SplattingConfig, *, seed: int, number: int
+) -> Tensor:
+    """What is behind everything in one step of a training. [3] -> [3]
+
+    Args:
+        background: The usual colour.
+        config: Says whether it is that, or a random one.
+        seed: Of the run; with the number of the step, all that the colour depends on.
+        number: Of the step.
+    """
+    if not config.random_background:
+        return background
+    generator = np.random.default_rng((seed, _BACKGROUND_STREAM, number))
+    return torch.from_numpy(generator.random(3, np.float32)).to(background.device)
+
+
 def collect_gradients(
     loss: Tensor,
     info: RasterInfo,
@@ -175,10 +203,16 @@ def mask_tensor(train: TrainingSet, index: int, device: str | torch.device) -> T
     return None if mask is None else torch.tensor(mask, device=device)
 
 
-def prediction_of(raster: Rasterization) -> Prediction:
-    """What a method hands to the harness, from a call with one view and with depth."""
+def prediction_of(raster: Rasterization, exposure: Tensor | None = None) -> Prediction:
+    """What a method hands to the harness, from a call with one view and with depth.
+
+    Args:
+        raster: The view.
+        exposure: Transform of its colours. [3, 4]
+    """
     assert raster.depths is not None
-    images = (raster.image[0], raster.alphas[0, ..., 0], raster.depths[0, ..., 0])
+    image = raster.image[0] if exposure is None else transformed(raster.image[0], exposure)
+    images = (image, raster.alphas[0, ..., 0], raster.depths[0, ..., 0])
     rgb, alpha, depth = (image.detach().cpu().numpy() for image in images)
     return Prediction(rgb=rgb.clip(0.0, 1.0), alpha=alpha, depth=depth)
 
@@ -224,7 +258,8 @@ class SplattingMethod(ABC):
         self.meta: dict[str, Any] = {}
         """Content of ``model.json``; subclasses add what `restore` needs."""
         self.trainer: Any = None
-        """What `start` gave; None after `load`."""
+        """What `start` gave, which has an `Exposure` as ``exposure``; None after `load`."""
+        self._exposure: Tensor | None = None
 
     @abstractmethod
     def start(self, train: TrainingSet, *, seed: int, device: str) -> Any:
@@ -265,17 +300,32 @@ class SplattingMethod(ABC):
         return self.trainer.step(index, progress)
 
     def render(self, view: View, period: float) -> Prediction:
+        transforms = self.exposure()
         with torch.no_grad():
-            return prediction_of(self.draw(view, period))
+            exposure = None if transforms is None else of_period(transforms, period)
+            return prediction_of(self.draw(view, period), exposure)
+
+    def exposure(self) -> Tensor | None:
+        """The transform of colours of each period, if the training learns any. [T, 3, 4]"""
+        if self.trainer is None:
+            return self._exposure
+        transforms: Tensor | None = self.trainer.exposure.by_period()
+        return transforms
+
+    def _all_tensors(self) -> dict[str, Tensor]:
+        """All that is stored, by name."""
+        exposure = self.exposure()
+        return self.stored_tensors() | ({} if exposure is None else {_EXPOSURE: exposure})
 
     def save(self, folder: Path) -> None:
         """Write the model; the state of the optimiser is not stored."""
-        save_tensors(folder, self.stored_tensors(), self.meta)
+        save_tensors(folder, self._all_tensors(), self.meta)
 
     def load(self, folder: Path, *, device: str) -> None:
         """Read a model; what is stored with it takes precedence over the options given here."""
         tensors, self.meta = load_tensors(folder, device=device, method=self.name)
         self.background = torch.tensor(self.meta["background"], dtype=torch.float32, device=device)
+        self._exposure = tensors.pop(_EXPOSURE, None)
         self.restore(folder, tensors, device)
         self.trainer = None
 
@@ -298,5 +348,5 @@ class SplattingMethod(ABC):
 
     def size(self) -> MethodSize:
         """Number of primitives, and of all stored numbers."""
-        tensors = self.stored_tensors()
+        tensors = self._all_tensors()
         return MethodSize(len(tensors[self.primitive]), sum(t.numel() for t in tensors.values()))

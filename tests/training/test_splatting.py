@@ -7,10 +7,12 @@ import torch
 from chronoscene.errors import SceneError
 from chronoscene.methods import View
 from chronoscene.training.splatting import (
+    SplattingConfig,
     camera_centre_tensor,
     camera_tensors,
     finite_rows,
     rms_spacing,
+    step_background,
 )
 
 
@@ -62,3 +64,20 @@ def test_spacing_is_the_root_mean_square_of_three() -> None:
 
 def test_a_lone_point_has_no_spacing() -> None:
     assert rms_spacing(np.zeros((1, 3), np.float32)).tolist() == [0.0]
+
+
+def test_a_random_background_follows_from_the_seed_and_the_step() -> None:
+    usual = torch.tensor([1.0, 0.0, 0.5])
+    config = SplattingConfig()
+    assert step_background(usual, config, seed=0, number=3) is usual
+    config = SplattingConfig(random_background=True)
+    colors = [
+        step_background(usual, config, seed=seed, number=number)
+        for seed, number in ((0, 3), (0, 3), (0, 4), (1, 3))
+    ]
+    assert torch.equal(colors[0], colors[1])
+    assert not torch.equal(colors[0], colors[2]) and not torch.equal(colors[0], colors[3])
+    many = torch.stack(
+        [step_background(usual, config, seed=0, number=number) for number in range(300)]
+    )
+    assert 0 <= many.min() < 0.05 and 0.95 < many.max() < 1

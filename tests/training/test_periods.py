@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.anchors.periods import period_weights
 from chronoscene.errors import ConfigError
+from chronoscene.training.periods import period_weights
 
 
 @given(st.integers(1, 50), st.data())

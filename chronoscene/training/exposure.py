@@ -1,0 +1,142 @@
+"""Exposure compensation: an affine transform of colours per training image, or per period.
+
+A photo may be brighter or warmer than its neighbours. The rendered image is transformed before it
+is compared with the photo, so that the model need not explain the difference. Transforms start as
+the identity and are learned with the model. Test images are never fitted: a view to render has the
+transform of its period, which is the mean over the period's training images where each image has
+its own.
+
+Source: the exposure option of the 2024 release of 3D Gaussian Splatting, whose rule for test
+images differs (the identity, or a fit to half of each).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import prange
+from numpy.typing import NDArray
+from torch import Tensor
+
+from chronoscene.kernels.compilation import kernel
+from chronoscene.methods import TrainingSet
+from chronoscene.training.adam import DenseTable
+from chronoscene.training.periods import period_weights
+from chronoscene.training.schedule import log_linear
+
+KINDS = ("none", "image", "period")
+"""``none``: no transforms; else what has one of its own."""
+
+LEARNING_RATE = (0.01, 0.001)
+"""Of Adam, at the start and at the end; log-linear between."""
+
+
+class Exposure:
+    """The transforms of a training.
+
+    Args:
+        kind: One of `KINDS`.
+        train: What is trained on.
+        device: Of the tensors.
+    """
+
+    def __init__(self, kind: str, train: TrainingSet, device: str | torch.device) -> None:
+        self._periods = np.array([view.period for view in train.views])
+        self._identity = torch.eye(3, 4, device=device).repeat(train.num_periods, 1, 1)
+        self._rows = np.arange(len(train.views)) if kind == "image" else self._periods
+        count = 0 if kind == "none" else 1 + int(self._rows.max())
+        table = DenseTable(self._identity[:1].repeat(count, 1, 1))
+        self.tables = [table] if count else []
+        """The transforms, a row for each; no table with kind ``none``. [R, 3, 4]"""
+
+    def apply(self, image: Tensor, number: int) -> Tensor:
+        """The image as view ``number`` would show it; gradients reach its transform. [H, W, 3]"""
+        for table in self.tables:
+            image = transformed(image, table.fetch(self._rows[number : number + 1])[0])
+        return image
+
+    def step(self, progress: float) -> None:
+        """One step of Adam; ``progress`` is the share of the training that is over."""
+        for table in self.tables:
+            table.step(log_linear(progress, *LEARNING_RATE))
+
+    def by_period(self) -> Tensor | None:
+        """The transform of each period, the identity where it has no training image. [T, 3, 4]"""
+        if not self.tables:
+            return None
+        result = self._identity.clone()
+        for period in np.unique(self._periods):
+            rows = np.unique(self._rows[self._periods == period])
+            result[period] = self.tables[0].value[torch.from_numpy(rows)].mean(0)
+        return result
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that later steps depend on, by name."""
+        return {name: t for table in self.tables for name, t in table.state().items()}
+
+    def load_state(self, state: dict[str, Tensor]) -> None:
+        """Go on from what `state` gave, with the same kind and views."""
+        for table in self.tables:
+            table.load_state(state)
+
+
+def of_period(transforms: Tensor, period: float) -> Tensor:
+    """The transform of a period, mixed as features are between two; of any if there is but one.
+
+    Args:
+        transforms: [T, 3, 4]
+        period: 0..T-1.
+    """
+    count = len(transforms)
+    weights = torch.from_numpy(period_weights(period if count > 1 else 0.0, count))
+    return (transforms * weights.to(transforms)[:, None, None]).sum(0)
+
+
+def transformed(image: Tensor, transform: Tensor) -> Tensor:
+    """A c + b for each pixel c, with [A b] the transform. [H, W, 3], [3, 4] -> [H, W, 3]
+
+    Gradients have equal bits for any number of threads.
+    """
+    return _Transform.apply(image, transform)
+
+
+class _Transform(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, transform: Tensor) -> Tensor:
+        ctx.save_for_backward(image, transform)
+        return _mixed(image, transform) + transform[:, 3]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
+        image, transform = ctx.saved_tensors
+        return _mixed(grads[0], transform[:, :3].T), _moments(grads[0], image)
+
+
+def _mixed(image: Tensor, matrix: Tensor) -> Tensor:
+    """A c for each pixel, by elementwise sums, which round alike on any number of threads."""
+    r, g, b = image.unbind(-1)
+    return torch.stack([row[0] * r + row[1] * g + row[2] * b for row in matrix], dim=-1)
+
+
+def _moments(grad: Tensor, image: Tensor) -> Tensor:
+    """Sum over the pixels of the gradient times (c, 1). [H, W, 3], [H, W, 3] -> [3, 4]"""
+    if grad.is_cuda:
+        products = torch.einsum("hwi,hwj->ij", grad, image)
+        return torch.cat([products, grad.sum((0, 1))[:, None]], dim=1)
+    sums = np.zeros((len(grad), 3, 4))
+    _row_moments(grad.contiguous().numpy(), image.detach().contiguous().numpy(), sums)
+    return torch.from_numpy(sums.sum(axis=0)).to(grad)
+
+
+@kernel(parallel=True)
+def _row_moments(  # type: ignore[no-untyped-def]
+    grad: NDArray[Any], image: NDArray[Any], sums: NDArray[np.float64]
+):
+    for y in prange(len(grad)):
+        for x in range(grad.shape[1]):
+            for i in range(3):
+                for j in range(3):
+                    sums[y, i, j] += grad[y, x, i] * image[y, x, j]
+                sums[y, i, 3] += grad[y, x, i]

@@ -1,0 +1,83 @@
+"""Options that methods share: each does what it says, and a training with it can be resumed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny_training
+
+from chronoscene.kernels.runtime import set_threads
+from chronoscene.methods import build_config, import_object, load_spec
+
+STEPS = 30
+
+OPTIONS = [
+    ("3dgs", {"random_background": True}),
+    ("3dgs", {"exposure": "image"}),
+    ("scaffold-gs", {"random_background": True, "exposure": "image"}),
+    ("chronogs", {"exposure": "period"}),
+    ("4dgs", {"exposure": "period"}),
+    ("3dgs", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
+]
+OPTIONS_IDS = [f"{method}-{'-'.join(options)}" for method, options in OPTIONS]
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    set_threads(1)
+    yield
+    set_threads()
+
+
+def start(name, data, **options):
+    spec = load_spec(name)
+    options = {"iterations": STEPS, **options}
+    method = import_object(spec.method)(build_config(spec, preset="fast", overrides=options))
+    method.setup(data, seed=0, device="cpu")
+    return method
+
+
+def train(method, start=0, stop=STEPS):
+    return [method.step(i, i / STEPS) for i in range(start, stop)]
+
+
+def saved(method, folder):
+    folder.mkdir()
+    method.save(folder)
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(("name", "options"), OPTIONS, ids=OPTIONS_IDS)
+def test_a_training_with_options_ends_the_same_when_interrupted(name, options, tmp_path):
+    data = tiny_training.make_training_set(tiny_training.periods_for(load_spec(name)))
+    whole = start(name, data, **options)
+    reports = train(whole)
+    first = start(name, data, **options)
+    train(first, 0, 17)
+    (tmp_path / "training").mkdir()
+    first.save_training(tmp_path / "training")
+    second = start(name, data, **options)
+    second.load_training(tmp_path / "training")
+    assert train(second, 17) == reports[17:]
+    assert saved(second, tmp_path / "second") == saved(whole, tmp_path / "whole")
+    loaded = import_object(load_spec(name).method)(whole.config)
+    loaded.load(tmp_path / "whole", device="cpu")
+    for view, period in ((data.views[0], 0.0), (data.views[-1], float(data.views[-1].period))):
+        ours, theirs = (m.render(view, period) for m in (whole, loaded))
+        np.testing.assert_array_equal(ours.rgb, theirs.rgb)
+    assert loaded.size() == whole.size()
+    assert saved(loaded, tmp_path / "again") == saved(whole, tmp_path / "and again")
+
+
+@pytest.mark.parametrize("name", ["3dgs", "scaffold-gs"])
+def test_a_random_background_leaves_no_hole_where_photos_are_as_dark_as_it(name):
+    """Black photos need no Gaussians before black; before any colour they need opaque ones."""
+    data = tiny_training.make_training_set(1)
+    black = np.zeros((tiny_training.HEIGHT, tiny_training.WIDTH, 3), np.uint8)
+    data = replace(data, load_image=lambda index: black)
+    drawn = []
+    for random in (False, True):
+        method = start(name, data, random_background=random)
+        train(method)
+        drawn.append(float(np.mean([method.render(v, 0.0).alpha.mean() for v in data.views])))
+    assert drawn[1] > 1.2 * drawn[0]
