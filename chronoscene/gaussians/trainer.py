@@ -128,7 +128,9 @@ class GaussianTrainer:
         background = step_background(
             self.background, self.config, seed=self.seed, number=self.sampler.drawn
         )
-        raster = draw(splats, view, background, near_plane=self.config.near_plane)
+        near_plane = self.config.near_plane
+        # A scale beyond all numbers shows in the gradients; one such step ends no training.
+        raster = draw(splats, view, background, near_plane=near_plane, check_finite=False)
         mask = mask_tensor(self.train, number, self.background.device)
         loss = self.loss(raster, number) + self._regulariser(splats)
         self.optimizer.zero_grad()

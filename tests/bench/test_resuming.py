@@ -93,10 +93,10 @@ def test_a_killed_training_ends_as_an_undisturbed_one(bench, scene_folder, tmp_p
 @pytest.mark.parametrize("method", method_names())
 def test_a_training_that_is_killed_again_and_again(scene_folder, tmp_path, method):
     generator = random.Random(2)
-    assert start(scene_folder, method, tmp_path / "whole", 400, "fast").communicate()
+    assert start(scene_folder, method, tmp_path / "whole", 1500, "fast").communicate()
     runs, kills = tmp_path / "killed", 0
     while kill_later(
-        start(scene_folder, method, runs, 400, "fast"), runs, generator.uniform(0, 0.5)
+        start(scene_folder, method, runs, 1500, "fast"), runs, generator.uniform(0, 0.5)
     ):
         kills += 1
     print(f"{method}: {kills} kills")

@@ -143,6 +143,16 @@ def test_an_empty_step_changes_nothing_but_the_schedule_goes_on():
     assert opacities_of(logits).max() < 0.0101
 
 
+def test_a_scale_beyond_all_numbers_is_a_step_that_is_not_finite():
+    method = GaussianSplatting(SHORT)
+    method.setup(toy_scene(), seed=0, device="cpu")
+    with torch.no_grad():
+        method.model.parameters["log_scales"][7] = 200.0
+    before = method.model.parameters["means"].detach().clone()
+    assert method.step(0, 0.0).skipped == "not finite"
+    assert torch.equal(method.model.parameters["means"], before)
+
+
 def test_a_set_that_died_out_still_trains_and_renders():
     scene = toy_scene(views=2)
     method = GaussianSplatting(replace(SHORT, min_opacity=2.0, densify_interval=2))
