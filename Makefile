@@ -36,7 +36,7 @@ $(DEMO)/.scene: | $(READY)
 	touch $@
 
 test: lint
-	$(BIN)/python -m pytest -q -m "not slow" --numprocesses auto --dist worksteal
+	$(BIN)/python -m pytest -q --numprocesses auto --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -123,6 +123,8 @@ class Prediction:
     """[H, W]"""
     depth: NDArray[np.float32] | None = None
     """Expected z-depth in units of the training frame; 0 where alpha is 0. [H, W]"""
+    drawn: int | None = None
+    """Gaussians, or whatever the method draws, that touch the image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +147,8 @@ class MethodSize:
     primitives: int
     parameters: int
     """Numbers stored in the checkpoint."""
+    unit: str = "primitives"
+    """What the primitives are: ``Gaussians``, ``anchors``."""
 
 
 class Method(Protocol):

@@ -135,6 +135,11 @@ def _scene_jobs(
     budget = settings.budget_seconds
     for (reference, spec), wanted, seed in product(specs, settings.strategies, settings.seeds):
         strategy, notice = effective_strategy(spec, wanted)
+        notices = [notice] if notice else []
+        if strategy == "separate":
+            each = settings.separate_iterations == "each"
+            has = "each model has all" if each else "the models of a run share the"
+            notices.append(f"separate: {has} iterations and time")
         job = Job(
             scene_root=str(scene.root.resolve()),
             scene_format=scene.format,
@@ -158,7 +163,7 @@ def _scene_jobs(
             runs=str(settings.runs.resolve()),
             lpips_weights=str(settings.lpips_weights.resolve()) if settings.lpips_weights else None,
             commit=commit,
-            notices=[*filter(None, [notice]), *([] if budget is None else [BUDGET_NOTICE])],
+            notices=[*notices, *([] if budget is None else [BUDGET_NOTICE])],
             plugin_path=str(Path.cwd()) if ":" in reference else None,
         )
         yield job, spec

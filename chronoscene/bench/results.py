@@ -54,6 +54,10 @@ class RunRecord(BaseModel):
     """Training clock: setup and steps, without probes, rendering and scoring."""
     iterations: int
     primitives: int
+    primitive: str = "primitives"
+    """What `primitives` counts: ``Gaussians``, ``anchors``."""
+    drawn: float | None = None
+    """Gaussians that touch a test view, mean over the views; None if the method does not say."""
     checkpoint_bytes: int
     peak_memory_bytes: int | None
     """None where the system does not tell."""
@@ -85,7 +89,7 @@ class RunRecord(BaseModel):
     setup_seconds: float
     """Share of `seconds` before the first step."""
     render_seconds: float
-    """Mean time to render a test view."""
+    """Mean time to render a test view, by the model as it was saved and loaded again."""
     peak_device_memory_bytes: int | None
     """Largest memory held on a GPU; None on a CPU."""
     threads: int

@@ -37,6 +37,8 @@ COSTS = (
     Cost("seconds", "training [s]", 1.0, 1),
     Cost("iterations", "iterations", 1.0, 0),
     Cost("primitives", "primitives", 1.0, 0),
+    Cost("drawn", "drawn per view", 1.0, 0),
+    Cost("render_seconds", "rendering [ms]", 1e3, 1),
     Cost("checkpoint_bytes", "checkpoint [MB]", 1e-6, 3),
     Cost("peak_memory_bytes", "peak memory [MB]", 1e-6, 0),
     Cost("peak_device_memory_bytes", "peak GPU memory [MB]", 1e-6, 0),
@@ -330,6 +332,12 @@ def footnotes(
         values = dict.fromkeys(str(getattr(run, name)) for run in records)
         if values:
             notes.append(f"{title}: {'; '.join(values)}")
+    counted: dict[str, dict[str, None]] = {}
+    for run in records:
+        counted.setdefault(run.primitive, {})[run.title] = None
+    if records:
+        units = "; ".join(f"{unit} of {', '.join(titles)}" for unit, titles in counted.items())
+        notes.append(f"primitives: {units}")
     absent: dict[str, list[str]] = {}
     for run in records:
         for metric, reason in run.skipped.items():

@@ -20,6 +20,7 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.methods import (
     Method,
     MethodSpec,
+    Prediction,
     StepReport,
     TrainingSet,
     TrainingView,
@@ -192,8 +193,13 @@ def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:
     Raises:
         TrainingError: If the image has another size or is not finite.
     """
-    view = part.view(frame)
-    rgb = np.asarray(method.render(view, part.method_period(frame)).rgb)
+    prediction = method.render(part.view(frame), part.method_period(frame))
+    return checked_bytes(prediction, part, frame)
+
+
+def checked_bytes(prediction: Prediction, part: Part, frame: Frame) -> NDArray[np.uint8]:
+    """The image of a prediction, quantised to 8 bits; errors as in `render_bytes`. [H, W, 3]"""
+    view, rgb = part.view(frame), np.asarray(prediction.rgb)
     finite = rgb.dtype.kind != "f" or bool(np.isfinite(rgb).all())
     if rgb.shape != (view.height, view.width, 3) or not finite:
         raise TrainingError(

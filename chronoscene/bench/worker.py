@@ -40,9 +40,9 @@ from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.bench.training_loop import (
     DivergedError,
     Truth,
+    checked_bytes,
     forget_peak_memory,
     probe_frames,
-    render_bytes,
     train,
     warm_up,
 )
@@ -66,7 +66,9 @@ class PartOutcome:
     trained: LoopState
     size: MethodSize
     render_seconds: float
-    """For all its test views together."""
+    """For all its test views together, by the model as it was saved and loaded again."""
+    drawn: int | None
+    """Sum over its test views; None if the method does not say."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,12 +178,22 @@ def _run_part(
         _save(method, checkpoint, part)  # as the last good step left it
         raise
     display.wait(f"{len(part.test)} test views")
-    _save(method, checkpoint, part)
-    before = time.perf_counter()
+    saved = _save(method, checkpoint, part)
+    # What is scored is what the checkpoint holds, and nothing that only the training knows.
+    method = import_object(spec.method)(job.method_config(spec))
+    method.load(saved, device=machine.device)
+    for frame in part.test[:1]:
+        method.render(part.view(frame), part.method_period(frame))  # the first time takes longer
+    seconds = 0.0
+    drawn: list[Any] = []
     for frame in part.test:
-        image = render_bytes(method, part, frame)
+        before = time.perf_counter()
+        prediction = method.render(part.view(frame), part.method_period(frame))
+        seconds += time.perf_counter() - before
+        image = checked_bytes(prediction, part, frame)
         writer.add(frame.name, image, camera_period=frame.period, rendered_period=frame.period)
-    return PartOutcome(trained, method.size(), time.perf_counter() - before)
+        drawn.append(prediction.drawn)
+    return PartOutcome(trained, method.size(), seconds, None if None in drawn else sum(drawn))
 
 
 def _checkpoints(
@@ -212,13 +224,14 @@ def _probe_truth(job: Job, part: Part) -> Truth:
     }
 
 
-def _save(method: Method, checkpoint: Path, part: Part) -> None:
+def _save(method: Method, checkpoint: Path, part: Part) -> Path:
     """Save into ``checkpoint``, or a folder below it for each of several models."""
     target = checkpoint if part.name == "all" else checkpoint / part.name
     partial = target.with_name(f"{target.name}.partial")
     partial.mkdir(parents=True)
     method.save(partial)
     os.replace(partial, target)
+    return target
 
 
 def _peak_device_memory(device: str) -> int | None:
@@ -241,6 +254,7 @@ def _record(
     """The record of the run, without its scores."""
     tests = len(scene.select(split="test"))
     code = [commit for outcome in outcomes for commit in outcome.trained.commits]
+    drawn = [outcome.drawn for outcome in outcomes]
     saved = (Path(job.staging) / results.CHECKPOINT).rglob("*")
     return results.RunRecord(
         method=spec.name,
@@ -255,6 +269,8 @@ def _record(
         skipped_steps=sum(o.trained.skipped_steps for o in outcomes),
         resumed=max(o.trained.resumed for o in outcomes),
         primitives=sum(o.size.primitives for o in outcomes),
+        primitive=outcomes[0].size.unit,
+        drawn=None if None in drawn else sum(filter(None, drawn)) / tests,
         checkpoint_bytes=sum(path.stat().st_size for path in saved if path.is_file()),
         peak_memory_bytes=peaks[0],
         device=describe_device(machine.device, machine.threads),

@@ -214,7 +214,8 @@ def prediction_of(raster: Rasterization, exposure: Tensor | None = None) -> Pred
     image = raster.image[0] if exposure is None else transformed(raster.image[0], exposure)
     images = (image, raster.alphas[0, ..., 0], raster.depths[0, ..., 0])
     rgb, alpha, depth = (image.detach().cpu().numpy() for image in images)
-    return Prediction(rgb=rgb.clip(0.0, 1.0), alpha=alpha, depth=depth)
+    drawn = int((raster.info.radii[0] > 0).all(dim=-1).sum())
+    return Prediction(rgb=rgb.clip(0.0, 1.0), alpha=alpha, depth=depth, drawn=drawn)
 
 
 def camera_tensors(view: View, device: str | torch.device = "cpu") -> tuple[Tensor, Tensor]:
@@ -349,4 +350,6 @@ class SplattingMethod(ABC):
     def size(self) -> MethodSize:
         """Number of primitives, and of all stored numbers."""
         tensors = self._all_tensors()
-        return MethodSize(len(tensors[self.primitive]), sum(t.numel() for t in tensors.values()))
+        count, parameters = len(tensors[self.primitive]), sum(t.numel() for t in tensors.values())
+        unit = "anchors" if self.primitive == "anchors" else "Gaussians"
+        return MethodSize(count, parameters, unit)
