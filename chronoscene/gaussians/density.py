@@ -36,14 +36,14 @@ class GradientStatistics:
         """Count one view whose ``backward`` is done.
 
         Args:
-            info: Of a call with one camera.
+            info: Of a call with one camera. If it has absolute gradients, these count.
             width: Of the image in pixels.
             height: The same.
             mask: Where the photo counts: the view does not count for Gaussians whose centre is
                 elsewhere in it. bool [H, W]
         """
         assert info.means2d.grad is not None
-        gradient = info.means2d.grad[0]
+        gradient = getattr(info.means2d, "absgrad", info.means2d.grad)[0]
         # Norm of d loss / d (u, v), with u and v in half image sizes: no matter the resolution.
         x, y = gradient[:, 0] * (0.5 * width), gradient[:, 1] * (0.5 * height)
         seen = (info.radii[0] > 0).all(-1)

@@ -125,13 +125,20 @@ class GaussianTrainer:
         number = self.sampler.next()
         view = self.train.views[number]
         splats = self.model.splats(view, view.period)
+        config, device = self.config, self.background.device
         background = step_background(
-            self.background, self.config, seed=self.seed, number=self.sampler.drawn
+            self.background, config, seed=self.seed, number=self.sampler.drawn
         )
-        near_plane = self.config.near_plane
-        # A scale beyond all numbers shows in the gradients; one such step ends no training.
-        raster = draw(splats, view, background, near_plane=near_plane, check_finite=False)
-        mask = mask_tensor(self.train, number, self.background.device)
+        raster = draw(
+            splats,
+            view,
+            background,
+            near_plane=config.near_plane,
+            absgrad=config.absgrad,
+            # A scale beyond all numbers shows in the gradients; one such step ends no training.
+            check_finite=False,
+        )
+        mask = mask_tensor(self.train, number, device)
         loss = self.loss(raster, number) + self._regulariser(splats)
         self.optimizer.zero_grad()
         skipped = collect_gradients(

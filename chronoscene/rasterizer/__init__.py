@@ -34,7 +34,9 @@ class RasterInfo:
 
     means2d: Tensor
     """Projected centres in pixels. After ``backward()`` its ``grad`` is d loss / d means2d in
-    pixels: the densification signal of 3DGS. Zero rows for culled Gaussians. [C, N, 2]"""
+    pixels: the densification signal of 3DGS. Zero rows for culled Gaussians. If absolute gradients
+    were asked for, its attribute ``absgrad`` is then the sum over the pixels of the absolute value
+    of what each adds to ``grad``, as in gsplat. [C, N, 2]"""
     radii: Tensor
     """Half extent of the footprint in pixels, per axis; 0 where culled. int32 [C, N, 2]"""
     depths: Tensor
@@ -71,6 +73,7 @@ def rasterize(
     eps2d: float = EPS2D,
     backgrounds: Tensor | None = None,
     render_depth: bool = False,
+    absgrad: bool = False,
     backend: str = "auto",
     check_finite: bool = True,
 ) -> Rasterization:
@@ -99,6 +102,8 @@ def rasterize(
         eps2d: Variance in pixels squared, 0 or more, added to the projected covariances.
         backgrounds: What the remaining light sees; None is black. [C, D]
         render_depth: Also return the expected z-depth, differentiable.
+        absgrad: Also sum absolute gradients, see `RasterInfo.means2d`; for three channels without
+            depth.
         backend: auto, reference, cpu or cuda. Auto is cuda for CUDA tensors, else cpu.
         check_finite: Raise on nan or infinite numbers, and on invalid cameras. Without this check,
             Gaussians with such numbers are culled.
@@ -115,7 +120,7 @@ def rasterize(
         backend = "cuda" if means.is_cuda else "cpu"
     gaussians = (means, quats, scales, opacities, colors)
     options = (near_plane, far_plane, eps2d, backgrounds, render_depth)
-    inputs = Inputs(*gaussians, viewmats, Ks, width, height, *options)
+    inputs = Inputs(*gaussians, viewmats, Ks, width, height, *options, absgrad=absgrad)
     check_inputs(inputs, check_finite)
     result: Rasterization = import_module(BACKENDS[backend]).rasterize(inputs)
     return result

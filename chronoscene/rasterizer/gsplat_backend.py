@@ -58,6 +58,7 @@ def rasterize(inputs: Inputs) -> Rasterization:
             eps2d=inputs.eps2d,
             backgrounds=inputs.backgrounds,
             packed=False,
+            absgrad=inputs.absgrad,
             rasterize_mode="classic",
             render_mode="RGB+ED" if inputs.render_depth else "RGB",
         )

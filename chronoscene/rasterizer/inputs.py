@@ -31,6 +31,7 @@ class Inputs:
     eps2d: float
     backgrounds: Tensor | None
     render_depth: bool
+    absgrad: bool = False
 
     @property
     def gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -76,6 +77,13 @@ def check_inputs(inputs: Inputs, finite: bool) -> None:
     _check_sizes(inputs.width, inputs.height)
     _check_shapes(arrays, inputs.backgrounds)
     _check_options(inputs.near_plane, inputs.far_plane, inputs.eps2d)
+    if inputs.absgrad and (inputs.colors.shape[1] != 3 or inputs.render_depth):
+        raise ShapeError(
+            "absgrad",
+            expected="three channels without depth",
+            found=f"{inputs.colors.shape[1]} channels, render_depth={inputs.render_depth}",
+            todo="render the others in a call of their own",
+        )
     if finite:
         if inputs.backgrounds is not None:
             arrays["backgrounds"] = inputs.backgrounds

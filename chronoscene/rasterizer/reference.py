@@ -11,6 +11,7 @@ and clamping follow the classic mode of gsplat.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -49,6 +50,8 @@ class _Splats:
     opacities: Tensor  # [V]
     values: Tensor  # [V, D], the depth appended if asked for
     extents: Tensor  # [V, 2]
+    absgrad: Tensor | None  # [N, 2], added to in the backward pass
+    rows: Tensor  # [V], of N
 
 
 def rasterize(inputs: Inputs) -> Rasterization:
@@ -56,6 +59,9 @@ def rasterize(inputs: Inputs) -> Rasterization:
     means, quats, scales, opacities, colors = inputs.gaussians
     width, height, eps2d = inputs.width, inputs.height, inputs.eps2d
     info = _new_info(means, len(inputs.viewmats), inputs.gaussians)
+    absgrad = torch.zeros_like(info.means2d.detach()) if inputs.absgrad else None
+    if absgrad is not None:
+        info.means2d.absgrad = absgrad  # type: ignore[attr-defined]
     images, alphas, depths = [], [], []
     for c, (viewmat, K) in enumerate(zip(inputs.viewmats, inputs.Ks, strict=True)):
         camera = (viewmat, K, width, height)
@@ -76,7 +82,8 @@ def rasterize(inputs: Inputs) -> Rasterization:
             values = torch.cat([values, projected.depths[:, None]], dim=1)
         # The leaf has the values, the projection the gradient; both receive it in backward().
         means2d = info.means2d[c, index] + (projected.means2d - projected.means2d.detach())
-        splats = _Splats(means2d, projected.axes, opacities[index], values, extents[index])
+        seen = (means2d, projected.axes, opacities[index], values, extents[index])
+        splats = _Splats(*seen, None if absgrad is None else absgrad[c], index)
         image, transmittance = _composite(splats, width, height, eps2d)
         alphas.append(1 - transmittance)
         if inputs.render_depth:
@@ -211,7 +218,9 @@ def _composite_tile(
             high > low.new_tensor([left, top])
         )
         index = torch.nonzero(near.all(-1))[:, 0]
-    means2d = splats.means2d[index]
+    means2d = splats.means2d[index].expand(width * height, -1, -1)
+    if splats.absgrad is not None and means2d.requires_grad:
+        means2d.register_hook(partial(_add_absolute, splats.absgrad, splats.rows[index]))
     xs = torch.arange(left, left + width, dtype=means2d.dtype, device=means2d.device) + 0.5
     ys = torch.arange(top, top + height, dtype=means2d.dtype, device=means2d.device) + 0.5
     pixels = torch.stack(torch.meshgrid(xs, ys, indexing="xy"), dim=-1).reshape(-1, 1, 2)
@@ -230,6 +239,11 @@ def _composite_tile(
     weights = alphas * transmittance[:, :-1]
     values = weights @ splats.values[index]
     return torch.cat([values, transmittance[:, -1:]], dim=1).reshape(height, width, -1)
+
+
+def _add_absolute(absgrad: Tensor, rows: Tensor, gradient: Tensor) -> None:
+    """Count what each pixel adds to the gradient of the centres. [N, 2], [V], [P, V, 2]"""
+    absgrad.index_add_(0, rows, gradient.abs().sum(0))
 
 
 def _distances(offsets: Tensor, axes: Tensor, eps2d: float) -> Tensor:

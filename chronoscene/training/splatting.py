@@ -128,6 +128,7 @@ def draw(
     *,
     near_plane: float,
     render_depth: bool = False,
+    absgrad: bool = False,
     check_finite: bool = True,
 ) -> Rasterization:
     """Rasterize Gaussians in one view; arguments as `chronoscene.rasterizer.rasterize`."""
@@ -139,6 +140,7 @@ def draw(
         near_plane=near_plane,
         backgrounds=background[None],
         render_depth=render_depth,
+        absgrad=absgrad,
         check_finite=check_finite,
     )
 

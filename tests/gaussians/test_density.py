@@ -160,3 +160,11 @@ def test_rounds_grow_small_sets_and_prune_large_ones_where_limits_say_so():
         result = run_round(parameters, gradient, config=GaussianConfig(**limits))
         sizes[tuple(limits.items())] = len(result.new["means"]), int(result.keep.sum())
     assert list(sizes.values()) == [(1, 3), (1, 3), (0, 3), (1, 3), (1, 4)]
+
+
+def test_absolute_gradients_count_where_there_are_some():
+    statistics = GradientStatistics(2, "cpu")
+    info = view_of([[0.0, 0.0], [1e-3, 0.0]], [[1, 1], [1, 1]])
+    info.means2d.absgrad = torch.tensor([[[3e-3, 4e-3], [2e-3, 0.0]]])
+    statistics.add(info, 20, 40)
+    np.testing.assert_allclose(statistics.mean(), [np.hypot(0.03, 0.08), 0.02], rtol=1e-6)

@@ -14,6 +14,7 @@ STEPS = 30
 OPTIONS = [
     ("3dgs", {"random_background": True}),
     ("3dgs", {"exposure": "image"}),
+    ("3dgs", {"absgrad": True, "densify_interval": 8}),
     ("scaffold-gs", {"random_background": True, "exposure": "image"}),
     ("chronogs", {"exposure": "period"}),
     ("4dgs", {"exposure": "period"}),

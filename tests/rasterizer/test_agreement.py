@@ -12,6 +12,8 @@ import torch
 from hypothesis import assume, given, settings
 from rasterizer_cases.scenes import SmallScene, scenes, well_posed
 
+from chronoscene.errors import ShapeError
+
 Check = Callable[..., Any]
 
 
@@ -229,3 +231,50 @@ def test_cuda_agrees(tools: SimpleNamespace, check_agreement: Check) -> None:
     for seed in range(3):
         scene = tools.random_scene(200, 48, 40, seed=seed, render_depth=True)
         check_agreement(scene, "cuda", "cuda")
+
+
+def with_absolute_gradients(
+    scene: SmallScene, backend: str, weights: torch.Tensor, dtype: torch.dtype, **options: Any
+) -> Any:
+    """Centres after the backward pass of a weighted sum of the image."""
+    result, _ = scene.with_(options=tuple(options.items())).render(backend, dtype)
+    (result.image * weights.to(dtype)).sum().backward()
+    return result.info.means2d
+
+
+def test_absolute_gradients_of_the_reference_are_those_of_each_pixel(
+    tools: SimpleNamespace,
+) -> None:
+    scene = tools.random_scene(12, 6, 5)
+    weights = torch.randn(5, 6, 3, generator=torch.Generator().manual_seed(0))
+    expected = torch.zeros(1, 12, 2, dtype=torch.float64)
+    for pixel in torch.eye(30).reshape(30, 5, 6, 1):
+        means2d = with_absolute_gradients(scene, "reference", weights * pixel, torch.float64)
+        expected += means2d.grad.abs()
+    whole = with_absolute_gradients(scene, "reference", weights, torch.float64, absgrad=True)
+    assert expected.max() > 0 and (expected > whole.grad.abs() + 1e-9).any()
+    torch.testing.assert_close(whole.absgrad, expected)
+
+
+@pytest.mark.parametrize(("count", "width", "height"), [(300, 70, 50), (15, 33, 3)])
+def test_absolute_gradients(
+    count: int, width: int, height: int, tools: SimpleNamespace, tolerances: Any
+) -> None:
+    scene = tools.random_scene(count, width, height)
+    weights = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
+    weights = weights * tools.steady_pixels(scene, 1e-3)[0]
+    expected = with_absolute_gradients(
+        scene, "reference", weights, torch.float64, absgrad=True
+    ).absgrad
+    got = with_absolute_gradients(scene, "cpu", weights, torch.float32, absgrad=True)
+    error = (got.absgrad.double() - expected).abs().max() / expected.max()
+    assert expected.max() > 0 and error < tolerances.GRADIENT
+    # To the bit: nothing else changes.
+    plain = with_absolute_gradients(scene, "cpu", weights, torch.float32)
+    assert torch.equal(plain.grad, got.grad) and not hasattr(plain, "absgrad")
+
+
+def test_absolute_gradients_are_for_colours_alone(tools: SimpleNamespace) -> None:
+    scene = tools.random_scene(3, 6, 5, render_depth=True, options=(("absgrad", True),))
+    with pytest.raises(ShapeError, match="absgrad: expected three channels"):
+        scene.render("cpu")

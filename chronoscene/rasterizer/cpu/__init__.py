@@ -18,6 +18,7 @@ from torch.nn.functional import pad
 from chronoscene.errors import BackendError
 from chronoscene.rasterizer import RasterInfo, Rasterization
 from chronoscene.rasterizer.constants import VALUE_MAX
+from chronoscene.rasterizer.cpu import layout
 from chronoscene.rasterizer.cpu.layout import LANES, AnyArray, View, make_view
 from chronoscene.rasterizer.cpu.passes import Gaussians, Rendering
 from chronoscene.rasterizer.cpu.project import set_colors
@@ -50,6 +51,9 @@ def rasterize(inputs: Inputs) -> Rasterization:
         torch.empty(cameras, padded),
     )
     leaf = info.means2d[:, :count].detach().requires_grad_(wants_grad)
+    absgrad = torch.zeros(cameras, padded, 2) if inputs.absgrad else None
+    if absgrad is not None:
+        leaf.absgrad = absgrad[:, :count]  # type: ignore[attr-defined]
     images, alphas, depths = [], [], []
     poses, intrinsics = (x.detach().double().numpy() for x in (viewmats, inputs.Ks))
     for c in range(cameras):
@@ -59,7 +63,7 @@ def rasterize(inputs: Inputs) -> Rasterization:
             *gaussians,
             _slot(leaf, c, padded) if wants_grad else None,
             background,
-            Request(view, _flat(info, c), render_depth),
+            Request(view, _flat(info, c), render_depth, None if absgrad is None else absgrad[c]),
         )
         images.append(image)
         alphas.append(alpha)
@@ -124,6 +128,8 @@ class Request:
     view: View
     visible: tuple[AnyArray, AnyArray, AnyArray]
     render_depth: bool
+    absgrad: Tensor | None
+    """Absolute gradients of means2d are added to it in the backward pass. [N, 2]"""
 
 
 class Render(torch.autograd.Function):
@@ -225,6 +231,7 @@ class _Job:
         depth_grads = np.empty(0, np.float32)
         if self.direct:
             summed: Any = self._sum_pixels(rendering, 0, image_grad, alpha_grad)
+            self._add_absolute(rendering, summed)
         else:
             if weighted_grad is not None:
                 image_grad = torch.cat([image_grad, weighted_grad], dim=-1)
@@ -237,6 +244,17 @@ class _Job:
         if not self.direct:
             colors = torch.from_numpy(values[:, : self.channels].copy())
         return means, quats, scales, opacities, colors, means2d
+
+    def _add_absolute(self, rendering: Rendering, summed: tuple[AnyArray, AnyArray]) -> None:
+        """Turn sums over pixels of absolute values into gradients in pixels, if asked for."""
+        if self.request.absgrad is None:
+            return
+        sums = np.zeros((self.count, layout.RECORD), np.float32)
+        rendering.sum_rows(*summed, sums.reshape(-1))
+        found = sums[:, layout.SUM_ABSOLUTE : layout.SUM_ABSOLUTE + 2]
+        # By numpy: torch would wake its threads, which keep those of the kernels from processors.
+        absgrad = self.request.absgrad.numpy()
+        absgrad += found * np.float32(layout.WHITEN**-2)
 
     def _sum_groups(
         self, rendering: Rendering, image_grad: Tensor, alpha_grad: Tensor | None
@@ -260,7 +278,8 @@ class _Job:
     ) -> tuple[AnyArray, AnyArray]:
         alpha = torch.empty(0) if alpha_grad is None else alpha_grad
         grads = (x.contiguous().numpy().reshape(-1) for x in (image_grad, alpha))
-        return rendering.composite_backward(self._background(group), *grads)
+        wants_absolute = self.request.absgrad is not None
+        return rendering.composite_backward(self._background(group), *grads, absgrad=wants_absolute)
 
     def _background(self, group: int) -> AnyArray:
         return self.background[3 * group : 3 * group + 3]

@@ -68,6 +68,14 @@ def start_gaussian(records: Any, at: int, left: Any, top: Any, state: Any, steps
 
 
 @inlined
+def slopes(records: Any, at: int) -> Any:
+    """How u changes along x and y, and v."""
+    u_x, u_y, v = records[at + layout.U_X], records[at + layout.U_Y], records[at + layout.V]
+    zero = np.float32(0.0)
+    return (u_x, u_y, zero, v) if v > zero else (u_x, u_y, v, zero)
+
+
+@inlined
 def color_of(records: Any, at: int) -> Any:
     """Red, green and blue of a Gaussian."""
     color = at + layout.COLOR

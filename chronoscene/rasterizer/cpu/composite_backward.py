@@ -9,7 +9,7 @@ from chronoscene.kernels.memory import prefetch, prefetch_write, store
 from chronoscene.kernels.thread_pool import draw
 from chronoscene.kernels.transposes import make_load_pixels, store_sums
 from chronoscene.kernels.vector_math import ROUNDER, exp2
-from chronoscene.kernels.vectors import as_float, as_int, minimum, select, trailing_zeros
+from chronoscene.kernels.vectors import absolute, as_float, as_int, minimum, select, trailing_zeros
 from chronoscene.rasterizer import constants
 from chronoscene.rasterizer.cpu import layout
 from chronoscene.rasterizer.cpu.composite import (
@@ -17,6 +17,7 @@ from chronoscene.rasterizer.cpu.composite import (
     STEPS,
     color_of,
     power_at,
+    slopes,
     start_gaussian,
     tile_corner,
 )
@@ -71,12 +72,12 @@ def _start_backward(
 
 
 @inner(fast_math=True)
-def _backward_tile(start, stop, left, top, entries, records, touched, rows, state):
+def _backward_tile(absgrad, start, stop, left, top, entries, records, touched, rows, state):
     """Rows of the entries of a tile, from the last to the first.
 
     With T the light before a Gaussian and B the gradient-weighted colour behind it as seen with
     unit light: d loss / d alpha = T (c . grad - B); behind the next one in front,
-    B' = B + alpha (c . grad - B).
+    B' = B + alpha (c . grad - B). The type of ``absgrad`` says what is compiled.
     """
     gaussians, blocks, places = entries
     for k in range(stop - start):
@@ -91,6 +92,7 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
         gaussian = start_gaussian(records, record, left, top, state, _STEPS)
         red, green, blue = color_of(records, record)
         s = su = sv = suu = suv = svv = sr = sg = sb = splat(np.float32(0.0))
+        sx, sy, slope = s, s, slopes(records, record)
         number = splat_int(entry)
         while bits != 0:
             block = trailing_zeros(bits)
@@ -123,15 +125,22 @@ def _backward_tile(start, stop, left, top, entries, records, touched, rows, stat
                 suu = suu + gu * u
                 suv = suv + gu * v
                 svv = svv + gv * v
+                if len(absgrad) > 0:
+                    sx = sx + absolute(gu * slope[0] + gv * slope[2])
+                    sy = sy + absolute(gu * slope[1] + gv * slope[3])
         place = places[entry]
         touched[place] = 1
         store_sums(rows, layout.RECORD * place, (s, su, sv, suu, suv, svv, sr, sg, sb))
         rows[layout.RECORD * place + layout.SUM_SIGN] = records[record + layout.V]
+        if len(absgrad) > 0:
+            store_sums(state, _STEPS, (sx, sy))
+            rows[layout.RECORD * place + layout.SUM_ABSOLUTE] = state[_STEPS]
+            rows[layout.RECORD * place + layout.SUM_ABSOLUTE + 1] = state[_STEPS + 1]
 
 
 @kernel(fast_math=True, extras=[constants])
 def composite_backward(
-    worker, control, size, tiles, entries, records, planes, states, background, grads, out
+    worker, control, size, tiles, entries, records, planes, states, background, grads, absgrad, out
 ):
     """Sums over pixels of every entry, from the gradients of image and opacity.
 
@@ -140,6 +149,7 @@ def composite_backward(
         tiles, entries, records, planes: As `composite` left them.
         states: Scratch, `BACKWARD_NUMBERS` per worker.
         grads: Of image and opacity. [H * W * 3], [H * W] or nothing
+        absgrad: A tuple; unless it is empty, rows have absolute gradients too.
         out: (touched, rows), written. Where touched, zeros at first, becomes 1, there is a row of
             16 numbers, see `layout`. uint8, float32
     """
@@ -154,5 +164,6 @@ def composite_backward(
         plane, light = layout.TILE_PIXELS * tile, (background[0], background[1], background[2])
         _start_backward(left, top, width, height, plane, planes, grads[0], grads[1], light, state)
         x, y = np.float32(left), np.float32(top)
-        _backward_tile(starts[tile], stops[tile], x, y, entries, records, touched, rows, state)
+        first, last = starts[tile], stops[tile]
+        _backward_tile(absgrad, first, last, x, y, entries, records, touched, rows, state)
         job = draw(control, 0)

@@ -47,9 +47,11 @@ INVERSE_Y = 15  # WHITEN over the standard deviation of y
 
 # One row of sums over the pixels of a tile, for a (Gaussian, tile) pair. With
 # g = alpha * d loss / d alpha: sums of g, g u, g v, g u^2, g u v, g v^2, and of the weight times
-# the gradient of each channel; and the sign of V, so that both passes agree on it.
+# the gradient of each channel; the sign of V, so that both passes agree on it; and, if asked for,
+# of |g (u U_X + v V_X)| and |g (u U_Y + v V_Y)|, where v = V_X dx + V_Y dy.
 SUM, SUM_U, SUM_V, SUM_UU, SUM_UV, SUM_VV, SUM_COLOR = 0, 1, 2, 3, 4, 5, 6
 SUM_SIGN = 9
+SUM_ABSOLUTE = 10  # Two numbers
 
 LOG2_E = math.log2(math.e)
 LEVEL_MIN = math.log2(ALPHA_MIN)  # LEVEL - u^2 - v^2 is at least this where alpha counts

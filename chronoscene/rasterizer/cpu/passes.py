@@ -182,9 +182,9 @@ class Rendering:
         self._launch_tiles(composite, ("forward", FORWARD_NUMBERS), background, image, alphas)
 
     def composite_backward(
-        self, background: AnyArray, image_grad: AnyArray, alpha_grad: AnyArray
+        self, background: AnyArray, image_grad: AnyArray, alpha_grad: AnyArray, *, absgrad: bool
     ) -> tuple[AnyArray, AnyArray]:
-        """Sums over pixels by entry: (touched, rows)."""
+        """Sums over pixels by entry: (touched, rows); of absolute gradients too if asked for."""
         count = int(self.numbering[1][-1])
         # One more than there are: `project_backward` may read the row after the last.
         rows = self.workspace.array("rows", (count + 1) * layout.RECORD, np.float32)
@@ -192,7 +192,8 @@ class Rendering:
         touched[:] = 0
         scratch = ("backward", BACKWARD_NUMBERS)
         grads, out = (image_grad, alpha_grad), (touched, rows)
-        self._launch_tiles(composite_backward, scratch, background, grads, out)
+        options = (1,) if absgrad else ()
+        self._launch_tiles(composite_backward, scratch, background, grads, options, out)
         return touched, rows
 
     def transmittance(self) -> AnyArray:
