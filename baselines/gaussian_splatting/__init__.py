@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from chronoscene.methods import MethodSpec
@@ -28,3 +29,13 @@ SPEC = MethodSpec(
     },
     resumable=True,
 )
+
+PERIOD_SPEC = replace(
+    SPEC,
+    name="3dgs-period",
+    title="3DGS, period exposure",
+    period_input="continuous",
+    method="baselines.gaussian_splatting.method:GaussianSplattingPeriod",
+    presets={name: {"exposure": "period", **values} for name, values in SPEC.presets.items()},
+)
+"""The least that time can be to 3DGS: a transform of the colours of each period."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from toy_scene import SHORT, mean_squared_error, toy_scene, train
 
-from baselines.gaussian_splatting import SPEC
+from baselines.gaussian_splatting import PERIOD_SPEC, SPEC
 from baselines.gaussian_splatting.config import GaussianSplattingConfig
 from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.errors import ConfigError
@@ -102,6 +102,18 @@ def test_iterations_are_those_of_the_other_methods():
 
 def test_the_class_is_found():
     assert import_object(SPEC.method) is GaussianSplatting
+
+
+def test_the_variant_for_periods_renders_each_with_its_exposure():
+    scene = toy_scene(colors_per_period=2)
+    dark = [scene.load_image(i) // (1 + view.period) for i, view in enumerate(scene.views)]
+    scene = replace(scene, load_image=dark.__getitem__, num_periods=2)
+    method_class = import_object(PERIOD_SPEC.method)
+    assert method_class.name == PERIOD_SPEC.name and PERIOD_SPEC.period_input == "continuous"
+    config = build_config(PERIOD_SPEC, preset="fast", overrides={"iterations": 60})
+    method = train(scene, config, method_class=method_class)
+    levels = [method.render(scene.views[0], p).rgb.mean() for p in (0, 0.5, 1)]
+    assert levels[0] > levels[1] > levels[2] and levels[2] < 0.8 * levels[0]
 
 
 @pytest.mark.parametrize(
