@@ -1,4 +1,4 @@
-# make demo    a scene, its checks and a benchmark of three methods, from nothing
+# make demo    a scene, its checks and a benchmark of four methods, from nothing
 # make test    lint, types and tests, from nothing
 # make lint    lint and types alone
 # make clean   remove what demo and tools wrote; distclean also removes the environment
@@ -15,8 +15,8 @@ TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 
 DEMO := demo
-DEMO_METHODS := chronogs,scaffold-gs,3dgs
-DEMO_BUDGET := 100s
+DEMO_METHODS := chronogs,scaffold-gs,3dgs,4dgs
+DEMO_BUDGET := 90s
 
 .PHONY: demo test lint clean distclean open3d-libraries
 

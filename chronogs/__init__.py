@@ -48,7 +48,7 @@ SPEC = MethodSpec(
     presets={  # what differs from the defaults, which are the paper's
         "paper": {},  # as released
         "paper-text": _TEXT,
-        "fast": _SHORT | {"iterations": 800, "density_interval": 40, "offsets_per_anchor": 5},
+        "fast": _SHORT | {"iterations": 1_000, "density_interval": 40, "offsets_per_anchor": 5},
         "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
         "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
     },

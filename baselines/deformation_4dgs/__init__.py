@@ -42,12 +42,8 @@ SPEC = MethodSpec(
     presets={
         "paper": {},
         "accurate": _SHORT | _MEDIUM | {"iterations": 8_000},
-        "balanced": _SHORT
-        | _MEDIUM
-        | {"iterations": 2_500, "reset_interval": 7_500, "max_gaussians": 60_000},
-        "fast": _SHORT
-        | _SMALL
-        | {"iterations": 1_000, "reset_interval": 30_000, "max_gaussians": 40_000},
+        "balanced": _SHORT | _MEDIUM | {"iterations": 3_000, "reset_interval": 8_000},
+        "fast": _SHORT | _SMALL | {"iterations": 1_000, "reset_interval": 30_000},
     },
     resumable=True,
 )
