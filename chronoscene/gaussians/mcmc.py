@@ -83,12 +83,14 @@ def relocate(
     weights = torch.where(alive, opacity, 0.0).double()
     drawn = _draw(weights, draws, generator)
     copies = torch.bincount(drawn, minlength=count) + 1
-    shared, factor = shared_opacity_and_scale(opacity, copies)
     is_source = copies > 1
-    rows = torch.cat([torch.nonzero(is_source)[:, 0], drawn])
+    sources = torch.nonzero(is_source)[:, 0]
+    shared, factor = shared_opacity_and_scale(opacity[sources], copies[sources])
+    rows = torch.cat([sources, drawn])
+    at = torch.searchsorted(sources, rows)
     new = {name: values[rows] for name, values in parameters.items()}
-    new["logit_opacities"] = torch.logit(shared[rows]).to(opacity.dtype)
-    new["log_scales"] = new["log_scales"] + factor.log()[rows, None].to(opacity.dtype)
+    new["logit_opacities"] = torch.logit(shared[at]).to(opacity.dtype)
+    new["log_scales"] = new["log_scales"] + factor.log()[at, None].to(opacity.dtype)
     return Round(alive & ~is_source, new)
 
 

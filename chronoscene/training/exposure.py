@@ -106,18 +106,26 @@ class _Transform(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, transform: Tensor) -> Tensor:
         ctx.save_for_backward(image, transform)
-        return _mixed(image, transform) + transform[:, 3]
+        return _mixed(image, transform)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
         image, transform = ctx.saved_tensors
-        return _mixed(grads[0], transform[:, :3].T), _moments(grads[0], image)
+        back = torch.nn.functional.pad(transform[:, :3].T, (0, 1))
+        return _mixed(grads[0], back), _moments(grads[0], image)
 
 
-def _mixed(image: Tensor, matrix: Tensor) -> Tensor:
-    """A c for each pixel, by elementwise sums, which round alike on any number of threads."""
-    r, g, b = image.unbind(-1)
-    return torch.stack([row[0] * r + row[1] * g + row[2] * b for row in matrix], dim=-1)
+def _mixed(image: Tensor, transform: Tensor) -> Tensor:
+    """The definition of `transformed`."""
+    if image.is_cuda:
+        return image @ transform[:, :3].T + transform[:, 3]
+    result = torch.empty_like(image, memory_format=torch.contiguous_format)
+    _mix_rows(_array(image), _array(transform), result.numpy())
+    return result
+
+
+def _array(tensor: Tensor) -> NDArray[Any]:
+    return tensor.detach().contiguous().numpy()
 
 
 def _moments(grad: Tensor, image: Tensor) -> Tensor:
@@ -126,8 +134,19 @@ def _moments(grad: Tensor, image: Tensor) -> Tensor:
         products = torch.einsum("hwi,hwj->ij", grad, image)
         return torch.cat([products, grad.sum((0, 1))[:, None]], dim=1)
     sums = np.zeros((len(grad), 3, 4))
-    _row_moments(grad.contiguous().numpy(), image.detach().contiguous().numpy(), sums)
+    _row_moments(_array(grad), _array(image), sums)
     return torch.from_numpy(sums.sum(axis=0)).to(grad)
+
+
+@kernel(parallel=True)
+def _mix_rows(  # type: ignore[no-untyped-def]
+    image: NDArray[Any], t: NDArray[Any], result: NDArray[Any]
+):
+    for y in prange(len(image)):
+        for x in range(image.shape[1]):
+            r, g, b = image[y, x, 0], image[y, x, 1], image[y, x, 2]
+            for i in range(3):
+                result[y, x, i] = t[i, 0] * r + t[i, 1] * g + t[i, 2] * b + t[i, 3]
 
 
 @kernel(parallel=True)
