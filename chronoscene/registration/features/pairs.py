@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
@@ -80,6 +79,8 @@ def _ordered(pairs: Iterable[Pair]) -> set[Pair]:
 
 def spatial_pairs(enu: NDArray[np.float64], periods: NDArray[np.int64]) -> set[Pair]:
     """Each image with its nearest in every period, on the map: heights of GPS are poor."""
+    from scipy.spatial import cKDTree  # takes longer to load than few images to pair
+
     found: list[Pair] = []
     known = np.flatnonzero(np.isfinite(enu).all(axis=1))
     for target in np.unique(periods).tolist():
