@@ -59,6 +59,8 @@ class LoopState(BaseModel):
     """Whose view showed no primitive."""
     skipped_steps: int = 0
     """Whose loss or gradients were not finite."""
+    first_loss: float | None = None
+    """Of the first step that had a finite one."""
     curve: list[CurvePoint] = []
     resumed: int = 0
     """How often the training went on from a checkpoint."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -120,7 +121,8 @@ def train(
 
     Raises:
         DivergedError: If the method skipped too many steps in a row.
-        TrainingError: If it took as many with a loss that is not finite.
+        TrainingError: If it took as many with a loss that is not finite, or if no view shows
+            anything of the model any more.
         CheckpointError: If all checkpoints are damaged.
     """
     seed_everything(seed)
@@ -133,6 +135,9 @@ def train(
     done = stop.progress(state.iterations, state.seconds)
     due = [share for share in PROBE_SHARES if share > done]
     last_good = state.iterations
+    # Losses of the latest steps, if those were empty. Views come once per pass, so two passes
+    # without the last draw contain all of them.
+    unseen = deque[float](maxlen=max(NOT_FINITE_LIMIT, 2 * len(part.train.views)))
     latest = None
     while done < 1.0:
         with clock:
@@ -144,6 +149,12 @@ def train(
             last_good = state.iterations
         elif state.iterations - last_good == NOT_FINITE_LIMIT:
             raise _diverged(report, part, last_good)
+        if report.skipped == "empty":
+            unseen.append(report.loss)
+        else:
+            unseen.clear()
+        if _is_lost(unseen, state):
+            raise _lost(part, state.iterations, len(unseen))
         if due and done >= due[0]:
             due = [share for share in due if share > done]
             state.curve.append(_probe(method, part, truth, state))
@@ -161,6 +172,8 @@ def _was_finite(report: StepReport, state: LoopState) -> bool:
     if report.skipped == "not finite" or not math.isfinite(report.loss):
         state.skipped_steps += 1
         return False
+    if state.first_loss is None:
+        state.first_loss = report.loss
     state.empty_steps += report.skipped == "empty"
     return True
 
@@ -174,6 +187,26 @@ def _diverged(report: StepReport, part: Part, last_good: int) -> TrainingError:
         expected="a finite loss and finite gradients",
         found=f"{NOT_FINITE_LIMIT} steps in a row without",
         todo=todo,
+    )
+
+
+def _is_lost(unseen: deque[float], state: LoopState) -> bool:
+    """Whether all views are empty, with a larger loss than the first step had.
+
+    Nothing is learned from empty views, so that such a model stays as it is. Photos of nothing but
+    the background, or behind masks, need no primitives: their loss is small.
+    """
+    if len(unseen) != unseen.maxlen or state.first_loss is None:
+        return False
+    return float(np.mean(unseen)) > state.first_loss
+
+
+def _lost(part: Part, iteration: int, count: int) -> TrainingError:
+    return TrainingError(
+        f"model {part.name}, iteration {iteration}",
+        expected="a training view that shows something of the model",
+        found=f"{count} steps in a row without, and a larger loss than at the start",
+        todo="lower the learning rates, or report this with the scene",
     )
 
 

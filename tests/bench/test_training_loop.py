@@ -195,6 +195,21 @@ def test_a_method_that_goes_on_with_a_loss_that_is_not_finite_keeps_no_model(par
     assert not isinstance(caught.value, DivergedError)
 
 
+def test_a_model_that_no_view_shows_any_more_ends_the_training(part):
+    """But not one of scenes in which there is nothing to learn, nor one that some views show."""
+    first = toy()
+    losses = []
+    run(first, part, StopRule(1, None), observer=lambda i, s, report, p: losses.append(report.loss))
+    worse, better = losses[0] + 0.1, losses[0] - 0.1
+    count = max(NOT_FINITE_LIMIT, 2 * len(part.train.views))
+    message = f"iteration {count + 7}: expected a training view that shows .* found {count} steps"
+    with pytest.raises(TrainingError, match=message):
+        run(reporting(range(7, 400), worse, "empty"), part, StopRule(400, None))
+    assert run(reporting(range(7, 400), better, "empty"), part, StopRule(400, None)).iterations
+    often = [i for i in range(1, 400) if i % count]
+    assert run(reporting(often, worse, "empty"), part, StopRule(400, None)).empty_steps
+
+
 def test_images_that_are_not_finite_are_refused(part):
     with pytest.raises(TrainingError, match="values that are not finite"):
         run(toy("BadImage"), part, StopRule(20, None))

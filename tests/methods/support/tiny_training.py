@@ -57,12 +57,12 @@ def make_balls(num_periods: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def paint(view: TrainingView, centres: Any, radii: Any, colors: Any) -> np.ndarray:
     """Balls as discs, far to near, on black. [H, W, 3] uint8"""
-    image = np.zeros((HEIGHT, WIDTH, 3))
+    image = np.zeros((view.height, view.width, 3))
     inside = centres @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
-    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     for i in np.argsort(-inside[:, 2]):
         u, v = (view.K @ (inside[i] / inside[i, 2]))[:2]
-        disc = (x - u) ** 2 + (y - v) ** 2 < (36.0 * radii[i] / inside[i, 2]) ** 2
+        disc = (x - u) ** 2 + (y - v) ** 2 < (view.K[0, 0] * radii[i] / inside[i, 2]) ** 2
         image[disc] = colors[i]
     return np.rint(255 * image).astype(np.uint8)
 

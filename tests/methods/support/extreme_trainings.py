@@ -1,0 +1,216 @@
+"""Trainings at the extremes of what a scene may be, through the harness, and what becomes of them.
+
+The scenes are those of `tiny_training`, in world coordinates, so that the frame of the training is
+found as for any scene.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tiny_training
+from numpy.typing import NDArray
+
+from chronoscene.bench.job import StopRule
+from chronoscene.bench.strategies import Part, effective_strategy, make_parts
+from chronoscene.bench.training_loop import render_bytes, train
+from chronoscene.errors import ChronoSceneError
+from chronoscene.methods import Method, MethodSpec, StepReport, build_config, import_object
+from chronoscene.metrics.psnr_ssim import psnr
+from chronoscene.scene import Camera, Frame, Period, Points, Scene
+
+PRESET = "fast"
+
+
+@dataclass(frozen=True)
+class Extreme:
+    """What differs from a scene of 3 periods with 5 photos of 40 x 30 px each and 280 points."""
+
+    name: str
+    periods: int = 3
+    photos: int = 5
+    """Per period."""
+    points: int = 280
+    points_apart: bool = True
+    cameras_apart: bool = True
+    origin: float = 0.0
+    """Distance of the scene from the origin of the world, in radii of the ring of cameras."""
+    size: float = 1.0
+    """Of the photos; times 40 x 30 px."""
+    level: int | None = None
+    """Value of all pixels of all photos, instead of a picture."""
+    rates: float = 1.0
+    """Factor of all learning rates."""
+    steps: int = 100
+
+
+EXTREMES = (
+    Extreme("none of them"),
+    Extreme("1 period", periods=1),
+    Extreme("40 periods of 2 photos", periods=40, photos=2),
+    Extreme("3 periods of 1 photo", photos=1),
+    Extreme("3 points", points=3),
+    Extreme("1,000,000 points", points=1_000_000, steps=1),
+    Extreme("all points in one place", points_apart=False),
+    Extreme("all cameras in one place", cameras_apart=False),
+    Extreme("1,000,000 units from the origin", origin=1e6),
+    Extreme("photos of 16 x 12 px", size=0.4),
+    Extreme("photos of 6,000 x 4,500 px", size=150.0, steps=1),
+    Extreme("black photos", level=0),
+    Extreme("white photos", level=255),
+    Extreme("learning rates times 100", rates=100.0),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a training."""
+
+    error: str | None
+    """Why there is no model; None if there is."""
+    clear: bool
+    """Whether the error, if any, is one that is meant for the user."""
+    reports: tuple[StepReport, ...]
+    before: float
+    """PSNR of one to three training views as the training starts, in dB."""
+    after: float
+    """The same at its end; NaN without a model."""
+    seconds: float
+
+
+class Photos:
+    """Takes the place of the store of images: pictures in memory."""
+
+    def __init__(self, images: dict[str, NDArray[np.uint8]]) -> None:
+        self.images = images
+
+    def camera(self, frame: Frame) -> Camera:
+        return frame.camera
+
+    def load(self, frame: Frame) -> NDArray[np.uint8]:
+        return self.images[frame.name]
+
+    def load_mask(self, frame: Frame) -> None:
+        return None
+
+
+def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
+    """The scene as the method gets it."""
+    centres, radii, colors = tiny_training.make_balls(extreme.periods)
+    offset = np.array([extreme.origin, 0.0, 0.0])
+    painted_size = min(extreme.size, 1.0)
+    repeats = round(extreme.size / painted_size)
+    frames: list[Frame] = []
+    images: dict[str, NDArray[np.uint8]] = {}
+    for index in range(extreme.periods * extreme.photos):
+        period, number = divmod(index, extreme.photos)
+        name = f"{period:02}_{number}.png"
+        share = (number + period / max(extreme.periods, 2)) / extreme.photos
+        view = tiny_training.make_view(2 * np.pi * share, period, name)
+        if not extreme.cameras_apart:
+            # Turned a little about the centre of the first one.
+            view = tiny_training.make_view(0.3 * share, period, name)
+            first = tiny_training.make_view(0.0, 0, "").cam_from_world
+            view.cam_from_world[:3, 3] = (
+                view.cam_from_world[:3, :3] @ first[:3, :3].T @ first[:3, 3]
+            )
+        K = np.diag([painted_size, painted_size, 1.0]) @ view.K
+        width, height = round(view.width * painted_size), round(view.height * painted_size)
+        view = dataclasses.replace(view, K=K, width=width, height=height)
+        image = tiny_training.paint(view, centres, radii, colors[period])
+        if extreme.level is not None:
+            image[:] = extreme.level
+        images[name] = image.repeat(repeats, axis=0).repeat(repeats, axis=1)
+        params = repeats * np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+        camera = Camera(1, "PINHOLE", width * repeats, height * repeats, tuple(params.tolist()))
+        pose = view.cam_from_world.copy()
+        pose[:3, 3] -= pose[:3, :3] @ offset
+        frames.append(Frame(name, index, camera, pose, period, "train"))
+    # The harness tests some of the training views.
+    tested = {0, len(frames) // 2, len(frames) - 1} if extreme.steps > 1 else {0}
+    for index in sorted(tested):
+        name = f"test_{frames[index].name}"
+        images[name] = images[frames[index].name]
+        frames.append(dataclasses.replace(frames[index], name=name, split="test"))
+    rng = np.random.default_rng(12)
+    ball = np.arange(extreme.points) % len(centres)
+    xyz = centres[ball] + rng.normal(0, 0.4, (len(ball), 3)) * radii[ball, None]
+    seen = np.arange(extreme.periods, dtype=np.int32) * extreme.photos
+    points = Points(
+        ids=np.arange(len(ball)),
+        xyz=xyz * extreme.points_apart + offset,
+        rgb=np.rint(255 * colors[0][ball]).astype(np.uint8),
+        error=np.zeros(len(ball)),
+        track_start=np.arange(len(ball) + 1) * extreme.periods,
+        track_frame=np.tile(seen, len(ball)),
+        track_xy=np.zeros((len(ball) * extreme.periods, 2)),
+    )
+    scene = Scene(
+        name=extreme.name,
+        root=Path(),
+        images_root=Path(),
+        frames=tuple(frames),
+        points=points,
+        periods=tuple(Period(i, str(i)) for i in range(extreme.periods)),
+        split_rule="",
+        format="",
+    )
+    strategy, _ = effective_strategy(spec, "joint")
+    photos: Any = Photos(images)
+    return make_parts(scene, photos, strategy)[0]
+
+
+def make_config(extreme: Extreme, spec: MethodSpec) -> Any:
+    """The preset with other learning rates, if so wanted."""
+    config = build_config(spec, preset=PRESET, overrides={"iterations": extreme.steps})
+    rates = {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if "_lr" in f.name}
+    return dataclasses.replace(
+        config,
+        **{
+            name: tuple(extreme.rates * x for x in rate)
+            if isinstance(rate, tuple)
+            else extreme.rates * rate
+            for name, rate in rates.items()
+        },
+    )
+
+
+def score(method: Method, part: Part) -> float:
+    """Mean PSNR of the training views that `make_part` gives as test views."""
+    load: Any = part.store.load
+    return float(np.mean([psnr(render_bytes(method, part, f), load(f)) for f in part.test]))
+
+
+def run(extreme: Extreme, spec: MethodSpec) -> Outcome:
+    """Train one method as the harness does."""
+    part, config = make_part(extreme, spec), make_config(extreme, spec)
+    reports: list[StepReport] = []
+    error, clear = None, True
+    before = after = math.nan
+    started = time.perf_counter()
+    try:
+        method: Method = import_object(spec.method)(config)
+        method.setup(part.train, seed=0, device="cpu")
+        before = score(method, part)
+        method = import_object(spec.method)(config)
+        train(
+            method,
+            part,
+            StopRule(extreme.steps, None),
+            {},
+            seed=0,
+            device="cpu",
+            observer=lambda done, seconds, report, probe: reports.append(report),
+        )
+        after = score(method, part)
+    except Exception as failure:  # the table has a line for it
+        error, clear = str(failure), isinstance(failure, ChronoSceneError)
+        if not clear:
+            error = f"{type(failure).__name__}: {error}"
+    return Outcome(error, clear, tuple(reports), before, after, time.perf_counter() - started)

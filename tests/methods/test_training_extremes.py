@@ -1,0 +1,31 @@
+"""Trainings at the extremes that are cheap: a finite model, or one clear error."""
+
+import extreme_trainings
+import numpy as np
+import pytest
+
+from chronoscene.kernels.runtime import set_threads
+from chronoscene.methods import load_spec, method_names
+
+CHEAP = [e for e in extreme_trainings.EXTREMES[1:] if e.steps > 1]
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    set_threads(1)
+    yield
+    set_threads()
+
+
+@pytest.mark.parametrize("name", method_names())
+@pytest.mark.parametrize("extreme", CHEAP, ids=lambda e: e.name)
+def test_a_training_ends_in_a_model_or_in_one_clear_error(extreme, name):
+    outcome = extreme_trainings.run(extreme, load_spec(name))
+    assert outcome.clear, outcome.error
+    if extreme.rates > 1:
+        # A step that is too long may leave a model that no view shows: that is the error.
+        assert outcome.error is None or "lower the learning rates" in outcome.error
+        return
+    assert outcome.error is None
+    assert np.isfinite([report.loss for report in outcome.reports]).all()
+    assert outcome.after > outcome.before - 0.05
