@@ -36,7 +36,7 @@ def row(extreme: Any, name: str) -> tuple[str, ...]:
     """Cells of one training."""
     outcome = extremes.run(extreme, load_spec(name))
     reports = outcome.reports
-    worse = " to less than it was" if outcome.after < outcome.before else ""
+    worse = ", but worse than at its start" if outcome.after < outcome.before else ""
     found = f"trained{worse}" if outcome.error is None else outcome.error
     if not outcome.clear:
         found = f"**traceback**: {found}"
