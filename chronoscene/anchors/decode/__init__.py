@@ -44,13 +44,13 @@ class DecodeInputs(NamedTuple):
     """What is decoded. Sizes: A anchors of which M are visible, k offsets, T periods."""
 
     anchors: Tensor
-    """Positions in world units; get no gradient. [A, 3]"""
+    """Positions in the training frame; get no gradient. [A, 3]"""
     offsets: Tensor
     """In units of the anchor's scale. [A, k, 3]"""
     features: Tensor
     """Base feature, then one block per period. [A, Fb + T * Fv]"""
     log_scales: Tensor
-    """Logarithms in world units; 0:3 for offsets, 3:6 for Gaussians. [A, 6]"""
+    """Logarithms, in units of the training frame; 0:3 for offsets, 3:6 for Gaussians. [A, 6]"""
     global_features: Tensor
     """One row per period. [T, G]"""
     period_weights: Tensor
@@ -62,7 +62,7 @@ class DecodeInputs(NamedTuple):
     color_head: HeadWeights
     """3 k outputs: rgb per offset."""
     camera_centre: Tensor
-    """In world units; gets no gradient. [3]"""
+    """In the training frame; gets no gradient. [3]"""
     visible: Tensor
     """Ascending indices of the anchors to decode. int64 [M]"""
     base_dim: int
