@@ -14,7 +14,6 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from hashlib import file_digest
 from json import dumps
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from chronoscene.bench.provenance import peak_memory_bytes
 from chronoscene.bench.results import CONFIG_FILE
 from chronoscene.errors import CheckpointError, DiskFullError
-from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.staging import sha256_of, write_text_atomic
 from chronoscene.methods import Method
 
 LOOP_FILE = "loop.json"
@@ -154,7 +153,7 @@ class Checkpoints:
             if not settings.exists():
                 write_text_atomic(settings, dumps(self.settings))
             method.save_training(partial)
-            state.files = {path.name: _sha256(path) for path in partial.iterdir()}
+            state.files = {path.name: sha256_of(path) for path in partial.iterdir()}
             (partial / LOOP_FILE).write_text(state.model_dump_json(), encoding="utf-8")
             for path in (*partial.iterdir(), partial, settings, settings.parent):
                 _flush(path)
@@ -184,7 +183,7 @@ def _read(folder: Path) -> LoopState:
         state = LoopState.model_validate_json(path.read_bytes())
         for name, digest in state.files.items():
             path = folder / Path(name).name
-            if _sha256(path) != digest:
+            if sha256_of(path) != digest:
                 raise _damaged(path, "another content")
     except OSError as error:
         raise _damaged(path, error.strerror or str(error)) from error
@@ -196,11 +195,6 @@ def _read(folder: Path) -> LoopState:
 def _damaged(path: Path, found: str) -> CheckpointError:
     todo = "the checkpoint is damaged or of another version"
     return CheckpointError(path, expected="what the training wrote", found=found, todo=todo)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return file_digest(file, "sha256").hexdigest()
 
 
 def _flush(path: Path) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 import chronoscene
 from chronoscene.errors import ImageError
+from chronoscene.io.staging import sha256_of
 from chronoscene.methods import ENTRY_POINT_GROUP
 from chronoscene.scene import Scene
 
@@ -41,8 +42,7 @@ def scene_hash(scene: Scene) -> str:
 
 def _file_hash(path: Path) -> str:
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return sha256_of(path)
     except OSError as error:
         raise ImageError(
             path,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -24,6 +25,12 @@ def disk_full(error: OSError, place: object) -> DiskFullError | None:
         found=error.strerror or str(error),
         todo="make room on this disk, or choose a place on another one",
     )
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of the content of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @contextmanager

@@ -6,7 +6,6 @@ The JSON file is written last and holds the digest of the tensor file, so a fold
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -19,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from chronoscene.errors import CheckpointError
-from chronoscene.io.staging import replacing, write_text_atomic
+from chronoscene.io.staging import replacing, sha256_of, write_text_atomic
 
 TENSOR_FILE = "model.safetensors"
 META_FILE = "model.json"
@@ -65,7 +64,7 @@ def save_tensors(
             if (number := re.search(r"\(os error (\d+)\)", str(error))) is None:
                 raise
             raise OSError(int(number[1]), os.strerror(int(number[1])), str(folder)) from error
-        digest = _sha256(partial)
+        digest = sha256_of(partial)
     document = {**meta, "format_version": FORMAT_VERSION, "tensors_sha256": digest}
     text = json.dumps(document, indent=2, sort_keys=True, allow_nan=False) + "\n"
     write_text_atomic(folder / f"{stem}.json", text)
@@ -93,7 +92,7 @@ def load_tensors(
     path = folder / f"{stem}.safetensors"
     if not path.is_file():
         raise _refusal(path, "the tensors of the model", "no such file", "train again")
-    if _sha256(path) != meta["tensors_sha256"]:
+    if sha256_of(path) != meta["tensors_sha256"]:
         raise _refusal(path, f"the digest given in {described.name}", "another one")
     try:
         return load_file(path, device=device), meta
@@ -124,8 +123,3 @@ def _refusal(
     todo: str = "the file is damaged or was edited: copy it again or train again",
 ) -> CheckpointError:
     return CheckpointError(path, expected=expected, found=found, todo=todo)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

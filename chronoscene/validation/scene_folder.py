@@ -351,7 +351,7 @@ class RawScene:
         return {name: header for name, header in self.headers.items() if header.problem is None}
 
     @cached_property
-    def digests(self) -> dict[str, bytes]:
+    def digests(self) -> dict[str, str]:
         """SHA-256 of the present files that have the same size as another; the rest are unique."""
         return pixels.hash_files(self.root / "images", self.present, self.track)
 

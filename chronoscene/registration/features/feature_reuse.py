@@ -19,9 +19,8 @@ from typing import Any
 import cv2
 
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.staging import sha256_of, write_text_atomic
 from chronoscene.registration.features import METHOD
-from chronoscene.registration.photos.photo import sha256_of
 from chronoscene.registration.stages import read_record
 
 Record = dict[str, Any]

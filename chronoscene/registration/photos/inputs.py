@@ -21,11 +21,11 @@ from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.geodesy import Georeference, from_crs
 from chronoscene.images.exif import set_upright
 from chronoscene.images.store import image_size, load_photo, place_image
-from chronoscene.io.staging import replacing
+from chronoscene.io.staging import replacing, sha256_of
 from chronoscene.registration.context import Context
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.gps_priors import Positions, locate
-from chronoscene.registration.photos.photo import Capture, sha256_of
+from chronoscene.registration.photos.photo import Capture
 from chronoscene.scene import Frame, Scene
 from chronoscene.scene.geometry import camera_centre
 

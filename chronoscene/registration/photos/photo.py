@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from dataclasses import dataclass
 from datetime import datetime
@@ -76,12 +75,6 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
         taken=taken_at(path, exif),
         gps=_position(exif),
     )
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of the content of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def is_panorama(path: Path) -> bool:

@@ -20,6 +20,7 @@ from PIL import Image
 from chronoscene.errors import ImageError
 from chronoscene.images.exif import ExifData, exif_of
 from chronoscene.images.store import load_rgb
+from chronoscene.io.staging import sha256_of
 from chronoscene.validation.checks import grouped
 
 T = TypeVar("T")
@@ -255,7 +256,7 @@ def _tiff_end(image: Image.Image) -> int:
     return max(ends)
 
 
-def hash_files(folder: Path, names: Sequence[str], track: Track) -> dict[str, bytes]:
+def hash_files(folder: Path, names: Sequence[str], track: Track) -> dict[str, str]:
     """SHA-256 of the files that have the same size as another one."""
     by_size = grouped((_size(folder / name), name) for name in names)
     same = [name for group in by_size.values() if len(group) > 1 for name in group]
@@ -313,7 +314,7 @@ def _size(path: Path) -> int:
     return -1
 
 
-def _digest(path: Path) -> bytes | None:
-    with suppress(OSError), path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").digest()
+def _digest(path: Path) -> str | None:
+    with suppress(OSError):
+        return sha256_of(path)
     return None

@@ -6,7 +6,7 @@ Equal bytes are always looked for, equal pixels and near copies with ``--decode`
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,7 +247,7 @@ def _equal(scene: RawScene) -> list[tuple[str, list[str]]]:
     return equal
 
 
-def _groups(items: Iterable[tuple[str, bytes]]) -> Iterator[list[str]]:
+def _groups(items: Iterable[tuple[str, Hashable]]) -> Iterator[list[str]]:
     """Sorted names that share a digest; groups of two or more."""
     groups = grouped((digest, name) for name, digest in items)
     return (sorted(group) for group in groups.values() if len(group) > 1)
