@@ -17,7 +17,7 @@ from PIL import Image
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images import undistortion
-from chronoscene.images.masks import FOLDER, find_masks, mask_name
+from chronoscene.images.masks import find_masks, mask_place
 from chronoscene.images.store import ImageSource, Progress, load_photo, place_image
 from chronoscene.io.staging import staged_folder
 from chronoscene.kernels.runtime import available_threads
@@ -111,7 +111,7 @@ def _write_images(
     def write(i: int) -> None:
         name = scene.frames[i].name
         source, target = scene.image_path(scene.frames[i]), root / "images" / name
-        mask, new_mask = scene.masks.get(name), root / FOLDER / mask_name(name)
+        mask, new_mask = scene.masks.get(name), root / mask_place(name)
         if not changes[i].is_copy:
             _resample((source, mask), (target, new_mask), changes[i])
             return

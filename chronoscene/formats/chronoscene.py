@@ -18,8 +18,7 @@ from chronoscene.formats.shared.json_values import (
     read_json,
     world_item,
 )
-from chronoscene.images.masks import FOLDER as MASKS
-from chronoscene.images.masks import find_masks
+from chronoscene.images.masks import MASKS, find_masks
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame, splits

@@ -42,8 +42,7 @@ from chronoscene.formats.shared.json_values import (
 )
 from chronoscene.formats.shared.ply import read_points, write_points
 from chronoscene.formats.shared.transforms import CameraTable, Shot
-from chronoscene.images.masks import FOLDER as MASKS
-from chronoscene.images.masks import mask_name
+from chronoscene.images.masks import mask_place
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Points, Scene, WorldFrame
@@ -376,7 +375,7 @@ def _to_json(scene: Scene) -> dict[str, Any]:
 
 
 def _mask_key(scene: Scene, name: str) -> dict[str, str]:
-    return {"mask_path": f"{MASKS}/{mask_name(name)}"} if name in scene.masks else {}
+    return {"mask_path": mask_place(name)} if name in scene.masks else {}
 
 
 def _camera_keys(camera: Camera) -> dict[str, Any]:

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-FOLDER = "masks"
-"""Beside ``images/``."""
+MASKS = "masks"  # Folder beside ``images/``
 
 MODES = ("L", "1")
 """Pillow's modes of mask files: one channel of 8 bits, or of one."""
@@ -27,9 +26,14 @@ def mask_name(name: str) -> str:
     return f"{name}.png"
 
 
+def mask_place(name: str) -> str:
+    """The same below the folder of the scene."""
+    return f"{MASKS}/{mask_name(name)}"
+
+
 def find_masks(parent: Path, names: Iterable[str]) -> dict[str, Path]:
     """The mask files of the images with these names, in the folder of masks below ``parent``."""
-    folder = parent / FOLDER
+    folder = parent / MASKS
     if not folder.is_dir():
         return {}
     return {name: path for name in names if (path := folder / mask_name(name)).is_file()}

@@ -30,7 +30,7 @@ from PIL import ExifTags, Image
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ImageError, SceneError
-from chronoscene.images.masks import FOLDER, MODES, mask_name, resize_mask
+from chronoscene.images.masks import MODES, mask_place, resize_mask
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.cameras import CAMERA_MODELS
 
@@ -340,7 +340,7 @@ def place_images(
             name = names[frame.name] if names is not None else frame.name
             place_image(scene.image_path(frame), root / name, image_source)
             if mask := scene.masks.get(frame.name):
-                place_image(mask, root.parent / FOLDER / mask_name(name), image_source)
+                place_image(mask, root.parent / mask_place(name), image_source)
         if progress is not None:
             progress(done, len(scene.frames))
 

@@ -19,8 +19,7 @@ from chronoscene.convert import remarks_on
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import load_format
-from chronoscene.images.masks import FOLDER as MASKS
-from chronoscene.images.masks import mask_name
+from chronoscene.images.masks import mask_place
 from chronoscene.images.store import place_image
 from chronoscene.io.wording import printable
 from chronoscene.validation.checks.reprojection import period_errors
@@ -149,7 +148,7 @@ def in_our_format(path: Path, format: str, reading: Reading) -> Iterator[tuple[P
                 if source.is_file():
                     place_image(source, ours / "images" / frame.name, "symlink")
             for name, mask in scene.masks.items():
-                place_image(mask, ours / MASKS / mask_name(name), "symlink")
+                place_image(mask, ours / mask_place(name), "symlink")
             notes = formats.model_notes(path, format)
             origin = Origin(format, None, notes, tuple(remarks_on(scene)))
         except SceneError as error:

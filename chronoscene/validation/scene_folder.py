@@ -22,8 +22,7 @@ from chronoscene.colmap.raw_model import RawImages, RawModel, RawPoints
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, read_periods
 from chronoscene.formats.shared.colmap_layout import Assigned
-from chronoscene.images.masks import FOLDER as MASKS
-from chronoscene.images.masks import mask_name
+from chronoscene.images.masks import MASKS, mask_name, mask_place
 from chronoscene.scene import Camera, Period, Scene, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.splits import NameEntry, Problem, SplitEntry
@@ -374,7 +373,7 @@ class RawScene:
         if not self.decode:
             return None
         readable = [name for name, header in self.mask_headers.items() if header.problem is None]
-        return {n: pixels.peak(self.root / MASKS / mask_name(n)) for n in readable}
+        return {n: pixels.peak(self.root / mask_place(n)) for n in readable}
 
     @cached_property
     def pixels(self) -> dict[str, Pixels] | None:

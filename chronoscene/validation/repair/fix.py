@@ -14,8 +14,7 @@ from chronoscene.colmap.write import write_raw_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD
 from chronoscene.images.exif import set_upright
-from chronoscene.images.masks import FOLDER as MASKS
-from chronoscene.images.masks import mask_name
+from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
@@ -171,10 +170,10 @@ class _Fix:
             if len(files) == 1 and files[0] not in registered and self._inside(files[0]):
                 self._written.add(f"images/{files[0]}")
                 _link(self._scene.image_path(files[0]), self._out / "images" / name)
-                mask = f"{MASKS}/{mask_name(files[0])}"
+                mask = mask_place(files[0])
                 if (self._scene.root / mask).is_file():
                     self._written.add(mask)
-                    _link(self._scene.root / mask, self._out / MASKS / mask_name(name))
+                    _link(self._scene.root / mask, self._out / mask_place(name))
                 renamed.append(name)
         if renamed:
             what = f"{counted(len(renamed), 'image')} renamed as in the model: {shown(renamed)}"
@@ -226,7 +225,7 @@ class _Fix:
         Images elsewhere are linked again, so that only the model is copied from there.
         """
         names = [f"images/{name}" for name in self._scene.present]
-        names += [f"{MASKS}/{mask_name(name)}" for name in self._scene.present]
+        names += [mask_place(name) for name in self._scene.present]
         below = f"{self._scene.model_place}/" if self._scene.model_place else ""
         stems = (*MODEL_FILES, "rigs", "frames")
         model = [f"{below}{stem}{form}" for stem in stems for form in FORMS]

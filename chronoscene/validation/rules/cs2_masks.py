@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from chronoscene.images.masks import FOLDER, MODES, mask_name
+from chronoscene.images.masks import MASKS, MODES, mask_name, mask_place
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.validation import rule
 from chronoscene.validation.checks.names import Spellings
 from chronoscene.validation.checks.pixels import Header
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.scene_folder import RawScene
-
-
-def _place(name: str) -> str:
-    return f"{FOLDER}/{mask_name(name)}"
 
 
 @rule.error(
@@ -27,11 +23,11 @@ def mask_unreadable(scene: RawScene, mask_headers: dict[str, Header]) -> Iterato
     peaks = scene.mask_peaks or {}
     for name, header in mask_headers.items():
         if header.problem is not None:
-            yield Hit(_place(name), "an image", header.problem)
+            yield Hit(mask_place(name), "an image", header.problem)
         elif header.mode not in MODES:
-            yield Hit(_place(name), "one channel of 8 bits", f"pixels of mode {header.mode}")
+            yield Hit(mask_place(name), "one channel of 8 bits", f"pixels of mode {header.mode}")
         elif header.truncated or peaks.get(name, 0) is None:
-            yield Hit(_place(name), "an image that can be decoded", "a damaged one")
+            yield Hit(mask_place(name), "an image that can be decoded", "a damaged one")
 
 
 @rule.error(
@@ -45,7 +41,7 @@ def mask_size(readable: dict[str, Header], mask_headers: dict[str, Header]) -> I
         if header.problem is None and name in readable and header.size != readable[name].size:
             width, height = readable[name].size
             found = f"{header.size[0]} x {header.size[1]}"
-            yield Hit(_place(name), f"{width} x {height} as images/{name}", found)
+            yield Hit(mask_place(name), f"{width} x {height} as images/{name}", found)
 
 
 @rule.warning(
@@ -62,7 +58,7 @@ def mask_without_image(scene: RawScene, names: list[str]) -> Iterator[Hit]:
             continue
         near = others.find(file) or others.find(file.removesuffix(".png"))
         hint = f"; the mask of {quote(near)} would be {quote(mask_name(near))}" if near else ""
-        yield Hit(f"{FOLDER}/{file}", "the mask of an image", f"no image of this name{hint}")
+        yield Hit(f"{MASKS}/{file}", "the mask of an image", f"no image of this name{hint}")
 
 
 @rule.warning(
@@ -74,7 +70,7 @@ def mask_ignores_everything(mask_peaks: dict[str, int | None]) -> Iterator[Hit]:
     """A mask ignores its whole image: nothing can be trained on it or tested (needs `--decode`)."""
     for name, largest in mask_peaks.items():
         if largest == 0:
-            yield Hit(_place(name), "pixels that count", "none")
+            yield Hit(mask_place(name), "pixels that count", "none")
 
 
 @rule.warning(
@@ -90,4 +86,4 @@ def masks_missing(periods: dict[str, int], mask_headers: dict[str, Header]) -> I
         if without:
             expected = f"a mask of each of the {len(images)} images of period {period}"
             found = f"none of {counted(len(without), 'image')}: {shown(without)}"
-            yield Hit(FOLDER, expected, found, count=len(without))
+            yield Hit(MASKS, expected, found, count=len(without))
