@@ -9,13 +9,15 @@ Offsets count numbers. None of these check bounds.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numpy import float32
 
+from chronoscene.kernels.compilation import inner
 from chronoscene.kernels.vectors import (
     FLOAT,
     I32,
@@ -25,6 +27,7 @@ from chronoscene.kernels.vectors import (
     emit_shuffle,
     emit_splat,
     intrinsic,
+    splat,
 )
 
 _I64 = ir.IntType(64)
@@ -255,3 +258,15 @@ def store_cycle(typingctx: Any, out: Any, start: Any, memory: Any, index: Any) -
         return context.get_dummy_value()
 
     return types.void(out, types.intp, memory, types.intp), codegen
+
+
+@inner
+def set_zero(memory, start, stop):  # type: ignore[no-untyped-def]
+    """Set the numbers start..stop to zero."""
+    for i in range(start, stop, LANES):
+        store_first(memory, i, splat(float32(0)), stop - i)
+
+
+def place(sizes: Sequence[int], address: int) -> list[int]:
+    """Addresses of arrays of float32 that lie one after the other."""
+    return [address + 4 * sum(sizes[:i]) for i in range(len(sizes))]

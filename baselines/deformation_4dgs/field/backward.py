@@ -28,6 +28,7 @@ from chronoscene.kernels.memory import (
     load_first,
     read,
     read_index,
+    set_zero,
     store,
     store_first,
     write,
@@ -77,12 +78,6 @@ def _gather_gradient(layout, grads, n, unit, work, slot):  # type: ignore[no-unt
         for c in range(0, REST, LANES):
             value = load_first(grads.sh_rest, n * REST + c, REST - c)
             store_first(work.colors, at + 3 + c, value, REST - c)
-
-
-@inner
-def _set_zero(memory, start, stop):  # type: ignore[no-untyped-def]
-    for i in range(start, stop, LANES):
-        store_first(memory, i, splat(ZERO), stop - i)
 
 
 @inner
@@ -246,9 +241,9 @@ def _block_gradient(layout, planes, weights, means, grads, count, unit, work, pa
         n = read_index(work.rows, i)
         gather_features(layout, planes, means, n, work.x, i)
         _gather_gradient(layout, grads, n, unit, work, i)
-    _set_zero(work.small, count * SMALL, BLOCK * SMALL)
+    set_zero(work.small, count * SMALL, BLOCK * SMALL)
     if layout.color:
-        _set_zero(work.colors, count * COLORS, BLOCK * COLORS)
+        set_zero(work.colors, count * COLORS, BLOCK * COLORS)
     hidden_layers(layout, weights, work)
     _layer_gradients(layout, weights, work, partial)
     for i in range(count):
@@ -304,7 +299,7 @@ def deform_backward(  # type: ignore[no-untyped-def]
     part = draw(control, 0)
     while part < parts:
         move = 4 * part * partial_size
-        _set_zero(partial.planes + move, 0, partial_size)
+        set_zero(partial.planes + move, 0, partial_size)
         sums = Gradients(
             partial.planes + move,
             partial.trunk_t + move,

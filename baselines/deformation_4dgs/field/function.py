@@ -24,11 +24,11 @@ from baselines.deformation_4dgs.field.layout import (
     level_sizes,
     make_layout,
     numbers,
-    place,
     rows_per_part,
     weight_shapes,
     work_sizes,
 )
+from chronoscene.kernels.memory import place
 from chronoscene.kernels.thread_pool import launch, num_workers
 from chronoscene.kernels.vectors import LANES
 

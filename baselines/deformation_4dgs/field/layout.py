@@ -9,7 +9,6 @@ zeros.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import NamedTuple
@@ -253,11 +252,6 @@ def work_sizes(layout: Layout) -> tuple[int, ...]:
 def rows_per_part(count: int) -> int:
     """Gaussians of each partial sum, whole blocks."""
     return max(1, -(-count // (PARTS * BLOCK))) * BLOCK
-
-
-def place(sizes: Sequence[int], address: int) -> list[int]:
-    """Addresses of arrays of float32 that lie one after the other."""
-    return [address + 4 * sum(sizes[:i]) for i in range(len(sizes))]
 
 
 def numbers(shapes: dict[str, tuple[int, ...]]) -> list[int]:

@@ -19,6 +19,7 @@ from chronoscene.kernels.memory import (
     load_first,
     read,
     read_index,
+    set_zero,
     store,
     store_cycle,
     store_first,
@@ -181,12 +182,6 @@ def _block_gradient(layout, weights, source, outputs, grads, count, work, partia
 
 
 @inner
-def _set_zero(memory, start, stop):  # type: ignore[no-untyped-def]
-    for i in range(start, stop, LANES):
-        store_first(memory, i, splat(ZERO), stop - i)
-
-
-@inner
 def _clear_rows(layout, source, begin, end, out):  # type: ignore[no-untyped-def]
     """Set to zero the rows of visible anchors begin..end, and those between them and the last
     visible one before: soon enough before they are written that they are still in the cache."""
@@ -194,9 +189,9 @@ def _clear_rows(layout, source, begin, end, out):  # type: ignore[no-untyped-def
     last = source.num_anchors
     if end < source.num_visible:
         last = read_index(source.visible, end - 1) + 1
-    _set_zero(out.offsets, 3 * layout.offsets * first, 3 * layout.offsets * last)
-    _set_zero(out.features, layout.row * first, layout.row * last)
-    _set_zero(out.log_scales, 6 * first, 6 * last)
+    set_zero(out.offsets, 3 * layout.offsets * first, 3 * layout.offsets * last)
+    set_zero(out.features, layout.row * first, layout.row * last)
+    set_zero(out.log_scales, 6 * first, 6 * last)
 
 
 @inner
@@ -237,7 +232,7 @@ def decode_backward(  # type: ignore[no-untyped-def]
             begin = chunk * CHUNK
             end = min(begin + CHUNK, source.num_visible)
             move = 4 * chunk * size
-            _set_zero(partial.w1_t + move, 0, size)
+            set_zero(partial.w1_t + move, 0, size)
             part = Gradients(
                 partial.w1_t + move, partial.b1 + move, partial.w2 + move, partial.b2 + move
             )

@@ -24,12 +24,11 @@ from chronoscene.anchors.decode.layout import (
     Work,
     gradient_sizes,
     make_layout,
-    place,
     weight_sizes,
     work_sizes,
 )
 from chronoscene.kernels.compilation import inner, kernel
-from chronoscene.kernels.memory import read, write
+from chronoscene.kernels.memory import place, read, write
 
 OUTPUTS = (1, 7, 3)  # Per offset, of the heads for opacity, covariance and colour
 

@@ -10,7 +10,6 @@ Outputs are grouped by kind: opacities, scales, quaternions, colours; each offse
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from chronoscene.kernels.matmul import PADDING
@@ -249,8 +248,3 @@ def work_sizes(layout: Layout) -> tuple[int, ...]:
         2 * CYCLE,
         *(n * (BLOCK * layout.offsets + LANES) for n in (1, 3, 4, 3, 3)),
     )
-
-
-def place(sizes: Sequence[int], address: int) -> list[int]:
-    """Addresses of arrays of float32 that lie one after the other."""
-    return [address + 4 * sum(sizes[:i]) for i in range(len(sizes))]
