@@ -19,34 +19,20 @@ Source: ChronoGS (arXiv 2511.18794), section 3, and the official code. The mixtu
 
 from __future__ import annotations
 
-from typing import Self
-
-import numpy as np
-import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from chronogs.config import ChronoGSConfig
 from chronoscene.anchors.config import AnchorConfig
-from chronoscene.anchors.model import AnchorLayout, AnchorModel, draw_start, zero_columns
+from chronoscene.anchors.model import AnchorLayout, AnchorModel, zero_columns
 
 
 class ChronoGSModel(AnchorModel):
     """Anchors with a base feature, one feature per period, and one global feature per period."""
 
     @classmethod
-    def start(
-        cls,
-        layout: AnchorLayout,
-        config: AnchorConfig,
-        anchors: NDArray[np.float32],
-        generator: torch.Generator,
-    ) -> Self:
+    def global_start(cls, config: AnchorConfig) -> str:
         assert isinstance(config, ChronoGSConfig)
-        model = super().start(layout, config, anchors, generator)
-        shape = (layout.num_periods, layout.global_dim)
-        model.global_features = draw_start(shape, config.global_init, 1.0, generator)
-        return model
+        return config.global_init
 
     @staticmethod
     def input_dim(layout: AnchorLayout, head: str) -> int:

@@ -136,15 +136,23 @@ class AnchorModel:
                 b2=draw_start((outputs,), "uniform", second, generator),
             )
         shape = (len(anchors), layout.feature_dim)
+        features = draw_start(shape, config.feature_init, config.feature_init_scale, generator)
+        shape = (layout.num_periods, layout.global_dim)
+        global_features = draw_start(shape, cls.global_start(config), 1.0, generator)
         return cls(
             layout,
             anchors=torch.from_numpy(anchors),
             offsets=torch.zeros(len(anchors), layout.offsets, 3),
-            features=draw_start(shape, config.feature_init, config.feature_init_scale, generator),
+            features=features,
             log_scales=torch.from_numpy(initial_log_scales(anchors)),
-            global_features=torch.zeros(layout.num_periods, layout.global_dim),
+            global_features=global_features,
             heads=heads,
         )
+
+    @classmethod
+    def global_start(cls, config: AnchorConfig) -> str:
+        """How global features start, see `draw_start`; here like any embedding."""
+        return "gaussian"
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that is stored, by name."""
