@@ -57,8 +57,8 @@ class DeformationTrainer(GaussianTrainer):
         super().load_state(state)
         self.model.is_deforming = state.values["is_deforming"]
 
-    def loss(self, raster: Rasterization, number: int) -> Tensor:
-        photometric = super().loss(raster, number)
+    def loss(self, raster: Rasterization, number: int, mask: Tensor | None) -> Tensor:
+        photometric = super().loss(raster, number, mask)
         if not self.model.is_deforming:
             return photometric
         config = self.config

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +12,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from chronoscene.bench.job import Job
-from chronoscene.bench.results import CHECKPOINT, RunRecord, damaged, read_config, read_run
+from chronoscene.bench.results import (
+    CHECKPOINT,
+    SOURCE_FILE,
+    RunRecord,
+    damaged,
+    read_config,
+    read_run,
+)
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import write_text_atomic
@@ -28,8 +34,6 @@ from chronoscene.methods import (
 )
 from chronoscene.scene import Camera, Scene
 from chronoscene.scene.similarity import Sim3
-
-SOURCE_FILE = "source.json"
 
 
 class RunSource(BaseModel):
@@ -47,18 +51,16 @@ class RunSource(BaseModel):
     """Similarity transform as a matrix. [4, 4]"""
 
 
-def write_source(job: Job, scene: Scene, training_from_world: Sim3) -> None:
+def write_source(job: Job, training_from_world: Sim3) -> None:
     """Write ``source.json`` of a run into its staging folder."""
     source = RunSource(
         method=job.method,
         plugin_path=job.plugin_path,
         scene_root=job.scene_root,
-        scene_format=scene.format,
+        scene_format=job.scene_format,
         training_from_world=training_from_world.to_matrix().tolist(),
     )
-    write_text_atomic(
-        Path(job.staging) / SOURCE_FILE, json.dumps(source.model_dump(), indent=1) + "\n"
-    )
+    write_text_atomic(Path(job.staging) / SOURCE_FILE, source.model_dump_json(indent=1) + "\n")
 
 
 @dataclass(frozen=True, eq=False)

@@ -210,7 +210,7 @@ def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
     Raises:
         CheckpointError: If the file is missing or not the one that the manifest lists.
     """
-    image = _load_png(folder, entry.file, entry.sha256, (entry.height, entry.width), 1)
+    image = _load_png(folder, entry.file, entry.sha256, (entry.height, entry.width), color=True)
     return np.ascontiguousarray(image[..., ::-1])
 
 
@@ -219,13 +219,13 @@ def load_mask(folder: Path, entry: ImageEntry) -> NDArray[np.bool_] | None:
     if entry.mask_file is None or entry.mask_sha256 is None:
         return None
     size = entry.height, entry.width
-    return np.asarray(_load_png(folder, entry.mask_file, entry.mask_sha256, size, 0) != 0)
+    return np.asarray(_load_png(folder, entry.mask_file, entry.mask_sha256, size, color=False) != 0)
 
 
 def _load_png(
-    folder: Path, file: str, sha256: str, size: tuple[int, int], mode: int
+    folder: Path, file: str, sha256: str, size: tuple[int, int], *, color: bool
 ) -> NDArray[np.uint8]:
-    """Decode one listed file; modes and order of channels are those of OpenCV."""
+    """Decode one listed file; channels are in OpenCV's order."""
     import cv2
 
     path = folder / _inside(file)
@@ -241,6 +241,7 @@ def _load_png(
             found="another file",
             todo="the image was changed after rendering: delete the run and run bench again",
         )
+    mode = cv2.IMREAD_COLOR if color else cv2.IMREAD_GRAYSCALE
     image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     if image is None or image.shape[:2] != size:
         raise _untrusted(path, "an image of another size" if image is not None else "no image")

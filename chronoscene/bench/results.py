@@ -26,6 +26,7 @@ FAILURE_FILE = "failed.json"
 ROWS_FILE = "rows.csv"
 CURVE_FILE = "curve.csv"
 RESULTS_FILE = "results.json"
+SOURCE_FILE = "source.json"
 CHECKPOINT = "checkpoint"
 TRAINING = "training"
 PREDICTIONS = "predictions"
@@ -60,8 +61,8 @@ class RunRecord(BaseModel):
     """Gaussians that touch a test view, mean over the views; None if the method does not say."""
     checkpoint_bytes: int
     peak_memory_bytes: int | None
-    """None where the system does not tell."""
-    """Largest resident memory of the process from the start of training to the end of rendering."""
+    """Largest resident memory of the process from the start of training to the end of rendering;
+    None where the system does not tell."""
     device: str
     commit: str
     skipped: dict[str, str]

@@ -88,7 +88,7 @@ def run_job(job: Job) -> None:
     write_text_atomic(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
     scene = read_scene(job.scene_root, format=job.scene_format)
     parts = make_parts(scene, ImageStore(scene, max_width=job.max_width), job.strategy)
-    write_source(job, scene, parts[0].train.training_from_world)
+    write_source(job, parts[0].train.training_from_world)
     writer = ImageWriter(staging / results.PREDICTIONS)
     outcomes = []
     with ProgressDisplay(job.label) as display:

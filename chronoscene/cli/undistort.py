@@ -46,7 +46,7 @@ def command(
 
     All its cameras become PINHOLE. Observations of points move with the images; poses, periods and
     split do not change. Images of cameras without distortion are copied; others become 8-bit RGB,
-    black where they were transparent. SCENE is not changed. OUT is in the ChronoScene format.
+    and what was transparent becomes a mask. SCENE is not changed. OUT is in the ChronoScene format.
     """
     check_outside(out, [source])
     with progress_bar(f"read {source}") as bar:

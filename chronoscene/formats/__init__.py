@@ -69,7 +69,6 @@ def detect_format(path: Path, *, period_by: str | None = None) -> str:
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
         raise SceneError(path, expected="a scene folder", found=found, todo="check the path")
-    modules = {name: load_format(name) for name in format_names()}
     matching = matching_formats(path, period_by)
     if len(matching) == 1:
         return matching[0]
@@ -89,7 +88,7 @@ def detect_format(path: Path, *, period_by: str | None = None) -> str:
             found="a part of one",
             todo=f"give the folder of the whole project, {project}",
         )
-    looked_for = "; ".join(f"{name}: {module.MARKS}" for name, module in modules.items())
+    looked_for = "; ".join(f"{name}: {load_format(name).MARKS}" for name in format_names())
     content = sorted(p.name + "/" * p.is_dir() for p in path.iterdir())
     raise SceneError(
         path,

@@ -21,7 +21,7 @@ from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.density import Round
 from chronoscene.gaussians.model import opacities_of, scales_of
 
-MOST_COPIES = 51
+MAX_COPIES = 51
 """Gaussians that may stand for one; where more are drawn, each is as one of so many."""
 
 MAX_OPACITY = 1 - 2.0**-22
@@ -41,7 +41,7 @@ def shared_opacity_and_scale(opacity: Tensor, copies: Tensor) -> tuple[Tensor, T
 
     Args:
         opacity: o, 0..1. [M]
-        copies: N, at least 1; counts as `MOST_COPIES` above it. int [M]
+        copies: N, at least 1; counts as `MAX_COPIES` above it. int [M]
 
     Returns:
         opacity: o' of each. float64 [M]
@@ -50,10 +50,10 @@ def shared_opacity_and_scale(opacity: Tensor, copies: Tensor) -> tuple[Tensor, T
     Source: the paper's equation 9, whose double sum is the one above.
     """
     o = opacity.double().clamp_max(MAX_OPACITY)
-    n = copies.clamp_max(MOST_COPIES)
+    n = copies.clamp_max(MAX_COPIES)
     shared = -torch.expm1(torch.log1p(-o) / n)
-    j = torch.arange(1, MOST_COPIES + 1, device=o.device)
-    table = [[math.comb(row, column) for column in j.tolist()] for row in range(MOST_COPIES + 1)]
+    j = torch.arange(1, MAX_COPIES + 1, device=o.device)
+    table = [[math.comb(row, column) for column in j.tolist()] for row in range(MAX_COPIES + 1)]
     binomials = torch.tensor(table, dtype=torch.float64, device=o.device)[n]
     terms = binomials * (-1.0) ** (j - 1) * shared[:, None] ** j / j.double().sqrt()
     return shared, o / terms.sum(-1)

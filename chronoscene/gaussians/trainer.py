@@ -139,7 +139,7 @@ class GaussianTrainer:
             check_finite=False,
         )
         mask = mask_tensor(self.train, number, device)
-        loss = self.loss(raster, number) + self._regulariser(splats)
+        loss = self.loss(raster, number, mask) + self._regulariser(splats)
         self.optimizer.zero_grad()
         skipped = collect_gradients(
             loss, raster.info, [self.optimizer, *self.exposure.tables], mask
@@ -189,11 +189,10 @@ class GaussianTrainer:
         self.timeline.last_moment = state.values["last_moment"]
         model.sh_degree = state.values["sh_degree"]
 
-    def loss(self, raster: Rasterization, number: int) -> Tensor:
+    def loss(self, raster: Rasterization, number: int, mask: Tensor | None) -> Tensor:
         """Photometric loss against the photo of view ``number``; methods may add terms."""
         # A copy, as cached images are not ours to write to, which torch cannot promise.
         photo = torch.from_numpy(self.train.load_image(number).copy()).to(raster.image.device)
-        mask = mask_tensor(self.train, number, photo.device)
         image, weight = self.exposure.apply(raster.image[0], number), self.config.ssim_weight
         return photometric_loss(image, photo, ssim_weight=weight, mask=mask)
 

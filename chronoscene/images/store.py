@@ -203,16 +203,17 @@ def _to_rgb(image: Image.Image) -> Image.Image:
         image = _from_16_bit(image)
     if image.mode == "F":
         raise ValueError("pixels that are floating point numbers")
-    return (image.convert("RGBA") if _is_transparent(image) else image).convert("RGB")
+    return (image.convert("RGBA") if is_transparent(image) else image).convert("RGB")
 
 
-def _is_transparent(image: Image.Image) -> bool:
+def is_transparent(image: Image.Image) -> bool:
+    """Whether it has an alpha channel, or one transparent colour."""
     return "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
 
 
 def _opaque(image: Image.Image) -> NDArray[np.bool_] | None:
     """Where alpha is one half or more; None where there is none. [H, W]"""
-    if image.mode.startswith("I") or not _is_transparent(image):
+    if image.mode.startswith("I") or not is_transparent(image):
         return None
     return np.asarray(image.convert("RGBA"))[..., 3] >= 128
 

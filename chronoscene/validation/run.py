@@ -289,7 +289,7 @@ def _summarise(scene: RawScene) -> Summary:
 def _labels(scene: RawScene) -> dict[int, str]:
     """Labels of the periods that are more than their ids; none if they cannot be read."""
     try:
-        periods = our_format.read_periods(scene.root, len(scene.period_ids))
+        periods = scene.period_table()
     except ChronoSceneError:  # a rule says so
         return {}
     return {p.id: printable(p.label) for p in periods if p.label != str(p.id)}

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chronoscene.bench.opening import SOURCE_FILE, OpenRun, open_run
+from chronoscene.bench.opening import OpenRun, open_run
 from chronoscene.bench.predictions import load_image, read_manifest, to_bytes
-from chronoscene.bench.results import CONFIG_FILE, PREDICTIONS
+from chronoscene.bench.results import CONFIG_FILE, PREDICTIONS, SOURCE_FILE
 from chronoscene.bench.runner import BenchSettings, run_bench
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.formats import read_scene

@@ -12,7 +12,7 @@ from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.errors import ConfigError
 from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.mcmc import (
-    MOST_COPIES,
+    MAX_COPIES,
     make_generator,
     noise,
     relocate,
@@ -50,7 +50,7 @@ def light_lost(opacity, scale, copies):
     return lost[len(x) // 2], lost.sum() * (x[1] - x[0])
 
 
-@pytest.mark.parametrize("copies", [1, 2, 3, 10, MOST_COPIES])
+@pytest.mark.parametrize("copies", [1, 2, 3, 10, MAX_COPIES])
 @pytest.mark.parametrize("opacity", [0.006, 0.3, 0.9, 0.9999])
 def test_copies_in_one_place_lose_the_light_that_the_one_lost(opacity, copies):
     shared, factor = shared_opacity_and_scale(
@@ -76,7 +76,7 @@ def test_the_formula_is_the_double_sum_of_the_paper():
 
 def test_an_opaque_gaussian_and_more_copies_than_allowed_stay_finite():
     shared, factor = shared_opacity_and_scale(torch.tensor([1.0, 0.5]), torch.tensor([51, 9_999]))
-    capped = shared_opacity_and_scale(torch.tensor([0.5]), torch.tensor([MOST_COPIES]))
+    capped = shared_opacity_and_scale(torch.tensor([0.5]), torch.tensor([MAX_COPIES]))
     assert 0 < shared[0] < 1 and factor[0] > 0
     assert (shared[1], factor[1]) == (capped[0][0], capped[1][0])
 

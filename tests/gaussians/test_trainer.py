@@ -75,7 +75,7 @@ def test_a_step_counts_its_gradients_once():
     raster = draw(
         method.model.splats(view, 0), view, trainer.background, near_plane=SHORT.near_plane
     )
-    trainer.loss(raster, number).backward()
+    trainer.loss(raster, number, None).backward()
     pixels = raster.info.means2d.grad[0].numpy() * [0.5 * WIDTH, 0.5 * HEIGHT]
     expected = np.where((raster.info.radii[0] > 0).all(-1), np.linalg.norm(pixels, axis=-1), 0)
     method.step(0, 0.0)

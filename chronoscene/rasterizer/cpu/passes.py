@@ -46,7 +46,7 @@ class Workspace:
         """Most (Gaussian, tile) pairs that an image has needed room for in one part of its list."""
 
     def array(self, name: str, size: int, dtype: type) -> AnyArray:
-        """AnyArray of ``size`` elements with any content."""
+        """Array of ``size`` elements with any content."""
         have = self._arrays.get(name)
         if have is None or have.size < size:
             capacity = size if have is None else max(size, int(have.size * _GROWTH))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
+Float = NDArray[np.float32]
 
 MAX_RATIO = 0.8
 """COLMAP's, of the distance to the nearest descriptor and that to the second nearest."""
@@ -33,7 +33,7 @@ _FARTHEST = np.float32((512 * MAX_DISTANCE) ** 2)
 _RATIO = np.float32(1 / MAX_RATIO**2)
 
 
-def subspace(descriptors: NDArray[np.uint8]) -> Array:
+def subspace(descriptors: NDArray[np.uint8]) -> Float:
     """Orthonormal basis of the directions in which descriptors vary most. [128, SUBSPACE]"""
     centred = descriptors - descriptors.sum(axis=0) / max(len(descriptors), 1)
     return np.linalg.eigh(centred.T @ centred)[1][:, -SUBSPACE:].astype(np.float32)
@@ -45,11 +45,11 @@ class Descriptors:
 
     values: NDArray[np.uint8]
     """[N, 128]"""
-    projected: Array
+    projected: Float
     """With the squared length in a last column. [N, SUBSPACE + 1]"""
 
     @classmethod
-    def of(cls, values: NDArray[np.uint8], basis: Array) -> Descriptors:
+    def of(cls, values: NDArray[np.uint8], basis: Float) -> Descriptors:
         return cls(values, _with_squares(values.astype(np.float32) @ basis))
 
 
@@ -76,12 +76,12 @@ def mutual_matches(first: Descriptors, second: Descriptors) -> NDArray[np.uint32
     return np.column_stack([rows[mutual], columns[mutual]]).astype(np.uint32)
 
 
-def _with_squares(values: Array) -> Array:
+def _with_squares(values: Float) -> Float:
     """Rows with their squared lengths in a last column. [N, D] -> [N, D + 1]"""
     return np.column_stack([values, np.einsum("ij,ij->i", values, values)])
 
 
-def _distances(queries: Array, searched: Array) -> Array:
+def _distances(queries: Float, searched: Float) -> Float:
     """|q - d|^2 - |q|^2, as the product (-2 q, 1) (d, |d|^2). [Q, N]"""
     factors = -2 * queries
     factors[:, -1] = 1
@@ -108,7 +108,7 @@ def _nearest(
     return nearest, clear
 
 
-def _pop_least(distances: Array) -> tuple[NDArray[np.intp], Array]:
+def _pop_least(distances: Float) -> tuple[NDArray[np.intp], Float]:
     """Column and value of the least of each row, which infinity replaces. [Q], [Q]"""
     rows, best = np.arange(len(distances)), distances.argmin(axis=1)
     least = distances[rows, best]
@@ -136,7 +136,7 @@ def _undecided(first: Descriptors, second: Descriptors) -> NDArray[np.intp]:
     return np.concatenate(rows)
 
 
-def _between(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> Array:
+def _between(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> Float:
     """Squared distances between rows. [N, 128], [N, 128] -> [N]"""
     apart = np.subtract(a, b, dtype=np.float32)
     return np.asarray(np.einsum("ij,ij->i", apart, apart), np.float32)

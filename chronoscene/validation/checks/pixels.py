@@ -19,7 +19,7 @@ from PIL import Image
 
 from chronoscene.errors import ImageError
 from chronoscene.images.exif import ExifData, exif_of
-from chronoscene.images.store import load_rgb
+from chronoscene.images.store import is_transparent, load_rgb
 from chronoscene.io.staging import sha256_of
 from chronoscene.validation.checks import grouped
 
@@ -32,9 +32,6 @@ GREY_SIDE = 160  # Pixels along the longer side of a small grey image: 20 kB for
 
 END_MARKS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND"}
 """End markers of files. Compressed JPEG data cannot contain its own."""
-
-ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
-"""Pillow's modes with transparency. Other modes may have one transparent colour."""
 
 JPEG = ("JPEG", "MPO")  # Pillow's names of JPEG files
 TAIL = 4096  # Bytes at the end of a file in which its end marker is looked for
@@ -134,7 +131,7 @@ def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
         orientation=exif.orientation,
         kind=kind,
         deep=_is_deep(image),
-        transparent=image.mode in ALPHA_MODES or "transparency" in image.info,
+        transparent=is_transparent(image),
         truncated=_is_truncated(path, file, image),
         animated=_has_frames(image),
         exif=exif,

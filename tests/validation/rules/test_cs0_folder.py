@@ -190,7 +190,10 @@ def test_colmap_project(project):
     assert codes(report) == {"CS006", "CS507"}
     (said,) = [f for f in report.findings if f.code == "CS006"]
     assert said.found == "a scene in colmap-folders, with the periods '2016', '2023'"
-    assert [(p.images, p.test) for p in report.summary.periods] == [(7, 1), (7, 1)]
+    assert [(p.label, p.images, p.test) for p in report.summary.periods] == [
+        ("2016", 7, 1),
+        ("2023", 7, 1),
+    ]
     assert {s.reason for s in report.skipped} == {
         "sparse/split.txt is no part of a COLMAP project",
         "the released code does not read colmap-folders",
