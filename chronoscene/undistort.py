@@ -17,8 +17,9 @@ from PIL import Image
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.images import undistortion
+from chronoscene.images.decoding import load_photo
 from chronoscene.images.masks import find_masks, mask_place
-from chronoscene.images.store import ImageSource, Progress, load_photo, place_image
+from chronoscene.images.store import ImageSource, Progress, place_image
 from chronoscene.io.staging import staged_folder
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.scene import Scene

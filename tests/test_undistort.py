@@ -11,7 +11,8 @@ from PIL import Image
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats import read_scene
-from chronoscene.images.store import ImageStore, load_rgb
+from chronoscene.images.decoding import load_rgb
+from chronoscene.images.store import ImageStore
 from chronoscene.images.undistortion import (
     CameraChange,
     move_pixels,

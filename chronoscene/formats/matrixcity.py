@@ -31,7 +31,7 @@ from chronoscene.formats.shared.colmap_layout import scan
 from chronoscene.formats.shared.grouping import Grouped, group_labels, natural_key, rule_error
 from chronoscene.formats.shared.json_values import json_error, read_json
 from chronoscene.formats.shared.transforms import CameraTable, Shot
-from chronoscene.images.store import image_size
+from chronoscene.images.decoding import image_size
 from chronoscene.scene import Period, Points, Scene, WorldFrame
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 

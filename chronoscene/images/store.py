@@ -1,23 +1,16 @@
-"""Images at the evaluation resolution: one way to decode, one rule to resize, one cache.
+"""Images at the evaluation resolution: one rule to resize, one cache; and copies of image files.
 
 The rule, for every method alike: an image wider than ``max_width`` is scaled to that width, its
 height truncated to whole pixels, with Pillow's bicubic filter, which smooths before it shrinks.
 The size of the model's camera decides; a file of a different size is resized to the target in one
 step. Intrinsics are scaled by the exact ratio of the sizes per axis.
-
-Orientation tags are not applied: COLMAP works on the pixels as stored, and so do the poses.
-
-Pixels that the mask of an image ignores, or whose alpha is below one half, do not count. Colours
-are those of the file: nothing is put behind transparent pixels.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-import struct
 import threading
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -26,11 +19,11 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
 
 from chronoscene.checks import check_choice
-from chronoscene.errors import ImageError, SceneError
-from chronoscene.images.masks import MODES, mask_place, resize_mask
+from chronoscene.errors import SceneError
+from chronoscene.images.decoding import load_photo
+from chronoscene.images.masks import mask_place
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.cameras import CAMERA_MODELS
 
@@ -43,33 +36,6 @@ IMAGE_SOURCES: tuple[ImageSource, ...] = ("copy", "link", "symlink", "none")
 
 Progress = Callable[[int, int], None]
 """Called with the number of images done and their total."""
-
-_UNDO_ORIENTATION = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_90,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_270,
-}
-"""Orientation tag to the operation that takes Pillow's rotation of a TIFF back."""
-
-_DECODE_ERRORS = (
-    OSError,  # also what Pillow raises for unknown and truncated files
-    ValueError,
-    SyntaxError,  # broken PNG chunks
-    TypeError,
-    KeyError,
-    IndexError,
-    EOFError,
-    MemoryError,
-    OverflowError,
-    RuntimeError,  # from the AVIF decoder
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-)
 
 
 def evaluation_size(width: int, height: int, max_width: int = MAX_WIDTH) -> tuple[int, int]:
@@ -110,130 +76,6 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     scaled = tuple(p * new / old for p, (new, old) in zip(params, ratios, strict=False))
     return replace(
         camera, model=model, width=width, height=height, params=scaled + params[len(ratios) :]
-    )
-
-
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of the stored pixels; reads only the header.
-
-    Raises:
-        ImageError: If the file is missing or not an image.
-    """
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-            turned = image.format == "TIFF" and _orientation(image) >= 5
-            return (height, width) if turned else (width, height)
-    except _DECODE_ERRORS as error:
-        raise _image_error(path, error) from error
-
-
-def load_rgb(path: Path, *, size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-    """Decode any image to RGB; arguments and errors as for `load_photo`. [H, W, 3]"""
-    return load_photo(path, size=size)[0]
-
-
-def load_photo(
-    path: Path, mask_path: Path | None = None, *, size: tuple[int, int] | None = None
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Decode any image to RGB, and find out which of its pixels count.
-
-    Args:
-        path: The image.
-        mask_path: Its mask file, if it has one.
-        size: Width and height to resize to; None to keep the file's.
-
-    Returns:
-        image: Colours of the file, also where it is transparent. [H, W, 3]
-        mask: Where the mask file and alpha allow it, by the rule of `resize_mask`; None where all
-            pixels count. [H, W]
-
-    Raises:
-        ImageError: If a file is missing or damaged, the image of a kind that has no plain colours,
-            or the mask not of one channel, or not of the size of the image.
-    """
-    try:
-        with Image.open(path) as image:
-            decoded = _decode(image)
-            rgb, mask = _to_rgb(decoded), _opaque(decoded)
-    except _DECODE_ERRORS as error:
-        raise _image_error(path, error) from error
-    if mask_path is not None:
-        allowed = _load_mask(mask_path, rgb.size)
-        mask = allowed if mask is None else mask & allowed
-    if size is not None and rgb.size != size:
-        rgb = rgb.resize(size, Image.Resampling.BICUBIC)
-        mask = mask if mask is None else resize_mask(mask, size)
-    return np.array(rgb), None if mask is None or mask.all() else mask
-
-
-def _load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where a mask file is not 0. [H, W]"""
-    try:
-        with Image.open(path) as image:
-            found = f"{image.width} x {image.height} pixels of mode {image.mode}"
-            if image.size == size and image.mode in MODES:
-                return np.asarray(image) != 0
-    except _DECODE_ERRORS as error:
-        raise _image_error(path, error) from error
-    raise ImageError(
-        path,
-        expected=f"a mask of {size[0]} x {size[1]} pixels as its image, one channel of 8 bits",
-        found=found,
-        todo="save the mask again as a grey PNG at the size of the image",
-    )
-
-
-def _orientation(image: Image.Image) -> int:
-    value = image.getexif().get(ExifTags.Base.Orientation, 1)
-    return value if value in _UNDO_ORIENTATION else 1
-
-
-def _decode(image: Image.Image) -> Image.Image:
-    """The pixels as stored. Pillow turns TIFF files while it decodes them; that is undone."""
-    orientation = _orientation(image) if image.format == "TIFF" else 1
-    image.load()
-    if orientation == 1:
-        return image
-    return image.transpose(_UNDO_ORIENTATION[orientation])
-
-
-def _to_rgb(image: Image.Image) -> Image.Image:
-    if image.mode.startswith("I"):
-        image = _from_16_bit(image)
-    if image.mode == "F":
-        raise ValueError("pixels that are floating point numbers")
-    return (image.convert("RGBA") if is_transparent(image) else image).convert("RGB")
-
-
-def is_transparent(image: Image.Image) -> bool:
-    """Whether it has an alpha channel, or one transparent colour."""
-    return "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
-
-
-def _opaque(image: Image.Image) -> NDArray[np.bool_] | None:
-    """Where alpha is one half or more; None where there is none. [H, W]"""
-    if image.mode.startswith("I") or not is_transparent(image):
-        return None
-    return np.asarray(image.convert("RGBA"))[..., 3] >= 128
-
-
-def _from_16_bit(image: Image.Image) -> Image.Image:
-    """Grey values 0..65535 as 0..255, rounded to the nearest."""
-    values = np.asarray(image).astype(np.int64)
-    if values.size and not 0 <= values.min() <= values.max() <= 65535:
-        raise ValueError("grey values outside 0..65535")
-    return Image.fromarray(((values * 255 + 32767) // 65535).astype(np.uint8))
-
-
-def _image_error(path: Path, error: BaseException) -> ImageError:
-    if isinstance(error, FileNotFoundError):
-        return ImageError(path, expected="an image", found="nothing", todo="copy the image there")
-    return ImageError(
-        path,
-        expected="an image that can be decoded",
-        found=str(error) or type(error).__name__,
-        todo="copy the file again, or convert it to JPEG or PNG",
     )
 
 

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.errors import SceneError
-from chronoscene.images.store import image_size, resize_camera
+from chronoscene.images.decoding import image_size
+from chronoscene.images.store import resize_camera
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.scene import Camera, Frame, Scene
 from chronoscene.scene.cameras import (

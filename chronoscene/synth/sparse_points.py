@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.arrays import Array
-from chronoscene.images.store import load_rgb
+from chronoscene.images.decoding import load_rgb
 from chronoscene.scene import Frame, Points, Scene
 from chronoscene.synth.render.mesh import MISS
 from chronoscene.synth.render.noise import rng_for

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.images.store import load_rgb
+from chronoscene.images.decoding import load_rgb
 from chronoscene.scene import Frame, Period, Scene
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.renderer import PeriodRenderer, PixelMaps

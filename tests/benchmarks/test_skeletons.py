@@ -12,7 +12,7 @@ from skeletons.tracks import LARGEST_RESIDUAL, LEAST_TRACK
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import read_scene
-from chronoscene.images.store import load_rgb
+from chronoscene.images.decoding import load_rgb
 from chronoscene.scene import Scene
 from chronoscene.stats.counts import PAPER_COUNTS, count_scene
 from chronoscene.validation.run import validate_scene

@@ -19,8 +19,9 @@ from PIL import Image
 
 from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.geodesy import Georeference, from_crs
+from chronoscene.images.decoding import image_size, load_photo
 from chronoscene.images.exif import set_upright
-from chronoscene.images.store import image_size, load_photo, place_image
+from chronoscene.images.store import place_image
 from chronoscene.io.staging import replacing, sha256_of
 from chronoscene.registration.context import Context
 from chronoscene.registration.photos.captures import Captures

@@ -14,7 +14,7 @@ from PIL import Image
 
 from chronoscene.arrays import Array
 from chronoscene.errors import ChronoSceneError
-from chronoscene.images.store import load_rgb
+from chronoscene.images.decoding import load_rgb
 from chronoscene.registration.report.spots import Spot
 from chronoscene.registration.result import Registered
 from chronoscene.scene.cameras import project_points

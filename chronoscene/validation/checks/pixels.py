@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from chronoscene.errors import ImageError
+from chronoscene.images.decoding import is_transparent, load_rgb
 from chronoscene.images.exif import ExifData, exif_of
-from chronoscene.images.store import is_transparent, load_rgb
 from chronoscene.io.staging import sha256_of
 from chronoscene.validation.checks import grouped
 
