@@ -14,6 +14,7 @@ from chronoscene.cli.output import check_place, emit, writing_to
 from chronoscene.cli.progress import announce, progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.formats import chronoscene as our_format
+from chronoscene.images.exif import capture_times
 from chronoscene.io.staging import check_outside, write_text_atomic
 from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, SplitSettings, make_split
 
@@ -82,7 +83,9 @@ def command(
     _check_targets(source, out, scene_out)
     announce(f"read {source}")
     scene = read_and_note(source, dataset_format, period_by)
-    split = make_split(scene, SplitSettings(fraction=_fraction(fraction, every), **options))
+    settings = SplitSettings(fraction=_fraction(fraction, every), **options)
+    names = [f.name for f in scene.frames] if settings.strategy == "date" else []
+    split = make_split(scene, settings, capture_times(scene.images_root, names))
     for frame in split.scene.frames:
         our_format.check_writable_name(source, frame)
     if scene_out is not None:

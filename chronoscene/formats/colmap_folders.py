@@ -15,7 +15,7 @@ from pathlib import Path
 from chronoscene.errors import SceneError
 from chronoscene.formats import nerfstudio, wat
 from chronoscene.formats.shared import colmap_layout, grouping
-from chronoscene.images.exif import read_exif, taken_at
+from chronoscene.images.exif import capture_times
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.io.wording import shown
 from chronoscene.scene import Scene
@@ -87,7 +87,7 @@ def _folder(images: Path, name: str) -> str:
 
 def _dates(images: Path, names: list[str]) -> dict[str, date]:
     """The day on which each photo was taken."""
-    times = {name: taken_at(images / name, read_exif(images / name)) for name in names}
+    times = capture_times(images, names)
     if lost := [name for name, time in times.items() if time is None]:
         if missing := [name for name in lost if not (images / name).is_file()]:
             raise SceneError(

@@ -13,7 +13,7 @@ import math
 import re
 import struct
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -106,6 +106,11 @@ def taken_at(path: Path, exif: ExifData) -> datetime | None:
         return datetime(*map(int, found.groups())) if found else None  # type: ignore[arg-type]
     except ValueError:
         return None
+
+
+def capture_times(images: Path, names: Iterable[str]) -> dict[str, datetime | None]:
+    """When each photo in a folder was taken, by name; None where nobody knows."""
+    return {name: taken_at(images / name, read_exif(images / name)) for name in names}
 
 
 def _ifd(tags: Image.Exif, key: int) -> Mapping[int, Any]:

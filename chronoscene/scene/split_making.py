@@ -15,16 +15,13 @@ are to the training views, because close ones make a split easy.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
 from scipy.spatial import cKDTree
 
 from chronoscene.errors import ConfigError, SceneError
@@ -94,8 +91,17 @@ class NewSplit:
         }
 
 
-def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
+Times = Mapping[str, datetime | None]
+"""When each image was taken, by name; None where nobody knows."""
+
+
+def make_split(scene: Scene, settings: SplitSettings, times: Times | None = None) -> NewSplit:
     """Give a scene a new split.
+
+    Args:
+        scene: Its images are not opened.
+        settings: How to choose test images.
+        times: Needed by ``date`` only.
 
     Raises:
         ConfigError: If the settings do not fit the scene.
@@ -104,7 +110,7 @@ def make_split(scene: Scene, settings: SplitSettings) -> NewSplit:
     _check(settings)
     if settings.strategy == "blocked" and settings.seed is None:
         settings = replace(settings, seed=0)
-    tests = STRATEGIES[settings.strategy](scene, settings)
+    tests = STRATEGIES[settings.strategy](scene, settings, times or {})
     if len(tests) == len(scene.frames):
         single = len(scene.frames) == scene.num_periods  # no share of one image is less than it
         todo = "hold out whole periods (--strategy periods)" if single else "hold out fewer images"
@@ -148,11 +154,11 @@ def _check(settings: SplitSettings) -> None:
         raise ConfigError(place, expected=expected, found=str(found), todo="give another value")
 
 
-STRATEGIES: Mapping[Strategy, Callable[[Scene, SplitSettings], set[str]]] = {
-    "stratified": lambda scene, s: stratified(scene, s.fraction, s.offset, s.seed),
-    "blocked": lambda scene, s: blocked(scene, s.fraction, s.blocks, s.seed or 0),
-    "date": lambda scene, s: latest(scene, s.fraction),
-    "periods": lambda scene, s: whole_periods(scene, s.periods),
+STRATEGIES: Mapping[Strategy, Callable[[Scene, SplitSettings, Times], set[str]]] = {
+    "stratified": lambda scene, s, _: stratified(scene, s.fraction, s.offset, s.seed),
+    "blocked": lambda scene, s, _: blocked(scene, s.fraction, s.blocks, s.seed or 0),
+    "date": lambda scene, s, times: latest(scene, s.fraction, times),
+    "periods": lambda scene, s, _: whole_periods(scene, s.periods),
 }
 """By name, what chooses the test images of a scene."""
 
@@ -272,14 +278,22 @@ def choose_blocks(
     return chosen
 
 
-def latest(scene: Scene, fraction: float) -> set[str]:
+def latest(scene: Scene, fraction: float, times: Times) -> set[str]:
     """The last images of each period, as close to the fraction as whole days allow."""
-    times = capture_times(scene)
+    taken = {name: time for name, time in times.items() if time is not None}
+    if lost := [f.name for f in scene.frames if f.name not in taken]:
+        raise SceneError(
+            scene.root,
+            expected="a date of capture of every image: EXIF DateTimeOriginal, or a file name that "
+            "begins with 2023-04-17 or 20230417",
+            found=f"none for {len(lost)} of {len(scene.frames)} images, {lost[0]!r} for example",
+            todo="choose another strategy, or hold out whole periods (--strategy periods)",
+        )
     tests = set()
     for period in scene.periods:
         frames = scene.select(period=period.id)
-        ordered = sorted(frames, key=lambda f: (times[f.name], f.name))
-        days = [times[f.name].date() for f in ordered]
+        ordered = sorted(frames, key=lambda f: (taken[f.name], f.name))
+        days = [taken[f.name].date() for f in ordered]
         wanted = fraction * len(ordered)
         # The held-out images begin with a day, except where there is only one.
         starts = [i for i in range(1, len(days)) if days[i] != days[i - 1]]
@@ -289,35 +303,3 @@ def latest(scene: Scene, fraction: float) -> set[str]:
             start = len(days) - max(1, round(wanted))
         tests |= {f.name for f in ordered[start:]}
     return tests
-
-
-def capture_times(scene: Scene) -> dict[str, datetime]:
-    """When each image was taken, by its EXIF block or else the beginning of its file name."""
-    times = {f.name: _capture_time(scene.image_path(f)) for f in scene.frames}
-    if lost := [name for name, time in times.items() if time is None]:
-        raise SceneError(
-            scene.root,
-            expected="a date of capture of every image: EXIF DateTimeOriginal, or a file name that "
-            "begins with 2023-04-17 or 20230417",
-            found=f"none for {len(lost)} of {len(times)} images, {lost[0]!r} for example",
-            todo="choose another strategy, or hold out whole periods (--strategy periods)",
-        )
-    return {name: time for name, time in times.items() if time is not None}
-
-
-def _capture_time(path: Path) -> datetime | None:
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
-    except Exception:  # Pillow raises anything for damaged EXIF; the name may still have a date
-        exif = {}
-    for tag in (ExifTags.Base.DateTimeOriginal, ExifTags.Base.DateTimeDigitized):
-        try:
-            return datetime.strptime(str(exif.get(tag, "")).strip("\0 "), "%Y:%m:%d %H:%M:%S")
-        except ValueError:
-            continue
-    match = re.match("((?:19|20)[0-9]{2})-?([0-9]{2})-?([0-9]{2})(?![0-9])", path.name)
-    try:
-        return datetime(*map(int, match.groups())) if match else None  # type: ignore[arg-type]
-    except ValueError:
-        return None

@@ -21,6 +21,7 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import FORMATS, detect_format, read_scene, writable_formats
 from chronoscene.formats.chronoscene import check_image
 from chronoscene.formats.shared.ply import read_points
+from chronoscene.images.exif import capture_times
 from chronoscene.images.undistortion import CameraChange, move_pixels, pinhole_camera, sampling_map
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import CAMERA_MODELS, MODEL_NAMES
@@ -106,6 +107,10 @@ def run_damaged(tmp_path):
     return loop
 
 
+def times_of(scene):
+    return capture_times(scene.images_root, [f.name for f in scene.frames])
+
+
 def use(rng, folder, name, out):
     """What a user may do with a scene; whatever is written has to be in ``out``."""
     shutil.rmtree(out, ignore_errors=True)
@@ -116,7 +121,7 @@ def use(rng, folder, name, out):
         scene = read_scene(folder, format=name)
         strategy = rng.choice(["stratified", "blocked", "date"])
         try:
-            make_split(scene, SplitSettings(strategy))
+            make_split(scene, SplitSettings(strategy), times_of(scene))
         except ChronoSceneError as error:
             assert "\n" not in str(error)
         if rng.random() < 0.2:
@@ -244,9 +249,10 @@ def test_damaged_images_are_undistorted_or_refused(colmap_folder, run_damaged, t
 
     def survive(rng):
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
-        make_split(scene, SplitSettings("date"))
+        make_split(scene, SplitSettings("date"), times_of(scene))
         undistort(scene, tmp_path / "out", center=rng.random() < 0.5, threads=1)
-        make_split(read_scene(tmp_path / "out"), SplitSettings("date"))
+        again = read_scene(tmp_path / "out")
+        make_split(again, SplitSettings("date"), times_of(again))
 
     run_damaged(files, 50, survive)
 

@@ -10,6 +10,7 @@ from PIL import Image
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.chronoscene import read
+from chronoscene.images.exif import capture_times
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.split_making import (
@@ -144,19 +145,23 @@ def put_images(root, taken):
         Image.new("RGB", (4, 4)).save(root / name, exif=exif)
 
 
+def times_of(scene):
+    return capture_times(scene.images_root, [f.name for f in scene.frames])
+
+
 def test_of_two_days_as_near_to_the_fraction_the_later_one_begins_the_test(tmp_path):
     days = (1, 2, 2, 3)
     taken = {f"{i}.jpg": datetime(2020, 1, day, 8 + i) for i, day in enumerate(days)}
     put_images(tmp_path, taken)
     scene = make_scene([0] * 4, root=tmp_path, names=list(taken))
-    assert latest(scene, 0.5) == {"3.jpg"}
+    assert latest(scene, 0.5, times_of(scene)) == {"3.jpg"}
 
 
 def test_last_hours_of_a_day(tmp_path):
     taken = {f"{i}.jpg": datetime(2020, 1, 1, 20 - i) for i in range(8)}
     put_images(tmp_path, taken)
     scene = make_scene([0] * 8, root=tmp_path, names=list(taken))
-    split = make_split(scene, SplitSettings("date", 0.25))
+    split = make_split(scene, SplitSettings("date", 0.25), times_of(scene))
     assert held_out(split) == {"0.jpg", "1.jpg"}
 
 
@@ -165,8 +170,8 @@ def test_last_days_of_each_period(tmp_path):
     taken |= {f"b{i}.jpg": datetime(2021, 1, 1, 20 - i) for i in range(4)}
     put_images(tmp_path, taken)
     scene = make_scene([0] * 9 + [1] * 4, root=tmp_path, names=list(taken))
-    assert latest(scene, 0.25) == {"a6.jpg", "a7.jpg", "a8.jpg", "b0.jpg"}
-    many = latest(scene, 0.6)
+    assert latest(scene, 0.25, times_of(scene)) == {"a6.jpg", "a7.jpg", "a8.jpg", "b0.jpg"}
+    many = latest(scene, 0.6, times_of(scene))
     assert {name for name in many if name[0] == "a"} == {f"a{i}.jpg" for i in range(3, 9)}
 
 
@@ -174,7 +179,7 @@ def test_dates_in_file_names(tmp_path):
     names = ["2009-08-31_a.jpg", "20090901_b.jpg", "c.jpg"]
     put_images(tmp_path, dict.fromkeys(names[:2]) | {"c.jpg": datetime(2009, 9, 3)})
     scene = make_scene([0] * 3, root=tmp_path, names=names)
-    assert latest(scene, 0.3) == {"c.jpg"}
+    assert latest(scene, 0.3, times_of(scene)) == {"c.jpg"}
 
 
 @pytest.mark.parametrize("name", ["IMG_1.jpg", "2009-13-01.jpg", "202001011.jpg"])
@@ -183,7 +188,7 @@ def test_images_without_a_date_are_named(tmp_path, name):
     scene = make_scene([0, 0], root=tmp_path, names=["2009-08-31_a.jpg", name])
     message = f"found none for 1 of 2 images, '{name}' for example; choose another strategy"
     with pytest.raises(SceneError) as error:
-        make_split(scene, SplitSettings("date"))
+        make_split(scene, SplitSettings("date"), times_of(scene))
     assert message in str(error.value)
 
 
