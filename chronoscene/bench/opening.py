@@ -180,6 +180,13 @@ def open_run(folder: Path, *, device: str = "cpu", plugin_path: Path | None = No
         ConfigError: If the method is not installed.
     """
     record = read_run(folder)
+    if not (folder / CHECKPOINT).is_dir():
+        raise CheckpointError(
+            folder,
+            expected="a run with a model",
+            found=f"no folder {CHECKPOINT}",
+            todo="open a run that bench trained, with its checkpoint",
+        )
     source = _read_source(folder / SOURCE_FILE)
     for path in filter(None, (plugin_path, source.plugin_path)):
         if str(path) not in sys.path:

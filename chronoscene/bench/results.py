@@ -51,15 +51,16 @@ class RunRecord(BaseModel):
     """``macro`` (mean over periods), ``micro`` (mean over views), ``worst`` (worst period)."""
     periods: dict[str, Values]
     """Mean over the views of each period, by period id."""
-    seconds: float
-    """Training clock: setup and steps, without probes, rendering and scoring."""
-    iterations: int
-    primitives: int
+    seconds: float | None
+    """Training clock: setup and steps, without probes, rendering and scoring. What is None here and
+    below was not measured; see `absent`."""
+    iterations: int | None
+    primitives: int | None
     primitive: str = "primitives"
     """What `primitives` counts: ``Gaussians``, ``anchors``."""
     drawn: float | None = None
     """Gaussians that touch a test view, mean over the views; None if the method does not say."""
-    checkpoint_bytes: int
+    checkpoint_bytes: int | None
     peak_memory_bytes: int | None
     """Largest resident memory of the process from the start of training to the end of rendering;
     None where the system does not tell."""
@@ -67,6 +68,8 @@ class RunRecord(BaseModel):
     commit: str
     skipped: dict[str, str]
     """Metric to the reason for its absence."""
+    absent: dict[str, str] = {}
+    """Cost, by the name of its field here, to the reason for its absence."""
 
     title: str
     """Name of the method in tables."""
@@ -77,9 +80,9 @@ class RunRecord(BaseModel):
     scene_hash: str
     split_hash: str
     period_labels: dict[str, str]
-    parameters: int
+    parameters: int | None
     """Numbers stored in the checkpoint."""
-    warmup_seconds: float
+    warmup_seconds: float | None
     """Compiling and loading of kernels before the clock starts; not part of `seconds`."""
     empty_steps: int = 0
     """Steps whose view showed nothing of the model; nothing is learned from them."""
@@ -87,18 +90,23 @@ class RunRecord(BaseModel):
     """Steps that changed nothing since their loss or a gradient was not finite."""
     resumed: int = 0
     """How often the training went on from a checkpoint."""
-    setup_seconds: float
+    setup_seconds: float | None
     """Share of `seconds` before the first step."""
-    render_seconds: float
+    render_seconds: float | None
     """Mean time to render a test view, by the model as it was saved and loaded again."""
     peak_device_memory_bytes: int | None
     """Largest memory held on a GPU; None on a CPU."""
-    threads: int
+    threads: int | None
     max_width: int
     libraries: dict[str, str]
     started: str
     """UTC, ISO 8601."""
     notices: list[str]
+
+    @property
+    def label(self) -> str:
+        """The run in words, as `Job.label`."""
+        return f"{self.scene}: {self.method} {self.strategy} {self.preset} seed {self.seed}"
 
 
 class Failure(BaseModel):

@@ -30,6 +30,7 @@ from chronoscene.bench.results import (
     write_summary,
 )
 from chronoscene.errors import CheckpointError, ChronoSceneError, ShapeError
+from chronoscene.io.wording import shown
 from chronoscene.metrics.registry import METRICS, Scorers
 
 
@@ -71,6 +72,19 @@ def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Sco
     # A metric that fails on one view has no mean over the test set.
     kept = tuple(row for row in rows if row.metric not in skipped)
     return Scores(kept, skipped, tuple(unscored))
+
+
+def score_run(staging: Path, record: RunRecord, truth: Path, scorers: Scorers) -> None:
+    """Score the predictions in the folder of a run, and write its record with the scores."""
+    scores = score_folder(staging / PREDICTIONS, truth, scorers)
+    record.aggregates, record.periods = aggregate(scores.rows)
+    record.skipped = scores.skipped
+    if scores.unscored:
+        views = shown(scores.unscored)
+        record.notices.append(
+            f"{record.label}: not scored, as their masks ignore every pixel: {views}"
+        )
+    write_run(staging, record, scores.rows)
 
 
 def score_pair(

@@ -230,7 +230,8 @@ def readable_tables(
     for scene, part in entries.groupby("scene", sort=False):
         runs = [run for run in records if run.scene == scene]
         made += [_quality_table(part, name, runs) for name in names]
-        made.append(_cost_table(part, str(scene)))
+        if (part.column == "").any():  # nobody knows what images of other programs cost
+            made.append(_cost_table(part, str(scene)))
     if entries.scene.nunique() > 1:
         made += [_summary_table(entries, name) for name in names]
     return made
@@ -334,17 +335,21 @@ def footnotes(
             notes.append(f"{title}: {'; '.join(values)}")
     counted: dict[str, dict[str, None]] = {}
     for run in records:
-        counted.setdefault(run.primitive, {})[run.title] = None
-    if records:
+        if run.primitives is not None:
+            counted.setdefault(run.primitive, {})[run.title] = None
+    if counted:
         units = "; ".join(f"{unit} of {', '.join(titles)}" for unit, titles in counted.items())
         notes.append(f"primitives: {units}")
     absent: dict[str, list[str]] = {}
+    costs = {cost.name: cost.title for cost in COSTS}
     for run in records:
-        for metric, reason in run.skipped.items():
+        skipped = {m: why for m, why in run.skipped.items() if not wanted or m in wanted}
+        costly = {costs[c]: why for c, why in run.absent.items() if c in costs}
+        for name, reason in {**skipped, **costly}.items():
             names = absent.setdefault(reason, [])
-            if metric not in names and (not wanted or metric in wanted):
-                names.append(metric)
-    notes += [f"absent: {', '.join(names)}: {reason}" for reason, names in absent.items() if names]
+            if name not in names:
+                names.append(name)
+    notes += [f"absent: {', '.join(names)}: {reason}" for reason, names in absent.items()]
     notices = dict.fromkeys(notice for run in records for notice in run.notices)
     seeds: dict[tuple[str, str], list[str]] = {}
     for f in failures:

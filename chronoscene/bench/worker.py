@@ -35,7 +35,7 @@ from chronoscene.bench.provenance import (
     method_version,
     peak_memory_bytes,
 )
-from chronoscene.bench.scoring import aggregate, score_folder
+from chronoscene.bench.scoring import score_run
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.bench.training_loop import (
     DivergedError,
@@ -52,7 +52,6 @@ from chronoscene.images.store import ImageStore
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
-from chronoscene.io.wording import shown
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
 from chronoscene.metrics.registry import make_scorers
@@ -121,18 +120,10 @@ def run_job(job: Job) -> None:
         display.wait("scores")
         weights = Path(job.lpips_weights) if job.lpips_weights else None
         scorers = make_scorers(lpips_weights=weights)
-        scores = score_folder(staging / results.PREDICTIONS, truth, scorers)
-    record = _record(job, spec, scene, machine, outcomes, peaks, started)
-    record.aggregates, record.periods = aggregate(scores.rows)
-    record.skipped = scores.skipped
-    record.warmup_seconds = warmup_seconds
-    record.notices = [*job.notices, *([notice] if notice else []), *_skips(job, record)]
-    if scores.unscored:
-        views = shown(scores.unscored)
-        record.notices.append(
-            f"{job.label}: not scored, as their masks ignore every pixel: {views}"
-        )
-    results.write_run(staging, record, scores.rows)
+        record = _record(job, spec, scene, machine, outcomes, peaks, started)
+        record.warmup_seconds = warmup_seconds
+        record.notices = [*job.notices, *([notice] if notice else []), *_skips(job, record)]
+        score_run(staging, record, truth, scorers)
 
 
 def pick_device(wanted: str, spec: MethodSpec) -> str:

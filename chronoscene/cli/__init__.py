@@ -18,6 +18,7 @@ COMMANDS = {
     "methods": "chronoscene.cli.methods:command",
     "register": "chronoscene.cli.register:command",
     "score": "chronoscene.cli.results:score",
+    "score-images": "chronoscene.cli.score_images:command",
     "split": "chronoscene.cli.split:command",
     "stats": "chronoscene.cli.stats:command",
     "synth": "chronoscene.cli.synth:command",

@@ -9,12 +9,13 @@ from typing import Any
 import click
 
 from chronoscene.bench.job import check_device, parse_duration
+from chronoscene.bench.results import read_failures
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.strategies import STRATEGIES
 from chronoscene.checks import check_choice
 from chronoscene.cli.convert import format_option
-from chronoscene.cli.output import check_place, emit
-from chronoscene.cli.results import split_list
+from chronoscene.cli.output import check_place
+from chronoscene.cli.results import print_runs, split_list
 from chronoscene.errors import ConfigError
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.staging import check_outside
@@ -172,16 +173,9 @@ def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
 
 
 def report(outcome: BenchOutcome, out: Path) -> None:
-    """Print the tables of all runs in the folder and the files that were written."""
-    from chronoscene.bench.comparison_figure import draw_figures
-    from chronoscene.bench.results import RESULTS_FILE, ROWS_FILE, read_failures
-    from chronoscene.bench.tables import format_runs, read_runs
-
+    """Print what is in the folder of runs, and why runs failed."""
     if outcome.finished:
-        records, failures = read_runs([out])
-        emit(format_runs(records, failures, "table") + "\n", None)
-        paths = [out / RESULTS_FILE, out / ROWS_FILE, *draw_figures(out)]
-        click.echo("\n".join(str(path) for path in paths))
+        print_runs(out)
     else:
         for failure in read_failures(out):
             click.echo(f"failed: {failure.scene}, {failure.method}: {failure.reason}", err=True)

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from chronoscene.bench.comparison_figure import draw_figures
+from chronoscene.bench.results import RESULTS_FILE, ROWS_FILE
 from chronoscene.bench.scoring import rescore
 from chronoscene.bench.tables import format_runs, read_runs
 from chronoscene.cli.output import emit
@@ -45,6 +47,13 @@ def score(runs: Path, lpips_weights: Path | None) -> None:
         click.echo(f"{metric} not computed: {reason}")
     if any(outcome.error is not None for outcome in outcomes):
         click.get_current_context().exit(SOME_FAILED)
+
+
+def print_runs(out: Path) -> None:
+    """Print the tables of all runs in a folder, and the files that belong to all of them."""
+    emit(format_runs(*read_runs([out]), "table") + "\n", None)
+    paths = [out / RESULTS_FILE, out / ROWS_FILE, *draw_figures(out)]
+    click.echo("\n".join(str(path) for path in paths))
 
 
 @click.command("table")

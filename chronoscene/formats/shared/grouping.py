@@ -93,12 +93,15 @@ def label_date(label: str) -> str | None:
     return label if label[:2] in ("19", "20") and is_iso_date(label) else None
 
 
-def read_table(path: Path, images: Sequence[str] = ("file",)) -> list[tuple[str, str, str]]:
+def read_table(
+    path: Path, images: Sequence[str] = ("file",), label: str = "period"
+) -> list[tuple[str, str, str]]:
     """Place for messages, image and label of each row of a CSV file.
 
     Args:
         path: Of the file.
-        images: Names that the column of the images may have; the other one is ``period``.
+        images: Names that the column of the images may have.
+        label: Name of the other column.
 
     Raises:
         SceneError: If it is not a CSV file, is empty, or lacks a column.
@@ -112,11 +115,11 @@ def read_table(path: Path, images: Sequence[str] = ("file",)) -> list[tuple[str,
         raise _table_error(path, "a CSV file", str(error)) from error
     columns = rows[0][1] if rows else {}
     column = next((name for name in images if name in columns), None)
-    if column is None or "period" not in columns:
+    if column is None or label not in columns:
         found = lines[0][1] if lines else "an empty file"
-        expected = f"the columns {images[0]} and period, and at least one row"
+        expected = f"the columns {images[0]} and {label}, and at least one row"
         raise _table_error(path, expected, found[:80])
-    return [(at, (row[column] or "").strip(), (row["period"] or "").strip()) for at, row in rows]
+    return [(at, (row[column] or "").strip(), (row[label] or "").strip()) for at, row in rows]
 
 
 def group_by_table(names: Sequence[str], path: Path) -> Grouped:
