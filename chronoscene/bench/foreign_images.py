@@ -23,7 +23,8 @@ from chronoscene.bench.scoring import score_run
 from chronoscene.bench.strategies import check_scene
 from chronoscene.errors import ConfigError, ImageError
 from chronoscene.formats.shared.grouping import read_table
-from chronoscene.images.store import ImageStore, image_size, load_rgb
+from chronoscene.images.decoding import image_size, load_rgb
+from chronoscene.images.store import ImageStore
 from chronoscene.io.staging import staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
 from chronoscene.metrics.registry import Scorers

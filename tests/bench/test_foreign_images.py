@@ -14,7 +14,7 @@ from chronoscene.bench.scoring import rescore
 from chronoscene.bench.tables import format_runs, read_runs
 from chronoscene.errors import CheckpointError, ConfigError, ImageError, SceneError
 from chronoscene.formats import read_scene
-from chronoscene.images.store import load_rgb
+from chronoscene.images.decoding import load_rgb
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.metrics.registry import make_scorers
 
