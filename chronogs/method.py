@@ -16,7 +16,7 @@ from chronoscene.anchors.method import AnchorMethod
 from chronoscene.anchors.model import AnchorLayout
 from chronoscene.anchors.trainer import AfterUpdate
 from chronoscene.methods import Prediction, View
-from chronoscene.training.splatting import draw, prediction_of
+from chronoscene.training.splatting import prediction_of
 
 
 class ChronoGS(AnchorMethod):
@@ -60,7 +60,4 @@ class ChronoGS(AnchorMethod):
         )
         splats, positions = model.decode_active(geometry, *seen)
         splats = splats._replace(colors=model.decode(appearance, *seen).colors[positions])
-        near_plane = model.layout.near_plane
-        return prediction_of(
-            draw(splats, view, self.background, near_plane=near_plane, render_depth=True)
-        )
+        return prediction_of(self.draw_splats(splats, view))

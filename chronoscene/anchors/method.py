@@ -20,7 +20,7 @@ from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
 from chronoscene.training.periods import period_weights
-from chronoscene.training.splatting import SplattingMethod, draw, finite_rows
+from chronoscene.training.splatting import Splats, SplattingMethod, draw, finite_rows
 
 
 class AnchorMethod(SplattingMethod):
@@ -104,8 +104,19 @@ class AnchorMethod(SplattingMethod):
         model = self.model
         weights = torch.from_numpy(self.weights(period)).to(model.device)
         splats, _ = model.decode_active(weights, *model.seen_from(view))
-        near_plane = model.layout.near_plane
-        return draw(splats, view, self.background, near_plane=near_plane, render_depth=True)
+        return self.draw_splats(splats, view)
+
+    def draw_splats(self, splats: Splats, view: View) -> Rasterization:
+        """Decoded Gaussians as the model's layout says, with depth."""
+        layout = self._model.layout
+        return draw(
+            splats,
+            view,
+            self.background,
+            near_plane=layout.near_plane,
+            antialiased=layout.antialiased,
+            render_depth=True,
+        )
 
     def stored_tensors(self) -> dict[str, Tensor]:
         return self.model.tensors()

@@ -54,6 +54,7 @@ class AnchorLayout:
     scale_unit: str = "anchor"
     visibility: str = "radius"
     near_plane: float = NEAR_PLANE
+    antialiased: bool = False
 
     @property
     def feature_dim(self) -> int:
@@ -76,7 +77,7 @@ class AnchorLayout:
     def from_meta(cls, meta: Mapping[str, Any]) -> AnchorLayout:
         """Read what ``dataclasses.asdict`` stored in ``model.json``."""
         known = {f.name for f in dataclasses.fields(cls)}
-        values: dict[str, Any] = {"near_plane": NEAR_PLANE}  # older models do not say
+        values: dict[str, Any] = {"near_plane": NEAR_PLANE, "antialiased": False}  # if not said
         values |= {k: tuple(v) if isinstance(v, list) else v for k, v in meta.items()}
         if set(values) != known:
             raise CheckpointError(

@@ -129,11 +129,17 @@ class AnchorTrainer:
         splats, positions = self._seen(visible, row).decode_active(
             self._one_period, self._seen_from(view), everything
         )
-        near_plane = self.model.layout.near_plane
         background = step_background(
             self.background, self.config, seed=self.seed, number=self.sampler.drawn
         )
-        raster = draw(splats, view, background, near_plane=near_plane, check_finite=False)
+        raster = draw(
+            splats,
+            view,
+            background,
+            near_plane=self.config.near_plane,
+            antialiased=self.config.antialiased,
+            check_finite=False,
+        )
         target = torch.from_numpy(photo).to(self.model.device)
         counts = None if mask is None else torch.tensor(mask, device=self.model.device)
         image, weight = self.exposure.apply(raster.image[0], position), self.config.ssim_weight

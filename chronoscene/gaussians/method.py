@@ -69,8 +69,14 @@ class GaussianMethod(SplattingMethod):
         )
 
     def draw(self, view: View, period: float) -> Rasterization:
-        splats, near_plane = self.model.splats(view, period), self.config.near_plane
-        return draw(splats, view, self.background, near_plane=near_plane, render_depth=True)
+        return draw(
+            self.model.splats(view, period),
+            view,
+            self.background,
+            near_plane=self.config.near_plane,
+            antialiased=self.config.antialiased,
+            render_depth=True,
+        )
 
     def stored_tensors(self) -> dict[str, Tensor]:
         return self.model.tensors()

@@ -134,6 +134,7 @@ class GaussianTrainer:
             view,
             background,
             near_plane=config.near_plane,
+            antialiased=config.antialiased,
             absgrad=config.absgrad,
             # A scale beyond all numbers shows in the gradients; one such step ends no training.
             check_finite=False,

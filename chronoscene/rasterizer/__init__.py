@@ -74,6 +74,7 @@ def rasterize(
     backgrounds: Tensor | None = None,
     render_depth: bool = False,
     absgrad: bool = False,
+    antialiased: bool = False,
     backend: str = "auto",
     check_finite: bool = True,
 ) -> Rasterization:
@@ -104,6 +105,7 @@ def rasterize(
         render_depth: Also return the expected z-depth, differentiable.
         absgrad: Also sum absolute gradients, see `RasterInfo.means2d`; for three channels without
             depth.
+        antialiased: Lower the opacity of small Gaussians, so that the blur does not add light.
         backend: auto, reference, cpu or cuda. Auto is cuda for CUDA tensors, else cpu.
         check_finite: Raise on nan or infinite numbers, and on invalid cameras. Without this check,
             Gaussians with such numbers are culled.
@@ -119,8 +121,20 @@ def rasterize(
     if backend == "auto":
         backend = "cuda" if means.is_cuda else "cpu"
     gaussians = (means, quats, scales, opacities, colors)
-    options = (near_plane, far_plane, eps2d, backgrounds, render_depth)
-    inputs = Inputs(*gaussians, viewmats, Ks, width, height, *options, absgrad=absgrad)
+    inputs = Inputs(
+        *gaussians,
+        viewmats,
+        Ks,
+        width,
+        height,
+        near_plane,
+        far_plane,
+        eps2d,
+        backgrounds,
+        render_depth,
+        absgrad=absgrad,
+        antialiased=antialiased,
+    )
     check_inputs(inputs, check_finite)
     result: Rasterization = import_module(BACKENDS[backend]).rasterize(inputs)
     return result

@@ -1,4 +1,4 @@
-"""The CUDA backend: gsplat's public ``rasterization``, classic mode, not packed.
+"""The CUDA backend: gsplat's public ``rasterization``, not packed.
 
 gsplat is the optional extra ``cuda``; it is imported when the backend is used. Its numbers differ
 from the reference by rounding and by its footprint rule; see README.md.
@@ -59,7 +59,7 @@ def rasterize(inputs: Inputs) -> Rasterization:
             backgrounds=inputs.backgrounds,
             packed=False,
             absgrad=inputs.absgrad,
-            rasterize_mode="classic",
+            rasterize_mode="antialiased" if inputs.antialiased else "classic",
             render_mode="RGB+ED" if inputs.render_depth else "RGB",
         )
     except (AttributeError, ImportError) as error:  # kernels are None, or could not be built

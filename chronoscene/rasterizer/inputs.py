@@ -31,7 +31,8 @@ class Inputs:
     eps2d: float
     backgrounds: Tensor | None
     render_depth: bool
-    absgrad: bool = False
+    absgrad: bool
+    antialiased: bool
 
     @property
     def gaussians(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -67,7 +67,7 @@ def rasterize(inputs: Inputs) -> Rasterization:
         camera = (viewmat, K, width, height)
         with torch.no_grad():
             everything = _project(means, quats, scales, *camera)
-            extents = _extents(everything.axes, opacities, eps2d)
+            extents = _extents(everything.axes, _seen(opacities, everything.axes, inputs), eps2d)
             visible = _visible(everything, extents, inputs)
             visible &= _determinants(everything.axes, eps2d) > 0
             visible &= (colors.abs() < VALUE_MAX).all(dim=-1) & (opacities < VALUE_MAX)
@@ -82,8 +82,9 @@ def rasterize(inputs: Inputs) -> Rasterization:
             values = torch.cat([values, projected.depths[:, None]], dim=1)
         # The leaf has the values, the projection the gradient; both receive it in backward().
         means2d = info.means2d[c, index] + (projected.means2d - projected.means2d.detach())
-        seen = (means2d, projected.axes, opacities[index], values, extents[index])
-        splats = _Splats(*seen, None if absgrad is None else absgrad[c], index)
+        seen = _seen(opacities[index], projected.axes, inputs)
+        shown = (means2d, projected.axes, seen, values, extents[index])
+        splats = _Splats(*shown, None if absgrad is None else absgrad[c], index)
         image, transmittance = _composite(splats, width, height, eps2d)
         alphas.append(1 - transmittance)
         if inputs.render_depth:
@@ -182,6 +183,16 @@ def _determinants(axes: Tensor, eps2d: float) -> Tensor:
     """Of the covariances: |a x b|^2 + eps2d (|a|^2 + |b|^2) + eps2d^2; nothing cancels. [M]"""
     area = torch.linalg.cross(axes[:, 0], axes[:, 1])
     return (area**2).sum(-1) + eps2d * (axes**2).sum((-2, -1)) + eps2d**2
+
+
+def _seen(opacities: Tensor, axes: Tensor, inputs: Inputs) -> Tensor:
+    """Opacities at the centres on the screen. [M]"""
+    return opacities * _compensations(axes, inputs.eps2d) if inputs.antialiased else opacities
+
+
+def _compensations(axes: Tensor, eps2d: float) -> Tensor:
+    """sqrt(det Sigma' / det Sigma) with Sigma' the covariance before the blur. [M]"""
+    return torch.sqrt(_determinants(axes, 0.0) / _determinants(axes, eps2d))
 
 
 def _visible(projected: _Projected, extents: Tensor, inputs: Inputs) -> Tensor:

@@ -74,6 +74,10 @@ class SplattingConfig:
     near_plane: float = NEAR_PLANE
     """Nearest depth that is drawn, in `length_unit`. The default is common to all methods here; the
     official rasterizer of 3DGS has 0.2."""
+    antialiased: bool = False
+    """Lower the opacity of Gaussians that are small on the screen, so that the rasterizer's blur
+    adds no light to them: what is thin keeps its brightness at other image sizes than those
+    trained on (Yu et al. 2024, Mip-Splatting)."""
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the loss; L1 gets the rest."""
     random_background: bool = False
@@ -127,6 +131,7 @@ def draw(
     background: Tensor,
     *,
     near_plane: float,
+    antialiased: bool,
     render_depth: bool = False,
     absgrad: bool = False,
     check_finite: bool = True,
@@ -138,6 +143,7 @@ def draw(
         view.width,
         view.height,
         near_plane=near_plane,
+        antialiased=antialiased,
         backgrounds=background[None],
         render_depth=render_depth,
         absgrad=absgrad,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import assume, given, settings
-from rasterizer_cases.scenes import SmallScene, scenes, well_posed
+from rasterizer_cases.scenes import ANTIALIASED, SmallScene, scenes, well_posed
 
 from chronoscene.errors import ShapeError
 
@@ -40,6 +40,7 @@ def test_random_scenes_drawn_afresh(scene: SmallScene, check_agreement: Check) -
     [
         (300, 70, 50, {}),
         (300, 33, 65, {"render_depth": True}),
+        (300, 70, 50, {"options": ANTIALIASED}),
         (15, 32, 32, {"backgrounds": np.array([[0.3, 0.6, 0.9]], np.float32)}),
         (17, 1, 1, {}),
         (1, 40, 3, {}),

@@ -80,7 +80,7 @@ def launched() -> SimpleNamespace:
     scene = crowd(COUNT, WIDTH, HEIGHT)
     gaussians: Any = tuple(getattr(scene, name).reshape(-1) for name in NAMES)
     size: Any = SimpleNamespace(
-        width=WIDTH, height=HEIGHT, near_plane=0.01, far_plane=1e10, eps2d=0.3
+        width=WIDTH, height=HEIGHT, near_plane=0.01, far_plane=1e10, eps2d=0.3, antialiased=False
     )
     view = layout.make_view(scene.viewmats[0], scene.Ks[0], size)
     rendering = passes.Rendering(view)

@@ -201,7 +201,9 @@ def test_blocks_are_those_that_the_ellipse_touches(tools: SimpleNamespace) -> No
     scene = tools.random_scene(400, 100, 70, seed=3)
     names = ("means", "quats", "scales", "opacities", "colors")
     gaussians: Any = tuple(getattr(scene, name).reshape(-1) for name in names)
-    size: Any = SimpleNamespace(width=100, height=70, near_plane=0.01, far_plane=1e10, eps2d=0.3)
+    size: Any = SimpleNamespace(
+        width=100, height=70, near_plane=0.01, far_plane=1e10, eps2d=0.3, antialiased=False
+    )
     view = layout.make_view(scene.viewmats[0], scene.Ks[0], size)
     visible = (np.empty(800, np.float32), np.empty(800, np.float32), np.empty(400, np.float32))
     binned = passes.Rendering(view)

@@ -19,7 +19,13 @@ from rasterizer_cases.comparison import Comparison, compare, everything, roundin
 from rasterizer_cases.exact import exact_pixels
 from rasterizer_cases.extremes import AGREES, CULLED, EXTREMES, Extreme, in_training_frame, rounded
 from rasterizer_cases.mixtures import FOUND
-from rasterizer_cases.scenes import SmallScene, extreme_scenes, random_scene, well_posed
+from rasterizer_cases.scenes import (
+    ANTIALIASED,
+    SmallScene,
+    extreme_scenes,
+    random_scene,
+    well_posed,
+)
 
 import chronoscene.rasterizer
 from chronoscene.errors import ShapeError
@@ -76,6 +82,37 @@ def test_agrees_with_the_reference(extreme: Extreme, tolerances: ModuleType) -> 
     assert comparison.expected["alphas"].mean() >= extreme.seen
     assert comparison.steady.mean() >= 0.99  # next to nothing is left out
     assert_close(comparison, moved, tolerances)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "pancakes seen edge-on",
+        "pancakes 1e4 by 1e-4",
+        "opacity 1e20",
+        "a world 1e-17 times as large",
+        "a focal length of 1/1000 of the width",
+    ],
+)
+def test_antialiased_extremes(name: str, tolerances: ModuleType) -> None:
+    scene = BY_NAME[name].build()
+    pixels = [(x, y) for y in range(0, scene.height, 5) for x in range(0, scene.width, 6)]
+    scene = scene.with_(options=(*scene.options, *ANTIALIASED))
+    comparison = compare(scene)
+    assert comparison.expected["alphas"].mean() > 0.05
+    assert_close(comparison, rounding(scene), tolerances)
+    result = scene.render("reference", torch.float64)[0]
+    got = np.array([result.image[0, y, x].detach().numpy() for x, y in pixels])
+    assert np.abs(got - exact_pixels(scene, pixels)[:, :3]).max() < 1e-11
+
+
+def test_antialiased_what_has_no_area_is_culled() -> None:
+    scene = BY_NAME["needles 1 by 1e-8"].build().with_(options=ANTIALIASED)
+    for backend in ("reference", "cpu"):
+        result, inputs = scene.render(backend)
+        (result.image.sum() + result.alphas.sum()).backward()
+        assert not result.alphas.any() and not result.info.radii.any()
+        assert all(not inputs[name].grad.any() for name in ("means", "quats", "scales"))
 
 
 @named(CULLING)
@@ -207,7 +244,8 @@ def test_most_mixtures_show_something() -> None:
     @given(scene=extreme_scenes())
     def look(scene: SmallScene) -> None:
         with torch.no_grad():
-            seen.append(scene.render("cpu")[0].alphas.max() > 0.01)
+            # Antialiased, what is tiny fades.
+            seen.append(scene.with_(options=()).render("cpu")[0].alphas.max() > 0.01)
 
     look()
     assert np.mean(seen) > 0.9

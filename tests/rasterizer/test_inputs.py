@@ -158,6 +158,8 @@ def test_cuda_backend_speaks_gsplats_language(
     assert result.info.radii[0, :, 0].tolist() == [1, 0, 0, 0, 1]
     result.image.sum().backward()
     assert result.info.means2d.grad is not None
+    rasterize(**arguments, backend="cuda", antialiased=True, check_finite=False)
+    assert seen["rasterize_mode"] == "antialiased"
 
 
 @pytest.mark.parametrize("failure", [AttributeError, ImportError])

@@ -66,6 +66,37 @@ def test_gaussian_on_the_axis_has_the_closed_form() -> None:
     assert result.info.depths[0, 0] == Z
 
 
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("reduced", [1, 4, 16])
+def test_antialiased_light_does_not_depend_on_the_size_of_the_image(
+    reduced: int, backend: str
+) -> None:
+    """The sum over pixels of a Gaussian's opacity is 2 pi o times the root of the determinant of
+    its covariance without the blur, here f^2 s_x s_y / z^2, which falls with the pixels."""
+    s_x, s_y, opacity, f, size = 0.3, 0.6, 0.9, F / reduced, 128 // reduced
+    light = {}
+    for antialiased in (False, True):
+        alphas = rasterize(
+            torch.tensor([[0.0, 0.0, Z]]),
+            torch.tensor([[1.0, 0, 0, 0]]),
+            torch.tensor([[s_x, s_y, 0.1]]),
+            torch.tensor([opacity]),
+            torch.ones(1, 1),
+            torch.eye(4)[None],
+            torch.tensor([[[f, 0, size / 2], [0, f, size / 2], [0, 0, 1]]]),
+            size,
+            size,
+            antialiased=antialiased,
+            backend=backend,
+        ).alphas
+        light[antialiased] = float(alphas.double().sum())
+    variances = (f / Z * np.array([s_x, s_y])) ** 2
+    sharp, blurred = np.sqrt(variances.prod()), np.sqrt((variances + EPS2D).prod())
+    outside = blurred / 255  # Where alpha is below its threshold.
+    assert light[True] == pytest.approx(2 * np.pi * (opacity * sharp - outside), rel=0.02)
+    assert light[False] == pytest.approx(2 * np.pi * (opacity * blurred - outside), rel=0.02)
+
+
 def test_off_axis_gaussian_is_stretched_by_the_jacobian() -> None:
     s, x = 0.1, 0.6
     result = render([[x, 0, Z]], [s], [0.9], [[1.0]])
@@ -255,7 +286,8 @@ def test_order_of_the_input_does_not_matter(tools: SimpleNamespace) -> None:
     assert (here.info.radii[:, order] == there.info.radii).all()
 
 
-def test_gradcheck(tools: SimpleNamespace) -> None:
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gradcheck(antialiased: bool, tools: SimpleNamespace) -> None:
     """Finite differences of every input, at pixels that no threshold is near to."""
     scene = tools.random_scene(7, 13, 11, seed=4)
     scene = scene.with_(
@@ -263,6 +295,7 @@ def test_gradcheck(tools: SimpleNamespace) -> None:
         scales=scene.scales * 3,
         backgrounds=np.array([[0.2, 0.4, 0.6]], np.float32),
         render_depth=True,
+        options=(("antialiased", antialiased),),
     )
     steady = tools.steady_pixels(scene, 1e-3)
     assert 0.5 < steady.float().mean() <= 1
@@ -280,6 +313,7 @@ def test_gradcheck(tools: SimpleNamespace) -> None:
             11,
             backgrounds=args[5],
             render_depth=True,
+            antialiased=antialiased,
             backend="reference",
         )
         assert result.depths is not None

@@ -166,7 +166,8 @@ def ellipse(rows: Any, normal: Any, s: Any, t: Any, blur: Any, sideways: Any) ->
 
     Returns:
         b and B; shear ab/bb; variance of a given b, that of b and one over its square root;
-        (a - shear b) / s.
+        (a - shear b) / s; a and n, of which |n|^2 over the variance of a given b is the ratio of
+        the determinants of Sigma without the blur and with it.
     """
     first, second = either(sideways, rows[1], rows[0]), either(sideways, rows[0], rows[1])
     a, b = times(first, s), times(second, s)
@@ -179,4 +180,4 @@ def ellipse(rows: Any, normal: Any, s: Any, t: Any, blur: Any, sideways: Any) ->
     share = blur * inverse * inverse
     rest = plus(cross(times(e, t), normal), by(share, first))
     given = dot(n, n) + (share * dot(a, a) + blur)
-    return b, second, dot(a, e) * inverse, given, (bb, inverse), rest
+    return b, second, dot(a, e) * inverse, given, (bb, inverse), rest, (a, n)

@@ -63,7 +63,8 @@ X_MIN, X_MAX, Y_MIN, Y_MAX = 16, 17, 18, 19  # Limits of x / z and y / z for the
 NEAR, FAR, BLUR = 20, 21, 22
 CENTRE_REST = 23  # What float32 cannot hold of the centre
 COFACTORS = 26  # Of the rotation: row i is the cross product of the rows i + 1 and i + 2
-CAMERA = 35
+ANTIALIASED = 35  # 1 if opacities make up for the blur, 0 if not
+CAMERA = 36
 
 CHUNK = 1024  # Gaussians that a thread takes at a time
 
@@ -103,7 +104,7 @@ def make_view(viewmat: AnyArray, K: AnyArray, inputs: Inputs) -> View:
     camera[X_MIN], camera[X_MAX] = -cx / fx - margin_x, (width - cx) / fx + margin_x
     camera[Y_MIN], camera[Y_MAX] = -cy / fy - margin_y, (height - cy) / fy + margin_y
     camera[NEAR], camera[FAR] = inputs.near_plane, inputs.far_plane
-    camera[BLUR] = inputs.eps2d
+    camera[BLUR], camera[ANTIALIASED] = inputs.eps2d, inputs.antialiased
     return View(camera, width, height)
 
 

@@ -64,13 +64,15 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     a, b = times(rows[0], s), times(rows[1], s)
     xx, yy = dot(a, a) + camera[layout.BLUR], dot(b, b) + camera[layout.BLUR]
     sideways = xx > yy
-    _, _, shear, given, (second, inverse), _ = ellipse(
+    _, _, shear, given, (second, inverse), _, (_, n) = ellipse(
         rows, normal, s, sizes, camera[layout.BLUR], sideways
     )
     # m = (f_x x / z + c_x, f_y y / z + c_y).
     mx, my = camera[layout.FX] * tx + camera[layout.CX], camera[layout.FY] * ty + camera[layout.CY]
 
-    opacity = load(opacities, at)
+    zero, inverse_given, inverse_y = splat(0.0), 1.0 / sqrt(given), 1.0 / sqrt(yy)
+    antialiased = splat(camera[layout.ANTIALIASED]) > zero
+    opacity = load(opacities, at) * select(antialiased, sqrt(dot(n, n)) * inverse_given, 1.0)
     level = log2(opacity)
     # Half extents of the ellipse alpha >= 1/255: sqrt(2 ln(255 o) Sigma_xx), likewise for y.
     reach = (level - layout.LEVEL_MIN) * (2.0 / layout.LOG2_E)
@@ -93,8 +95,7 @@ def _project_group(at, gaussians, camera, size, records, keys, out):
     ty0, nty = _tile_range(my - ey * 1.001 - 0.01, my + ey * 1.001 + 0.01, height)
     drawn = visible & (ntx > 0) & (nty > 0)
     ntx, nty = select(drawn, ntx, 0), select(drawn, nty, 0)
-    zero = splat(0.0)
-    inverse_given, inverse_y, xy = 1.0 / sqrt(given), 1.0 / sqrt(yy), shear * second
+    xy = shear * second
     # The conic Sigma^-1 = W^T W with W = ((1, -shear) / sqrt(given), (0, 1) / sqrt(second)): u and
     # v are the rows of W times WHITEN.
     u, v = layout.WHITEN * inverse_given, layout.WHITEN * inverse

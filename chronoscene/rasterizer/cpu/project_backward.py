@@ -15,6 +15,7 @@ from chronoscene.rasterizer import constants
 from chronoscene.rasterizer.cpu import layout
 from chronoscene.rasterizer.cpu.ellipses import (
     by,
+    cross,
     dot,
     either,
     ellipse,
@@ -125,15 +126,15 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     sizes = by(rz, load_triples(scales, 3 * at))
     s = by(inverse2, sizes)
     sideways = f[layout.SUM_SIGN] < 0.0
-    b, second, shear, given, (_, k), rest = ellipse(
+    b, second, shear, given, (_, inverse_b), rest, (a, n) = ellipse(
         rows, normal, s, sizes, camera[layout.BLUR], sideways
     )
 
     # Whitening W = [[i, -shear i], [0, k]] for offsets (first, second): Sigma^-1 = W^T W. The sums
     # are over u, v, which are WHITEN times the whitened offset W d; d loss / d Sigma =
     # W^T (sum g (W d)(W d)^T) W / 2 and d loss / d mean = W^T sum g W d.
-    i = 1.0 / sqrt(given)
-    k = select(sideways, 0.0 - k, k)
+    i, zero = 1.0 / sqrt(given), splat(0.0)
+    k = select(sideways, zero - inverse_b, inverse_b)
     su, sv = f[layout.SUM_U] * (1.0 / layout.WHITEN), f[layout.SUM_V] * (1.0 / layout.WHITEN)
     scale = 1.0 / (layout.WHITEN * layout.WHITEN)
     suu, suv, svv = f[layout.SUM_UU] * scale, f[layout.SUM_UV] * scale, f[layout.SUM_VV] * scale
@@ -146,6 +147,13 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
     d = times(rest, s)
     gd = plus(by(huu, d), by(huv, b))
     gb = plus(by(huv, d), by(hvv, b))
+    # Where the opacity is multiplied by c = |n| i, the root of det Sigma' / det Sigma with Sigma'
+    # the covariance without the blur: d ln c / d (a, b) = (Sigma'^-1 - Sigma^-1) (a, b) =
+    # blur Sigma^-1 (b x N, N x a) / |N|^2 with N = a x b = n / k.
+    fade = f[layout.SUM] * camera[layout.BLUR] * (1.0 / dot(n, n)) * inverse_b
+    fade = select(splat(camera[layout.ANTIALIASED]) > zero, fade, zero)
+    gd = plus(gd, by(fade * i * i, cross(plus(b, by(shear, a)), n)))
+    gb = plus(gb, by(fade * k * k, cross(n, a)))
     gs = plus(times(gd, rest), times(gb, second))
     turning = dot(gs, s)
     gb = plus(gb, by(0.0 - shear, gd))
@@ -153,7 +161,6 @@ def _backward_group(at, sums, sums_at, gaussians, depth_gradients, camera, keys,
 
     d0 = times(by(camera[layout.FX], row_x), sizes)
     d1 = times(by(camera[layout.FY], row_y), sizes)
-    zero = splat(0.0)
     d2 = plus(by(zero - jx, d0), by(zero - jy, d1))
     # The Jacobian's x / z and y / z have a gradient only where they are not held.
     free_x = (tx > camera[layout.X_MIN]) & (tx < camera[layout.X_MAX])

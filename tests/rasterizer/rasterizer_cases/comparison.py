@@ -64,6 +64,8 @@ def _at_the_cap(scene: SmallScene, c: int, band: float) -> torch.Tensor:
     eps2d = dict(scene.options).get("eps2d", EPS2D)
     distances = reference._distances(offsets, projected.axes, eps2d)
     alphas = torch.tensor(scene.opacities[opaque]).double() * torch.exp(-0.5 * distances)
+    if dict(scene.options).get("antialiased"):
+        alphas = alphas * reference._compensations(projected.axes, eps2d)
     near = (alphas / reference.ALPHA_MAX - 1).abs() < band
     return near.any(-1).reshape(scene.height, scene.width)
 

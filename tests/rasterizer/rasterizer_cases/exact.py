@@ -66,8 +66,12 @@ def _project(scene: SmallScene, i: int) -> dict[str, Any] | None:
         jacobian[k, 2] = -f / p[2] * min(max(ratio, -c / f - margin), (size - c) / f + margin)
         centre.append(f * ratio + c)
     blur = mpf(dict(scene.options).get("eps2d", EPS2D))
-    covariance = (jacobian * axes) * (jacobian * axes).T + blur * mpmath.eye(2)
-    return {"i": i, "depth": p[2], "centre": centre, "conic": covariance**-1}
+    sharp = (jacobian * axes) * (jacobian * axes).T
+    covariance, opacity = sharp + blur * mpmath.eye(2), mpf(float(scene.opacities[i]))
+    if dict(scene.options).get("antialiased"):
+        opacity *= mpmath.sqrt(mpmath.det(sharp) / mpmath.det(covariance))
+    found = {"i": i, "depth": p[2], "centre": centre, "conic": covariance**-1}
+    return found | {"opacity": opacity}
 
 
 def _composite(
@@ -76,7 +80,7 @@ def _composite(
     light, values = mpf(1), [mpf(0)] * scene.colors.shape[1]
     for s in splats:
         d = mpmath.matrix([column + mpf(0.5) - s["centre"][0], row + mpf(0.5) - s["centre"][1]])
-        alpha = float(scene.opacities[s["i"]]) * mpmath.exp(-(d.T * s["conic"] * d)[0] / 2)
+        alpha = s["opacity"] * mpmath.exp(-(d.T * s["conic"] * d)[0] / 2)
         if alpha < ALPHA_MIN:
             continue
         alpha = min(alpha, mpf(ALPHA_MAX))

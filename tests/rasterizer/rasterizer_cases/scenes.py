@@ -14,6 +14,7 @@ from hypothesis.extra import numpy as hnp
 from chronoscene.rasterizer import Rasterization, rasterize
 from chronoscene.rasterizer.constants import NEAR_PLANE
 
+ANTIALIASED = (("antialiased", True),)
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 
 
@@ -120,6 +121,7 @@ def scenes(draw: st.DrawFn, max_count: int = 20) -> SmallScene:
         height=height,
         backgrounds=array((cameras, channels), 0.0, 1.0) if draw(st.booleans()) else None,
         render_depth=draw(st.booleans()),
+        options=ANTIALIASED if draw(st.booleans()) else (),
     )
 
 
@@ -204,4 +206,5 @@ def extreme_scenes(draw: st.DrawFn) -> SmallScene:
         height=height,
         backgrounds=array((1, 3), 0, 1),
         render_depth=draw(st.booleans()),
+        options=ANTIALIASED if draw(st.booleans()) else (),
     )
