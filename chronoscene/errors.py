@@ -62,6 +62,10 @@ class DiskFullError(ChronoSceneError):
     """A disk without space for what is to be written; nothing half written is left."""
 
 
+class DownloadError(ChronoSceneError):
+    """A host that does not answer, or what came from it and is not what it should be."""
+
+
 class RegistrationError(ChronoSceneError):
     """Photos that cannot be registered, or a step that failed; what was computed is kept."""
 

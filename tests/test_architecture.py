@@ -14,7 +14,7 @@ LAYERS = (
     ("leaderboard", "chronogs", "baselines", "chronoscene.__main__"),
     ("chronoscene.cli",),
     ("chronoscene.bench", "chronoscene.registration", "chronoscene.figures", "chronoscene.synth"),
-    ("chronoscene.stats", "chronoscene.validation"),
+    ("chronoscene.stats", "chronoscene.validation", "chronoscene.download"),
     ("chronoscene.anchors", "chronoscene.gaussians"),
     ("chronoscene.training",),
     ("chronoscene.rasterizer", "chronoscene.metrics"),

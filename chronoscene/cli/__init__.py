@@ -15,6 +15,8 @@ from chronoscene.io.staging import disk_full
 COMMANDS = {
     "bench": "chronoscene.cli.bench:command",
     "convert": "chronoscene.cli.convert:command",
+    "doctor": "chronoscene.cli.doctor:command",
+    "download": "chronoscene.cli.download:command",
     "methods": "chronoscene.cli.methods:command",
     "register": "chronoscene.cli.register:command",
     "score": "chronoscene.cli.results:score",

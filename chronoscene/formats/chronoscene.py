@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from chronoscene.formats.shared.json_values import (
 )
 from chronoscene.images.masks import MASKS, find_masks
 from chronoscene.images.store import ImageSource, Progress, place_images
-from chronoscene.io.staging import staged_folder
+from chronoscene.io.staging import leads_out, staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame, splits
 
 NAME = "chronoscene"
@@ -132,9 +132,7 @@ def check_image(place: Path, image: PosedImage) -> None:
 
 def check_name(place: Path, name: str) -> None:
     """Refuse an image name that leads out of ``images/``."""
-    parts = set(name.split("/"))
-    drive = (":" in name or "\\" in name) and PureWindowsPath(name).drive
-    if not parts - {"", "."} or ".." in parts or name.startswith("/") or drive:
+    if leads_out(name):
         raise SceneError(
             place,
             expected="image names below images/",

@@ -8,7 +8,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 from chronoscene.errors import ConfigError, DiskFullError, SceneError
 
@@ -31,6 +31,13 @@ def sha256_of(path: Path) -> str:
     """SHA-256 of the content of a file, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def leads_out(name: str) -> bool:
+    """Whether a name with slashes leads out of the folder it is joined to, or names nothing."""
+    parts = set(name.split("/"))
+    drive = (":" in name or "\\" in name) and PureWindowsPath(name).drive
+    return bool(not parts - {"", "."} or ".." in parts or name.startswith("/") or drive)
 
 
 @contextmanager

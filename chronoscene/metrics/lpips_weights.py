@@ -1,4 +1,5 @@
-"""Where the weights of LPIPS are found. Nothing is downloaded and nothing is unpickled.
+"""Where the weights of LPIPS are found. Nothing is unpickled, and nothing is downloaded from here:
+``chronoscene download lpips-weights`` does that.
 
 Two parts are needed: the convolutions of VGG16 trained on ImageNet (``vgg16-397923af.pth``, the
 file that torchvision downloads) and the five linear heads of LPIPS 0.1 (``vgg.pth`` of the
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 ENVIRONMENT = "CHRONOSCENE_LPIPS_WEIGHTS"
 BACKBONE_FILE = "vgg16-397923af.pth"
+HEADS_FILE = "lpips-vgg-v0.1.pth"
+"""Our name in torch's cache for what is ``weights/v0.1/vgg.pth`` in the lpips package."""
 CONVOLUTIONS = (
     ((0, 3, 64), (2, 64, 64)),
     ((5, 64, 128), (7, 128, 128)),
@@ -31,11 +34,7 @@ CONVOLUTIONS = (
 )
 """VGG16 by slices that end in a tap: index in torchvision's ``features``, channels in and out."""
 
-TODO = (
-    f"put {BACKBONE_FILE} (torchvision's VGG16) and vgg.pth (folder weights/v0.1 of the lpips "
-    f"package) into a folder and name it with --lpips-weights or {ENVIRONMENT}, or install lpips "
-    f"and put {BACKBONE_FILE} into torch's hub cache"
-)
+TODO = "run chronoscene download lpips-weights, or name a folder with both by --lpips-weights"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +64,7 @@ def candidate_files(explicit: Path | None = None) -> Iterator[Path]:
             yield from sorted(p for p in path.iterdir() if p.suffix in (".pth", ".safetensors"))
         elif path is not None:
             yield path
-    for path in (hub_cache() / BACKBONE_FILE, _package_heads()):
+    for path in (hub_cache() / BACKBONE_FILE, hub_cache() / HEADS_FILE, _package_heads()):
         if path is not None and path.is_file():
             yield path
 

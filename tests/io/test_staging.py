@@ -9,6 +9,7 @@ import pytest
 from chronoscene.errors import ConfigError, DiskFullError, SceneError
 from chronoscene.io.staging import (
     check_outside,
+    leads_out,
     needing_space,
     replacing,
     staged_folder,
@@ -83,3 +84,11 @@ def test_other_errors_of_the_system_are_no_full_disks(tmp_path):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     with pytest.raises(SceneError, match="Permission denied"), staged_folder(tmp_path / "out"):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+@pytest.mark.parametrize(
+    ("name", "out"),
+    [("a/b", False), ("./a", False), ("a/../b", True), ("/a", True), ("", True), ("C:a", True)],
+)
+def test_leads_out(name, out):
+    assert leads_out(name) == out

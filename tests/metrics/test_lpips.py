@@ -116,6 +116,9 @@ def test_environment_variable_and_hub_cache(folder, random_lpips, monkeypatch):
     torch.save(backbone, cache / "vgg16-397923af.pth")
     monkeypatch.setenv(ENVIRONMENT, str(folder / "vgg.pth"))
     assert load_weights().files == (cache / "vgg16-397923af.pth", folder / "vgg.pth")
+    (folder / "vgg.pth").rename(cache / "lpips-vgg-v0.1.pth")
+    monkeypatch.delenv(ENVIRONMENT)
+    assert load_weights().files == (cache / "vgg16-397923af.pth", cache / "lpips-vgg-v0.1.pth")
 
 
 def test_heads_inside_an_installed_package_are_found_without_importing_it(no_weights, monkeypatch):
@@ -129,11 +132,11 @@ def test_heads_inside_an_installed_package_are_found_without_importing_it(no_wei
     assert package / "weights" / "v0.1" / "vgg.pth" in list(candidate_files())
 
 
-def test_without_weights_the_reason_says_what_to_put_where(no_weights):
+def test_without_weights_the_reason_says_what_to_do(no_weights):
     scorers = make_scorers(["psnr", "lpips_vgg", "lpips_vgg_3dgs"])
     assert list(scorers.functions) == ["psnr"]
     assert set(scorers.skipped) == {"lpips_vgg", "lpips_vgg_3dgs"}
-    for part in ("vgg16-397923af.pth", "vgg.pth", "--lpips-weights", ENVIRONMENT):
+    for part in ("chronoscene download lpips-weights", "--lpips-weights"):
         assert part in scorers.skipped["lpips_vgg"]
 
 

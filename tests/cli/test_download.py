@@ -1,0 +1,101 @@
+"""chronoscene download: what it prints, and how it fails."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+from click.testing import CliRunner
+from hub_standin import serving
+
+from chronoscene.cli import cli
+from chronoscene.download import weights
+from chronoscene.download.catalogue import DATASETS
+from chronoscene.errors import ConfigError, DownloadError
+
+CHRONOSCENE = DATASETS["chronoscene"]
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, ["download", *map(str, arguments)])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture
+def hub(monkeypatch, make_scene_folder):
+    """A stand-in of the hub with one scene."""
+    folder = make_scene_folder(name="source")
+    files = {f"Canteen/{p.relative_to(folder)}": p for p in folder.rglob("*") if p.is_file()}
+    content = {name: path.read_bytes() for name, path in files.items()}
+    with serving(CHRONOSCENE.repo, content) as server:
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+        yield server
+
+
+def test_downloads_a_scene_that_is_valid(hub, tmp_path):
+    out = tmp_path / "data"
+    result = run("chronoscene", "Canteen", "--out", out)
+    assert result.exit_code == 0
+    said, *after = result.stdout.splitlines()
+    assert said.startswith("ChronoScene: ") and f"kB in {len(hub.files)} files" in said
+    assert after == [
+        "licence: Apache-2.0 (https://huggingface.co/datasets/wangzhongtao/ChronoScene)",
+        f"cite: {CHRONOSCENE.citation}",
+        f"next: chronoscene validate {out}",
+    ]
+    for step in ("list https://huggingface.co/datasets/", "MB downloaded", "files checked"):
+        assert step in result.stderr
+    assert CliRunner().invoke(cli, ["validate", str(out)]).exit_code == 0
+
+
+def test_default_folder_is_named_for_the_dataset(hub, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("chronoscene").exit_code == 0
+    assert (tmp_path / "data/chronoscene/Canteen/sparse/split.txt").is_file()
+
+
+def test_failure_says_the_way_by_hand(hub, tmp_path):
+    hub.damaged = {"Canteen/sparse/split.txt"}
+    command = [sys.executable, "-m", "chronoscene", "download", "chronoscene", "--out", tmp_path]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 2
+    by_hand, error = result.stderr.splitlines()[-2:]
+    assert by_hand == f"by hand: {CHRONOSCENE.by_hand}"
+    assert error.startswith(f"error: {tmp_path}/.download: expected files with the checksums")
+
+
+def test_other_hosts_are_for_people():
+    result = run("5pointz")
+    assert result.exit_code == 1
+    assert "5Pointz (NeuSC) is on Google Drive. By hand: pip install gdown" in result.stdout
+    assert "next: chronoscene validate 5pointz\n" in result.stdout
+
+
+def test_lists_what_there_is():
+    lines = run().stdout.splitlines()
+    assert [line.split()[0] for line in lines[3:]] == [*DATASETS, "lpips-weights"]
+    assert "Apache-2.0" in lines[3] and lines[3].endswith("chronoscene")
+
+
+def test_weights(monkeypatch, tmp_path):
+    with serving("a/b", {"vgg.pth": b"heads"}) as hub:
+        url = f"{hub.url}/datasets/a/b/resolve/0123456789abcdef0123456789abcdef01234567/vgg.pth"
+        blob = "f3a9ef7d3a2b0ebcd0bd8ea37b1e2ba6ae2bb1a8"
+        file = replace(weights.LPIPS_WEIGHTS[1], url=url, size=5, checksum=blob)
+        monkeypatch.setattr(weights, "LPIPS_WEIGHTS", [file])
+        with pytest.raises(DownloadError, match="checksums"):
+            run("lpips-weights", "--out", tmp_path)
+        blob = hub.entries()[0]["oid"]
+        monkeypatch.setattr(weights, "LPIPS_WEIGHTS", [replace(file, checksum=blob)])
+        result = run("lpips-weights", "--out", tmp_path)
+        monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+        elsewhere = run("lpips-weights")
+    assert f"LPIPS weights are in {tmp_path}\nnext: give {tmp_path} as" in result.stdout
+    assert elsewhere.stdout == f"LPIPS weights are in {tmp_path}/hub/checkpoints\n"
+
+
+def test_weights_have_no_scenes():
+    with pytest.raises(ConfigError, match="expected no scenes, found Canteen"):
+        run("lpips-weights", "Canteen")

@@ -1,0 +1,106 @@
+"""Files arrive whole, in spite of broken connections, and damage is found."""
+
+import hashlib
+from collections import namedtuple
+
+import pytest
+
+from chronoscene.download.hub import list_files
+from chronoscene.download.transfer import RemoteFile, fetch, in_words, missing_bytes
+from chronoscene.errors import DiskFullError, DownloadError
+
+CONTENT = bytes(range(256)) * 20
+
+
+def no_report(what, done, total):
+    pass
+
+
+def files_of(hub):
+    return list_files(hub.repo)[1]
+
+
+def test_large_and_small_files_with_progress(hub, tmp_path):
+    hub.files = {"a b/1.png": CONTENT, "ü.txt": b"small", "empty": b""}
+    steps = []
+    fetch(files_of(hub), tmp_path / "new", report=lambda *step: steps.append(step))
+    for name, content in hub.files.items():
+        assert (tmp_path / "new" / name).read_bytes() == content
+    assert ("MB downloaded", 0, 0) in steps and steps[-1] == ("files checked", 3, 3)
+    assert {len(file.checksum) for file in files_of(hub)} == {40, 64}
+    hub.asked.clear()
+    fetch(files_of(hub), tmp_path / "new", report=no_report)
+    assert not hub.asked
+
+
+def test_broken_connection_goes_on_in_the_same_command(hub, tmp_path):
+    hub.files, hub.breaks = {"a": CONTENT}, {"a": [3000]}
+    fetch(files_of(hub), tmp_path, report=no_report)
+    assert hub.asked == [("a", None), ("a", "bytes=3000-")]
+    assert (tmp_path / "a").read_bytes() == CONTENT
+
+
+def test_broken_command_goes_on_in_the_next_one(hub, tmp_path):
+    hub.files, hub.breaks = {"a": CONTENT}, {"a": [3000] * 20}
+    (file,) = files_of(hub)
+    with pytest.raises(DownloadError, match="run the same command again"):
+        fetch([file], tmp_path, report=no_report)
+    assert missing_bytes(file, tmp_path) == len(CONTENT) - 3000
+    assert not (tmp_path / "a").exists()
+    hub.breaks.clear()
+    hub.asked.clear()
+    fetch([file], tmp_path, report=no_report)
+    assert hub.asked == [("a", "bytes=3000-")]
+    assert (tmp_path / "a").read_bytes() == CONTENT
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_another_version_of_a_file_is_not_a_continuation(hub, tmp_path):
+    hub.files, hub.breaks = {"a": CONTENT}, {"a": [3000] * 20}
+    with pytest.raises(DownloadError):
+        fetch(files_of(hub), tmp_path, report=no_report)
+    hub.files, hub.breaks = {"a": CONTENT[::-1]}, {}
+    fetch(files_of(hub), tmp_path, report=no_report)
+    assert (tmp_path / "a").read_bytes() == CONTENT[::-1]
+
+
+def test_damaged_files_are_named_together_and_fetched_anew(hub, tmp_path):
+    hub.files = {"large": CONTENT, "small": b"abc", "good": b"abd"}
+    hub.damaged = {"large", "small"}
+    with pytest.raises(DownloadError, match="found other contents in 'large', 'small';"):
+        fetch(files_of(hub), tmp_path, report=no_report)
+    assert [path.name for path in tmp_path.iterdir()] == ["good"]
+    hub.damaged.clear()
+    hub.asked.clear()
+    fetch(files_of(hub), tmp_path, report=no_report)
+    assert {name for name, _ in hub.asked} == {"large", "small"}
+
+
+def test_full_disk_is_said_before(hub, tmp_path, monkeypatch):
+    hub.files = {"a": CONTENT}
+    disk = namedtuple("disk", "free")(1000)
+    monkeypatch.setattr("chronoscene.download.transfer.shutil.disk_usage", lambda place: disk)
+    with pytest.raises(DiskFullError, match=r"expected 5.1 kB of free space, found 1.0 kB"):
+        fetch(files_of(hub), tmp_path, report=no_report)
+    assert not hub.asked
+
+
+def test_other_hosts_and_missing_files(hub, tmp_path):
+    checksum = hashlib.sha256(CONTENT).hexdigest()
+    file = RemoteFile("a", f"{hub.url}/elsewhere/a", len(CONTENT), checksum)
+    with pytest.raises(DownloadError, match=r"expected an answer, found .*404"):
+        fetch([file], tmp_path, report=no_report)
+
+
+def test_conditions_that_were_not_accepted(hub, tmp_path):
+    hub.files, hub.gated = {"a": CONTENT}, True
+    with pytest.raises(DownloadError, match="accept them on the page of the dataset, log in"):
+        fetch(files_of(hub), tmp_path, report=no_report)
+
+
+@pytest.mark.parametrize(
+    ("size", "text"),
+    [(0, "0.0 kB"), (7289, "7.3 kB"), (553433881, "553.4 MB"), (2e12, "2,000.0 GB")],
+)
+def test_sizes_in_words(size, text):
+    assert in_words(size) == text
