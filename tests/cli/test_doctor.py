@@ -1,0 +1,115 @@
+"""chronoscene doctor: the table, what to install, and the exit status."""
+
+import subprocess
+import sys
+from importlib.machinery import ModuleSpec
+
+import pytest
+from click.testing import CliRunner
+
+from chronoscene import __version__
+from chronoscene.cli import cli, doctor
+from chronoscene.synth.render.renderer import load_open3d
+
+
+def run():
+    result = CliRunner().invoke(cli, ["doctor"])
+    assert not result.exception or isinstance(result.exception, SystemExit)
+    return result
+
+
+def rows(text):
+    table = text.split("\n\n")[0].splitlines()[3:]
+    return {line[:13].strip(): line[15:].split(maxsplit=1) for line in table}
+
+
+@pytest.fixture
+def bare(monkeypatch, tmp_path):
+    """A machine without anything that is optional."""
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.delenv("CHRONOSCENE_LPIPS_WEIGHTS", raising=False)
+    monkeypatch.setattr("chronoscene.metrics.lpips_weights.find_spec", lambda name: None)
+    monkeypatch.setattr(doctor, "find_spec", lambda name: None)
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: None)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    load_open3d.cache_clear()
+    yield tmp_path
+    load_open3d.cache_clear()
+
+
+def test_bare_machine_trains_and_is_told_what_to_install(bare):
+    result = run()
+    found = rows(result.stdout)
+    assert result.exit_code == 0
+    assert found["chronoscene"][1].startswith(f"{__version__}, Python 3.")
+    assert {part for part, (state, _) in found.items() if state == "missing"} == {
+        "CUDA",
+        "gsplat",
+        "open3d",
+        "LPIPS weights",
+        "ffmpeg",
+    }
+    assert "compiled once and kept in" in found["kernels"][1]
+    assert found["memory"][1].endswith("GB") and found["disk"][1].endswith("free here")
+    for advice in (
+        "CUDA: not needed: methods are trained on the CPU",
+        "gsplat: pip install 'chronoscene[cuda]'; --device cuda needs it",
+        "open3d: pip install 'chronoscene[synth]'",
+        "LPIPS weights: run chronoscene download lpips-weights",
+    ):
+        assert f"\n{advice}" in result.stdout
+
+
+def test_full_machine(bare, monkeypatch):
+    (bare / "hub/checkpoints").mkdir(parents=True)
+    (bare / "hub/checkpoints/vgg16-397923af.pth").write_bytes(bytes(1_000_001))
+    device = type("", (), {"name": "GPU 1", "total_memory": 8e10})
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    monkeypatch.setattr("torch.cuda.get_device_properties", lambda number: device)
+    monkeypatch.setattr(doctor, "find_spec", lambda name: ModuleSpec(name, None))
+    monkeypatch.setattr(doctor, "version", lambda name: "1.5.3")
+    found = rows(run().stdout)
+    assert found["CUDA"] == ["ok", "GPU 1, 80.0 GB"]
+    assert found["gsplat"] == ["ok", "gsplat 1.5.3"]
+    assert found["LPIPS weights"][1].endswith("vgg16-397923af.pth")
+
+
+@pytest.mark.parametrize(
+    "modules", [{"torch": "torch"}, {"numba": "kernels", "pycolmap": "COLMAP"}], ids=", ".join
+)
+def test_works_without_what_training_needs(modules):
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({[*modules, 'open3d']}))\n"
+        "sys.argv = ['chronoscene', 'doctor']\n"
+        "from chronoscene.cli import main; main()"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 1 and not result.stderr
+    needed = {part for part, (state, _) in rows(result.stdout).items() if state == "needed"}
+    assert needed == set(modules.values())
+    for module, part in modules.items():
+        assert f"\n{part}: pip install {module}" in result.stdout
+    assert result.stdout.endswith("commands on datasets may work.\n")
+
+
+def test_kernels_that_cannot_be_kept(monkeypatch):
+    def without_a_cache(function):
+        from numba import njit
+
+        return njit(function)
+
+    monkeypatch.setattr("chronoscene.kernels.compilation.kernel", without_a_cache)
+    result = run()
+    assert result.exit_code == 0 and rows(result.stdout)["kernels"][0] == "missing"
+    assert "kernels: set NUMBA_CACHE_DIR to such a folder" in result.stdout
+
+
+def test_memory_of_a_container(monkeypatch, tmp_path):
+    limit = tmp_path / "memory.max"
+    monkeypatch.setattr(doctor, "CONTAINER_LIMIT", limit)
+    limit.write_text("1500000000\n")
+    assert doctor._memory().found == "1.5 GB"
+    limit.write_text("max\n")
+    assert doctor._memory().found != "1.5 GB"
