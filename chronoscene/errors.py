@@ -70,6 +70,10 @@ class RegistrationError(ChronoSceneError):
     """Photos that cannot be registered, or a step that failed; what was computed is kept."""
 
 
+class ProgramError(ChronoSceneError):
+    """Another program that cannot be started, or that failed."""
+
+
 class CheckpointError(ChronoSceneError):
     """A checkpoint or run folder that is incomplete or of another kind."""
 

@@ -5,6 +5,9 @@ A method is a plug-in. Its `MethodSpec` is pure data, found through the entry-po
 harness owns the loop, the clock, the seeds and the files; a method sees a `TrainingSet` in the
 normalised training frame and never a dataset folder.
 
+A method may instead be another program, which trains itself in an environment of its own: then its
+spec has a `Runner` and no class, and its entry point is in the group ``chronoscene.programs``.
+
 A method that splats Gaussians need not implement all of `Method`: `GaussianMethod` in
 `chronoscene.gaussians` and `AnchorMethod` in `chronoscene.anchors` do it, and say what to override.
 """
@@ -16,7 +19,7 @@ import importlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -30,6 +33,55 @@ from chronoscene.scene.similarity import Sim3
 PeriodInput = Literal["none", "label", "continuous"]
 Skipped = Literal["empty", "not finite"]
 ENTRY_POINT_GROUP = "chronoscene.methods"
+PROGRAM_GROUP = "chronoscene.programs"
+
+
+@dataclass(frozen=True, slots=True)
+class Runner:
+    """How another program is trained, and asked for the test views.
+
+    A command is a tuple of words. In them, and in the option ``prefix``, these stand for values:
+    ``{data}``, the folder of the exported training set; ``{output}``, an empty folder, the current
+    one of every command; ``{work}``, the folder that holds both; ``{iterations}``; ``{seconds}``,
+    of ``--budget``, 0 without; ``{seed}``; and the options of the config.
+
+    The training set has the test views, too, for the program's own command that renders them, but
+    their photos are black, and no point has an observation in them.
+    """
+
+    exports: str
+    """Format of the training set, one that ``chronoscene convert --to`` writes."""
+    train: tuple[str, ...]
+    """The command that trains. Its time is the training time."""
+    render: tuple[tuple[str, ...], ...]
+    """Commands that follow it, and end with an image of each test view."""
+    images: str
+    """Place of these images below ``{output}``, with ``{name}``, the file name of the view in the
+    training set without its extension, or ``{index}``, its number among the test views by name."""
+    model: str
+    """Files of the trained model below ``{output}``, as a glob pattern."""
+    primitives: str | None = None
+    """PLY file below ``{output}`` with a vertex for each Gaussian, or whatever is drawn."""
+    unit: str = "primitives"
+    """What these are: ``Gaussians``, ``anchors``."""
+    prepare: str | None = None
+    """``module:function``, called with ``{data}``, ``{output}`` and the config before the training:
+    it writes there what the export lacks for this program, and returns notices for the user."""
+    version: tuple[str, ...] = ()
+    """Command whose last line of output is the version of the program."""
+    tested: str = "untested"
+    """How far this recipe was tried, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProgramConfig:
+    """Options of another program. A class of its own with more fields is possible."""
+
+    iterations: int = 30_000
+    prefix: str = ""
+    """Words before each command: ``conda run -n ENVIRONMENT``, or ``docker run ... IMAGE``."""
+    source: str = ""
+    """Folder with the source code of the program, where its commands are files in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +102,15 @@ class MethodSpec:
     devices: tuple[str, ...]
     """Subset of ``cpu, cuda``."""
     method: str
-    """``module:Class`` that fulfils `Method`."""
+    """``module:Class`` that fulfils `Method`; empty where there is a `runner`."""
     config: str
-    """``module:Class``, a frozen dataclass with a field ``iterations``."""
+    """``module:Class``, a frozen dataclass with a field ``iterations``, like `ProgramConfig`."""
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Preset name to the values that differ from the defaults of the config class."""
     resumable: bool = False
     """Whether it has `Method.save_training` and `Method.load_training`."""
+    runner: Runner | None = None
+    """How it is run, if it is another program."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -212,9 +266,15 @@ def import_object(reference: str) -> Any:
         ) from error
 
 
-def method_names() -> tuple[str, ...]:
-    """Names of all installed methods, sorted; imports none of them."""
-    return tuple(sorted({entry.name for entry in entry_points(group=ENTRY_POINT_GROUP)}))
+def method_names(group: str = ENTRY_POINT_GROUP) -> tuple[str, ...]:
+    """Names of the installed methods of an entry-point group, sorted; imports none of them."""
+    return tuple(sorted({entry.name for entry in entry_points(group=group)}))
+
+
+def installed_methods() -> dict[str, EntryPoint]:
+    """Entry points of all methods by their names, other programs among them."""
+    groups = (PROGRAM_GROUP, ENTRY_POINT_GROUP)
+    return {entry.name: entry for group in groups for entry in entry_points(group=group)}
 
 
 def load_spec(name: str) -> MethodSpec:
@@ -226,9 +286,9 @@ def load_spec(name: str) -> MethodSpec:
     if ":" in name:
         spec = import_object(name)
     else:
-        check_choice("--method", name, method_names())
-        (entry, *_) = entry_points(group=ENTRY_POINT_GROUP, name=name)
-        spec = entry.load()
+        installed = installed_methods()
+        check_choice("--method", name, installed)
+        spec = installed[name].load()
     if not isinstance(spec, MethodSpec):
         raise ConfigError(
             name, expected="a MethodSpec", found=type(spec).__name__, todo="name its SPEC object"

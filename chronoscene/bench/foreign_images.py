@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from chronoscene.bench import results
 from chronoscene.bench.predictions import (
@@ -33,11 +34,6 @@ from chronoscene.scene.splits import NameIndex, split_hash
 
 STRATEGY, PRESET = "external", "images"
 """What stands for strategy and preset in the name of such a run."""
-
-ABSENT = (
-    *("seconds", "iterations", "primitives"),
-    *("render_seconds", "checkpoint_bytes", "peak_memory_bytes"),
-)
 
 
 def find_images(folder: Path, scene: Scene, table: Path | None = None) -> dict[str, Path]:
@@ -114,6 +110,34 @@ def add_images(
     return resized
 
 
+def foreign_record(scene: Scene, reason: str, **known: Any) -> results.RunRecord:
+    """The record of a run of another program: what of its cost is not given is absent.
+
+    Args:
+        scene: What the program was trained on.
+        reason: Why costs are absent.
+        known: Fields of the record.
+    """
+    costs = ("seconds", "iterations", "primitives", "checkpoint_bytes", "peak_memory_bytes")
+    inside = ("parameters", "warmup_seconds", "setup_seconds", "render_seconds", "threads")
+    unknown = dict.fromkeys((*costs, *inside, "peak_device_memory_bytes"))
+    fields: dict[str, Any] = {
+        "scene": scene.name,
+        "aggregates": {},
+        "periods": {},
+        "skipped": {},
+        "split_hash": split_hash(scene),
+        "period_labels": {str(p.id): p.label for p in scene.periods},
+        "libraries": library_versions(),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "notices": [],
+        **unknown,
+        **known,
+    }
+    absent = [name for name in (*costs, "render_seconds") if fields[name] is None]
+    return results.RunRecord(**fields, absent=dict.fromkeys(absent, reason))
+
+
 def score_images(
     scene: Scene,
     folder: Path,
@@ -162,47 +186,19 @@ def score_images(
         "strategy": STRATEGY,
         "max_width": max_width,
     }
-    fingerprint = config_hash(config)
-    document = {
-        "config": config,
-        "config_hash": fingerprint,
-        "scene": scene.name,
-        "scene_hash": digest,
-        "seed": seed,
-    }
-    record = results.RunRecord(
+    run = {"config_hash": config_hash(config), "scene_hash": digest, "seed": seed}
+    record = foreign_record(
+        scene,
+        f"{name} is another program, and only its images are here",
+        title=name,
         method=method,
         strategy=STRATEGY,
-        scene=scene.name,
-        seed=seed,
-        aggregates={},
-        periods={},
-        seconds=None,
-        iterations=None,
-        primitives=None,
-        checkpoint_bytes=None,
-        peak_memory_bytes=None,
-        device="not known",
-        commit=code_version(),
-        skipped={},
-        absent=dict.fromkeys(ABSENT, f"{name} is another program, and only its images are here"),
-        title=name,
         preset=PRESET,
-        method_version="not known",
-        config_hash=fingerprint,
-        scene_hash=digest,
-        split_hash=split_hash(scene),
-        period_labels={str(p.id): p.label for p in scene.periods},
-        parameters=None,
-        warmup_seconds=None,
-        setup_seconds=None,
-        render_seconds=None,
-        peak_device_memory_bytes=None,
-        threads=None,
         max_width=max_width,
-        libraries=library_versions(),
-        started=datetime.now(UTC).isoformat(timespec="seconds"),
-        notices=[],
+        commit=code_version(),
+        method_version="not known",
+        device="not known",
+        **run,
     )
     with staged_folder(out) as staging:
         writer = ImageWriter(staging / results.PREDICTIONS)
@@ -213,6 +209,7 @@ def score_images(
             record.notices.append(
                 f"{record.label}: {counted(resized, 'image')} of full size resized like the photos"
             )
+        document = {"config": config, "scene": scene.name, **run}
         write_text_atomic(staging / results.CONFIG_FILE, json.dumps(document, indent=1) + "\n")
         score_run(staging, record, ground_truth_folder(runs, scene.name), scorers)
     return out

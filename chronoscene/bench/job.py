@@ -6,7 +6,9 @@ import dataclasses
 import json
 import re
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
+from string import Formatter
 from textwrap import shorten
 from typing import Any
 
@@ -15,7 +17,8 @@ from chronoscene.bench.provenance import config_hash
 from chronoscene.bench.results import Failure
 from chronoscene.checks import check_choice
 from chronoscene.errors import BackendError, ConfigError
-from chronoscene.methods import MethodSpec, build_config
+from chronoscene.formats import writable_formats
+from chronoscene.methods import MethodSpec, Runner, build_config
 
 _UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
 
@@ -205,6 +208,44 @@ def check_device(device: str) -> None:
         )
 
 
+VALUES = ("data", "output", "work", "iterations", "seconds", "seed")
+"""What a `Runner` may name besides the options of its config."""
+
+
+def used_values(runner: Runner, prefix: str) -> set[str]:
+    """Values that the commands of another program name."""
+    words = (prefix, *runner.version, *runner.train, *chain(*runner.render))
+    return {name for word in words for _, name, _, _ in Formatter().parse(word) if name}
+
+
+def check_runner(job: Job, spec: MethodSpec, runner: Runner) -> None:
+    """Check what another program needs before it is run.
+
+    Raises:
+        ConfigError: If a command names a value that does not exist or is not set, or the program
+            cannot be stopped by the clock.
+    """
+    options = dataclasses.asdict(job.method_config(spec))
+    used = used_values(runner, options["prefix"])
+    for name in sorted(used):
+        check_choice(f"{spec.name}: commands", name, {*VALUES, *options})
+        if options.get(name) == "":
+            raise ConfigError(
+                f"{spec.name} --set {name}",
+                expected="a value, which its commands need",
+                found="none",
+                todo=f"pass --set {name}=..., as docs/other-programs.md says",
+            )
+    if job.budget_seconds is not None and "seconds" not in used:
+        raise ConfigError(
+            f"{spec.name} --budget",
+            expected="a program that ends by the clock",
+            found="one that ends after a number of iterations",
+            todo="use --iterations",
+        )
+    check_choice(f"{spec.name}: exports", runner.exports, writable_formats())
+
+
 def check_job(job: Job, spec: MethodSpec) -> None:
     """Check the settings before anything is trained.
 
@@ -219,6 +260,8 @@ def check_job(job: Job, spec: MethodSpec) -> None:
             todo="run this method without",
         )
     check_choice("--separate-iterations", job.separate_iterations, SHARING)
+    if spec.runner is not None:
+        check_runner(job, spec, spec.runner)
     if job.device != "auto":
         check_choice(f"{spec.name} --device", job.device, spec.devices)
     config = job.method_config(spec)

@@ -192,6 +192,13 @@ def open_run(folder: Path, *, device: str = "cpu", plugin_path: Path | None = No
         if str(path) not in sys.path:
             sys.path.append(str(path))
     spec = load_spec(source.method)
+    if spec.runner is not None:
+        raise CheckpointError(
+            folder,
+            expected="a run of a method that renders here",
+            found=f"one of {spec.title}, which is another program",
+            todo=f"open the files in its folder {CHECKPOINT} with that program",
+        )
     return OpenRun(
         folder=folder,
         record=record,

@@ -7,7 +7,7 @@ import json
 import platform
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError, entry_points, version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 import chronoscene
 from chronoscene.errors import ImageError
 from chronoscene.io.staging import sha256_of
-from chronoscene.methods import ENTRY_POINT_GROUP
+from chronoscene.methods import installed_methods
 from chronoscene.scene import Scene
 
 
@@ -80,10 +80,10 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 def method_version(name: str) -> str:
     """Version of the package that provides a method; ``unpackaged`` for ``module:SPEC``."""
-    for entry in entry_points(group=ENTRY_POINT_GROUP, name=name):
-        if entry.dist is not None:
-            return f"{entry.dist.name} {entry.dist.version}"
-    return "unpackaged"
+    entry = installed_methods().get(name)
+    if entry is None or entry.dist is None:
+        return "unpackaged"
+    return f"{entry.dist.name} {entry.dist.version}"
 
 
 def library_versions() -> dict[str, str]:

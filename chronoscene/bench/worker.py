@@ -20,6 +20,7 @@ from typing import Any
 from chronoscene.bench import results
 from chronoscene.bench.checkpoints import Checkpoints, CurvePoint, LoopState
 from chronoscene.bench.display import ProgressDisplay
+from chronoscene.bench.external import run_external
 from chronoscene.bench.job import Job, StopRule, check_device
 from chronoscene.bench.opening import write_source
 from chronoscene.bench.predictions import (
@@ -81,8 +82,11 @@ class Machine:
 def run_job(job: Job) -> None:
     """Train, save, render and score; writes into ``job.staging`` only."""
     started = datetime.now(UTC).isoformat(timespec="seconds")
-    keep_freed_memory()
     spec, staging = load_spec(job.method), Path(job.staging)
+    if spec.runner is not None:
+        run_external(job, spec, spec.runner)
+        return
+    keep_freed_memory()
     machine = Machine(pick_device(job.device, spec), set_threads(job.threads))
     write_text_atomic(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
     scene = read_scene(job.scene_root, format=job.scene_format)

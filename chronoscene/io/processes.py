@@ -5,6 +5,9 @@ result come back as lines of JSON, and large results stay in files. The worker e
 does, even if the parent is killed; a crash of the worker is reported and harms nothing else. Runs
 of a bench and steps of a registration go through it.
 
+A worker may start programs of others. `process_tree` finds all that they started, and
+`end_processes` ends it: so it is done where a worker is interrupted or loses its parent.
+
 `map_parallel` maps a function over items in a pool. The commands use it for folders of scenes.
 
 To run benches somewhere else, on a cluster say, write a function with the signature of
@@ -24,10 +27,11 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 from chronoscene.errors import ChronoSceneError
@@ -59,6 +63,43 @@ def stoppable() -> Iterator[None]:
     finally:
         # None stands for a handler that was not set in Python, which cannot be put back.
         signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
+# Everything that a process started
+
+GRACE = 5.0  # Seconds that a program has to end after SIGTERM: a container is stopped in them
+
+
+def process_tree(roots: Iterable[int]) -> set[int]:
+    """Processes that run: the given ones, their descendants, and all in the session of one of them.
+
+    Who leads a session has started what is in it, also where the parent in between has ended. Needs
+    ``/proc``; elsewhere nothing is found.
+    """
+    running = {}
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError, ValueError):  # ended in the meantime
+            # After the name, which is in brackets and may have any character.
+            state, parent, _, session = (entry / "stat").read_text().rpartition(")")[2].split()[:4]
+            if state != "Z":
+                running[int(entry.name)] = (int(parent), int(session))
+    members = set(roots)
+    while new := {pid for pid, above in running.items() if members & {*above}} - members:
+        members |= new
+    return members & running.keys()
+
+
+def end_processes(roots: Iterable[int], *, grace: float = GRACE) -> None:
+    """End processes and what they started: SIGTERM, and SIGKILL if they still run after a while."""
+    told: set[int] = set()
+    end = time.monotonic() + grace
+    while members := process_tree(roots):
+        late = time.monotonic() > end
+        for pid in members if late else members - told:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL if late else signal.SIGTERM)
+        told |= members
+        time.sleep(0.05)
 
 
 # One worker, one job
@@ -96,8 +137,8 @@ def run_worker(
 ) -> Outcome:
     """Call a function in a process of its own and wait for its end.
 
-    If waiting is interrupted, the worker is killed: it must leave nothing behind that its caller
-    does not clean up.
+    If waiting is interrupted, the worker is killed, and all that it started is ended: it must leave
+    nothing behind that its caller does not clean up.
 
     Args:
         function: ``module:name``. Takes the job and a `Report`; returns what JSON can hold.
@@ -128,8 +169,10 @@ def run_worker(
         message = _listen(process, report)
         return Outcome(process.wait(), message)
     except BaseException:
+        started = process_tree([process.pid]) - {process.pid}
         process.kill()  # not SIGTERM: a library's handler might take its time
         process.wait()
+        end_processes(started)
         raise
 
 
@@ -150,11 +193,15 @@ def _listen(process: Popen[str], report: Report | None) -> dict[str, Any] | None
 
 
 def _end_with(parent: int) -> None:
-    """End this process when its parent is gone: another one may already write to its folder."""
+    """End this process and what it started when its parent is gone.
+
+    Another one may already write to its folder.
+    """
 
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(0.5)
+        end_processes(process_tree([os.getpid()]) - {os.getpid()})
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

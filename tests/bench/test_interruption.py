@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from chronoscene.bench.results import read_run, run_folders
+from chronoscene.io.processes import process_tree
 
 SCRIPT = """
 import sys
@@ -20,11 +21,12 @@ from chronoscene.bench.runner import BenchSettings, run_bench
 run_bench(
     BenchSettings(
         scenes=(Path(sys.argv[1]),),
-        methods=("toy_methods:MEAN",),
+        methods=(sys.argv[3] if len(sys.argv) > 3 else "toy_methods:MEAN",),
         runs=Path(sys.argv[2]),
         threads=1,
         seeds=(0, 1),
         iterations=20,
+        overrides=dict(o.split("=") for o in sys.argv[4:]),
         overwrite=True,
     ),
     lambda line: print(line, flush=True),
@@ -104,3 +106,23 @@ def test_an_interrupted_bench_leaves_no_process_and_no_half_run(
     assert not Path(f"/proc/{worker}").exists()
     assert not list(runs.rglob("*.partial"))
     assert json.loads((runs / "results.json").read_text()) == []
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs /proc")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_program_that_a_bench_runs_ends_with_it(number, scene_folder, tmp_path):
+    """It is in a session of its own; after SIGKILL, the worker notices that its bench is gone."""
+    runs, hold = tmp_path / "runs", tmp_path / "hold"
+    hold.touch()
+    arguments = [str(scene_folder), str(runs), "toy_programs:PROGRAM", f"hold={hold}"]
+    process = subprocess.Popen([sys.executable, "-c", SCRIPT, *arguments])
+    try:
+        (log,) = wait_for(lambda: list(runs.glob("ring/*/.seed0.*.partial/program.log")))
+        wait_for(lambda: "training 20" in log.read_text())
+        started = process_tree([process.pid])
+        assert len(started) == 3  # bench, worker, program
+    finally:
+        process.send_signal(number)
+        process.wait()
+    wait_for(lambda: not process_tree(started))
+    assert number == signal.SIGKILL or not list(runs.rglob("*.partial"))

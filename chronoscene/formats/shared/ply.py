@@ -39,6 +39,16 @@ def read_points(path: Path) -> Points:
     return _to_points(path, vertices)
 
 
+def count_vertices(path: Path) -> int:
+    """Number of vertices of a PLY file, whatever they have; reads the header alone.
+
+    Raises:
+        SceneError: If it is no such file.
+    """
+    with path.open("rb") as file:
+        return _read_header(path, file)[1]
+
+
 def write_points(path: Path, points: Points) -> None:
     """Write positions (double) and colours as a binary PLY file."""
     fields = [*((axis, "<f8") for axis in "xyz"), *((colour, "u1") for colour in COLOURS)]

@@ -1,0 +1,143 @@
+"""Recipes for programs of others, which are installed on their own: commands and where files lie.
+
+Written from the documentation and the sources of the programs; `Runner.tested` says what was tried.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from chronoscene.methods import MethodSpec, ProgramConfig, Runner
+
+
+@dataclass(frozen=True, slots=True)
+class ChronoGSConfig(ProgramConfig):
+    """Options of the official ChronoGS."""
+
+    iterations: int = 40_000
+
+
+@dataclass(frozen=True, slots=True)
+class FourDGaussiansConfig(ProgramConfig):
+    """Options of the official 4DGaussians."""
+
+    iterations: int = 14_000
+    """Of the fine stage; the coarse one before it has 3,000."""
+    arguments: str = "arguments/hypernerf/default.py"
+    """File below `source` with all other options: the one that its page names for own scenes."""
+
+
+SPLATFACTO = MethodSpec(
+    name="nerfstudio-splatfacto",
+    title="Splatfacto (nerfstudio)",
+    paper="Tancik et al., Nerfstudio, 2023; Ye et al., gsplat, 2025",
+    licence="Apache-2.0",
+    period_input="none",
+    outputs=("rgb",),
+    devices=("cuda",),
+    method="",
+    config="chronoscene.methods:ProgramConfig",
+    presets={"balanced": {}, "fast": {"iterations": 7_000}},
+    runner=Runner(
+        exports="nerfstudio",
+        train=(
+            *("ns-train", "splatfacto", "--output-dir", "{output}", "--experiment-name", "run"),
+            *("--timestamp", "run", "--max-num-iterations", "{iterations}"),
+            # The default, a viewer, would wait for its user after the training.
+            *("--machine.seed", "{seed}", "--vis", "tensorboard"),
+            *("nerfstudio-data", "--data", "{data}", "--load-3D-points", "True"),
+        ),
+        render=(
+            (
+                *(
+                    "ns-render",
+                    "dataset",
+                    "--load-config",
+                    "{output}/run/splatfacto/run/config.yml",
+                ),
+                *("--output-path", "{output}/renders", "--split", "test"),
+                *("--rendered-output-names", "rgb", "--image-format", "png"),
+            ),
+            (
+                *("ns-export", "gaussian-splat", "--output-dir", "{output}/export"),
+                *("--load-config", "{output}/run/splatfacto/run/config.yml"),
+            ),
+        ),
+        images="renders/test/rgb/{name}.png",
+        model="export/splat.ply",
+        primitives="export/splat.ply",
+        unit="Gaussians",
+        version=(
+            *("python", "-c"),
+            "from importlib.metadata import version; print('nerfstudio', version('nerfstudio'))",
+        ),
+        tested="untested",
+    ),
+)
+
+CHRONOGS = MethodSpec(
+    name="chronogs-official",
+    title="ChronoGS (official)",
+    paper="Wang et al., ChronoGS, CVPR 2026",
+    licence="that of 3DGS: research and evaluation only",
+    period_input="label",
+    outputs=("rgb",),
+    devices=("cuda",),
+    method="",
+    config="baselines.external:ChronoGSConfig",
+    presets={"balanced": {}},
+    runner=Runner(
+        exports="chronoscene",
+        prepare="baselines.external.prepare:chronogs",
+        train=(
+            *("python", "{source}/train.py", "--config", "{output}/config.yaml"),
+            *("--source_path", "{data}", "--model_path", "{output}/model"),
+        ),
+        render=(
+            (
+                *("python", "{source}/render.py", "-m", "{output}/model", "-s", "{data}"),
+                "--skip_train",
+            ),
+        ),
+        images="model/test/ours_{iterations}/renders/{index:05d}.png",
+        model="model/point_cloud/iteration_{iterations}/*",
+        primitives="model/point_cloud/iteration_{iterations}/point_cloud.ply",
+        unit="anchors",
+        version=("git", "-C", "{source}", "rev-parse", "HEAD"),
+        tested="untested",
+    ),
+)
+
+FOUR_D_GAUSSIANS = MethodSpec(
+    name="4dgs-official",
+    title="4DGaussians (official)",
+    paper="Wu et al., 4D Gaussian Splatting for Real-Time Dynamic Scene Rendering, CVPR 2024",
+    licence="that of 3DGS: research and evaluation only",
+    period_input="label",
+    outputs=("rgb",),
+    devices=("cuda",),
+    method="",
+    config="baselines.external:FourDGaussiansConfig",
+    presets={"balanced": {}},
+    runner=Runner(
+        exports="nerfstudio",
+        prepare="baselines.external.prepare:four_d_gaussians",
+        train=(
+            *("python", "{source}/train.py", "-s", "{data}", "--model_path", "{output}/model"),
+            # Only on the command line: what a file says of iterations is read after this list.
+            *("--configs", "{output}/config.py", "--save_iterations", "{iterations}"),
+        ),
+        render=(
+            (
+                *("python", "{source}/render.py", "--model_path", "{output}/model"),
+                *("--configs", "{output}/config.py", "--skip_train", "--skip_video"),
+            ),
+        ),
+        images="model/test/ours_{iterations}/renders/{index:05d}.png",
+        model="model/point_cloud/iteration_{iterations}/*",
+        primitives="model/point_cloud/iteration_{iterations}/point_cloud.ply",
+        unit="Gaussians",
+        version=("git", "-C", "{source}", "rev-parse", "HEAD"),
+        tested="untested",
+    ),
+)

@@ -1,0 +1,140 @@
+"""What exported training sets lack for programs that do not read them as they are.
+
+A function gets the folder of the training set, that of the output, and the config, and returns what
+the user must know of the scene.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+
+from baselines.external import FourDGaussiansConfig
+from chronoscene.errors import ProgramError
+from chronoscene.formats import read_scene
+from chronoscene.methods import ProgramConfig
+from chronoscene.scene import Frame, Scene
+from chronoscene.scene.geometry import camera_centre
+
+OFF_CENTRE = 0.5  # Pixels of the principal point from the centre that are told
+
+PUBLISHED_ITERATIONS = "40_000"
+"""Iterations, and the ends of schedules, as the config file of ChronoGS writes them."""
+
+
+def chronogs(data: Path, output: Path, config: ProgramConfig) -> list[str]:
+    """``config.yaml`` with another number of iterations; growth ends at half of it."""
+    file = Path(config.source, "config/chronogs.yaml")
+    text = _read(file)
+    if PUBLISHED_ITERATIONS not in text:
+        raise ProgramError(
+            file,
+            expected=f"a config with {PUBLISHED_ITERATIONS} iterations",
+            found="another one",
+            todo="use the version of the program that docs/other-programs.md names",
+        )
+    text = text.replace(PUBLISHED_ITERATIONS, str(config.iterations))
+    text = text.replace("update_until: 20000", f"update_until: {config.iterations // 2}")
+    (output / "config.yaml").write_text(text, encoding="utf-8")
+    return _ignored(read_scene(data, format="chronoscene"))
+
+
+def four_d_gaussians(data: Path, output: Path, config: FourDGaussiansConfig) -> list[str]:
+    """The layout of Nerfies beside that of nerfstudio, and a config with the iterations.
+
+    It is the one layout in which the loader takes the time of an image and the list of test images
+    from files: with COLMAP models, every image has its own time, and every eighth is a test image.
+    The folder for images of half size, which is the one it reads, holds those of full size: fields
+    of view come from the sizes in the camera files.
+    """
+    scene = read_scene(data, format="nerfstudio")
+    stems = {frame.name: Path(frame.name).stem for frame in scene.frames}
+    tests = [stems[frame.name] for frame in scene.select(split="test")]
+    # Times are divided by the largest of them.
+    times = {f.name: f.period if scene.num_periods > 1 else 1 for f in scene.frames}
+    _write(data / "scene.json", {"scale": 1.0, "center": [0.0, 0.0, 0.0], "near": 0.0, "far": 1.0})
+    _write(
+        data / "dataset.json",
+        {
+            "ids": list(stems.values()),
+            "train_ids": [stem for stem in stems.values() if stem not in tests],
+            "val_ids": tests,
+        },
+    )
+    metadata = {
+        stems[n]: {"warp_id": t, "appearance_id": t, "camera_id": 0} for n, t in times.items()
+    }
+    _write(data / "metadata.json", metadata)
+    (data / "camera").mkdir()
+    (data / "rgb/2x").mkdir(parents=True)
+    for frame in scene.frames:
+        stem = stems[frame.name]
+        _write(data / f"camera/{stem}.json", _nerfies_camera(frame))
+        (data / f"rgb/2x/{stem}.png").hardlink_to(scene.image_path(frame))
+    _write_cloud(data / "points3D_downsample2.ply", scene.points.xyz, scene.points.rgb)
+    base = Path(config.source, config.arguments).absolute()
+    _read(base)
+    (output / "config.py").write_text(
+        f"_base_ = [{str(base)!r}]\nOptimizationParams = dict(iterations={config.iterations})\n",
+        encoding="utf-8",
+    )
+    return _ignored(scene)
+
+
+def _nerfies_camera(frame: Frame) -> dict[str, Any]:
+    """A camera as Nerfies stores it: rotation from the world, centre, one focal length."""
+    K = frame.camera.K
+    return {
+        "orientation": frame.cam_from_world[:3, :3].tolist(),
+        "position": camera_centre(frame.cam_from_world).tolist(),
+        "focal_length": K[0, 0].item(),
+        "principal_point": K[:2, 2].tolist(),
+        "skew": 0.0,
+        "pixel_aspect_ratio": (K[1, 1] / K[0, 0]).item(),
+        "radial_distortion": [0.0, 0.0, 0.0],
+        "tangential_distortion": [0.0, 0.0],
+        "image_size": list(frame.camera.size),
+    }
+
+
+def _write_cloud(path: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> None:
+    """A point cloud with normals, which the loader of 3DGS wants and nobody uses."""
+    names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
+    vertices = np.zeros(len(xyz), [(name, "u1" if i > 5 else "f4") for i, name in enumerate(names)])
+    for i in range(3):
+        vertices[names[i]], vertices[names[6 + i]] = xyz[:, i], rgb[:, i]
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(path)
+
+
+def _ignored(scene: Scene) -> list[str]:
+    """What of the cameras programs that derive from 3DGS do not read."""
+    offsets = [
+        float(np.abs(f.camera.K[:2, 2] - np.divide(f.camera.size, 2)).max()) for f in scene.frames
+    ]
+    if max(offsets) <= OFF_CENTRE:
+        return []
+    return [
+        f"the program ignores principal points, here up to {max(offsets):.1f} pixels off the "
+        "centre: chronoscene undistort --center makes a scene without"
+    ]
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ProgramError(
+            path,
+            expected="a file of the program",
+            found=error.strerror or "an error",
+            todo="name the folder of its source code with --set source=FOLDER",
+        ) from error
+
+
+def _write(path: Path, value: Any) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,99 @@
+"""Programs of others: run to their end, with a log, and watched with all that they start."""
+
+from __future__ import annotations
+
+import shlex
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from subprocess import DEVNULL, STDOUT, Popen, TimeoutExpired
+
+from chronoscene.errors import ProgramError
+from chronoscene.io.processes import Outcome, end_processes, process_tree, stoppable
+
+END_OF_LOG = 300  # Characters that an error repeats
+FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0
+"""Seconds between two looks at the memory: to measure a large process takes some milliseconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What a program took."""
+
+    seconds: float
+    peak_memory_bytes: int | None
+    """Of all its processes together, pages that they share counted once, looked at once a second;
+    None where the system does not tell."""
+
+
+def run_program(command: Sequence[str], *, folder: Path, log: Path) -> Usage:
+    """Run a command to its end. Whatever it started ends with it, also if we are interrupted.
+
+    Args:
+        command: The words.
+        folder: The current folder of the program.
+        log: File that everything it prints is added to.
+
+    Raises:
+        ProgramError: If it cannot be started or fails; with the last lines of the log.
+    """
+    started, peak = time.perf_counter(), 0
+    with log.open("ab") as file, stoppable():
+        file.write(f"$ {shlex.join(command)}\n".encode())
+        file.flush()
+        try:
+            process = Popen(
+                command,
+                cwd=folder,
+                stdin=DEVNULL,
+                stdout=file,
+                stderr=STDOUT,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise ProgramError(
+                shlex.join(command)[:80],
+                expected="a program that can be started",
+                found=error.strerror or str(error),
+                todo="install it, or name its environment with --set prefix=...; "
+                "docs/other-programs.md says how",
+            ) from error
+        try:
+            pause = FIRST_PAUSE
+            while process.poll() is None:
+                peak = max(peak, memory_of(process_tree([process.pid])))
+                with suppress(TimeoutExpired):
+                    process.wait(pause)
+                pause = min(2 * pause, LONGEST_PAUSE)
+            seconds = time.perf_counter() - started
+        finally:
+            end_processes([process.pid])
+            process.wait()
+    if process.returncode:
+        raise ProgramError(
+            shlex.join(command)[:80],
+            expected="the program to succeed",
+            found=f"{Outcome(process.returncode, None).cause}; {log.name} ends with: "
+            + " | ".join(log_lines(log))[-END_OF_LOG:],
+            todo="correct what it says",
+        )
+    return Usage(seconds, peak or None)
+
+
+def log_lines(log: Path) -> list[str]:
+    """The lines of a log that are not empty, without blanks around them."""
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    return [line.strip() for line in lines if line.strip()]
+
+
+def memory_of(processes: set[int]) -> int:
+    """Bytes of memory that processes take, a share of what they have in common with others."""
+    total = 0
+    for pid in processes:
+        with suppress(OSError):  # ended in the meantime
+            for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
+                if line.startswith("Pss:"):
+                    total += 1024 * int(line.split()[1])
+    return total
