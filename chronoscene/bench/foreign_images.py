@@ -118,9 +118,12 @@ def foreign_record(scene: Scene, reason: str, **known: Any) -> results.RunRecord
         reason: Why costs are absent.
         known: Fields of the record.
     """
-    costs = ("seconds", "iterations", "primitives", "checkpoint_bytes", "peak_memory_bytes")
-    inside = ("parameters", "warmup_seconds", "setup_seconds", "render_seconds", "threads")
-    unknown = dict.fromkeys((*costs, *inside, "peak_device_memory_bytes"))
+    costs = (
+        *("seconds", "iterations", "primitives"),
+        *("render_seconds", "checkpoint_bytes", "peak_memory_bytes"),
+    )
+    others = ("parameters", "warmup_seconds", "setup_seconds", "threads")
+    unknown = dict.fromkeys((*costs, *others, "peak_device_memory_bytes"))
     fields: dict[str, Any] = {
         "scene": scene.name,
         "aggregates": {},
@@ -134,7 +137,7 @@ def foreign_record(scene: Scene, reason: str, **known: Any) -> results.RunRecord
         **unknown,
         **known,
     }
-    absent = [name for name in (*costs, "render_seconds") if fields[name] is None]
+    absent = [name for name in costs if fields[name] is None]
     return results.RunRecord(**fields, absent=dict.fromkeys(absent, reason))
 
 
