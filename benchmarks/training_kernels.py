@@ -22,9 +22,7 @@ from itertools import cycle
 import chronoscene  # noqa: F401
 
 # isort: split
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.decode import (
@@ -202,11 +200,11 @@ def time_tables(anchors: int, repeats: int) -> None:
     for share in (0.5, 0.1):
         for name, kind in (("all rows", DenseTable), ("rows in view", RowAdam)):
             table = kind(start.clone(), blocks)
-            turns = (np.arange(t, anchors, round(1 / share)) for t in cycle(range(10)))
+            turns = (torch.arange(t, anchors, round(1 / share)) for t in cycle(range(10)))
             leaf = torch.zeros(0)
 
             def fetch(
-                table: DenseTable | RowAdam = table, turns: Iterator[NDArray[np.int64]] = turns
+                table: DenseTable | RowAdam = table, turns: Iterator[torch.Tensor] = turns
             ) -> None:
                 nonlocal leaf
                 leaf = table.fetch(next(turns), (0, 1))

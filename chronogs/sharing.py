@@ -16,6 +16,7 @@ from torch import Tensor
 
 from chronoscene.anchors.model import AnchorLayout, AnchorModel
 from chronoscene.kernels.compilation import kernel
+from chronoscene.training import devices
 
 
 @torch.no_grad()
@@ -28,7 +29,7 @@ def share_periods(model: AnchorModel, threshold: float) -> None:
     layout, features = model.layout, model.features
     if layout.period_dim == 0:
         return
-    if features.is_cuda:
+    if not devices.has_kernels(features):
         blocks = features[:, layout.base_dim :].view(len(model), layout.num_periods, -1)
         mean = blocks.mean(dim=1, keepdim=True)
         norm = (blocks - mean).square().sum(dim=(1, 2), keepdim=True).sqrt()

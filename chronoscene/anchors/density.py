@@ -2,8 +2,9 @@
 density control by statistics of the views: where new anchors appear, which ones are pruned.
 
 Source: Scaffold-GS (Lu et al., CVPR 2024), section 3.3, and the official code of Scaffold-GS and
-ChronoGS; differences from the papers are named options of `AnchorConfig`. Everything is numpy or
-Numba on arrays of a fixed order, so a seed gives the same anchors for any number of threads.
+ChronoGS; differences from the papers are named options of `AnchorConfig`. Everything is on arrays
+of a fixed order, so on a CPU a seed gives the same anchors for any number of threads. What happens
+during a training stays on the device of the training.
 """
 
 from __future__ import annotations
@@ -11,44 +12,44 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from numba import prange
 from numpy.typing import NDArray
+from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.kernels.compilation import kernel
+from chronoscene.training import devices
 from chronoscene.training.splatting import rms_spacing
 
-Float = NDArray[np.float32]
 MIN_DISTANCE = 1e-7
 """Lower bound of a neighbour distance: keeps the log-scales of coinciding points finite."""
 COUNTERS = ("opacity_sum", "visits", "motion", "grad_sum", "hits")
 """Arrays of `DensityStatistics`."""
 
 
-def cell_indices(
-    positions: NDArray[np.floating], size: float, origin: NDArray[np.float64] | None = None
-) -> NDArray[np.int64]:
-    """Cell of each position: the nearest multiple of ``size``, halves to even. [P, 3] -> [P, 3]"""
-    shifted = positions.astype(np.float64)
-    if origin is not None:
-        shifted -= origin
-    return np.round(shifted / size).astype(np.int64)
+def cell_indices(positions: Tensor, size: float) -> Tensor:
+    """Cell of each position: the nearest multiple of ``size``, halves to even.
+
+    [P, 3] -> int64 [P, 3]
+    """
+    return torch.round(positions.double() / size).long()
 
 
-def pack_cells(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One integer per cell, equal exactly where the cells are equal. [P, 3] -> [P]
+def pack_cells(cells: Tensor) -> Tensor:
+    """One integer per cell, equal exactly where the cells are equal. int64 [P, 3] -> int64 [P]
 
     Keys of different calls are not comparable: pack everything that is compared in one call.
     """
     if len(cells) == 0:
-        return np.zeros(0, np.int64)
-    low = cells.min(axis=0)
-    extent = [int(n) for n in cells.max(axis=0) - low + 1]
+        return cells.new_zeros(0)
+    low = cells.amin(0)
+    extent = (cells.amax(0) - low + 1).tolist()
     if extent[0] * extent[1] * extent[2] < 2**62:
         ranks = cells - low
     else:  # far outliers: ranks per axis are below the number of rows
-        ranks = np.stack([np.unique(c, return_inverse=True)[1] for c in cells.T], axis=1)
-        extent = [int(n) for n in ranks.max(axis=0) + 1]
+        ranks = torch.stack([c.unique(return_inverse=True)[1] for c in cells.unbind(1)], dim=1)
+        extent = (ranks.amax(0) + 1).tolist()
     return (ranks[:, 0] * extent[1] + ranks[:, 1]) * extent[2] + ranks[:, 2]
 
 
@@ -92,9 +93,9 @@ def voxelize(
         origin: See `AnchorConfig.voxel_origin`.
     """
     corner = points.min(axis=0).astype(np.float64) if origin == "box" else np.zeros(3)
-    cells = cell_indices(points, size, corner)
-    _, first = np.unique(pack_cells(cells), return_index=True)
-    return (cells[first] * size + corner).astype(np.float32)
+    cells = cell_indices(torch.from_numpy(points - corner), size)
+    _, first = np.unique(pack_cells(cells).numpy(), return_index=True)
+    return (cells.numpy()[first] * size + corner).astype(np.float32)
 
 
 def initial_anchors(
@@ -122,49 +123,76 @@ def initial_log_scales(anchors: NDArray[np.floating]) -> NDArray[np.float32]:
 class DensityStatistics:
     """What training views said about each anchor and Gaussian since it was last judged."""
 
-    def __init__(self, anchors: int, offsets: int) -> None:
-        self.opacity_sum, self.visits, self.motion = np.zeros((3, anchors), np.float32)
-        self.grad_sum, self.hits = np.zeros((2, anchors, offsets), np.float32)
+    def __init__(self, anchors: int, offsets: int, device: str | torch.device = "cpu") -> None:
+        self.opacity_sum, self.visits, self.motion = torch.zeros(3, anchors, device=device)
+        self.grad_sum, self.hits = torch.zeros(2, anchors, offsets, device=device)
 
     def update(
         self,
-        visible: NDArray[np.int64],
-        positions: NDArray[np.int64],
-        opacities: Float,
-        radii: NDArray[np.int32],
-        means2d_grad: Float,
+        visible: Tensor,
+        positions: Tensor,
+        opacities: Tensor,
+        radii: Tensor,
+        means2d_grad: Tensor,
         width: int,
         height: int,
-        counted: NDArray[np.bool_] | None = None,
+        counted: Tensor | None = None,
     ) -> None:
         """Add one training view.
 
         Args:
-            visible: Anchors that were decoded. [M]
-            positions: Which of their M * k Gaussians are switched on, ascending. [L]
+            visible: Anchors that were decoded. int64 [M]
+            positions: Which of their M * k Gaussians are switched on, ascending. int64 [L]
             opacities: Opacities of those. [L]
-            radii: 0 where a Gaussian was culled, or does not count. [L, 2]
+            radii: 0 where a Gaussian was culled, or does not count. int32 [L, 2]
             means2d_grad: d loss / d centre in pixels. [L, 2]
             width: Image width in pixels: gradients count in units of half an image.
             height: Image height in pixels.
-            counted: Anchors for which the view counts as a visit; None for all. [M]
+            counted: Anchors for which the view counts as a visit; None for all. bool [M]
         """
         if counted is None:
-            counted = np.ones(len(visible), np.bool_)
-        _accumulate(
-            visible, counted, positions, opacities, radii, means2d_grad, 0.5 * width, 0.5 * height,
-            self.opacity_sum, self.visits, self.motion, self.grad_sum, self.hits,
-        )  # fmt: skip
+            counted = torch.ones_like(visible, dtype=torch.bool)
+        seen = (visible, counted, positions, opacities, radii, means2d_grad)
+        halves = (0.5 * width, 0.5 * height)
+        if devices.has_kernels(opacities, self.visits):
+            counters = (getattr(self, name).numpy() for name in COUNTERS)
+            _accumulate(*(tensor.numpy() for tensor in seen), *halves, *counters)
+        else:
+            self._add(*seen, *halves)
+
+    def _add(
+        self,
+        visible: Tensor,
+        counted: Tensor,
+        positions: Tensor,
+        opacities: Tensor,
+        radii: Tensor,
+        grad: Tensor,
+        half_width: float,
+        half_height: float,
+    ) -> None:
+        """`_accumulate` in plain torch."""
+        k = self.hits.shape[1]
+        row = positions // k
+        place = visible[row] * k + positions % k
+        hit = (radii > 0).all(-1)
+        x, y = grad[:, 0] * half_width, grad[:, 1] * half_height
+        norm = torch.where(hit, (x * x + y * y).sqrt(), 0.0)
+        self.grad_sum.view(-1).index_add_(0, place, norm)
+        self.hits.view(-1).index_add_(0, place, hit.to(norm))
+        for total, values in ((self.opacity_sum, opacities), (self.motion, norm)):
+            sums = values.new_zeros(len(visible)).index_add_(0, row, values)
+            total.index_add_(0, visible, sums * counted)
+        self.visits.index_add_(0, visible, counted.to(norm))
 
     def extend(self, count: int) -> None:
         """Make room for new anchors, which start with zeros."""
         for name in COUNTERS:
             old = getattr(self, name)
-            room = np.zeros((count, *old.shape[1:]), np.float32)
-            setattr(self, name, np.concatenate([old, room]))
+            setattr(self, name, torch.cat([old, old.new_zeros(count, *old.shape[1:])]))
 
-    def keep(self, mask: NDArray[np.bool_]) -> None:
-        """Forget the anchors outside a mask. [A]"""
+    def keep(self, mask: Tensor) -> None:
+        """Forget the anchors outside a mask. bool [A]"""
         for name in COUNTERS:
             setattr(self, name, getattr(self, name)[mask])
 
@@ -203,15 +231,15 @@ def _accumulate(  # type: ignore[no-untyped-def]
 
 
 class AnchorRows(NamedTuple):
-    """What has one row per anchor, as arrays."""
+    """What has one row per anchor."""
 
-    anchors: Float
+    anchors: Tensor
     """Positions in training units. [A, 3]"""
-    offsets: Float
+    offsets: Tensor
     """In units of the anchor's scale. [A, k, 3]"""
-    log_scales: Float
+    log_scales: Tensor
     """Columns 0..2 scale the offsets. [A, 6]"""
-    features: Float
+    features: Tensor
     """[A, F]"""
 
 
@@ -244,54 +272,59 @@ def grow(
             the anchors of the candidates in the cell; log-scales that of the edge of the cell.
     """
     eligible = statistics.hits > 0.5 * min_visits(config)
-    gradients = statistics.grad_sum / np.maximum(statistics.hits, np.float32(1.0))
+    gradients = statistics.grad_sum / statistics.hits.clamp_min(1.0)
     occupied, found = model.anchors, [_take(model, slice(0))]
     for level in range(config.growth_levels):
         chosen = eligible & (gradients >= config.grad_threshold * 2**level)
         if config.random_growth:
-            chosen &= generator.random(chosen.shape, dtype=np.float32) > 0.5 ** (level + 1)
+            drawn = devices.uniform(generator, tuple(chosen.shape), gradients)
+            chosen &= drawn > 0.5 ** (level + 1)
         if level > 0 and config.chained_levels and len(occupied) == len(model.anchors):
             continue
         voxels = max(config.coarsest_cell // config.cell_refinement**level, 1)
         new = _new_in_level(model, chosen, occupied, voxel_size * voxels)
         count, room = len(new.anchors), config.max_anchors - len(occupied)
         if config.max_anchors and count > room:
-            new = _take(new, np.sort(generator.permutation(count)[: max(room, 0)]))
+            rows = np.sort(generator.permutation(count)[: max(room, 0)])
+            new = _take(new, devices.to_device(rows, occupied.device))
         found.append(new)
-        occupied = np.concatenate([occupied, new.anchors])
+        occupied = torch.cat([occupied, new.anchors])
     statistics.hits[eligible] = 0.0
     statistics.grad_sum[eligible] = 0.0
-    return AnchorRows(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return AnchorRows(*(torch.cat(parts) for parts in zip(*found, strict=True)))
 
 
-def _new_in_level(
-    model: AnchorRows, chosen: NDArray[np.bool_], occupied: Float, size: float
-) -> AnchorRows:
+def _new_in_level(model: AnchorRows, chosen: Tensor, occupied: Tensor, size: float) -> AnchorRows:
     """One anchor per cell that holds a chosen Gaussian and no anchor yet."""
-    parent, slot = np.nonzero(chosen)
-    reach = np.exp(model.log_scales[parent, :3])
+    parent, slot = chosen.nonzero(as_tuple=True)
+    reach = devices.exp(model.log_scales[parent, :3])
     centres = model.anchors[parent] + model.offsets[parent, slot] * reach
-    cells = np.concatenate([cell_indices(centres, size), cell_indices(occupied, size)])
+    cells = torch.cat([cell_indices(centres, size), cell_indices(occupied, size)])
     keys = pack_cells(cells)
-    free = np.flatnonzero(~np.isin(keys[: len(parent)], keys[len(parent) :]))
+    free = (~torch.isin(keys[: len(parent)], keys[len(parent) :])).nonzero()[:, 0]
     if len(free) == 0:
         return _take(model, slice(0))
-    order = free[np.argsort(keys[free], kind="stable")]
-    starts = np.flatnonzero(np.diff(keys[order], prepend=keys[order[0]] - 1))
+    keys, order = keys[free].sort(stable=True)
+    order = free[order]
+    is_first = torch.cat([keys.new_ones(1, dtype=torch.bool), keys[1:] != keys[:-1]])
+    cells = cells[order[is_first]]
+    features = model.features[parent[order]]
+    cell = (is_first.cumsum(0) - 1)[:, None].expand_as(features)
+    lowest = features.new_full((len(cells), features.shape[1]), -torch.inf)
     return AnchorRows(
-        anchors=(cells[order[starts]] * size).astype(np.float32),
-        offsets=np.zeros((len(starts), *model.offsets.shape[1:]), np.float32),
-        log_scales=np.full((len(starts), 6), np.log(size), np.float32),
-        features=np.maximum.reduceat(model.features[parent[order]], starts, axis=0),
+        anchors=(cells.double() * size).float(),
+        offsets=features.new_zeros(len(cells), *model.offsets.shape[1:]),
+        log_scales=features.new_full((len(cells), 6), float(np.log(size))),
+        features=lowest.scatter_reduce_(0, cell, features, "amax"),
     )
 
 
-def _take(anchors: AnchorRows, rows: slice | NDArray[np.int64]) -> AnchorRows:
-    return AnchorRows(*(array[rows] for array in anchors))
+def _take(anchors: AnchorRows, rows: slice | Tensor) -> AnchorRows:
+    return AnchorRows(*(tensor[rows] for tensor in anchors))
 
 
-def prune_mask(statistics: DensityStatistics, config: AnchorConfig) -> NDArray[np.bool_]:
-    """Anchors that stay; counters of the anchors that were judged are zeroed. [A]"""
+def prune_mask(statistics: DensityStatistics, config: AnchorConfig) -> Tensor:
+    """Anchors that stay; counters of the anchors that were judged are zeroed. bool [A]"""
     judged = statistics.visits > min_visits(config)
     faint = statistics.opacity_sum < config.min_opacity * statistics.visits
     still = statistics.motion < config.prune_gradient * statistics.visits

@@ -181,16 +181,14 @@ class AnchorModel:
                 tensor.requires_grad_()
         return self
 
-    def visible(self, view: View) -> NDArray[np.int64]:
-        """Anchors that a view can see, ascending. [M]"""
-        anchors, log_scales = self.anchors.cpu().numpy(), self.log_scales.detach().cpu().numpy()
+    def visible(self, view: View) -> Tensor:
+        """Anchors that a view can see, ascending. int64 [M]"""
         by, near_plane = self.layout.visibility, self.layout.near_plane
-        return visible_anchors(anchors, log_scales, view, by=by, near_plane=near_plane)
+        return visible_anchors(self.anchors, self.log_scales, view, by=by, near_plane=near_plane)
 
     def seen_from(self, view: View) -> tuple[Tensor, Tensor]:
         """Camera centre [3] and indices of the visible anchors [M], as `decode` takes them."""
-        visible = torch.from_numpy(self.visible(view)).to(self.device)
-        return camera_centre_tensor(view, self.device), visible
+        return camera_centre_tensor(view, self.device), self.visible(view)
 
     def decode(self, period_weights: Tensor, centre: Tensor, visible: Tensor) -> Splats:
         """Gaussians of the visible anchors; arguments as those of `DecodeInputs`, see `decode`."""

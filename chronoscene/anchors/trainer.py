@@ -21,8 +21,10 @@ from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
 from chronoscene.anchors.visibility import projected_centres
 from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
+from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.adam import Adam, DenseTable
 from chronoscene.training.checkpoint import TrainingState, parts
+from chronoscene.training.devices import to_device
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.losses import mean_volume, photometric_loss
 from chronoscene.training.row_adam import make_table
@@ -34,7 +36,6 @@ from chronoscene.training.schedule import (
     log_linear,
 )
 from chronoscene.training.splatting import (
-    camera_centre_tensor,
     centres_count,
     collect_gradients,
     draw,
@@ -125,7 +126,7 @@ class AnchorTrainer:
     ) -> tuple[float, Skipped | None]:
         """Loss, and why the step must be skipped, if it must."""
         visible, row = self.model.visible(view), int(self.feature_rows[position])
-        everything = torch.arange(len(visible), device=self.model.device)
+        everything = torch.arange(len(visible), device=visible.device)
         splats, positions = self._seen(visible, row).decode_active(
             self._one_period, self._seen_from(view), everything
         )
@@ -140,29 +141,29 @@ class AnchorTrainer:
             antialiased=self.config.antialiased,
             check_finite=False,
         )
-        target = torch.from_numpy(photo).to(self.model.device)
-        counts = None if mask is None else torch.tensor(mask, device=self.model.device)
+        target = to_device(photo, self.model.device)
+        counts = None if mask is None else to_device(mask.copy(), self.model.device)
         image, weight = self.exposure.apply(raster.image[0], position), self.config.ssim_weight
         loss = photometric_loss(image, target, ssim_weight=weight, mask=counts)
         if self.config.scale_weight:
             volume = mean_volume(splats.scales, splats.opacities)
             loss = loss + self.config.scale_weight * volume
         optimizers = [self.optimizer, *self.tables.values(), *self.exposure.tables]
-        skipped = collect_gradients(loss, raster.info, optimizers, counts)
+        value, skipped = collect_gradients(loss, raster.info, optimizers, counts)
         collects = (
             self.config.statistics_from + _MARGIN < done < self.config.density_until - _MARGIN
         )
         if collects and skipped is None:
             self._collect(view, visible, positions, splats.opacities, raster.info, counts)
-        return float(loss.detach()), skipped
+        return value, skipped
 
-    def _seen(self, visible: np.ndarray, row: int) -> AnchorModel:
+    def _seen(self, visible: Tensor, row: int) -> AnchorModel:
         """The visible anchors with one of the features that vary: a model of a single period."""
         tables, model = self.tables, self.model
         blocks = (0, 1 + row) if model.layout.period_dim else (0,)
         return type(model)(
             self._seen_layout,
-            anchors=model.anchors[torch.from_numpy(visible).to(model.device)],
+            anchors=model.anchors[visible],
             offsets=tables["offsets"].fetch(visible),
             features=tables["features"].fetch(visible, blocks),
             log_scales=tables["log_scales"].fetch(visible),
@@ -177,8 +178,7 @@ class AnchorTrainer:
         sources["adam"] = self.optimizer.state()
         sources["exposure"] = self.exposure.state()
         if self.statistics is not None:
-            counters = {n: torch.from_numpy(getattr(self.statistics, n)) for n in COUNTERS}
-            sources["statistics"] = counters
+            sources["statistics"] = {n: getattr(self.statistics, n) for n in COUNTERS}
         for prefix, source in sources.items():
             tensors |= {f"{prefix}.{name}": tensor for name, tensor in source.items()}
         values = {
@@ -202,9 +202,9 @@ class AnchorTrainer:
         self.exposure.load_state(parts(state.tensors, "exposure"))
         self.statistics = None
         if counters := parts(state.tensors, "statistics"):
-            self.statistics = DensityStatistics(len(model), model.layout.offsets)
+            self.statistics = self._new_statistics()
             for name in COUNTERS:
-                setattr(self.statistics, name, counters[name].numpy().copy())
+                getattr(self.statistics, name).copy_(counters[name])
         self.sampler.drawn = state.values["views_drawn"]
         self.growth_generator.bit_generator.state = state.values["growth_generator"]
         self.noise_generator.bit_generator.state = state.values["noise_generator"]
@@ -217,17 +217,17 @@ class AnchorTrainer:
 
     def _seen_from(self, view: TrainingView) -> Tensor:
         """Camera centre for the viewing directions, with random noise if so configured. [3]"""
-        centre = camera_centre_tensor(view, self.model.device)
+        centre = camera_centre(view.cam_from_world.astype(np.float64)).astype(np.float32)
         if self.config.direction_noise:
-            distance = float(np.linalg.norm(centre.cpu().numpy() - self._middle))
+            distance = float(np.linalg.norm(centre - self._middle))
             shift = self.noise_generator.normal(0.0, self.config.direction_noise * distance, 3)
-            centre = centre + torch.from_numpy(shift.astype(np.float32)).to(centre.device)
-        return centre
+            centre += shift.astype(np.float32)
+        return to_device(centre, self.model.device)
 
     def _collect(
         self,
         view: TrainingView,
-        visible: np.ndarray,
+        visible: Tensor,
         positions: Tensor,
         opacities: Tensor,
         info: RasterInfo,
@@ -235,17 +235,16 @@ class AnchorTrainer:
     ) -> None:
         assert info.means2d.grad is not None
         if self.statistics is None:
-            self.statistics = DensityStatistics(len(self.model), self.model.layout.offsets)
-        drawn, counted = info.radii[0], None
+            self.statistics = self._new_statistics()
+        radii, counted = info.radii[0], None
         if mask is not None:
-            drawn = drawn * centres_count(info.means2d[0].detach(), mask)[:, None]
-            anchors = self.model.anchors.cpu().numpy()[visible]
-            centres = torch.from_numpy(projected_centres(anchors, view)).to(mask.device)
-            counted = centres_count(centres, mask).cpu().numpy()
-        tensors = (positions, opacities, drawn, info.means2d.grad[0])
-        at, alphas, radii, grads = (tensor.detach().cpu().numpy() for tensor in tensors)
-        size = view.width, view.height
-        self.statistics.update(visible, at, alphas, radii, grads, *size, counted)
+            radii = radii * centres_count(info.means2d[0].detach(), mask)[:, None]
+            counted = centres_count(projected_centres(self.model.anchors[visible], view), mask)
+        facts = (positions, opacities.detach(), radii, info.means2d.grad[0])
+        self.statistics.update(visible, *facts, view.width, view.height, counted)
+
+    def _new_statistics(self) -> DensityStatistics:
+        return DensityStatistics(len(self.model), self.model.layout.offsets, self.model.device)
 
     def _densify_if_due(self, index: int, done: float) -> bool:
         """Grow and prune; whether the rows of the anchors changed."""
@@ -265,23 +264,20 @@ class AnchorTrainer:
 
     def _grow(self, statistics: DensityStatistics) -> None:
         model = self.model
-        names = AnchorRows._fields
-        rows = AnchorRows(*(getattr(model, n).detach().cpu().numpy() for n in names))
+        rows = AnchorRows(*(getattr(model, name).detach() for name in AnchorRows._fields))
         new = grow(rows, statistics, self.config, self.voxel_size, self.growth_generator)
-        added = {n: torch.from_numpy(rows).to(model.device) for n, rows in new._asdict().items()}
         for name, table in self.tables.items():
-            setattr(model, name, table.extend(added[name]))
-        model.anchors = torch.cat([model.anchors, added["anchors"]])
+            setattr(model, name, table.extend(getattr(new, name)))
+        model.anchors = torch.cat([model.anchors, new.anchors])
         statistics.extend(len(new.anchors))
 
     def _prune(self, statistics: DensityStatistics) -> None:
         """Drop anchors and bound the scales. A model is never left without any anchor."""
         keep = prune_mask(statistics, self.config)
         if not keep.all() and keep.any():
-            mask = torch.from_numpy(keep).to(self.model.device)
             for name, table in self.tables.items():
-                setattr(self.model, name, table.keep(mask))
-            self.model.anchors = self.model.anchors[mask]
+                setattr(self.model, name, table.keep(keep))
+            self.model.anchors = self.model.anchors[keep]
             statistics.keep(keep)
         with torch.no_grad():
             self.model.log_scales[:, 3:].clamp_(max=self.config.max_log_scale)

@@ -7,13 +7,15 @@ anchor's scale and no rotation; the projection is that of the rasterizer (EWA, Z
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numba import prange
-from numpy.typing import NDArray
+from torch import Tensor
 
 from chronoscene.kernels.compilation import kernel
 from chronoscene.methods import View
 from chronoscene.rasterizer import constants
 from chronoscene.rasterizer.constants import CLAMP_MARGIN, EPS2D, FAR_PLANE
+from chronoscene.training import devices
 
 _EXTENT = 3.33
 """Half width of a footprint in standard deviations: where an opacity of 1 falls below 1/255."""
@@ -22,14 +24,9 @@ _SLACK = CLAMP_MARGIN / 2
 
 
 def visible_anchors(
-    anchors: NDArray[np.float32],
-    log_scales: NDArray[np.float32],
-    view: View,
-    *,
-    by: str = "radius",
-    near_plane: float,
-) -> NDArray[np.int64]:
-    """Indices of the anchors to decode, ascending. [M]
+    anchors: Tensor, log_scales: Tensor, view: View, *, by: str = "radius", near_plane: float
+) -> Tensor:
+    """Indices of the anchors to decode, ascending. int64 [M]
 
     Args:
         anchors: Positions in the training frame. [A, 3]
@@ -39,21 +36,47 @@ def visible_anchors(
             projects into it.
         near_plane: Anchors nearer than this are invisible.
     """
+    anchors, log_scales = anchors.detach(), log_scales.detach()
+    extent = _EXTENT if by == "radius" else 0.0
+    if not devices.has_kernels(anchors, log_scales):
+        return _marked(anchors, log_scales, view, near_plane, extent).nonzero()[:, 0]
     mask = np.empty(len(anchors), np.bool_)
     pose = np.ascontiguousarray(view.cam_from_world, dtype=np.float64)
     intrinsics = np.array([view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]])
-    extent = _EXTENT if by == "radius" else 0.0
     size = (float(view.width), float(view.height))
-    _mark(anchors, log_scales, pose, intrinsics, size, near_plane, extent, mask)
-    return np.flatnonzero(mask)
+    arrays = anchors.numpy(), log_scales.numpy()
+    _mark(*arrays, pose, intrinsics, size, near_plane, extent, mask)
+    return torch.from_numpy(np.flatnonzero(mask))
 
 
-def projected_centres(anchors: NDArray[np.float32], view: View) -> NDArray[np.float64]:
-    """Pixel positions of anchors in front of a camera. [M, 3] -> [M, 2]"""
-    pose = view.cam_from_world
-    rays = np.einsum("ij,mj->mi", pose[:3, :3], anchors.astype(np.float64)) + pose[:3, 3]
-    pixels = np.einsum("ij,mj->mi", view.K, rays)
-    return np.asarray(pixels[:, :2] / pixels[:, 2:])
+def projected_centres(anchors: Tensor, view: View) -> Tensor:
+    """Pixel positions of anchors in front of a camera. [M, 3] -> float64 [M, 2]"""
+    rays, _ = _from_camera(anchors, view)
+    pixels = rays @ devices.to_device(view.K.astype(np.float64), rays.device).T
+    return pixels[:, :2] / pixels[:, 2:]
+
+
+def _from_camera(anchors: Tensor, view: View) -> tuple[Tensor, Tensor]:
+    """Anchors in the frame of a camera, float64 [M, 3], and its rotation."""
+    pose = devices.to_device(view.cam_from_world.astype(np.float64), anchors.device)
+    return anchors.double() @ pose[:3, :3].T + pose[:3, 3], pose[:3, :3]
+
+
+def _marked(anchors: Tensor, log_scales: Tensor, view: View, near: float, extent: float) -> Tensor:
+    """`_mark` in plain torch: whether an anchor is visible. bool [A]"""
+    rays, rotation = _from_camera(anchors, view)
+    z, spreads = rays[:, 2], torch.exp(2.0 * log_scales[:, :3].double())
+    visible = (z >= near) & (z <= FAR_PLANE)
+    for axis, size in enumerate((view.width, view.height)):
+        focal, centre = float(view.K[axis, axis]), float(view.K[axis, 2])
+        ratio = rays[:, axis] / z
+        low, high = -(centre + _SLACK * size) / focal, ((1.0 + _SLACK) * size - centre) / focal
+        slope = ratio.clamp(low, high)
+        jacobian = (focal / z)[:, None] * (rotation[axis] - slope[:, None] * rotation[2])
+        radius = torch.ceil(extent * (EPS2D + (spreads * jacobian.square()).sum(-1)).sqrt())
+        place = focal * ratio + centre
+        visible &= (place + radius > 0.0) & (place - radius < size)
+    return visible
 
 
 @kernel(parallel=True, extras=[constants])

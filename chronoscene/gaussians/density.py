@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from chronoscene.gaussians.config import GaussianConfig
-from chronoscene.gaussians.model import logit, opacities_of, scales_of
+from chronoscene.gaussians.model import axes_of, dot, logit, opacities_of, scales_of
 from chronoscene.rasterizer import RasterInfo
-from chronoscene.scene.geometry import rotation_from_quaternion
+from chronoscene.training.devices import exp, normal
 from chronoscene.training.splatting import centres_count
 
 PARTS = 2  # Gaussians that a split one becomes
@@ -125,12 +125,12 @@ def _split(
 ) -> dict[str, Tensor]:
     """Two smaller Gaussians for each, centred on samples of N(mean, R S S^T R^T)."""
     parts = {name: rows.repeat(PARTS, *(1,) * (rows.dim() - 1)) for name, rows in parents.items()}
-    quats = parts["quats"].cpu().double().numpy()
-    quats[np.linalg.norm(quats, axis=-1) == 0] = (1, 0, 0, 0)
-    scales = np.exp(parts["log_scales"].cpu().double().numpy())
-    samples = scales * generator.standard_normal(scales.shape)
-    moves = np.einsum("nij,nj->ni", rotation_from_quaternion(quats), samples)
-    parts["means"] += torch.from_numpy(moves.astype(np.float32)).to(parts["means"].device)
+    scales = exp(parts["log_scales"].double())
+    samples = scales * normal(generator, tuple(scales.shape), scales)
+    axes = axes_of(parts["quats"].double())
+    moves = torch.stack([dot(row, samples.unbind(-1)) for row in zip(*axes, strict=True)], dim=-1)
+    # A quaternion of length zero has no axes.
+    parts["means"] += torch.where(moves.isfinite(), moves, samples).float()
     parts["log_scales"] -= float(np.log(config.split_factor))
     return parts
 

@@ -11,7 +11,6 @@ here: what a round moves and what it adds is drawn at once, and all of it starts
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.density import Round
-from chronoscene.gaussians.model import opacities_of, scales_of
+from chronoscene.gaussians.model import axes_of, dot, opacities_of, scales_of
 
 MAX_COPIES = 51
 """Gaussians that may stand for one; where more are drawn, each is as one of so many."""
@@ -119,29 +118,14 @@ def noise(
     gate = opacities_of(
         _GATE_STEEPNESS * (_GATE_OPACITY - opacities_of(parameters["logit_opacities"]))
     )
-    # Sums are written out, so that bits do not depend on how a product shares its work.
-    quats = parameters["quats"].unbind(-1)
-    length = _dot(quats, quats).sqrt()
-    w, x, y, z = (part / length for part in quats)
-    axes = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
+    axes = axes_of(parameters["quats"])
     directions = normal.unbind(-1)
     variances = scales_of(parameters["log_scales"]).square().unbind(-1)
-    along = [v * _dot(axis, directions) for v, axis in zip(variances, axes, strict=True)]
-    moves = torch.stack([_dot(along, row) for row in zip(*axes, strict=True)], dim=-1)
+    along = [v * dot(axis, directions) for v, axis in zip(variances, axes, strict=True)]
+    moves = torch.stack([dot(along, row) for row in zip(*axes, strict=True)], dim=-1)
     moves = moves * (gate * (rate * config.mcmc_noise))[:, None]
     # A quaternion of length zero has no axes; its Gaussian is not drawn, wherever it is.
     return torch.where(moves.isfinite(), moves, 0.0)
-
-
-def _dot(left: Sequence[Tensor], right: Sequence[Tensor]) -> Tensor:
-    total = left[0] * right[0]
-    for a, b in zip(left[1:], right[1:], strict=True):
-        total = total + a * b
-    return total
 
 
 def make_generator(device: torch.device, *key: int) -> torch.Generator:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from chronoscene.gaussians.spherical_harmonics import NUM_BASES, dc_from_rgb, evaluate
 from chronoscene.methods import TrainingSet, View
+from chronoscene.training.devices import exp
 from chronoscene.training.splatting import Splats, camera_centre_tensor, finite_rows, rms_spacing
 
 SHAPES: dict[str, tuple[int, ...]] = {
@@ -109,7 +110,7 @@ class _Exp(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = _exp(x.detach())
+        y = exp(x.detach())
         ctx.save_for_backward(y)
         return y
 
@@ -124,7 +125,8 @@ class _Sigmoid(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
-        y = 1 / (1 + _exp(-x.detach()))
+        # Products and quotients of float32 are exact to the bit wherever they are done.
+        y = 1 / (1 + exp(-x.detach()))
         ctx.save_for_backward(y)
         return y
 
@@ -132,15 +134,6 @@ class _Sigmoid(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
         (y,) = ctx.saved_tensors
         return grads[0] * (1 - y) * y
-
-
-def _exp(x: Tensor) -> Tensor:
-    # Torch may take another code path at the end of each thread's share of the rows; NumPy makes
-    # one pass. Products and quotients of float32 are exact to the bit wherever they are done.
-    if x.is_cuda:
-        return x.exp()
-    with np.errstate(over="ignore"):
-        return torch.from_numpy(np.exp(x.contiguous().numpy()))
 
 
 def scales_of(log_scales: Tensor) -> Tensor:
@@ -151,3 +144,27 @@ def scales_of(log_scales: Tensor) -> Tensor:
 def opacities_of(logit_opacities: Tensor) -> Tensor:
     """Opacities 0..1. [N]"""
     return _Sigmoid.apply(logit_opacities)
+
+
+def axes_of(quats: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], ...]:
+    """The axes x, y, z of Gaussians, each as three coordinates of [N]. [N, 4]
+
+    The columns of a rotation; not finite for a quaternion of length zero. Sums are written out, so
+    that bits do not depend on how a product shares its work.
+    """
+    parts = quats.unbind(-1)
+    length = dot(parts, parts).sqrt()
+    w, x, y, z = (part / length for part in parts)
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def dot(left: Sequence[Tensor], right: Sequence[Tensor]) -> Tensor:
+    """Sum of products, from the first on."""
+    total = left[0] * right[0]
+    for a, b in zip(left[1:], right[1:], strict=True):
+        total = total + a * b
+    return total

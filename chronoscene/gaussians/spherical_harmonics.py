@@ -4,8 +4,8 @@
 camera centre to the Gaussian. The basis is the real one with the Condon-Shortley phase, in the
 order (0, 0), (1, -1), (1, 0), (1, 1), (2, -2), ...: that of the 3DGS file format.
 
-`evaluate` runs a fused kernel on the CPU, forward and backward; `evaluate_reference` is the
-definition, in plain torch, and what a GPU runs.
+`evaluate` runs a fused kernel, forward and backward: ours on the CPU, that of gsplat on a GPU.
+`evaluate_reference` is the definition, in plain torch.
 
 Source: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field Rendering"; the
 polynomials are the textbook ones (Sloan 2008, "Stupid Spherical Harmonics Tricks").
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.kernels.compilation import inner, kernel
+from chronoscene.training import devices
 
 MAX_DEGREE = 3
 NUM_BASES = (MAX_DEGREE + 1) ** 2
@@ -94,9 +95,24 @@ def evaluate(
     Returns:
         colors: At least 0, without an upper bound. float32 [N, 3]
     """
+    if devices.has_kernels(means):
+        return _Evaluate.apply(sh_dc, sh_rest, means, camera_centre, degree)
     if means.is_cuda:
-        return evaluate_reference(sh_dc, sh_rest, means, camera_centre, degree)
-    return _Evaluate.apply(sh_dc, sh_rest, means, camera_centre, degree)
+        return _evaluate_gsplat(sh_dc, sh_rest, means, camera_centre, degree)
+    return evaluate_reference(sh_dc, sh_rest, means, camera_centre, degree)
+
+
+def _evaluate_gsplat(
+    sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_centre: Tensor, degree: int
+) -> Tensor:
+    from chronoscene.rasterizer import gsplat_backend
+
+    offsets = means - camera_centre
+    # The kernel divides by the length; a Gaussian on the camera centre is never seen.
+    offsets = torch.where((offsets == 0).all(-1, keepdim=True), 1.0, offsets)
+    coeffs = torch.cat([sh_dc[:, None], sh_rest], dim=1)
+    sums = gsplat_backend.spherical_harmonics(degree, offsets, coeffs)
+    return (sums + 0.5).clamp_min(0.0)
 
 
 class _Evaluate(torch.autograd.Function):

@@ -21,6 +21,7 @@ from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.training.adam import Adam
 from chronoscene.training.checkpoint import TrainingState, parts
+from chronoscene.training.devices import to_device
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.losses import photometric_loss
 from chronoscene.training.schedule import ViewSampler, log_linear
@@ -125,7 +126,7 @@ class GaussianTrainer:
         number = self.sampler.next()
         view = self.train.views[number]
         splats = self.model.splats(view, view.period)
-        config, device = self.config, self.background.device
+        config = self.config
         background = step_background(
             self.background, config, seed=self.seed, number=self.sampler.drawn
         )
@@ -139,11 +140,13 @@ class GaussianTrainer:
             # A scale beyond all numbers shows in the gradients; one such step ends no training.
             check_finite=False,
         )
-        mask = mask_tensor(self.train, number, device)
-        loss = self.loss(raster, number, mask) + self._regulariser(splats)
+        mask = mask_tensor(self.train, number, self.background.device)
         self.optimizer.zero_grad()
-        skipped = collect_gradients(
-            loss, raster.info, [self.optimizer, *self.exposure.tables], mask
+        loss, skipped = collect_gradients(
+            self.loss(raster, number, mask) + self._regulariser(splats),
+            raster.info,
+            [self.optimizer, *self.exposure.tables],
+            mask,
         )
         if skipped:
             self.optimizer.zero_grad()
@@ -156,7 +159,7 @@ class GaussianTrainer:
         self._update(due)
         if not skipped:
             self._move_at_random(index, due)
-        return StepReport(float(loss.detach()), len(self.model), skipped)
+        return StepReport(loss, len(self.model), skipped)
 
     def state(self) -> TrainingState:
         """Everything that the steps to come depend on; methods may add to it."""
@@ -193,7 +196,7 @@ class GaussianTrainer:
     def loss(self, raster: Rasterization, number: int, mask: Tensor | None) -> Tensor:
         """Photometric loss against the photo of view ``number``; methods may add terms."""
         # A copy, as cached images are not ours to write to, which torch cannot promise.
-        photo = torch.from_numpy(self.train.load_image(number).copy()).to(raster.image.device)
+        photo = to_device(self.train.load_image(number).copy(), raster.image.device)
         image, weight = self.exposure.apply(raster.image[0], number), self.config.ssim_weight
         return photometric_loss(image, photo, ssim_weight=weight, mask=mask)
 

@@ -1,16 +1,18 @@
-"""The CUDA backend: gsplat's public ``rasterization``, not packed.
+"""The CUDA backend: gsplat's public ``rasterization``, not packed, and its spherical harmonics.
 
 gsplat is the optional extra ``cuda``; it is imported when the backend is used. Its numbers differ
-from the reference by rounding and by its footprint rule; see README.md.
+from the reference by rounding and by its footprint rule, those of 1.6 also by its cap of alpha; see
+README.md.
 
-Source: gsplat 1.5 documentation of ``rasterization`` and its ``meta`` dictionary.
+Source: documentation and source of gsplat 1.5.0 to 1.5.3 and 1.6.0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import torch
@@ -21,6 +23,9 @@ from chronoscene.rasterizer import RasterInfo, Rasterization, reference
 from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
 from chronoscene.rasterizer.inputs import Inputs, recentred
 
+ALPHA_MAX = {"1.5": 0.999, "1.6": 0.99}
+"""Cap of alpha in the kernels, by version of gsplat. Others were not looked at and are refused."""
+
 _TOOLKIT = (
     "gsplat compiles its kernels when it is first used, and needs for that a C++ compiler and the "
     f"CUDA toolkit of torch's version, {torch.version.cuda or 'none in this build of torch'}, "
@@ -30,7 +35,7 @@ _TOOLKIT = (
 
 def rasterize(inputs: Inputs) -> Rasterization:
     """Render Gaussians. Everything is cast to float32."""
-    render = _load(inputs.means.device)
+    gsplat = _load(inputs.means.device)
     means, viewmats = recentred(inputs.means, inputs.viewmats)
     inputs = replace(
         inputs,
@@ -46,46 +51,74 @@ def rasterize(inputs: Inputs) -> Rasterization:
     if len(means) == 0:  # gsplat launches no kernel for nothing
         return reference.rasterize(inputs)
     gaussians, drawable = _without_bad_rows(*inputs.gaussians)
-    try:
-        image, alphas, meta = render(
-            *gaussians,
-            inputs.viewmats,
-            inputs.Ks,
-            inputs.width,
-            inputs.height,
-            near_plane=inputs.near_plane,
-            far_plane=inputs.far_plane,
-            eps2d=inputs.eps2d,
-            backgrounds=inputs.backgrounds,
-            packed=False,
-            absgrad=inputs.absgrad,
-            rasterize_mode="antialiased" if inputs.antialiased else "classic",
-            render_mode="RGB+ED" if inputs.render_depth else "RGB",
-        )
-    except (AttributeError, ImportError) as error:  # kernels are None, or could not be built
-        raise BackendError(
-            "backend 'cuda'",
-            expected="gsplat's compiled kernels",
-            found=f"gsplat could not build or load them ({error})",
-            todo=f"install the CUDA toolkit: {_TOOLKIT}; or choose backend='cpu'",
-        ) from error
+    image, alphas, meta = gsplat.rasterization(
+        *gaussians,
+        inputs.viewmats,
+        inputs.Ks,
+        inputs.width,
+        inputs.height,
+        near_plane=inputs.near_plane,
+        far_plane=inputs.far_plane,
+        eps2d=inputs.eps2d,
+        backgrounds=inputs.backgrounds,
+        packed=False,
+        absgrad=inputs.absgrad,
+        rasterize_mode="antialiased" if inputs.antialiased else "classic",
+        render_mode="RGB+ED" if inputs.render_depth else "RGB",
+    )
     depths = None
     if inputs.render_depth:
         image, depths = image[..., :-1], torch.where(alphas > 0, image[..., -1:], 0)
     return Rasterization(image, alphas, depths, _info(meta, drawable))
 
 
-def _load(device: torch.device) -> Callable[..., Any]:
-    """gsplat's function, if it can be used here."""
+def spherical_harmonics(degree: int, offsets: Tensor, coeffs: Tensor) -> Tensor:
+    """Sums of coefficients times basis values. float32
+
+    Args:
+        degree: Highest degree that counts.
+        offsets: From the camera to the Gaussians, of any length but 0. [N, 3]
+        coeffs: [N, 16, 3]
+
+    Returns:
+        sums: Colours less 0.5, not clamped. [N, 3]
+    """
+    gsplat = _load(offsets.device)
+    if release() == "1.5":
+        sums: Tensor = gsplat.spherical_harmonics(degree, offsets, coeffs)
+        return sums
+    # From 1.6 on it takes centres and cameras; this camera is at the origin.
+    camera = torch.eye(4, device=offsets.device)[None]
+    sums = gsplat.spherical_harmonics(degree, offsets, camera, coeffs)[0]
+    return sums
+
+
+@cache
+def release() -> str:
+    """Major and minor version of gsplat.
+
+    Raises:
+        BackendError: If there is none, or one that is not in `ALPHA_MAX`.
+    """
+    expected = f"gsplat {' or '.join(ALPHA_MAX)}"
     try:
-        module = import_module("gsplat")
-    except ImportError as error:
-        raise BackendError(
-            "backend 'cuda'",
-            expected="the package gsplat",
-            found=f"{type(error).__name__}: {error}",
-            todo=f"pip install 'chronoscene[cuda]' ({_TOOLKIT}), or choose backend='cpu'",
-        ) from None
+        found = version("gsplat")
+    except PackageNotFoundError:
+        found = "none"
+    if (short := ".".join(found.split(".")[:2])) in ALPHA_MAX:
+        return short
+    raise BackendError(
+        "backend 'cuda'",
+        expected=expected,
+        found=found,
+        todo=f"pip install 'chronoscene[cuda]' ({_TOOLKIT}), or choose backend='cpu'",
+    )
+
+
+@cache
+def _load(device: torch.device) -> Any:
+    """The package gsplat with its kernels, if it can be used here."""
+    release()
     if not torch.cuda.is_available():
         raise BackendError(
             "backend 'cuda'",
@@ -100,8 +133,29 @@ def _load(device: torch.device) -> Callable[..., Any]:
             found=str(device),
             todo="move them with .cuda(), or choose backend='auto'",
         )
-    function: Callable[..., Any] = module.rasterization
-    return function
+    try:
+        gsplat, kernels = import_module("gsplat"), import_module("gsplat.cuda._backend")._C
+    except (AttributeError, ImportError, OSError, RuntimeError) as error:
+        raise _without_kernels(_first_error(str(error))) from error
+    if kernels is None:
+        raise _without_kernels("no CUDA toolkit")
+    return gsplat
+
+
+def _without_kernels(reason: str) -> BackendError:
+    return BackendError(
+        "backend 'cuda'",
+        expected="gsplat's compiled kernels",
+        found=f"gsplat could not build or load them ({reason})",
+        todo=f"install the CUDA toolkit: {_TOOLKIT}; python -c 'import gsplat.cuda._backend' shows "
+        "the whole output; or choose backend='cpu'",
+    )
+
+
+def _first_error(output: str) -> str:
+    """The line to show of what compilers wrote, which can be hundreds."""
+    lines = [line.strip() for line in output.splitlines() if line.strip()] or ["no message"]
+    return next((line for line in lines if "error:" in line or "fatal" in line), lines[0])
 
 
 def _without_bad_rows(*arrays: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
@@ -109,7 +163,8 @@ def _without_bad_rows(*arrays: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
     means, quats, scales, opacities, colors = arrays
     finite = torch.stack([torch.isfinite(x.reshape(len(x), -1)).all(-1) for x in arrays]).all(0)
     good = finite & (quats.abs().amax(-1) >= QUATERNION_MIN) & (opacities > ALPHA_MIN)
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    identity = torch.zeros_like(quats[:1])
+    identity[:, 0] = 1.0
     rows = good[:, None]
     return (
         torch.where(rows, means, 0),

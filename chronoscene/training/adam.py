@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numba import prange
 from numpy import float32
-from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
 from chronoscene.kernels.compilation import kernel
+from chronoscene.training import devices
 
 BETA1 = 0.9
 BETA2 = 0.999
@@ -94,7 +94,7 @@ class Adam:
             moments.steps += 1
             rate = lrs[name] / (1 - BETA1**moments.steps)
             root = (1 - BETA2**moments.steps) ** -0.5
-            update = _step_compiled if is_cpu_float32(value) else _step_torch
+            update = _step_compiled if devices.has_kernels(value) else _step_torch
             update(value, value.grad, moments, rate, root)
 
     def extend(self, name: str, new_rows: Tensor) -> Tensor:
@@ -143,11 +143,6 @@ class Adam:
     def _replace(self, name: str, value: Tensor) -> Tensor:
         self.params[name] = value.requires_grad_()
         return self.params[name]
-
-
-def is_cpu_float32(value: Tensor) -> bool:
-    """Whether the compiled updates can work on a tensor."""
-    return value.device.type == "cpu" and value.dtype == torch.float32
 
 
 def _step_compiled(
@@ -199,18 +194,21 @@ def adam_blocks(values, grads, means, squares, rate, root, eps):  # type: ignore
         adam_block(values[part], grads[part], means[part], squares[part], rate, root, eps)
 
 
-def all_finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether no number is nan or infinite; costs far less than an update of the same size."""
-    for tensor in tensors:
-        if not is_cpu_float32(tensor):
-            finite = bool(tensor.isfinite().all())
-        else:
-            bits = tensor.detach().contiguous().view(-1).numpy().view(np.int32)
-            largest = largest_bits_of_blocks(bits) if len(bits) > BLOCK else largest_bits(bits)
-            finite = largest < INFINITY_BITS
-        if not finite:
-            return False
-    return True
+def all_finite(tensors: Sequence[Tensor]) -> Tensor:
+    """Whether no number is nan or infinite; costs far less than an update of the same size.
+
+    Returns:
+        A scalar on the device of the tensors. bool
+    """
+    if not devices.has_kernels(*tensors):
+        return torch.stack([tensor.isfinite().all() for tensor in tensors]).all()
+    return torch.tensor(all(map(_is_finite, tensors)))
+
+
+def _is_finite(tensor: Tensor) -> bool:
+    bits = tensor.detach().contiguous().view(-1).numpy().view(np.int32)
+    largest = largest_bits_of_blocks(bits) if len(bits) > BLOCK else largest_bits(bits)
+    return bool(largest < INFINITY_BITS)
 
 
 INFINITY_BITS = 0x7F800000
@@ -261,24 +259,23 @@ class DenseTable:
         grad = None if self._fetched is None else self._fetched[1].grad
         return [] if grad is None else [grad]
 
-    def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
+    def fetch(self, rows: Tensor, blocks: Sequence[int] = (0,)) -> Tensor:
         """Copies of some rows and blocks, up to date, as a leaf that collects a gradient.
 
         `step` uses that gradient; the copies of an earlier call are forgotten. The table is left as
         it is.
 
         Args:
-            rows: Each at most once. [M]
+            rows: Each at most once. int64 [M]
             blocks: Their columns come one after the other.
 
         Returns:
             [M, ...], with the table's own shape of a row if there is one block.
         """
-        cells: tuple[Tensor, ...] = (torch.from_numpy(rows).to(self.value.device),)
+        cells: tuple[Tensor, ...] = (rows,)
         if self._blocks is not None:
-            columns = torch.arange(sum(self._blocks)).split(list(self._blocks))
-            chosen = torch.cat([columns[block] for block in blocks]).to(self.value.device)
-            cells = (cells[0][:, None], chosen)
+            columns = torch.arange(sum(self._blocks), device=rows.device).split(list(self._blocks))
+            cells = (rows[:, None], torch.cat([columns[block] for block in blocks]))
         leaf = self.value[cells].requires_grad_()
         self._fetched = cells, leaf
         return leaf

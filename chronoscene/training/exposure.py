@@ -22,6 +22,7 @@ from torch import Tensor
 
 from chronoscene.kernels.compilation import kernel
 from chronoscene.methods import TrainingSet
+from chronoscene.training import devices
 from chronoscene.training.adam import DenseTable
 from chronoscene.training.periods import period_weights
 from chronoscene.training.schedule import log_linear
@@ -43,9 +44,11 @@ class Exposure:
     """
 
     def __init__(self, kind: str, train: TrainingSet, device: str | torch.device) -> None:
-        self._periods = np.array([view.period for view in train.views])
+        periods = np.array([view.period for view in train.views])
+        self._periods = torch.from_numpy(periods).to(device)
         self._identity = torch.eye(3, 4, device=device).repeat(train.num_periods, 1, 1)
-        self._rows = np.arange(len(train.views)) if kind == "image" else self._periods
+        own = torch.arange(len(train.views), device=device)
+        self._rows = own if kind == "image" else self._periods
         count = 0 if kind == "none" else 1 + int(self._rows.max())
         table = DenseTable(self._identity[:1].repeat(count, 1, 1))
         self.tables = [table] if count else []
@@ -67,9 +70,9 @@ class Exposure:
         if not self.tables:
             return None
         result = self._identity.clone()
-        for period in np.unique(self._periods):
-            rows = np.unique(self._rows[self._periods == period])
-            result[period] = self.tables[0].value[torch.from_numpy(rows)].mean(0)
+        for period in self._periods.unique().tolist():
+            rows = self._rows[self._periods == period].unique()
+            result[period] = self.tables[0].value[rows].mean(0)
         return result
 
     def state(self) -> dict[str, Tensor]:
@@ -117,7 +120,7 @@ class _Transform(torch.autograd.Function):
 
 def _mixed(image: Tensor, transform: Tensor) -> Tensor:
     """The definition of `transformed`."""
-    if image.is_cuda:
+    if not devices.has_kernels(image):
         return image @ transform[:, :3].T + transform[:, 3]
     result = torch.empty_like(image, memory_format=torch.contiguous_format)
     _mix_rows(_array(image), _array(transform), result.numpy())
@@ -130,7 +133,7 @@ def _array(tensor: Tensor) -> NDArray[Any]:
 
 def _moments(grad: Tensor, image: Tensor) -> Tensor:
     """Sum over the pixels of the gradient times (c, 1). [H, W, 3], [H, W, 3] -> [3, 4]"""
-    if grad.is_cuda:
+    if not devices.has_kernels(grad):
         products = torch.einsum("hwi,hwj->ij", grad, image)
         return torch.cat([products, grad.sum((0, 1))[:, None]], dim=1)
     sums = np.zeros((len(grad), 3, 4))

@@ -12,6 +12,7 @@ from torch import Tensor
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
 from chronoscene.kernels.compilation import kernel
+from chronoscene.training import devices, ssim_torch
 from chronoscene.training.ssim_kernel import CHANNELS, RADIUS, SIGMA, l1_ssim
 
 _CHUNK = 4096
@@ -26,9 +27,9 @@ def photometric_loss(
         loss = (1 - w) mean|I - T| + w (1 - SSIM(I, T))
 
     SSIM has an 11x11 Gaussian window of sigma 1.5, zero padding, constants 0.01² and 0.03², and is
-    the mean over pixels and channels. On a CPU, value and gradient come from one compiled pass in
-    float32, with equal bits for any number of threads; elsewhere from
-    `photometric_loss_reference`.
+    the mean over pixels and channels. In float32, value and gradient come from one pass: compiled
+    on a CPU, with equal bits for any number of threads; in plain torch on a GPU. Other types go
+    through `photometric_loss_reference`.
 
     Args:
         image: 0..1. float32 [H, W, 3]
@@ -50,7 +51,7 @@ def photometric_loss(
     if mask is not None:
         image, target, share = _where_it_counts(image, target, mask)
         return photometric_loss(image, target, ssim_weight=ssim_weight) / share
-    if image.device.type != "cpu" or image.dtype != torch.float32:
+    if image.dtype != torch.float32:
         return photometric_loss_reference(image, target, ssim_weight=ssim_weight)
     return _PhotometricLoss.apply(image, target, ssim_weight)
 
@@ -73,11 +74,11 @@ def _unit_range(target: Tensor) -> Tensor:
     return target.float() / 255 if target.dtype == torch.uint8 else target
 
 
-def _where_it_counts(image: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, float]:
+def _where_it_counts(image: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Both images with the same constants where the mask ignores, and the share that counts."""
     check_shape("mask", mask, tuple(image.shape[:2]))
     counts, fixed = mask[..., None], image.detach()
-    share = max(int(mask.sum()), 1) / mask.numel()
+    share = (mask.sum().clamp_min(1).double() / mask.numel()).to(image.dtype)
     truth = _unit_range(target).to(image)
     return torch.where(counts, image, fixed), torch.where(counts, truth, fixed), share
 
@@ -105,6 +106,10 @@ class _PhotometricLoss(torch.autograd.Function):
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
         count = image.numel()
         weights = ((1 - ssim_weight) / count, ssim_weight / count)
+        if not devices.has_kernels(image):
+            value, gradient = ssim_torch.l1_ssim(image, _unit_range(target), weights)
+            ctx.save_for_backward(gradient)
+            return value
         gradient = torch.empty(image.shape if ctx.needs_input_grad[0] else (0, *image.shape[1:]))
         is_byte = target.dtype == torch.uint8
         arrays = _rows(image), _rows(target if is_byte else target.float())
@@ -153,9 +158,10 @@ def mean_volume(scales: Tensor, opacities: Tensor) -> Tensor:
 
     Source: the official code of Scaffold-GS and ChronoGS (the ChronoGS paper leaves the term out).
     """
-    if scales.is_cuda:
-        volumes = scales.prod(dim=1)[opacities > 0]
-        return volumes.mean() if len(volumes) else scales.sum() * 0.0
+    if not devices.has_kernels(scales):
+        active = opacities > 0
+        a, b, c = scales.unbind(-1)
+        return torch.where(active, a * b * c, 0).sum() / active.sum().clamp_min(1)
     return _MeanVolume.apply(scales, opacities)
 
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.memory import load_first, read, read_index, store_first, write_index
 from chronoscene.kernels.vectors import LANES, select, splat, sqrt
+from chronoscene.training import devices
 from chronoscene.training.adam import (
     BETA1,
     BETA2,
@@ -31,7 +32,6 @@ from chronoscene.training.adam import (
     TINY_MEAN,
     TINY_SQUARE,
     DenseTable,
-    is_cpu_float32,
 )
 
 _HORIZON = 256
@@ -47,7 +47,7 @@ ZERO = float32(0)
 
 def make_table(value: Tensor, blocks: Sequence[int] | None = None) -> RowAdam | DenseTable:
     """A `RowAdam` where its kernels run, else a `DenseTable`."""
-    if is_cpu_float32(value):
+    if devices.has_kernels(value):
         return RowAdam(value, blocks)
     return DenseTable(value, blocks)
 
@@ -87,18 +87,18 @@ class RowAdam:
         self._fetched: tuple[NDArray[np.int64], NDArray[np.int64], Tensor] | None = None
         """Rows and places (see `_Part`) of the last copies, and these."""
 
-    def fetch(self, rows: NDArray[np.int64], blocks: Sequence[int] = (0,)) -> Tensor:
-        rows, chosen = np.ascontiguousarray(rows, np.int64), np.array(blocks, np.int64)
+    def fetch(self, rows: Tensor, blocks: Sequence[int] = (0,)) -> Tensor:
+        numbers, chosen = rows.contiguous().numpy(), np.array(blocks, np.int64)
         widths = self._widths[chosen]
         starts = np.cumsum(widths) - widths
         places = np.stack([chosen, self._starts[chosen], widths, starts], axis=1)
-        out = torch.empty(len(rows), int(widths.sum()))
+        out = torch.empty(len(numbers), int(widths.sum()))
         # In units of the root of the second moment without bias correction.
         eps = float32(EPS * (1 - BETA2 ** max(self.steps, 1)) ** 0.5)
-        _fetch(*self._addresses(rows, places), eps, out.data_ptr())
+        _fetch(*self._addresses(numbers, places), eps, out.data_ptr())
         if len(self._widths) == 1:
-            out = out.view(len(rows), *self.value.shape[1:])
-        self._fetched = rows, places, out.requires_grad_()
+            out = out.view(len(numbers), *self.value.shape[1:])
+        self._fetched = numbers, places, out.requires_grad_()
         return out
 
     def gradients(self) -> list[Tensor]:
@@ -139,8 +139,8 @@ class RowAdam:
         if not (self._stamps < self.steps).any():
             return self.value
         fetched = self._fetched
-        rows = np.arange(len(self.value), dtype=np.int64)
-        copies = self.fetch(rows, range(len(self._widths))).detach()
+        everything = torch.arange(len(self.value))
+        copies = self.fetch(everything, range(len(self._widths))).detach()
         self._fetched = fetched
         return copies.view(self.value.shape)
 

@@ -26,6 +26,7 @@ from chronoscene.rasterizer import NEAR_PLANE, RasterInfo, Rasterization, raster
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.adam import Adam, DenseTable, all_finite
 from chronoscene.training.checkpoint import TRAINING, TrainingState, load_tensors, save_tensors
+from chronoscene.training.devices import to_device
 from chronoscene.training.exposure import KINDS, of_period, transformed
 from chronoscene.training.row_adam import RowAdam
 
@@ -165,7 +166,7 @@ def step_background(
     if not config.random_background:
         return background
     generator = np.random.default_rng((seed, _BACKGROUND_STREAM, number))
-    return torch.from_numpy(generator.random(3, np.float32)).to(background.device)
+    return to_device(generator.random(3, np.float32), background.device)
 
 
 def collect_gradients(
@@ -173,8 +174,8 @@ def collect_gradients(
     info: RasterInfo,
     optimizers: Iterable[Adam | DenseTable | RowAdam],
     mask: Tensor | None = None,
-) -> Skipped | None:
-    """The backward pass of a training step.
+) -> tuple[float, Skipped | None]:
+    """The backward pass of a training step. What it returns is all that the host waits for.
 
     Args:
         loss: What to minimise.
@@ -183,13 +184,21 @@ def collect_gradients(
         mask: Where the photo counts; None for everywhere. bool [H, W]
 
     Returns:
-        Why the step must be skipped, if it must: the optimisers may not use what they have then.
+        loss: The same as a number.
+        skipped: Why the step must be skipped, if it must: the optimisers may not use what they have
+            then.
     """
-    if not (info.radii > 0).any() or (mask is not None and not mask.any()):
-        return "empty"
+    sees = (info.radii > 0).any()
+    if mask is not None:
+        sees = sees & mask.any()
     loss.backward()
-    gradients = (gradient for optimizer in optimizers for gradient in optimizer.gradients())
-    return None if all_finite([loss]) and all_finite(gradients) else "not finite"
+    loss = loss.detach()
+    gradients = [gradient for optimizer in optimizers for gradient in optimizer.gradients()]
+    finite = all_finite([loss, *gradients])
+    value, seen, sound = torch.stack([loss, sees.to(loss), finite.to(loss)]).tolist()
+    if not seen:
+        return value, "empty"
+    return value, None if sound else "not finite"
 
 
 def centres_count(means2d: Tensor, mask: Tensor) -> Tensor:
@@ -208,7 +217,7 @@ def centres_count(means2d: Tensor, mask: Tensor) -> Tensor:
 def mask_tensor(train: TrainingSet, index: int, device: str | torch.device) -> Tensor | None:
     """Where the photo of a training view counts; None for everywhere. bool [H, W]"""
     mask = train.load_mask(index)
-    return None if mask is None else torch.tensor(mask, device=device)
+    return None if mask is None else to_device(mask.copy(), device)
 
 
 def prediction_of(raster: Rasterization, exposure: Tensor | None = None) -> Prediction:
@@ -233,15 +242,15 @@ def camera_tensors(view: View, device: str | torch.device = "cpu") -> tuple[Tens
         viewmats: Pose in the training frame. float32 [1, 4, 4]
         Ks: Intrinsics in pixels. float32 [1, 3, 3]
     """
-    viewmats = torch.from_numpy(np.array(view.cam_from_world, dtype=np.float32)[None])
-    Ks = torch.from_numpy(np.array(view.K, dtype=np.float32)[None])
-    return viewmats.to(device), Ks.to(device)
+    viewmats = np.array(view.cam_from_world, dtype=np.float32)[None]
+    Ks = np.array(view.K, dtype=np.float32)[None]
+    return to_device(viewmats, device), to_device(Ks, device)
 
 
 def camera_centre_tensor(view: View, device: str | torch.device = "cpu") -> Tensor:
     """Camera centre in the training frame, computed in float64. float32 [3]"""
     centre = camera_centre(np.asarray(view.cam_from_world, dtype=np.float64))
-    return torch.from_numpy(centre.astype(np.float32)).to(device)
+    return to_device(centre.astype(np.float32), device)
 
 
 class SplattingMethod(ABC):

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
@@ -28,24 +29,22 @@ def arrays_of(positions: list[list[float]], features: list[list[float]]) -> Anch
     """One anchor in the origin cell with one Gaussian per position: offset scale 1."""
     count = len(positions)
     return AnchorRows(
-        anchors=np.zeros((count, 3), np.float32),
-        offsets=np.array(positions, np.float32)[:, None],
-        log_scales=np.zeros((count, 6), np.float32),
-        features=np.array(features, np.float32),
+        anchors=torch.zeros(count, 3),
+        offsets=torch.tensor(positions)[:, None],
+        log_scales=torch.zeros(count, 6),
+        features=torch.tensor(features),
     )
 
 
 def statistics_of(gradients: list[float], hits: float) -> DensityStatistics:
     statistics = DensityStatistics(len(gradients), 1)
     statistics.hits[:, 0] = hits
-    statistics.grad_sum[:, 0] = np.array(gradients) * hits
+    statistics.grad_sum[:, 0] = torch.tensor(gradients) * hits
     return statistics
 
 
-def sizes(new_log_scales: np.ndarray) -> list[float]:
-    return sorted(
-        np.round(np.exp(new_log_scales[:, 0].astype(np.float64)), 6).tolist(), reverse=True
-    )
+def sizes(new_log_scales: torch.Tensor) -> list[float]:
+    return sorted(new_log_scales[:, 0].double().exp().round(decimals=6).tolist(), reverse=True)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +87,7 @@ def test_a_new_anchor_sits_in_its_cell_with_the_largest_features_of_its_parents(
 
 
 def test_offsets_count_in_units_of_the_anchor() -> None:
-    log_scales = np.full((1, 6), np.log(0.32), np.float32)
+    log_scales = torch.full((1, 6), float(np.log(0.32)))
     arrays = arrays_of([[1.0, 0, 0]], [[1.0]])._replace(log_scales=log_scales)
     rules = dataclasses.replace(CONFIG, growth_levels=1)
     new = grown(arrays, statistics_of([3e-4], 41), rules)
@@ -111,9 +110,7 @@ def test_the_random_masks_keep_more_at_finer_levels() -> None:
     arrays = arrays_of(positions, [[0.0]] * count)
     rules = dataclasses.replace(CONFIG, random_growth=True)
     new = grown(arrays, statistics_of([9e-4] * count, 41), rules)
-    edges, counts = np.unique(
-        np.round(np.exp(new.log_scales[:, 0].astype(np.float64)), 6), return_counts=True
-    )
+    edges, counts = np.unique(sizes(new.log_scales), return_counts=True)
     shares = dict(zip(edges.tolist(), (counts / count).tolist(), strict=True))
     expected = {0.016: 0.5, 0.004: 0.75, 0.001: 0.875}
     assert shares == pytest.approx(expected, abs=0.03)
@@ -140,18 +137,18 @@ def test_faint_anchors_are_pruned(visits: float, opacity_sum: float, kept: bool)
 def test_the_paper_prunes_anchors_that_do_not_move() -> None:
     statistics = DensityStatistics(2, 1)
     statistics.visits[:], statistics.opacity_sum[:] = 100, 50.0
-    statistics.motion[:] = [0.0, 1.0]
+    statistics.motion[:] = torch.tensor([0.0, 1.0])
     rules = dataclasses.replace(CONFIG, prune_by="gradient")
     assert prune_mask(statistics, rules).tolist() == [False, True]
 
 
 def test_statistics_of_a_view() -> None:
     statistics = DensityStatistics(3, 2)
-    positions = np.array([0, 2, 3])  # the second Gaussian of the first anchor is off
-    opacities = np.array([0.5, 0.25, 0.5], np.float32)
-    radii = np.array([[1, 1], [0, 4], [2, 2]], np.int32)
-    grads = np.array([[3e-3, 4e-3], [9.0, 9.0], [0.0, 1e-3]], np.float32)
-    statistics.update(np.array([0, 2]), positions, opacities, radii, grads, 20, 40)
+    positions = torch.tensor([0, 2, 3])  # the second Gaussian of the first anchor is off
+    opacities = torch.tensor([0.5, 0.25, 0.5])
+    radii = torch.tensor([[1, 1], [0, 4], [2, 2]], dtype=torch.int32)
+    grads = torch.tensor([[3e-3, 4e-3], [9.0, 9.0], [0.0, 1e-3]])
+    statistics.update(torch.tensor([0, 2]), positions, opacities, radii, grads, 20, 40)
     np.testing.assert_array_equal(statistics.visits, [1, 0, 1])
     np.testing.assert_allclose(statistics.opacity_sum, [0.5, 0, 0.75])
     # Gradients count in half images: 10 pixels across, 20 down. Off or culled ones do not count.
@@ -164,11 +161,11 @@ def test_statistics_of_a_view() -> None:
 def test_a_view_does_not_count_for_anchors_in_what_its_mask_ignores() -> None:
     """No visit of the anchor; a Gaussian of it that lies elsewhere is hit all the same."""
     statistics = DensityStatistics(2, 2)
-    positions, opacities = np.arange(4), np.full(4, 0.5, np.float32)
-    radii = np.array([[1, 1], [0, 0], [2, 2], [2, 2]], np.int32)
-    grads = np.full((4, 2), 1e-3, np.float32)
-    counted = np.array([False, True])
-    statistics.update(np.arange(2), positions, opacities, radii, grads, 2, 2, counted)
+    positions, opacities = torch.arange(4), torch.full((4,), 0.5)
+    radii = torch.tensor([[1, 1], [0, 0], [2, 2], [2, 2]], dtype=torch.int32)
+    grads = torch.full((4, 2), 1e-3)
+    counted = torch.tensor([False, True])
+    statistics.update(torch.arange(2), positions, opacities, radii, grads, 2, 2, counted)
     assert statistics.visits.tolist() == [0, 1] and statistics.opacity_sum.tolist() == [0, 1]
     assert statistics.motion[0] == 0 and statistics.motion[1] > 0
     assert statistics.hits.tolist() == [[1, 0], [1, 1]]
@@ -185,7 +182,8 @@ def test_statistics_of_many_anchors() -> None:
     radii = rng.integers(0, 2, (count, 2)).astype(np.int32)
     grads = rng.normal(size=(count, 2)).astype(np.float32)
     statistics = DensityStatistics(anchors, k)
-    statistics.update(visible, positions, opacities, radii, grads, 2, 2)
+    arrays = (visible, positions, opacities, radii, grads)
+    statistics.update(*map(torch.from_numpy, arrays), 2, 2)
     seen = radii.min(axis=1) > 0
     owner = visible[positions // k]
     norms = np.hypot(grads[:, 0], grads[:, 1])
@@ -204,8 +202,8 @@ def test_statistics_of_many_anchors() -> None:
 
 def test_counters_follow_their_anchors() -> None:
     statistics = DensityStatistics(3, 2)
-    statistics.visits[:] = [1, 2, 3]
+    statistics.visits[:] = torch.tensor([1.0, 2.0, 3.0])
     statistics.extend(1)
-    statistics.keep(np.array([True, False, True, True]))
+    statistics.keep(torch.tensor([True, False, True, True]))
     assert statistics.visits.tolist() == [1, 3, 0]
     assert statistics.hits.shape == (3, 2)

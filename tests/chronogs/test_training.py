@@ -125,7 +125,9 @@ def test_a_round_is_not_lost_to_an_empty_step(
     for index in range(11):
         made.step(index, index / 24)
     start, weights = len(made.model), made.model.heads["opacity"].w1.detach().clone()
-    monkeypatch.setattr(made.trainer.model, "visible", lambda view: np.zeros(0, np.int64))
+    monkeypatch.setattr(
+        made.trainer.model, "visible", lambda view: torch.zeros(0, dtype=torch.int64)
+    )
     report = made.step(11, 11 / 24)
     assert report.skipped == "empty" and report.primitives > start
     assert torch.equal(made.model.heads["opacity"].w1, weights)

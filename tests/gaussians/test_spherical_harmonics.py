@@ -1,5 +1,7 @@
 """Spherical harmonics: against scipy, closed forms and finite differences."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from scipy.special import sph_harm_y
 
 from chronoscene.gaussians import spherical_harmonics as sh
 from chronoscene.kernels.runtime import set_threads
+from chronoscene.rasterizer import gsplat_backend
 
 
 def random_inputs(count, *, seed=0, dtype=torch.float32):
@@ -91,3 +94,47 @@ def test_a_gaussian_on_the_camera_centre_gives_no_nan():
     colors = sh.evaluate(*leaves, centre, 3)
     grads = torch.autograd.grad(colors.sum(), leaves)
     assert all(torch.isfinite(t).all() for t in (colors, *grads))
+
+
+@pytest.mark.parametrize("release", ["1.5", "1.6"])
+def test_gsplat_is_asked_in_the_words_of_its_version(monkeypatch, release):
+    """With stand-ins of both signatures; they, too, add no half and cut nothing off."""
+
+    def of_directions(degree, directions, coeffs):
+        centre = torch.zeros(3, dtype=directions.dtype)
+        return sh.evaluate_reference(coeffs[:, 0], coeffs[:, 1:], directions, centre, degree) - 0.5
+
+    def of_cameras(degree, means, viewmats, coeffs):
+        assert torch.equal(viewmats, torch.eye(4)[None])
+        return of_directions(degree, means, coeffs)[None]
+
+    functions = {"1.5": of_directions, "1.6": of_cameras}
+    gsplat = SimpleNamespace(spherical_harmonics=functions[release])
+    monkeypatch.setattr(gsplat_backend, "release", lambda: release)
+    monkeypatch.setattr(gsplat_backend, "_load", lambda device: gsplat)
+    dc, rest, means, centre = random_inputs(40)
+    means[7] = centre
+    for degree in range(4):
+        ours = sh._evaluate_gsplat(dc, rest, means, centre, degree)
+        wanted = sh.evaluate_reference(dc, rest, means, centre, degree)
+        assert ours.isfinite().all()
+        seen = torch.arange(40) != 7
+        torch.testing.assert_close(ours[seen], wanted[seen], atol=1e-6, rtol=0)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("degree", range(4))
+def test_gsplats_kernel_equals_the_definition(degree):
+    pytest.importorskip("gsplat", reason="needs the extra cuda")
+    *parameters, centre = random_inputs(1300)
+    weights = torch.randn(1300, 3, generator=torch.Generator().manual_seed(9))
+    results = []
+    for device, dtype in (("cuda", torch.float32), ("cpu", torch.float64)):
+        leaves = [p.to(device, dtype).requires_grad_() for p in parameters]
+        colors = sh.evaluate(*leaves, centre.to(device, dtype), degree)
+        (colors * weights.to(device, dtype)).sum().backward()
+        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in leaves]
+        results.append([x.detach().cpu().double() for x in (colors, *grads)])
+    for mine, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(mine, theirs, atol=2e-5, rtol=1e-5)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
+import chronoscene
 from chronoscene.errors import BackendError, ShapeError
-from chronoscene.rasterizer import rasterize
+from chronoscene.rasterizer import gsplat_backend, rasterize
 
 
 @pytest.fixture
@@ -104,15 +109,36 @@ def test_unknown_backend(arguments: dict[str, Any]) -> None:
         rasterize(**arguments, backend="cdua")
 
 
-def test_cuda_without_gsplat_or_gpu_says_what_to_install(
-    arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import sys
+@pytest.fixture
+def other_gsplat(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Pretends that another gsplat is installed: its version, its module, its kernels."""
 
-    monkeypatch.setitem(sys.modules, "gsplat", None)  # as if it were not installed
-    with pytest.raises(BackendError, match=r"pip install 'chronoscene\[cuda\]'"):
+    def pretend(version: str, module: Any = None, kernels: Any = None) -> None:
+        modules = {"gsplat": module, "gsplat.cuda._backend": SimpleNamespace(_C=kernels)}
+        monkeypatch.setattr(gsplat_backend, "version", lambda name: version)
+        monkeypatch.setattr(gsplat_backend, "import_module", modules.__getitem__)
+        gsplat_backend.release.cache_clear()
+        gsplat_backend._load.cache_clear()
+
+    yield pretend
+    gsplat_backend.release.cache_clear()
+    gsplat_backend._load.cache_clear()
+
+
+def test_cuda_without_gsplat_or_gpu_says_what_to_install(
+    arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch, other_gsplat: Callable[..., None]
+) -> None:
+    def missing(name: str) -> str:
+        raise PackageNotFoundError
+
+    monkeypatch.setattr(gsplat_backend, "version", missing)
+    with pytest.raises(BackendError, match=r"found none; pip install 'chronoscene\[cuda\]'"):
         rasterize(**arguments, backend="cuda")
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=None))
+    for version in ("1.4.0", "1.7.0"):
+        other_gsplat(version)
+        with pytest.raises(BackendError, match=rf"expected gsplat 1.5 or 1.6, found {version}"):
+            rasterize(**arguments, backend="cuda")
+    other_gsplat("1.5.3")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(BackendError, match=r"expected an NVIDIA GPU"):
         rasterize(**arguments, backend="cuda")
@@ -121,12 +147,17 @@ def test_cuda_without_gsplat_or_gpu_says_what_to_install(
         rasterize(**arguments, backend="cuda")
 
 
+def test_versions_in_the_packaging_are_those_that_were_looked_at() -> None:
+    path = Path(chronoscene.__file__).parents[1] / "pyproject.toml"
+    (extra,) = tomllib.loads(path.read_text())["project"]["optional-dependencies"]["cuda"]
+    minors = [int(version.removeprefix("1.")) for version in gsplat_backend.ALPHA_MAX]
+    assert extra == f"gsplat>=1.{min(minors)},<1.{max(minors) + 1}"
+
+
 def test_cuda_backend_speaks_gsplats_language(
     arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Names of arguments, shapes and culling, with a stand-in for gsplat on the CPU."""
-    import sys
-
     seen: dict[str, Any] = {}
 
     def rasterization(means: Any, quats: Any, *rest: Any, **options: Any) -> Any:
@@ -141,10 +172,8 @@ def test_cuda_backend_speaks_gsplats_language(
         image = means2d.sum() * torch.ones(1, 10, 12, 3 + depth)
         return image, torch.zeros(1, 10, 12, 1), meta
 
-    from chronoscene.rasterizer import gsplat_backend
-
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
-    monkeypatch.setattr(gsplat_backend, "_load", lambda device: rasterization)
+    gsplat = SimpleNamespace(rasterization=rasterization)
+    monkeypatch.setattr(gsplat_backend, "_load", lambda device: gsplat)
     arguments["opacities"] = torch.tensor([0.5, -0.5, float("nan"), 0.5, 0.5])
     arguments["quats"][3] = 0
     arguments["means"].requires_grad_()
@@ -162,19 +191,39 @@ def test_cuda_backend_speaks_gsplats_language(
     assert seen["rasterize_mode"] == "antialiased"
 
 
-@pytest.mark.parametrize("failure", [AttributeError, ImportError])
-def test_cuda_without_a_toolkit_says_what_to_install(
-    arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch, failure: type[Exception]
+BUILD_OUTPUT = """Error building extension 'gsplat_cuda': [1/30] nvcc -O3 Projection.cu
+Projection.cu(7): error: identifier "make_float9" is undefined
+ninja: build stopped: subcommand failed."""
+
+
+@pytest.mark.parametrize(
+    ("failure", "found"),
+    [
+        (None, "no CUDA toolkit"),
+        (ImportError("gsplat_cuda.so"), "gsplat_cuda.so"),
+        (RuntimeError(BUILD_OUTPUT), 'error: identifier "make_float9" is undefined'),
+        (RuntimeError("Ninja is required to load C++ extensions"), "Ninja is required"),
+    ],
+)
+def test_kernels_that_cannot_be_built_are_one_error(
+    monkeypatch: pytest.MonkeyPatch,
+    other_gsplat: Callable[..., None],
+    failure: Exception | None,
+    found: str,
 ) -> None:
-    """Without nvcc gsplat imports, and fails when its kernels are called."""
-    from chronoscene.rasterizer import gsplat_backend
+    """What fails first: without nvcc the kernels are None, or else the build ends."""
+    other_gsplat("1.5.3")
 
-    def rasterization(*inputs: Any, **options: Any) -> Any:
-        raise failure("gsplat_cuda.so")
+    def load(name: str) -> Any:
+        if failure is not None:
+            raise failure
+        return SimpleNamespace(_C=None)
 
-    monkeypatch.setattr(gsplat_backend, "_load", lambda device: rasterization)
-    with pytest.raises(BackendError, match=r"install the CUDA toolkit.*nvcc"):
-        rasterize(**arguments, backend="cuda")
+    monkeypatch.setattr(gsplat_backend, "import_module", load)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    with pytest.raises(BackendError, match=r"install the CUDA toolkit.*nvcc") as error:
+        gsplat_backend._load(torch.device("cuda"))
+    assert found in str(error.value) and "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])

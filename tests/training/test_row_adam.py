@@ -32,7 +32,7 @@ class Both:
         rows = np.flatnonzero(self.rng.random(len(self.dense)) < share)
         starts = np.cumsum(self.blocks) - self.blocks
         columns = np.concatenate([starts[b] + np.arange(self.blocks[b]) for b in blocks])
-        leaf = self.lazy.fetch(rows, blocks)
+        leaf = self.lazy.fetch(torch.from_numpy(rows), blocks)
         cells = np.ix_(rows, columns)
         np.testing.assert_allclose(
             leaf.detach(), self.dense.detach().numpy()[cells], rtol=0, atol=self.tolerance
@@ -126,14 +126,14 @@ def test_without_a_gradient_nothing_is_lost() -> None:
     """Rows that were fetched and not used move as those that were not fetched."""
     both = Both(4, [2], seed=2)
     both.step(1.0, [0], 0.01)
-    both.lazy.fetch(np.array([1, 3]))
+    both.lazy.fetch(torch.tensor([1, 3]))
     both.compare()
 
 
 def test_a_row_keeps_its_shape() -> None:
     table = RowAdam(torch.zeros(4, 5, 3))
-    assert table.fetch(np.array([2, 0])).shape == (2, 5, 3)
-    assert RowAdam(torch.zeros(0, 5, 3)).fetch(np.empty(0, np.int64)).shape == (0, 5, 3)
+    assert table.fetch(torch.tensor([2, 0])).shape == (2, 5, 3)
+    assert RowAdam(torch.zeros(0, 5, 3)).fetch(torch.empty(0, dtype=torch.int64)).shape == (0, 5, 3)
 
 
 def test_equal_bits_for_any_number_of_threads() -> None:

@@ -19,7 +19,7 @@ from torch.nn.functional import grid_sample, linear, relu
 from baselines.deformation_4dgs.field.function import Deform
 from baselines.deformation_4dgs.field.layout import HEADS, PAIRS, Corner, Field
 from chronoscene.checks import check_shape
-from chronoscene.training.adam import is_cpu_float32
+from chronoscene.training import devices
 
 _AXES = {"x": 0, "y": 1, "z": 2, "t": 3}
 
@@ -40,7 +40,7 @@ def deform(
     Returns:
         Those groups that a head changes.
     """
-    if not all(is_cpu_float32(tensor) for tensor in (*parameters.values(), *tensors.values())):
+    if not devices.has_kernels(*parameters.values(), *tensors.values()):
         return deform_reference(parameters, tensors, field, time)
     for name, shape in field.shapes().items():
         check_shape(name, tensors[name], shape)
@@ -82,15 +82,16 @@ def _linear(tensors: Mapping[str, Tensor], name: str, inputs: Tensor) -> Tensor:
 
 def _features(means: Tensor, tensors: Mapping[str, Tensor], field: Field, time: float) -> Tensor:
     """[N, levels * channels]"""
-    low, scale = means.new_tensor(field.low), means.new_tensor(field.scale)
     # Cell centres are at -1 and 1 at the ends of an axis (align_corners).
-    places = torch.cat([(means - low) * scale, means.new_full((len(means), 1), time)], 1) * 2 - 1
+    corners = zip(means.unbind(1), field.low, field.scale, strict=True)
+    places = [(place - low) * scale * 2 - 1 for place, low, scale in corners]
+    places.append(torch.full_like(places[0], time * 2 - 1))
     levels = []
     for level in range(len(field.sizes)):
         feature = torch.ones_like(means[:, :1])
         for pair in PAIRS:
             plane = tensors[f"planes.{level}.{pair}"].permute(2, 0, 1)[None]
-            at = places[:, [_AXES[axis] for axis in pair]][None, None]
+            at = torch.stack([places[_AXES[axis]] for axis in pair], 1)[None, None]
             sampled = grid_sample(plane, at, padding_mode="border", align_corners=True)
             feature = feature * sampled[0, :, 0].T
         levels.append(feature)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from baselines.deformation_4dgs.field.layout import Field
 from chronoscene.kernels.compilation import kernel
-from chronoscene.training.adam import is_cpu_float32
+from chronoscene.training import devices
 
 
 class Weights(NamedTuple):
@@ -34,7 +34,7 @@ def smoothness(tensors: Mapping[str, Tensor], field: Field, weights: Weights) ->
     """`smoothness_reference`, compiled for float32 on a CPU."""
     names = [name for name in field.shapes() if name.startswith("planes.")]
     planes = [tensors[name] for name in names]
-    if not all(map(is_cpu_float32, planes)):
+    if not devices.has_kernels(*planes):
         return smoothness_reference(tensors, field, weights)
     return _Smoothness.apply([weights.of(name) for name in names], *planes)
 

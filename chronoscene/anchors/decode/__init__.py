@@ -19,6 +19,7 @@ from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.decode.layout import MIN_DISTANCE, MIN_QUAT_NORM
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
+from chronoscene.training import devices
 from chronoscene.training.splatting import Splats
 
 _ALL = np.float32(-np.inf)  # Opacity above which Gaussians are active, if all are to be
@@ -93,9 +94,10 @@ def decode_reference(x: DecodeInputs) -> Splats:
     check_shape(
         "features", x.features, (x.anchors.shape[0], x.base_dim + num_periods * x.period_dim)
     )
-    rows = x.features[x.visible]
+    # Not x.features[x.visible], whose gradient would be sorted by rows.
+    rows = x.features.index_select(0, x.visible)
     periods = rows[:, x.base_dim :].reshape(len(x.visible), num_periods, x.period_dim)
-    centres = x.anchors[x.visible].detach()
+    centres = x.anchors.index_select(0, x.visible).detach()
     directions = centres - x.camera_centre.detach()
     lengths = directions.norm(dim=-1, keepdim=True)
     directions = torch.where(lengths > MIN_DISTANCE, directions / lengths, 0)
@@ -108,10 +110,11 @@ def decode_reference(x: DecodeInputs) -> Splats:
         ),
         dim=-1,
     )
-    factors = torch.exp(x.log_scales[x.visible])[:, None, :]
+    factors = torch.exp(x.log_scales.index_select(0, x.visible))[:, None, :]
+    offsets = x.offsets.index_select(0, x.visible)
     covariances = _mlp(inputs, x.covariance_head).reshape(-1, num_offsets, 7)
     return Splats(
-        means=(centres[:, None] + x.offsets[x.visible] * factors[..., :3]).reshape(-1, 3),
+        means=(centres[:, None] + offsets * factors[..., :3]).reshape(-1, 3),
         quats=_unit_quats(covariances[..., 3:].reshape(-1, 4)),
         scales=(factors[..., 3:] * torch.sigmoid(covariances[..., :3])).reshape(-1, 3),
         opacities=torch.tanh(_mlp(inputs, x.opacity_head)).reshape(-1),
@@ -150,13 +153,14 @@ def _decode(x: DecodeInputs, above: np.float32) -> tuple[Splats, Tensor]:
     tensors = (x.offsets, x.features, x.log_scales, x.global_features)
     weights = [weight for head in x.heads for weight in head]
     floats = (*fixed[:3], *tensors, *weights)
-    if all(tensor.device.type == "cpu" and tensor.dtype == torch.float32 for tensor in floats):
+    if devices.has_kernels(*floats):
+        _check_visible(x.visible, len(x.anchors))
         dims = (x.base_dim, x.period_dim)
         *outputs, index = Decode.apply(dims, above, fixed, *tensors, *weights)
         return Splats(*outputs), index
     splats = decode_reference(x)
     index = (~(splats.opacities <= float(above))).nonzero()[:, 0]
-    return Splats(*(value[index] for value in splats)), index
+    return Splats(*(value.index_select(0, index) for value in splats)), index
 
 
 def _check(x: DecodeInputs) -> None:
@@ -177,7 +181,10 @@ def _check(x: DecodeInputs) -> None:
         check_shape(f"{name} head b1", head.b1, (hidden,))
         check_shape(f"{name} head w2", head.w2, (width * count, hidden))
         check_shape(f"{name} head b2", head.b2, (width * count,))
-    visible = x.visible
+
+
+def _check_visible(visible: Tensor, rows: int) -> None:
+    """Check the indices: the kernels read whatever they point at."""
     rising = bool((visible[1:] > visible[:-1]).all())
     if not rising or (len(visible) and (visible[0] < 0 or visible[-1] >= rows)):
         raise ShapeError(

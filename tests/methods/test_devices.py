@@ -1,0 +1,187 @@
+"""What a GPU runs, for every method that says it can: on a GPU, and the same code on a CPU.
+
+On a CPU, `devices.has_kernels` is told to say no: then everything but the rasterizer is what a GPU
+runs. It is compared with the compiled code.
+"""
+
+import dataclasses
+import sys
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import tiny_training
+import torch
+
+from chronoscene.methods import (
+    Method,
+    MethodSpec,
+    TrainingSet,
+    import_object,
+    load_spec,
+    method_names,
+)
+from chronoscene.training import devices
+
+STEPS = 3
+"""Few, since Adam makes whole steps of differences that are rounding."""
+LOSS_TOLERANCE = 1e-4
+"""Of the losses, relatively. Measured on a CPU in plain torch: 7e-7. Not measured on a GPU."""
+IMAGE_TOLERANCE = 1e-3
+"""Of images after `STEPS`. Measured on a CPU in plain torch: 6e-5. Not measured on a GPU."""
+RENDER_TOLERANCE = 1e-4
+"""Of images of one model. Measured on a CPU in plain torch: 8e-7. Not measured on a GPU."""
+QUESTIONS = 3
+"""To tensors in a step: what is in view, what of it is switched on; and how the step went."""
+
+
+@dataclass
+class Compiled:
+    """A method as the compiled code trains it."""
+
+    spec: MethodSpec
+    data: TrainingSet
+
+    def method(self, device: str = "cpu") -> Method:
+        """At the start of a training with as many options as all methods have."""
+        config = tiny_training.small_config(self.spec)
+        options = {"exposure": "image", "random_background": True}
+        known = {k: v for k, v in options.items() if hasattr(config, k)}
+        method: Method = import_object(self.spec.method)(dataclasses.replace(config, **known))
+        method.setup(self.data, seed=0, device=device)
+        return method
+
+    def image(self, method: Method) -> np.ndarray:
+        return method.render(self.data.views[0], 0.0).rgb
+
+
+@pytest.fixture(
+    scope="module", params=[n for n in method_names() if "cuda" in load_spec(n).devices]
+)
+def compiled(request: pytest.FixtureRequest) -> Compiled:
+    spec = load_spec(request.param)
+    data = tiny_training.make_training_set(tiny_training.periods_for(spec))
+    mask = np.ones((tiny_training.HEIGHT, tiny_training.WIDTH), bool)
+    mask[8:20, 5:18] = False
+    return Compiled(spec, dataclasses.replace(data, load_mask=lambda i: mask if i % 2 else None))
+
+
+@pytest.fixture(scope="module")
+def first_steps(compiled: Compiled) -> tuple[list[float], np.ndarray]:
+    """Losses, and an image after them."""
+    method = compiled.method()
+    losses = [method.step(i, i / tiny_training.STEPS).loss for i in range(STEPS)]
+    return losses, compiled.image(method)
+
+
+GPU = pytest.param(
+    "cuda",
+    marks=[
+        pytest.mark.gpu,
+        pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+    ],
+)
+
+
+@pytest.fixture(params=["cpu", GPU])
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A GPU, or a CPU that runs what a GPU would."""
+    if request.param == "cpu":
+        without_kernels(monkeypatch)
+    return request.param
+
+
+def without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
+
+
+def test_first_steps_are_those_of_the_compiled_code(
+    compiled: Compiled, first_steps: tuple[list[float], np.ndarray], device: str
+) -> None:
+    losses, image = first_steps
+    method = compiled.method(device)
+    found = [method.step(i, i / tiny_training.STEPS).loss for i in range(STEPS)]
+    np.testing.assert_allclose(found, losses, rtol=LOSS_TOLERANCE)
+    np.testing.assert_allclose(compiled.image(method), image, atol=IMAGE_TOLERANCE)
+
+
+def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
+    compiled: Compiled, device: str, tmp_path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Trained on the device, saved; loaded on a CPU with its kernels, saved; loaded again."""
+    method = compiled.method(device)
+    steps = tiny_training.STEPS
+    losses = [method.step(i, i / steps).loss for i in range(steps)]
+    assert np.isfinite(losses).all() and np.mean(losses[-15:]) < 0.9 * np.mean(losses[:5])
+    folders = [tmp_path / name for name in ("there", "here")]
+    for folder in folders:
+        folder.mkdir()
+    method.save(folders[0])
+    image = compiled.image(method)
+    monkeypatch.undo()
+    here = import_object(compiled.spec.method)(method.config)
+    here.load(folders[0], device="cpu")
+    np.testing.assert_allclose(compiled.image(here), image, atol=RENDER_TOLERANCE)
+    here.save(folders[1])
+    for name in ("model.json", "model.safetensors"):
+        assert (folders[1] / name).read_bytes() == (folders[0] / name).read_bytes()
+    if device == "cpu":
+        without_kernels(monkeypatch)
+    back = import_object(compiled.spec.method)(method.config)
+    back.load(folders[1], device=device)
+    np.testing.assert_allclose(compiled.image(back), image, atol=RENDER_TOLERANCE)
+
+
+def test_a_training_goes_on_where_it_was_saved(compiled: Compiled, device: str, tmp_path) -> None:
+    if not compiled.spec.resumable:
+        pytest.skip("the method cannot be resumed")
+    method, resumed = compiled.method(device), compiled.method(device)
+    for i in range(63):
+        method.step(i, i / tiny_training.STEPS)
+    method.save_training(tmp_path)
+    resumed.load_training(tmp_path)
+    reports = [m.step(63, 63 / tiny_training.STEPS) for m in (method, resumed)]
+    assert reports[0].primitives == reports[1].primitives
+    assert reports[1].loss == pytest.approx(reports[0].loss, rel=LOSS_TOLERANCE)
+
+
+def test_a_step_asks_a_gpu_little_and_gets_no_table(
+    compiled: Compiled, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As asked on a CPU, except by what is of the CPU alone."""
+    without_kernels(monkeypatch)
+    method = compiled.method()
+    for i in range(63):  # the rounds that change the set of primitives are among them
+        method.step(i, i / tiny_training.STEPS)
+    found = count_questions(monkeypatch)
+    for i in (63, 64):
+        found.clear()
+        method.step(i, i / tiny_training.STEPS)
+        assert sum(found.values()) <= QUESTIONS, found
+        assert not found.keys() & {"numpy", "cpu", "tensor", "new_tensor"}, found
+
+
+def count_questions(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Count, from now on, by name what makes the host wait for a GPU."""
+    found: Counter[str] = Counter()
+
+    def watch(owner, name: str) -> None:
+        function = getattr(owner, name)
+
+        def watched(*args, **kwargs):
+            masks = [a for a in args[1:] if isinstance(a, torch.Tensor) and a.dtype == torch.bool]
+            caller = sys._getframe(1).f_code.co_filename
+            of_cpu = "/rasterizer/cpu/" in caller or caller == devices.__file__
+            if not of_cpu and (name != "__getitem__" or masks):
+                found[name] += 1
+            return function(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, watched)
+
+    for name in ("numpy", "cpu", "tolist", "item", "nonzero", "unique", "new_tensor"):
+        watch(torch.Tensor, name)
+    for name in ("__bool__", "__int__", "__float__", "__index__", "__getitem__"):
+        watch(torch.Tensor, name)
+    watch(torch, "tensor")
+    return found
