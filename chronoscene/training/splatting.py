@@ -208,9 +208,9 @@ def centres_count(means2d: Tensor, mask: Tensor) -> Tensor:
         means2d: Places in pixels; pixel (0, 0) is centred at (0.5, 0.5).
         mask: Where the photo counts. bool [H, W]
     """
-    size = means2d.new_tensor(mask.shape[::-1])
-    inside = ((means2d >= 0) & (means2d < size)).all(-1)
-    x, y = torch.where(inside[:, None], means2d, 0.0).long().unbind(-1)
+    (x, y), (height, width) = means2d.unbind(-1), mask.shape
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    x, y = (torch.where(inside, place, 0.0).long() for place in (x, y))
     return mask[y, x] | ~inside
 
 
