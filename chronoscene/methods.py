@@ -14,13 +14,17 @@ A method that splats Gaussians need not implement all of `Method`: `GaussianMeth
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import importlib
+import inspect
+import itertools
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from textwrap import dedent
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -317,6 +321,48 @@ def build_config(
     return config_class(**values)
 
 
+@dataclass(frozen=True, slots=True)
+class Option:
+    """An option of a method, as ``chronoscene methods NAME`` lists it."""
+
+    name: str
+    default: Any
+    presets: dict[str, Any]
+    """Preset name to its value, where it differs from the default."""
+    meaning: str
+    """The docstring below the field; empty if there is none."""
+
+
+def options_of(spec: MethodSpec) -> list[Option]:
+    """All options of a method, in the order of its config class."""
+    config_class = import_object(spec.config)
+    meanings: dict[str, str] = {}
+    for base in reversed(config_class.__mro__[:-1]):
+        meanings |= _field_docstrings(base)
+    options = []
+    for name, default in dataclasses.asdict(config_class()).items():
+        values = {key: preset.get(name, default) for key, preset in spec.presets.items()}
+        differ = {key: value for key, value in values.items() if value != default}
+        options.append(Option(name, default, differ, meanings.get(name, "")))
+    return options
+
+
+def _field_docstrings(config_class: type) -> dict[str, str]:
+    """Python keeps no docstrings of fields, so they are read from the source."""
+    try:
+        (definition,) = ast.parse(dedent(inspect.getsource(config_class))).body
+    except (OSError, TypeError):  # made without a file
+        return {}
+    assert isinstance(definition, ast.ClassDef)
+    found = {}
+    for field_, text in itertools.pairwise(definition.body):
+        if isinstance(field_, ast.AnnAssign) and isinstance(field_.target, ast.Name):
+            match text:
+                case ast.Expr(ast.Constant(str(docstring))):
+                    found[field_.target.id] = " ".join(docstring.split())
+    return found
+
+
 def config_from_values(spec: MethodSpec, values: Mapping[str, Any]) -> Any:
     """Make the frozen config of a method from all of its values, as JSON gives them back.
 
@@ -333,6 +379,11 @@ def config_from_values(spec: MethodSpec, values: Mapping[str, Any]) -> Any:
             found=str(error),
             todo="use the version of the software that made the run, or run bench again",
         ) from error
+
+
+def as_typed(value: Any) -> str:
+    """A value of an option as ``--set`` takes it."""
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _parse_like(place: str, value: Any, default: Any) -> Any:

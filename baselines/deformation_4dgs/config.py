@@ -34,6 +34,7 @@ class Deformation4DGSConfig(GaussianConfig):
     plane_size: int = 64
     """Cells along each spatial axis of the first level; twice as many on each next."""
     levels: int = 2
+    """Resolutions of the planes along the spatial axes."""
     time_cells: int = 150
     """Cells along the time axis. 0: as many as there are periods, but at least 3."""
     width: int = 128
@@ -58,7 +59,9 @@ class Deformation4DGSConfig(GaussianConfig):
     field_lr_final: float = 1.6e-5
     """The same, at the end of the schedule; log-linear between."""
     plane_lr_initial: float = 1.6e-3
+    """Of the planes; as `field_lr_initial` otherwise."""
     plane_lr_final: float = 1.6e-4
+    """The same, at the end of the schedule."""
 
     # Weights of terms of the loss
     space_smoothness: float = 2e-4

@@ -21,3 +21,4 @@ class ScaffoldGSConfig(AnchorConfig):
     ``scaffold-gs`` has one per training image and renders with their mean,
     ``scaffold-gs-period`` one per period."""
     appearance_lr: tuple[float, float] = (0.05, 0.0005)
+    """Of the appearance vectors."""

@@ -69,6 +69,7 @@ class AnchorConfig(SplattingConfig):
     """Share of the training in which photos are 1/`coarse_factor` of their size; faster there.
     Not in the papers."""
     coarse_factor: int = 2
+    """How much smaller than the photos the images are until then."""
 
     # Loss
     scale_weight: float = 0.01
@@ -87,10 +88,15 @@ class AnchorConfig(SplattingConfig):
     offset_lr: tuple[float, float] = (0.01, 0.0001)
     """Multiplied by the extent of the cameras, in `length_unit`."""
     feature_lr: tuple[float, float] = (0.0075, 0.0075)
+    """Of the features of anchors."""
     scaling_lr: tuple[float, float] = (0.007, 0.007)
+    """Of the logarithms of the scales of anchors."""
     opacity_lr: tuple[float, float] = (0.002, 0.00002)
+    """Of the MLP that gives opacities."""
     covariance_lr: tuple[float, float] = (0.004, 0.004)
+    """Of the MLP that gives scales and rotations."""
     color_lr: tuple[float, float] = (0.008, 0.00005)
+    """Of the MLP that gives colours."""
 
     # Growth and pruning
     statistics_from: float = 500 / 40_000

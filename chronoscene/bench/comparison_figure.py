@@ -19,6 +19,7 @@ from chronoscene.bench.predictions import (
     safe_name,
 )
 from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord, read_run, run_folders
+from chronoscene.bench.tables import kind_of
 from chronoscene.io.staging import replacing
 from chronoscene.metrics.psnr_ssim import psnr
 
@@ -49,6 +50,8 @@ def draw_figures(runs: Path, *, views_per_period: int = 1) -> list[Path]:
         truth = ground_truth_folder(runs, scene)
         labels = found[0][1].period_labels
         rows = chosen_views(truth, views_per_period)
+        if not rows:  # trained on all photos
+            continue
         for errors, name in ((False, "comparison"), (True, "errors")):
             path = runs / FIGURES / f"{safe_name(scene)}_{name}.png"
             _draw(path, scene, truth, rows, columns, labels, errors=errors)
@@ -57,10 +60,10 @@ def draw_figures(runs: Path, *, views_per_period: int = 1) -> list[Path]:
 
 
 def first_seeds(found: Sequence[tuple[Path, RunRecord]]) -> list[tuple[Path, RunRecord]]:
-    """The lowest seed of each method, strategy and preset."""
-    chosen: dict[tuple[str, str, str], tuple[Path, RunRecord]] = {}
+    """The lowest seed of each method, strategy, preset and variant."""
+    chosen: dict[tuple[str, str], tuple[Path, RunRecord]] = {}
     for folder, record in sorted(found, key=lambda item: item[1].seed):
-        chosen.setdefault((record.method, record.strategy, record.preset), (folder, record))
+        chosen.setdefault((record.method, kind_of(record)), (folder, record))
     return sorted(chosen.values(), key=lambda item: str(item[0]))
 
 
@@ -79,7 +82,7 @@ def chosen_views(truth: Path, per_period: int) -> list[ImageEntry]:
 def _column(folder: Path, record: RunRecord) -> Column:
     predictions = folder / PREDICTIONS
     entries = {e.view: e for e in read_manifest(predictions).images}
-    title = f"{record.title}\n{record.strategy}, {record.preset}"
+    title = f"{record.title}\n{kind_of(record)}"
     return Column(title, predictions, entries)
 
 

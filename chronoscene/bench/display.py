@@ -81,7 +81,7 @@ class ProgressDisplay:
             self._shown = now
             status = self.status(iteration, seconds, psnr)
             self._bar.update(self._task, completed=progress, status=status)
-        elif not self._live and psnr is not None and psnr != self._psnr:
+        elif not self._live and psnr is not None and str(psnr) != str(self._psnr):  # or nan
             status = self.status(iteration, seconds, psnr)
             self._print(f"{self._name}: {progress:4.0%} {status}, {report.primitives} primitives")
         self._psnr = psnr
@@ -95,7 +95,7 @@ class ProgressDisplay:
         pieces = [f"iteration {iteration}"]
         if self._loss is not None:
             pieces.append(f"loss {self._loss:.4f}")
-        if psnr is not None:
+        if psnr is not None and not math.isnan(psnr):
             pieces.append(f"{psnr:.2f} dB")
         pieces.append(f"{iteration / max(seconds, 1e-9):.1f} it/s")
         if left is not None and left > 0:

@@ -90,6 +90,7 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
         method=spec.name,
         strategy=job.strategy,
         preset=job.preset,
+        variant=job.variant,
         seed=job.seed,
         seconds=sum(model.seconds for model in trained),
         iterations=None if None in iterations else sum(filter(None, iterations)),

@@ -18,7 +18,7 @@ from chronoscene.bench.results import Failure
 from chronoscene.checks import check_choice
 from chronoscene.errors import BackendError, ConfigError
 from chronoscene.formats import writable_formats
-from chronoscene.methods import MethodSpec, Runner, build_config
+from chronoscene.methods import MethodSpec, Runner, as_typed, build_config
 
 _UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
 
@@ -71,6 +71,8 @@ class StopRule:
         return tuple(StopRule(base + (i < extra), seconds) for i in range(parts))
 
 
+LONGEST_NAME = 180  # Characters; file systems allow 255 bytes, and special ones become longer
+
 SHARING = ("total", "each")
 """Under the strategy separate: the models share iterations and time, or each get all of them."""
 
@@ -112,14 +114,25 @@ class Job:
     """Whether the finished run keeps what it takes to be trained further."""
     continued_from: list[int] = field(default_factory=list)
     """Iterations of the shorter trainings that this one began with."""
+    continues: str = ""
+    """Folder of the last of them."""
+    variant: str = ""
+    """What differs from the preset, as `with_variant` writes it."""
     plugin_path: str | None = None
     """Folder from which ``module:SPEC`` may be imported."""
 
     @property
     def folder(self) -> Path:
         """Where the finished run goes."""
-        name = f"{self.method_name}-{self.strategy}-{self.preset}"
-        return Path(self.runs) / safe_name(self.scene) / safe_name(name) / f"seed{self.seed}"
+        name = "-".join(filter(None, (*self._names, self.variant)))
+        if len(name) > LONGEST_NAME:
+            name = f"{name[:LONGEST_NAME]}-{config_hash({'variant': self.variant})[:8]}"
+        folder = safe_name(name).replace("/", "%2F")
+        return Path(self.runs) / safe_name(self.scene) / folder / f"seed{self.seed}"
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return self.method_name, self.strategy, self.preset
 
     @property
     def training(self) -> Path:
@@ -129,12 +142,27 @@ class Job:
     @property
     def label(self) -> str:
         """The run in words."""
-        return f"{self.scene}: {self.method_name} {self.strategy} {self.preset} seed {self.seed}"
+        names = " ".join(filter(None, (*self._names, self.variant)))
+        return f"{self.scene}: {names} seed {self.seed}"
 
-    def shorter(self) -> Job:
-        """The run that this one continues."""
-        *earlier, last = self.continued_from
-        return replace(self, iterations=last, continued_from=earlier)
+    def with_variant(self, spec: MethodSpec) -> Job:
+        """The job with its name: options that differ from the preset, and what else ends it.
+
+        ``iterations=20+50`` is a training of 20 iterations that went on to 50.
+        """
+        preset = dataclasses.asdict(build_config(spec, preset=self.preset))
+        config = dataclasses.asdict(self.method_config(spec))
+        differ = {name: value for name, value in config.items() if value != preset[name]}
+        if spec.runner is not None:  # where a program is, and not what it does
+            differ = {name: v for name, v in differ.items() if name not in ("prefix", "source")}
+        if self.continued_from:
+            lengths = [*self.continued_from, config["iterations"]]
+            differ["iterations"] = "+".join(map(str, lengths))
+        if self.budget_seconds is not None:
+            differ["budget"] = f"{self.budget_seconds:g}s"
+        if self.separate_iterations != SHARING[0]:
+            differ["separate_iterations"] = self.separate_iterations
+        return replace(self, variant=",".join(f"{k}={as_typed(v)}" for k, v in differ.items()))
 
     def failure(self, reason: str) -> Failure:
         """The record of a run that has no result; the reason becomes one line."""
@@ -142,6 +170,7 @@ class Job:
             method=self.method_name,
             strategy=self.strategy,
             preset=self.preset,
+            variant=self.variant,
             scene=self.scene,
             seed=self.seed,
             reason=shorten(reason, 500, placeholder=" ..."),

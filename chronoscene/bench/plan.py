@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
@@ -63,6 +62,7 @@ class BenchSettings:
 def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]:
     """All runs asked for, checked; freezes the ground truth of the scenes."""
     specs = [(name, load_spec(name)) for name in settings.methods]
+    _check_lengths(settings)
     split_overrides(settings, [spec for _, spec in specs])
     if settings.lpips_weights is not None:
         check_available(settings.lpips_weights)
@@ -78,9 +78,10 @@ def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]
         check_scene(scene)
         say(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
         for job, spec in _scene_jobs(settings, scene, commit, specs):
+            check_job(job, spec)
+            job = job.with_variant(spec)
             if settings.continue_to is not None:
                 job = continued(job, spec, settings.continue_to)
-            check_job(job, spec)
             plan.setdefault(job.folder, (job, spec))
             notices.update(dict.fromkeys(job.notices))
         store = ImageStore(scene, max_width=settings.max_width)
@@ -88,6 +89,30 @@ def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]
     for notice in notices:
         say(f"note: {notice}")
     return list(plan.values())
+
+
+def _check_lengths(settings: BenchSettings) -> None:
+    """Refuse two numbers of iterations, of which one would silently win.
+
+    Raises:
+        ConfigError: If several options give one.
+    """
+    given = {
+        "--continue-to": settings.continue_to,
+        "--iterations": settings.iterations,
+        "--set iterations": any(
+            key.rpartition(".")[2] == "iterations" for key in settings.overrides or {}
+        ),
+        "--budget": settings.continue_to and settings.budget_seconds,
+    }
+    options = [name for name, value in given.items() if value]
+    if len(options) > 1:
+        raise ConfigError(
+            options[0],
+            expected=f"no {' and no '.join(options[1:])} beside it",
+            found="both",
+            todo="leave one of them out",
+        )
 
 
 def split_overrides(settings: BenchSettings, specs: list[MethodSpec]) -> dict[str, dict[str, str]]:
@@ -170,7 +195,7 @@ def _scene_jobs(
 
 
 def continued(job: Job, spec: MethodSpec, iterations: int) -> Job:
-    """The job that trains a finished run further.
+    """The job that trains a finished run further: the longest there is.
 
     Args:
         job: With the settings of the finished run, apart from the number of iterations.
@@ -180,30 +205,41 @@ def continued(job: Job, spec: MethodSpec, iterations: int) -> Job:
     Raises:
         ConfigError: If there is no such run, or nothing to train further or to go on from.
     """
-    stop, earlier, found = {}, [], "none"
-    if (job.folder / results.RUN_FILE).is_file():
-        config = results.read_config(job.folder)["config"]
-        stop, earlier = config["stop"], config.get("continued_from", [])
-        found = "one with " + ", ".join(f"{k} {v}" for k, v in stop.items() if v is not None)
-    before = stop.get("iterations")
-    if before is None or before > iterations or stop["seconds"] is not None:
+    there = {done.iterations or 0: done for done in _lengths(job, spec)}
+    shorter = [length for length in there if length <= iterations]
+    if not shorter:
         raise ConfigError(
             job.folder,
             expected=f"a finished run that ended after at most {iterations} iterations",
-            found=found,
+            found=f"one with {min(there)}" if there else "none",
             todo="correct --continue-to, or train anew with --iterations",
         )
-    if before == iterations:
-        return replace(job, iterations=before, continued_from=earlier)
-    longer = replace(job, iterations=iterations, continued_from=[*earlier, before])
-    if not is_finished(longer, spec) and not (job.folder / results.TRAINING).is_dir():
+    last = there[max(shorter)]
+    is_finished(last, spec)  # raises if its settings are others
+    if last.iterations == iterations:
+        return last
+    if not (last.folder / results.TRAINING).is_dir():
         raise ConfigError(
-            job.folder,
+            last.folder,
             expected="a run that kept its training",
             found="its model alone",
             todo="train anew with --keep-training; such a run can be trained further",
         )
-    return longer
+    lengths = [*last.continued_from, max(shorter)]
+    longer = replace(job, iterations=iterations, continued_from=lengths)
+    return replace(longer, continues=str(last.folder)).with_variant(spec)
+
+
+def _lengths(job: Job, spec: MethodSpec) -> Iterator[Job]:
+    """Finished runs like a job apart from the number of iterations, those begun afresh first."""
+    found = []
+    for file in sorted(job.folder.parent.parent.glob(f"*/{job.folder.name}/{results.RUN_FILE}")):
+        config = results.read_config(file.parent)["config"]
+        earlier = config.get("continued_from", [])
+        same = replace(job, iterations=config["stop"]["iterations"], continued_from=earlier)
+        if same.iterations is not None and same.with_variant(spec).folder == file.parent:
+            found.append(same.with_variant(spec))
+    yield from sorted(found, key=lambda done: len(done.continued_from))
 
 
 def is_finished(job: Job, spec: MethodSpec, overwrite: bool = False) -> bool:
@@ -216,31 +252,23 @@ def is_finished(job: Job, spec: MethodSpec, overwrite: bool = False) -> bool:
         return False
     results.read_run(job.folder)
     stored, wanted = results.read_config(job.folder), job.document(spec)
-    if stored == wanted:
-        return True
-    if job.continued_from:  # a shorter run is not finished, one with other settings is refused
-        wanted = job.shorter().document(spec)
-        if stored == wanted:
-            return False
-    elif overwrite:
-        return False
+    if stored == wanted or overwrite:
+        return stored == wanted
     raise _other_settings(job.folder, "a finished", stored, wanted)
 
 
-def check_unfinished(job: Job, spec: MethodSpec, overwrite: bool = False) -> None:
-    """Raise if there are checkpoints of a training with other settings; delete them if allowed.
+def is_obsolete(job: Job, spec: MethodSpec, overwrite: bool = False) -> bool:
+    """Whether there are checkpoints of a training with other settings, which may be deleted.
 
     Raises:
-        ConfigError: If there are.
+        ConfigError: If there are, and they may not.
     """
     if not (job.training / results.CONFIG_FILE).is_file():
-        return
+        return False
     stored, wanted = results.read_config(job.training), job.document(spec)
-    if stored == wanted:
-        return
-    if not overwrite:
-        raise _other_settings(job.training, "an unfinished", stored, wanted)
-    shutil.rmtree(job.training)
+    if stored == wanted or overwrite:
+        return stored != wanted
+    raise _other_settings(job.training, "an unfinished", stored, wanted)
 
 
 def _other_settings(folder: Path, kind: str, stored: Any, wanted: Any) -> ConfigError:

@@ -74,6 +74,8 @@ class RunRecord(BaseModel):
     title: str
     """Name of the method in tables."""
     preset: str
+    variant: str = ""
+    """What differs from the preset, such as ``sh_degree=2``."""
     method_version: str
     config_hash: str
     """Of everything that decides the result but scene, seed, device and threads."""
@@ -106,7 +108,8 @@ class RunRecord(BaseModel):
     @property
     def label(self) -> str:
         """The run in words, as `Job.label`."""
-        return f"{self.scene}: {self.method} {self.strategy} {self.preset} seed {self.seed}"
+        names = (self.method, self.strategy, self.preset, self.variant)
+        return f"{self.scene}: {' '.join(filter(None, names))} seed {self.seed}"
 
 
 class Failure(BaseModel):
@@ -117,6 +120,7 @@ class Failure(BaseModel):
     method: str
     strategy: str
     preset: str
+    variant: str = ""
     scene: str
     seed: int
     reason: str
@@ -137,7 +141,7 @@ class Row:
 
 RUN_COLUMNS = (
     *("scene", "scene_hash", "split_hash", "method", "method_version"),
-    *("strategy", "preset", "config_hash", "seed", "device"),
+    *("strategy", "preset", "variant", "config_hash", "seed", "device"),
 )
 ROW_COLUMNS = tuple(field.name for field in fields(Row))
 

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from chronoscene.bench import results
 from chronoscene.bench.job import Job
-from chronoscene.bench.plan import BenchSettings, Say, check_unfinished, is_finished, plan_jobs
+from chronoscene.bench.plan import BenchSettings, Say, is_finished, is_obsolete, plan_jobs
 from chronoscene.errors import DiskFullError
 from chronoscene.io.processes import run_worker, stoppable
+from chronoscene.methods import MethodSpec
+
+LOCKS = ".locks"  # Folder beside the results, with a file for each run
+PATIENCE = 1.0  # Seconds from one look for runs that have become free to the next
 
 Execute = Callable[[Job], results.Failure | None]
 """Runs one job to its end, so that `Job.folder` is complete; returns why it failed, if it did."""
@@ -47,13 +55,20 @@ def run_bench(settings: BenchSettings, say: Say, *, execute: Execute | None = No
     if len(todo) < len(plan):
         say(f"{len(plan) - len(todo)} of {len(plan)} runs are finished and kept")
     for job, spec in todo:
-        check_unfinished(job, spec, settings.overwrite)
+        is_obsolete(job, spec, settings.overwrite)  # raises before anything is trained
     for job, _ in plan:
-        settle_training(job)  # of a run that was killed between its end and this
+        with _held(job) as ours:
+            if ours:
+                settle_training(job)  # of a run that was killed between its end and this
     failures = []
     try:
         with stoppable():
-            for number, (job, _) in enumerate(todo, start=1):
+            for number, (job, spec) in enumerate(_in_turn(todo, say), start=1):
+                if is_finished(job, spec, settings.overwrite):
+                    say(f"[{number}/{len(todo)}] {job.label}: another command has finished it")
+                    continue
+                if is_obsolete(job, spec, settings.overwrite):
+                    shutil.rmtree(job.training)
                 say(f"[{number}/{len(todo)}] {job.label}")
                 if (failure := (execute or run_in_process)(job)) is not None:
                     failures.append(failure)
@@ -62,6 +77,43 @@ def run_bench(settings: BenchSettings, say: Say, *, execute: Execute | None = No
         results.write_summary(settings.runs)
     finished = [job.folder for job, _ in plan if (job.folder / results.RUN_FILE).is_file()]
     return BenchOutcome(tuple(finished), len(plan) - len(todo), tuple(failures))
+
+
+def _in_turn(todo: list[tuple[Job, MethodSpec]], say: Say) -> Iterator[tuple[Job, MethodSpec]]:
+    """Each run while no other command can have it; those that one has now come last."""
+    waiting, told = list(todo), False
+    while waiting:
+        before = len(waiting)
+        for run in tuple(waiting):
+            with _held(run[0]) as ours:
+                if ours:
+                    waiting.remove(run)
+                    yield run
+        if len(waiting) == before:
+            if not told:
+                say(f"waiting for another command, which has {waiting[0][0].label}")
+            told = True
+            time.sleep(PATIENCE)
+
+
+@contextmanager
+def _held(job: Job) -> Iterator[bool]:
+    """Whether no other command has the run; none can take it during the block then.
+
+    The system frees the lock of a process that is killed.
+    """
+    file = Path(job.runs) / LOCKS / job.folder.relative_to(job.runs)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(f"{file}.lock")
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
 
 
 def run_in_process(job: Job) -> results.Failure | None:
@@ -88,14 +140,8 @@ def run_in_process(job: Job) -> results.Failure | None:
 
 
 def put_in_place(job: Job, staging: Path) -> results.Failure | None:
-    """Give what a worker wrote its final name; returns why the run failed, if it did.
-
-    A finished run stays as it is if it could not be trained further.
-    """
+    """Give what a worker wrote its final name; returns why the run failed, if it did."""
     failure = results.read_failure(staging)
-    if failure is not None and job.continued_from:
-        shutil.rmtree(staging)
-        return failure
     if job.folder.exists():
         shutil.rmtree(job.folder)
     os.replace(staging, job.folder)

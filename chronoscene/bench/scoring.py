@@ -33,6 +33,8 @@ from chronoscene.errors import CheckpointError, ChronoSceneError, ShapeError
 from chronoscene.io.wording import shown
 from chronoscene.metrics.registry import METRICS, Scorers
 
+NO_TESTS = "trained on all photos: there are no test views"
+
 
 @dataclass(frozen=True, slots=True)
 class Scores:
@@ -65,7 +67,9 @@ def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Sco
         skipped |= {name: f"{entry.view}: {reason}" for name, reason in refused.items()}
         periods = entry.camera_period, entry.rendered_period
         rows += [Row(entry.view, *periods, "all", name, value) for name, value in values.items()]
-    if pairs and len(unscored) == len(pairs):
+    if not pairs:
+        skipped = dict.fromkeys(METRICS, NO_TESTS)
+    elif len(unscored) == len(pairs):
         skipped |= dict.fromkeys(
             scorers.functions, "the masks of all test views ignore every pixel"
         )

@@ -80,10 +80,10 @@ def make_parts(scene: Scene, store: ImageStore, strategy: str) -> tuple[Part, ..
 
 
 def check_scene(scene: Scene) -> None:
-    """Refuse scenes that no method can be trained or tested on.
+    """Refuse scenes that no method can be trained on.
 
     Raises:
-        SceneError: If a camera is distorted, or there is no training or no test image.
+        SceneError: If a camera is distorted, or there is no training image.
     """
     for frame in scene.frames:
         if not frame.camera.is_pinhole:
@@ -94,18 +94,14 @@ def check_scene(scene: Scene) -> None:
                 found=frame.camera.model,
                 todo=f"run 'chronoscene undistort {scene.root} OUT' and use OUT",
             )
-    new = f"(chronoscene split {scene.root} --scene-out NEW"
-    for split, todo in (
-        ("train", f"hold out whole periods {new} --strategy periods --period ID), and use NEW"),
-        ("test", f"choose some {new}), and use NEW"),
-    ):
-        if not any(f.split == split for f in scene.frames):
-            raise SceneError(
-                scene.root,
-                expected=f"at least one {split} image",
-                found=f"none ({scene.split_rule})",
-                todo=todo,
-            )
+    if not scene.select(split="train"):
+        raise SceneError(
+            scene.root,
+            expected="at least one train image",
+            found=f"none ({scene.split_rule})",
+            todo=f"hold out whole periods (chronoscene split {scene.root} --scene-out NEW "
+            "--strategy periods --period ID), and use NEW",
+        )
 
 
 def training_frame(scene: Scene) -> Sim3:

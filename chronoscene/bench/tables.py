@@ -49,7 +49,7 @@ DISPLAY |= {cost.name: (cost.factor, cost.decimals) for cost in COSTS}
 """Quantity to its factor from the stored to the shown unit, and to its decimals."""
 
 ENTRY_COLUMNS = (
-    *("scene", "method", "strategy", "preset", "config_hash"),
+    *("scene", "method", "strategy", "preset", "variant", "config_hash"),
     *("quantity", "column", "mean", "sd", "n", "seeds", "device", "commit"),
 )
 """Columns of CSV and JSON. ``quantity`` is a metric, or a cost in the unit of `RunRecord`;
@@ -135,7 +135,7 @@ def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> Data
         return pd.DataFrame(columns=[*ENTRY_COLUMNS, "label"])
     runs = _labelled(records).sort_values("seed", kind="stable")
     in_group = runs.groupby(["scene", "label"], sort=False)
-    groups = in_group[["method", "strategy", "preset", "config_hash", "device"]].first()
+    groups = in_group[["method", "strategy", "preset", "variant", "config_hash", "device"]].first()
     groups["runs"] = in_group.size()
     groups["seeds"] = in_group.seed.agg(lambda seeds: " ".join(map(str, seeds)))
     groups["commit"] = in_group.commit.agg(lambda commits: " ".join(commits.unique()))
@@ -171,9 +171,11 @@ def _labelled(records: Sequence[RunRecord]) -> DataFrame:
     """What tells runs apart, one row per record."""
     import pandas as pd
 
-    fields = ("scene", "method", "strategy", "preset", "config_hash", "seed", "device", "commit")
-    runs = pd.DataFrame([{name: getattr(run, name) for name in fields} for run in records])
-    runs["label"] = [f"{run.title} ({run.strategy}, {run.preset})" for run in records]
+    fields = ("scene", "method", "strategy", "preset", "variant", "config_hash", "seed", "device")
+    runs = pd.DataFrame(
+        [{name: getattr(run, name) for name in (*fields, "commit")} for run in records]
+    )
+    runs["label"] = [f"{run.title} ({kind_of(run)})" for run in records]
     differences = pd.DataFrame(
         {
             "method": runs.method,
@@ -188,6 +190,11 @@ def _labelled(records: Sequence[RunRecord]) -> DataFrame:
             told = ", ".join(differences.loc[i, columns])
             runs.loc[i, "label"] += f" [{told}]"
     return runs
+
+
+def kind_of(run: RunRecord | Failure) -> str:
+    """Strategy and preset, and what differs from it."""
+    return ", ".join(filter(None, (run.strategy, run.preset, run.variant.replace(",", ", "))))
 
 
 def _numbers(run: RunRecord, metrics: Sequence[str]) -> Iterable[tuple[str, str, float]]:
@@ -235,6 +242,14 @@ def readable_tables(
     if entries.scene.nunique() > 1:
         made += [_summary_table(entries, name) for name in names]
     return made
+
+
+def cost_tables(records: Sequence[RunRecord]) -> list[Table]:
+    """What runs cost, a table per scene."""
+    return [
+        _cost_table(part, str(scene))
+        for scene, part in summarise(records).groupby("scene", sort=False)
+    ]
 
 
 def _quality_table(part: DataFrame, metric: str, runs: Sequence[RunRecord]) -> Table:
@@ -353,7 +368,7 @@ def footnotes(
     notices = dict.fromkeys(notice for run in records for notice in run.notices)
     seeds: dict[tuple[str, str], list[str]] = {}
     for f in failures:
-        name = f"{f.scene}, {f.method} ({f.strategy}, {f.preset})"
+        name = f"{f.scene}, {f.method} ({kind_of(f)})"
         seeds.setdefault((name, f.reason), []).append(str(f.seed))
     failed = [f"failed: {n}, seed {', '.join(s)}: {reason}" for (n, reason), s in seeds.items()]
     return [*notes, *notices, *failed]

@@ -36,7 +36,7 @@ from chronoscene.bench.provenance import (
     method_version,
     peak_memory_bytes,
 )
-from chronoscene.bench.scoring import score_run
+from chronoscene.bench.scoring import NO_TESTS, score_run
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.bench.training_loop import (
     DivergedError,
@@ -195,7 +195,6 @@ def _checkpoints(
     job: Job, spec: MethodSpec, part: Part, parts: int, display: ProgressDisplay
 ) -> Checkpoints:
     """Those of one model of the run."""
-    finished = job.folder / results.TRAINING / part.name
     return Checkpoints(
         folder=job.training / part.name,
         settings=job.document(spec),
@@ -203,7 +202,7 @@ def _checkpoints(
         every=job.checkpoint_seconds,
         # With several models, those that are done must not be trained again.
         keep_last=job.keep_training or parts > 1,
-        start=finished if job.continued_from else None,
+        start=Path(job.continues) / results.TRAINING / part.name if job.continues else None,
         say=display.say,
     )
 
@@ -265,14 +264,16 @@ def _record(
         resumed=max(o.trained.resumed for o in outcomes),
         primitives=sum(o.size.primitives for o in outcomes),
         primitive=outcomes[0].size.unit,
-        drawn=None if None in drawn else sum(filter(None, drawn)) / tests,
+        drawn=None if None in drawn or not tests else sum(filter(None, drawn)) / tests,
         checkpoint_bytes=sum(path.stat().st_size for path in saved if path.is_file()),
         peak_memory_bytes=peaks[0],
         device=describe_device(machine.device, machine.threads),
         commit="; ".join(dict.fromkeys([*code, job.commit])),
         skipped={},
+        absent={} if tests else dict.fromkeys(("drawn", "render_seconds"), NO_TESTS),
         title=spec.title,
         preset=job.preset,
+        variant=job.variant,
         method_version=method_version(job.method),
         config_hash=job.document(spec)["config_hash"],
         scene_hash=job.scene_hash,
@@ -281,7 +282,7 @@ def _record(
         parameters=sum(o.size.parameters for o in outcomes),
         warmup_seconds=0.0,
         setup_seconds=sum(o.trained.setup_seconds for o in outcomes),
-        render_seconds=sum(o.render_seconds for o in outcomes) / tests,
+        render_seconds=sum(o.render_seconds for o in outcomes) / tests if tests else None,
         peak_device_memory_bytes=peaks[1],
         threads=machine.threads,
         max_width=job.max_width,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.strategies import STRATEGIES
 from chronoscene.checks import check_choice
 from chronoscene.cli.convert import format_option
+from chronoscene.cli.methods import look_here_for
 from chronoscene.cli.output import check_place
 from chronoscene.cli.results import print_runs, split_list
 from chronoscene.errors import ConfigError
@@ -126,18 +126,10 @@ def command(
     predictions and scores. Finished runs are kept, so the same command resumes after an
     interruption. docs/benchmark.md describes strategies, budget, seeds and files.
     """
-    if options["continue_to"] and (budget or options["iterations"]):
-        raise ConfigError(
-            "--continue-to",
-            expected="no --iterations and no --budget beside it",
-            found="both",
-            todo="leave them out: the finished run says where to begin",
-        )
     check_outside(out, options["scenes"], option="--out")
     check_place("--out", out)
     names = split_list("--method", methods)
-    if any(":" in name for name in names) and str(Path.cwd()) not in sys.path:
-        sys.path.append(str(Path.cwd()))  # a plug-in under development, named module:SPEC
+    look_here_for(names)
     settings = BenchSettings(
         methods=names,
         runs=out,

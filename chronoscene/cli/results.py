@@ -43,8 +43,9 @@ def score(runs: Path, lpips_weights: Path | None) -> None:
         click.echo(f"{name}: {'; '.join(outcome.changes) or 'unchanged'}")
         for metric in outcome.kept:
             click.echo(f"{name}: {metric} kept from an earlier scoring")
-    for metric, reason in scorers.skipped.items():
-        click.echo(f"{metric} not computed: {reason}")
+    for reason in dict.fromkeys(scorers.skipped.values()):
+        names = ", ".join(name for name, why in scorers.skipped.items() if why == reason)
+        click.echo(f"{names} not computed: {reason}")
     if any(outcome.error is not None for outcome in outcomes):
         click.get_current_context().exit(SOME_FAILED)
 

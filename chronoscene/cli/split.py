@@ -29,7 +29,8 @@ from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, Split
     show_default=True,
     help="How to choose. stratified: one of every 8 images in name order, in each period. blocked: "
     "all cameras in some blocks of space, the same in all periods. date: the images of each period "
-    "that were taken last. periods: all images of some periods.",
+    "that were taken last. periods: all images of some periods. none: no images; methods are then "
+    "trained on all of them and cannot be scored.",
 )
 @click.option(
     "--fraction", type=float, help=f"Share of test images, 0 to 1.  [default: {FRACTION}]"

@@ -58,6 +58,7 @@ class GaussianConfig(SplattingConfig):
     positions move at random: `chronoscene.gaussians.mcmc`. Its authors train so with
     ``densify_until=25000``, ``initial_opacity=0.5`` and ``initial_scale=0.1``."""
     initial_opacity: float = 0.1
+    """Of each Gaussian at the start."""
     initial_scale: float = 1.0
     """Times the distance of the points around it."""
     densify_from: int = 500

@@ -119,5 +119,7 @@ def make_scorers(
     except MetricUnavailableError as error:
         if lpips_weights is not None:
             raise
-        return Scorers(functions, dict.fromkeys(perceptual, str(error)))
+        found = f"{error.fields['place']}: {error.fields['found']}"
+        reason = f"{found}; run chronoscene download lpips-weights"
+        return Scorers(functions, dict.fromkeys(perceptual, reason))
     return Scorers(functions | {name: available[name] for name in perceptual}, {})

@@ -10,6 +10,7 @@ are to the training views, because close ones make a split easy.
 - ``date``: in each period, the images taken last are held out: whole days where a period has
   several.
 - ``periods``: all images of some periods are held out; methods see nothing of these periods.
+- ``none``: no images are held out: methods are trained on all of them and cannot be scored.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.splits import split_hash, split_of
 
-Strategy = Literal["stratified", "blocked", "date", "periods"]
+Strategy = Literal["stratified", "blocked", "date", "periods", "none"]
 
 FRACTION = 1 / 8
 
@@ -159,6 +160,7 @@ STRATEGIES: Mapping[Strategy, Callable[[Scene, SplitSettings, Times], set[str]]]
     "blocked": lambda scene, s, _: blocked(scene, s.fraction, s.blocks, s.seed or 0),
     "date": lambda scene, s, times: latest(scene, s.fraction, times),
     "periods": lambda scene, s, _: whole_periods(scene, s.periods),
+    "none": lambda scene, s, _: set(),
 }
 """By name, what chooses the test images of a scene."""
 

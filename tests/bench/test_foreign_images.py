@@ -65,7 +65,10 @@ def test_the_run_stands_beside_those_of_bench(score, bench_here, tmp_path):
     score()
     score(seed=1)
     text = format_runs(*read_runs([tmp_path / "runs"]), "table")
-    assert "Some Program 2 (external, images)" in text and "Mean (joint, balanced)" in text
+    assert (
+        "Some Program 2 (external, images)" in text
+        and "Mean (joint, balanced, iterations=5)" in text
+    )
     why = "Some Program 2 is another program, and only its images are here"
     assert "absent: training [s], iterations, primitives, rendering [ms], checkpoint [MB]" in text
     assert why in text

@@ -90,3 +90,9 @@ def test_where_and_how_fast_it_runs_is_not_compared():
     spec = load_spec("toy_methods:MEAN")
     other = replace(JOB, runs="/other", threads=3, commit="5", scene_root="/copy")
     assert other.document(spec) == JOB.document(spec)
+
+
+def test_folders_have_names_that_file_systems_take():
+    one, other = (replace(JOB, variant=f"a={'9' * 300}{i}").folder.parent.name for i in (1, 2))
+    assert len(one) < 200 and one[:180] == other[:180] and one != other
+    assert replace(JOB, variant="path=/a").folder.parent.name.endswith("-path=%2Fa")

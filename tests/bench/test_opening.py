@@ -44,7 +44,7 @@ def test_a_run_of_gaussians_renders_its_predictions_with_depth_in_world_units(
         scenes=(scene_folder,), methods=("3dgs",), runs=tmp_path, threads=1, iterations=5
     )
     run_bench(settings, lambda line: None)
-    run = open_run(tmp_path / "ring" / "3dgs-pooled-balanced" / "seed0")
+    run = open_run(tmp_path / "ring" / "3dgs-pooled-balanced-iterations=5" / "seed0")
     assert_renders_its_predictions(run)
     scene = run.scene()
     frame = scene.frames[0]

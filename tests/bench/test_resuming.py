@@ -42,8 +42,9 @@ def start(scene, method, runs, iterations, preset="balanced"):
 
 
 def run_of(runs):
-    (folder,) = (path.parent for path in runs.glob("ring/*/seed0/run.json"))
-    return folder
+    """The run that was made last."""
+    folders = [path.parent for path in runs.glob("ring/*/seed0/run.json")]
+    return max(folders, key=lambda folder: (folder / "run.json").stat().st_mtime_ns)
 
 
 def outcome(runs):
@@ -113,10 +114,10 @@ def test_an_unfinished_training_is_not_given_up_for_other_settings(
         patch.setattr(Checkpoints, "finish", dying)
         with pytest.raises(SystemExit):
             bench_here(TOY, **options)
-    with pytest.raises(ConfigError, match="with iterations 9, found an unfinished"):
-        bench_here(TOY, iterations=9, preset="slow")
+    with pytest.raises(ConfigError, match="with device cpu, found an unfinished"):
+        bench_here(TOY, **options, device="cpu")
     assert checkpoint_of(runs)
-    bench_here(TOY, iterations=9, preset="slow", overwrite=True)
+    bench_here(TOY, **options, device="cpu", overwrite=True)
     assert read_run(run_of(runs)).resumed == 0
     assert not list(runs.glob("ring/*/.*"))
 
@@ -144,13 +145,18 @@ def test_finished_runs_are_trained_further(bench_here, tmp_path, strategy):
     assert ours == theirs
     config = json.loads((run_of(runs) / "config.json").read_text())["config"]
     assert config["continued_from"] == [20, 30]
+    names = [p.name for p in sorted((runs / "ring").iterdir())]
+    variants = ["", "-iterations=20+30", "-iterations=20+30+42"]
+    assert names == [f"drawing-{strategy}-balanced{variant}" for variant in variants]
     again, _ = bench_here(TOY, runs=runs, continue_to=42, **options)
     assert again.skipped == 1
-    with pytest.raises(ConfigError, match=r"rate 0[.]25, found a finished one"):
+    with pytest.raises(ConfigError, match=r"rate=0[.]25.* at most 50 iterations, found none"):
         bench_here(TOY, runs=runs, continue_to=50, overrides={"rate": "0.25"}, **options)
-    with pytest.raises(ConfigError, match="at most 41 iterations, found one with"):
-        bench_here(TOY, runs=runs, continue_to=41, **options)
-    shutil.rmtree(kept)
+    with pytest.raises(ConfigError, match="at most 19 iterations, found one with 20"):
+        bench_here(TOY, runs=runs, continue_to=19, **options)
+    with pytest.raises(ConfigError, match="with device cpu, found a finished one"):
+        bench_here(TOY, runs=runs, continue_to=50, device="cpu", **options)
+    shutil.rmtree(run_of(runs) / "training")
     with pytest.raises(ConfigError, match="that kept its training, found its model alone"):
         bench_here(TOY, runs=runs, continue_to=50, **options)
 

@@ -4,11 +4,14 @@ import csv
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
-from chronoscene.bench import results
+from chronoscene.bench import results, runner
+from chronoscene.bench.comparison_figure import draw_figures
 from chronoscene.bench.predictions import read_manifest
 from chronoscene.bench.results import read_rows, read_run, run_folders
 from chronoscene.bench.tables import format_runs
@@ -147,11 +150,76 @@ def test_finished_runs_are_kept_and_failed_ones_tried_again(bench, runs):
 
 def test_other_settings_are_refused_or_replace(bench, runs):
     folder = runs / "ring/mean-joint-balanced/seed0"
-    with pytest.raises(ConfigError, match=r"with iterations 7, found .* with iterations 20;"):
-        bench("MEAN", runs=runs, iterations=7)
-    assert read_run(folder).iterations == 20
-    bench("MEAN", runs=runs, iterations=7, overwrite=True)
-    assert read_run(folder).iterations == 7
+    with pytest.raises(ConfigError, match=r"with device cpu, found .* with device auto;"):
+        bench("MEAN", runs=runs, device="cpu")
+    assert results.read_config(folder)["device"] == "auto"
+    bench("MEAN", runs=runs, device="cpu", overwrite=True)
+    assert results.read_config(folder)["device"] == "cpu"
+
+
+def test_variants_lie_side_by_side_and_are_named_by_what_differs(bench_here):
+    toy = "toy_methods:MEAN"
+    outcome, _ = bench_here(toy, overrides={"rate": "0.5", "iterations": "20"})  # the defaults
+    (plain,) = outcome.finished
+    assert plain.parent.name == "mean-joint-balanced"
+    changes = {"overrides": {"sleep": "0.001", "rate": "0.25"}, "separate_iterations": "each"}
+    outcome, said = bench_here(toy, budget_seconds=0.05, iterations=3, **changes)
+    (folder,) = outcome.finished
+    variant = "iterations=3,rate=0.25,sleep=0.001,budget=0.05s,separate_iterations=each"
+    assert folder.parent.name == f"mean-joint-balanced-{variant}" and plain.is_dir()
+    assert read_run(folder).variant == variant
+    assert f"[1/1] ring: mean joint balanced {variant} seed 0" in said
+    table = format_runs([read_run(plain), read_run(folder)], [], "table")
+    assert "Mean (joint, balanced) " in table
+    assert "Mean (joint, balanced, iterations=3, rate=0.25, " in table
+
+
+def test_two_commands_share_a_folder_run_by_run(bench_here, tmp_path, monkeypatch):
+    toy, runs = "toy_methods:MEAN", tmp_path / "runs"
+    other = FileLock(runs / runner.LOCKS / "ring/mean-joint-balanced/seed0.lock")
+    Path(other.lock_file).parent.mkdir(parents=True)
+    other.acquire()
+
+    def other_command(seconds):
+        assert names(runs) == ["ring/mean-joint-balanced/seed1"]
+        other.release()
+        bench_here(toy)
+
+    monkeypatch.setattr(runner, "time", SimpleNamespace(sleep=other_command))
+    outcome, said = bench_here(toy, seeds=(0, 1))
+    assert names(runs) == [f"ring/mean-joint-balanced/seed{i}" for i in (0, 1)]
+    assert len(outcome.finished) == 2 and outcome.failures == ()
+    assert [line for line in said if "command" in line] == [
+        "waiting for another command, which has ring: mean joint balanced seed 0",
+        "[2/2] ring: mean joint balanced seed 0: another command has finished it",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"iterations": 5}, "--iterations: expected no --set iterations beside it"),
+        ({"continue_to": 5}, "--continue-to: expected no --set iterations beside it"),
+        ({"continue_to": 5, "budget_seconds": 1.0}, "no --set iterations and no --budget beside"),
+    ],
+)
+def test_two_lengths_are_refused(bench, changes, message):
+    with pytest.raises(ConfigError, match=message):
+        bench("MEAN", overrides={"mean.iterations": "7"}, **changes)
+
+
+def test_without_test_views_nothing_is_scored(scene_folder, bench_here, tmp_path):
+    folder = Path(shutil.copytree(scene_folder, tmp_path / "ring"))
+    (folder / "sparse/0/test.txt").write_text("")
+    for strategies in (("joint",), ("separate",)):
+        outcome, _ = bench_here("toy_methods:MEAN", scenes=(folder,), strategies=strategies)
+    record, rows = read_run(outcome.finished[0]), read_rows(outcome.finished[0])
+    assert record.render_seconds is None and record.drawn is None and rows == []
+    assert draw_figures(tmp_path / "runs") == []
+    table = format_runs([record], [], "table")
+    metrics = "psnr, ssim, ssim_valid, lpips_vgg, lpips_vgg_3dgs"
+    reason = "trained on all photos: there are no test views"
+    assert f"absent: {metrics}, drawn per view, rendering [ms]: {reason}\n" in table
 
 
 def test_seeds_overrides_and_budgets(bench):
@@ -170,10 +238,10 @@ def test_seeds_overrides_and_budgets(bench):
 
 
 def test_a_full_disk_ends_the_bench_and_leaves_nothing_half(bench, tmp_path):
-    with pytest.raises(DiskFullError, match=r"full-disk-joint-balanced/seed0: expected space for"):
+    with pytest.raises(DiskFullError, match=r"balanced-iterations=1/seed0: expected space for"):
         bench("MEAN", "FULL_DISK", "BLIND", iterations=1)
     runs = tmp_path / "runs"
-    assert names(runs) == ["ring/mean-joint-balanced/seed0"]
+    assert names(runs) == ["ring/mean-joint-balanced-iterations=1/seed0"]
     assert not list(runs.rglob("*.partial")) and not list(runs.rglob("seed0/failed.json"))
     assert len(json.loads((runs / "results.json").read_text())) == 1
 

@@ -43,18 +43,21 @@ def test_bench_score_and_table(make_scene_folder, tmp_path):
     )  # fmt: skip
     assert done.returncode == 1, done.stderr
     assert "place: PSNR [dB] (psnr), higher is better" in done.stdout
-    assert "Mean (joint, balanced)" in done.stdout
-    assert "failed: place, raises (joint, balanced), seed 0: RuntimeError" in done.stdout
+    assert "Mean (joint, balanced, iterations=12, rate=0.25)" in done.stdout
+    assert (
+        "failed: place, raises (joint, balanced, iterations=12), seed 0: RuntimeError"
+        in done.stdout
+    )
     for file in ("results.json", "rows.csv", "figures/place_comparison.png"):
         assert str(runs / file) in done.stdout and (runs / file).is_file()
-    assert "[1/2] place: mean joint balanced seed 0" in done.stderr
+    assert "[1/2] place: mean joint balanced iterations=12,rate=0.25 seed 0" in done.stderr
     assert "Traceback" not in done.stderr
     (record,) = json.loads((runs / "results.json").read_text())
     assert record["method"] == "mean" and record["iterations"] == 12
 
     again = chronoscene("score", runs)
     assert again.returncode == 0, again.stderr
-    assert "place/mean-joint-balanced/seed0: unchanged" in again.stdout
+    assert "place/mean-joint-balanced-iterations=12,rate=0.25/seed0: unchanged" in again.stdout
 
     table = chronoscene("table", runs, "--format", "json", "--metric", "psnr")
     assert table.returncode == 0, table.stderr
@@ -96,7 +99,7 @@ def settings(monkeypatch):
         return BenchOutcome((), 0, ())
 
     monkeypatch.setattr(bench_module, "run_bench", run_bench)
-    monkeypatch.setattr("chronoscene.bench.results.read_failures", lambda runs: [])
+    monkeypatch.setattr(bench_module, "read_failures", lambda runs: [])
 
     def invoke(*arguments):
         result = CliRunner().invoke(cli, ["bench", *arguments], catch_exceptions=False)
@@ -183,7 +186,7 @@ def test_a_failed_bench_has_status_1(monkeypatch):
         method="m", strategy="joint", preset="fast", scene="s", seed=0, reason="because"
     )
     monkeypatch.setattr(bench_module, "run_bench", lambda *a: BenchOutcome((), 0, (failure,)))
-    monkeypatch.setattr("chronoscene.bench.results.read_failures", lambda runs: [failure])
+    monkeypatch.setattr(bench_module, "read_failures", lambda runs: [failure])
     result = CliRunner().invoke(cli, ["bench", "a", "--method", "m"])
     assert result.exit_code == 1
     assert "failed: s, m: because" in result.output

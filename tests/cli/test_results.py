@@ -133,7 +133,7 @@ def test_changes_are_told(score, tmp_path):
         Rescored(tmp_path / "s/m/seed0", [], []),
         Rescored(tmp_path / "s/m/seed1", ["psnr 20 -> 21 (macro)", "lpips_vgg new: 0.1"], []),
         Rescored(tmp_path / "s/m/seed2", [], ["lpips_vgg"]),
-        skipped={"lpips_vgg": "no weights"},
+        skipped={"lpips_vgg": "no weights", "lpips_vgg_3dgs": "no weights"},
     )
     assert result.exit_code == 0
     assert result.stdout.splitlines() == [
@@ -141,7 +141,7 @@ def test_changes_are_told(score, tmp_path):
         "s/m/seed1: psnr 20 -> 21 (macro); lpips_vgg new: 0.1",
         "s/m/seed2: unchanged",
         "s/m/seed2: lpips_vgg kept from an earlier scoring",
-        "lpips_vgg not computed: no weights",
+        "lpips_vgg, lpips_vgg_3dgs not computed: no weights",
     ]
 
 

@@ -253,3 +253,8 @@ def test_periods_of_one_image_can_only_be_held_out_whole(make_scene_folder):
     with pytest.raises(ConfigError, match=r"found none left; hold out whole periods \(--strat"):
         make_split(scene, SplitSettings())
     assert make_split(scene, SplitSettings("periods", periods=(1,))).hash
+
+
+def test_no_image_is_held_out_if_asked_for():
+    new = make_split(make_scene([0, 0, 1]), SplitSettings("none"))
+    assert {frame.split for frame in new.scene.frames} == {"train"} and new.nearest is None
