@@ -123,12 +123,12 @@ def _cuda() -> Finding:
 
 def _gsplat() -> Finding:
     todo = "pip install 'chronoscene[cuda]'; --device cuda needs it"
-    return _package("gsplat", "gsplat", "gsplat", todo)
+    return _package("gsplat", "gsplat", todo)
 
 
-def _package(what: str, module: str, package: str, todo: str) -> Finding:
+def _package(what: str, package: str, todo: str) -> Finding:
     """Whether an optional package is installed, which is not imported."""
-    if find_spec(module) is None:
+    if find_spec(package) is None:
         return Finding(what, "missing", "not installed", todo)
     return Finding(what, "ok", f"{package} {version(package)}")
 
@@ -154,9 +154,7 @@ def _lpips() -> Finding:
 
 
 def _video() -> Finding:
-    if path := shutil.which("ffmpeg"):
-        return Finding("ffmpeg", "ok", path)
-    return Finding("ffmpeg", "missing", "not on the PATH")
+    return _package("video", "av", "pip install av; MP4 files need it")
 
 
 def _processors() -> Finding:

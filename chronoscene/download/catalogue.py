@@ -18,30 +18,26 @@ class Dataset:
     title: str
     page: str
     """Where its authors describe it."""
-    repo: str
-    """``owner/name`` of a dataset on the Hugging Face hub; empty if it is elsewhere."""
+    host: str
     licence: str
     format: str
     """What reads its scenes, as ``--dataset-format`` names it."""
     citation: str
     by_hand: str
     """How to get it without this command, to follow on "by hand:"."""
+    repo: str = ""
+    """``owner/name`` of a dataset on the Hugging Face hub; empty if it is elsewhere."""
     scene_file: str = ""
     """Regular expression of a path that every scene has, below the folder of the scene."""
     left_out: tuple[str, ...] = ()
     """Endings of files that are no part of a scene."""
-
-    @property
-    def host(self) -> str:
-        """Where the files are."""
-        return "Hugging Face" if self.repo else "Google Drive"
 
 
 DATASETS = {
     "chronoscene": Dataset(
         title="ChronoScene",
         page=f"{HUB}wangzhongtao/ChronoScene",
-        repo="wangzhongtao/ChronoScene",
+        host="Hugging Face",
         licence="Apache-2.0",
         format="chronoscene",
         citation="Wang et al., ChronoGS: Disentangling Invariants and Changes in Multi-Period "
@@ -49,27 +45,30 @@ DATASETS = {
         by_hand="ChronoScene.zip from "
         "https://disk.pku.edu.cn/link/AA13F383F5CD6B462D8C7B745D4576133D or "
         "https://pan.baidu.com/s/1PLDmMzUFP_5QIStMMiz7xw (code sfpj)",
+        repo="wangzhongtao/ChronoScene",
         scene_file=r"sparse/split\.txt",
     ),
     "wat": Dataset(
         title="World Across Time (CLNeRF)",
         page=f"{HUB}IntelLabs/WAT-WorldAcrossTime",
-        repo="IntelLabs/WAT-WorldAcrossTime",
+        host="Hugging Face",
         licence="CC BY-NC 4.0, conditions to accept",
         format="wat",
         citation="Cai and Müller, CLNeRF: Continual Learning Meets NeRF, ICCV 2023",
         by_hand=f"accept the conditions on {HUB}IntelLabs/WAT-WorldAcrossTime and take the files",
+        repo="IntelLabs/WAT-WorldAcrossTime",
         scene_file=r"sparse/0/images\.(bin|txt)",
     ),
     "cl-splats": Dataset(
         title="CL-Splats",
         page=f"{HUB}ackermannj/cl-splats-dataset",
-        repo="ackermannj/cl-splats-dataset",
+        host="Hugging Face",
         licence="see its page",
         format="cl-splats",
         citation="Ackermann et al., CL-Splats: Continual Learning of Gaussian Splatting with Local "
         "Optimization, ICCV 2025",
         by_hand=f"take the folders of the scenes from {HUB}ackermannj/cl-splats-dataset",
+        repo="ackermannj/cl-splats-dataset",
         # A scene is a base with its changes, or has a folder for each of its dates t0, t1, ...
         scene_file=r"transforms_train\.json|t\d+/.+|sparse/0/images\.(bin|txt)",
         left_out=(".blend", ".blend1", ".pth"),
@@ -77,7 +76,7 @@ DATASETS = {
     "5pointz": Dataset(
         title="5Pointz (NeuSC)",
         page="https://github.com/zju3dv/NeuSC",
-        repo="",
+        host="Google Drive",
         licence="none stated",
         format="neusc",
         citation="Lin et al., Neural Scene Chronology, CVPR 2023",

@@ -94,9 +94,7 @@ def download_scenes(
 
     listed = {unfinished / file.path for file in files}
     for name, prefix in choice.folders.items():
-        for path in (unfinished / prefix).rglob("*"):
-            if path.is_file() and path not in listed:  # left by the download of an older version
-                path.unlink()
+        _remove_others(unfinished / prefix, listed)
         (unfinished / prefix).rename(out / name)
         record.scenes[name] = commit
     _write_record(out, dataset, record)
@@ -105,8 +103,8 @@ def download_scenes(
         record.archives[archive.checksum] = names
         record.scenes.update(dict.fromkeys(unpacked, commit))
         _write_record(out, dataset, record)
+        _check_names(dataset, scenes, choice.known.union(names))  # if not, the archive stays
         (unfinished / archive.path).unlink()
-    _check_names(dataset, scenes, choice.known.union(*record.archives.values()))
     if not any(path.is_file() for path in unfinished.rglob("*")):  # nothing of other scenes
         shutil.rmtree(unfinished, ignore_errors=True)
 
@@ -186,6 +184,13 @@ def _wanted(archive: RemoteFile, names: Iterable[str], scenes: Collection[str]) 
     """Those scenes of an archive that were asked for, by their names or by its own."""
     whole = not scenes or archive_stem(archive.path) in scenes
     return [name for name in names if whole or name in scenes]
+
+
+def _remove_others(folder: Path, listed: Collection[Path]) -> None:
+    """Remove what the download of an older version has left in the folder of a scene."""
+    for path in folder.rglob("*"):
+        if path.is_file() and path not in listed:
+            path.unlink()
 
 
 def _unpack(

@@ -12,6 +12,7 @@ from chronoscene.cli import cli
 from chronoscene.download import weights
 from chronoscene.download.catalogue import DATASETS
 from chronoscene.errors import ConfigError, DownloadError
+from chronoscene.metrics.lpips_weights import ENVIRONMENT
 
 CHRONOSCENE = DATASETS["chronoscene"]
 
@@ -58,8 +59,12 @@ def test_default_folder_is_named_for_the_dataset(hub, tmp_path, monkeypatch):
 
 def test_failure_says_the_way_by_hand(hub, tmp_path):
     hub.damaged = {"Canteen/sparse/split.txt"}
-    command = [sys.executable, "-m", "chronoscene", "download", "chronoscene", "--out", tmp_path]
-    result = subprocess.run(command, capture_output=True, text=True)
+    code = (
+        "import sys; sys.modules['torch'] = None\n"  # not needed
+        f"sys.argv[1:] = ['download', 'chronoscene', '--out', {str(tmp_path)!r}]\n"
+        "from chronoscene.cli import main; main()"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 2
     by_hand, error = result.stderr.splitlines()[-2:]
     assert by_hand == f"by hand: {CHRONOSCENE.by_hand}"
@@ -82,16 +87,20 @@ def test_lists_what_there_is():
 def test_weights(monkeypatch, tmp_path):
     with serving("a/b", {"vgg.pth": b"heads"}) as hub:
         url = f"{hub.url}/datasets/a/b/resolve/0123456789abcdef0123456789abcdef01234567/vgg.pth"
-        blob = "f3a9ef7d3a2b0ebcd0bd8ea37b1e2ba6ae2bb1a8"
-        file = replace(weights.LPIPS_WEIGHTS[1], url=url, size=5, checksum=blob)
+        file = replace(weights.LPIPS_WEIGHTS[1], url=url, size=5)
         monkeypatch.setattr(weights, "LPIPS_WEIGHTS", [file])
-        with pytest.raises(DownloadError, match="checksums"):
-            run("lpips-weights", "--out", tmp_path)
+        failed = CliRunner().invoke(cli, ["download", "lpips-weights", "--out", str(tmp_path)])
         blob = hub.entries()[0]["oid"]
         monkeypatch.setattr(weights, "LPIPS_WEIGHTS", [replace(file, checksum=blob)])
         result = run("lpips-weights", "--out", tmp_path)
         monkeypatch.setenv("TORCH_HOME", str(tmp_path))
         elsewhere = run("lpips-weights")
+    assert isinstance(failed.exception, DownloadError)
+    by_hand = failed.stderr.splitlines()[-1]
+    assert by_hand.startswith(
+        "by hand: save https://download.pytorch.org/models/vgg16-397923af.pth"
+    )
+    assert by_hand.endswith(f"vgg.pth in a folder and set {ENVIRONMENT} to it")
     assert f"LPIPS weights are in {tmp_path}\nnext: give {tmp_path} as" in result.stdout
     assert elsewhere.stdout == f"LPIPS weights are in {tmp_path}/hub/checkpoints\n"
 

@@ -94,9 +94,10 @@ def test_unknown_scenes_are_answered_with_the_names(hub, tmp_path, files):
     with pytest.raises(DownloadError, match=r"names of scenes: 'A', .*'B', found 'C', 'a';"):
         download(tmp_path, "A", "a", "C")
     hub.asked.clear()
-    download(tmp_path, "A")
-    assert (tmp_path / "A").is_dir()
-    assert not any(path.endswith("All.zip") for path, _ in hub.asked)
+    download(tmp_path, "A", "B")
+    assert (tmp_path / "A").is_dir() and (tmp_path / "B").is_dir()
+    assert not any(path == "All.zip" for path, _ in hub.asked)
+    assert not (tmp_path / ".download").exists()
 
 
 def test_archive_beside_folders_is_fetched_only_by_its_name(hub, tmp_path):
