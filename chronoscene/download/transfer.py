@@ -60,6 +60,9 @@ def fetch(
         DownloadError: If a file cannot be had, or arrived damaged; damaged files are deleted.
         DiskFullError: If the files do not fit on the disk.
     """
+    from huggingface_hub.utils import disable_progress_bars
+
+    disable_progress_bars()  # one for each file
     folder.mkdir(parents=True, exist_ok=True)
     check_space(folder, sum(missing_bytes(file, folder) for file in files))
     meter = _Meter(sum(file.size for file in files), report)

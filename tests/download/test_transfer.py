@@ -4,6 +4,7 @@ import hashlib
 from collections import namedtuple
 
 import pytest
+from huggingface_hub.utils import are_progress_bars_disabled, enable_progress_bars
 
 from chronoscene.download.hub import list_files
 from chronoscene.download.transfer import RemoteFile, fetch, in_words, missing_bytes
@@ -23,10 +24,12 @@ def files_of(hub):
 def test_large_and_small_files_with_progress(hub, tmp_path):
     hub.files = {"a b/1.png": CONTENT, "ü.txt": b"small", "empty": b""}
     steps = []
+    enable_progress_bars()
     fetch(files_of(hub), tmp_path / "new", report=lambda *step: steps.append(step))
     for name, content in hub.files.items():
         assert (tmp_path / "new" / name).read_bytes() == content
     assert ("MB downloaded", 0, 0) in steps and steps[-1] == ("files checked", 3, 3)
+    assert are_progress_bars_disabled()  # of huggingface_hub
     assert {len(file.checksum) for file in files_of(hub)} == {40, 64}
     hub.asked.clear()
     fetch(files_of(hub), tmp_path / "new", report=no_report)
