@@ -3,6 +3,8 @@
 A matrix is ``(memory, start, row)``, memory as in `memory`, with the distance between rows; a left
 factor is ``(memory, start, row, step)`` with the distance between columns too, so that it can be
 read transposed. Lengths are padded to `PADDING`, so there are no remainders.
+
+Numbers are float32, or pairs of whole numbers of 16 bits whose products are summed in 32 bits.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from chronoscene.kernels.vectors import (
     FLOAT,
     LANES,
     MANY_REGISTERS,
+    emit_add_pair_products,
     emit_lanes,
     emit_multiply_add,
     emit_splat,
@@ -45,7 +48,7 @@ class _Matrix:
         return emit_address(self.context, b, self.kind, self.memory, index)
 
 
-def _make_tile(vectors: int, relu: bool) -> Any:
+def _make_tile(vectors: int, multiply_add: Any, relu: bool) -> Any:
     """Make the inner loop of `product` for ROW_TILE rows and some vectors of columns."""
 
     def tile(
@@ -73,7 +76,7 @@ def _make_tile(vectors: int, relu: bool) -> Any:
                 for m, row_sums in zip(rows, sums, strict=True):
                     factor = emit_splat(builder, builder.load(a.at(m, loop.index)), LANES)
                     for total, vector in zip(row_sums, vectors_b, strict=True):
-                        new = emit_multiply_add(builder, factor, vector, builder.load(total))
+                        new = multiply_add(builder, factor, vector, builder.load(total))
                         builder.store(new, total)
             zero = emit_lanes([0.0] * LANES, FLOAT)
             for m, row_sums in zip(rows, sums, strict=True):
@@ -91,8 +94,8 @@ def _make_tile(vectors: int, relu: bool) -> Any:
     return intrinsic(tile)
 
 
-def _make_product(relu: bool) -> Any:
-    one, two = _make_tile(1, relu), _make_tile(2, relu)
+def _make_product(multiply_add: Any = emit_multiply_add, relu: bool = False) -> Any:
+    one, two = (_make_tile(vectors, multiply_add, relu) for vectors in (1, 2))
 
     @inner
     def product(left, right, first, out, rows, columns, depth):  # type: ignore[no-untyped-def]
@@ -106,7 +109,7 @@ def _make_product(relu: bool) -> Any:
     return product
 
 
-product = _make_product(relu=False)
+product = _make_product()
 """out = first + left @ right.
 
 Args:
@@ -120,3 +123,5 @@ Args:
 """
 relu_product = _make_product(relu=True)
 """out = max(0, first + left @ right); nan stays nan."""
+pair_product = _make_product(emit_add_pair_products)
+"""The same of matrices of int32, each a pair of int16: sums of the products of both."""

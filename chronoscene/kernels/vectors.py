@@ -4,8 +4,9 @@ Numba has no vector type, and leaving loops to the auto-vectoriser costs a facto
 the compositing kernels; in matrix products LLVM does not keep a block in registers. Here a vector
 is a Numba type of its own, with any number of lanes; ``+ - * /``, comparisons and bit operations
 emit one or a few instructions of LLVM's portable vector IR, which LLVM turns into AVX-512, AVX2,
-SSE or NEON as the machine has it. Nothing names a processor's instruction, so the same kernels run
-everywhere; only the width that they are written for is chosen from the processor.
+SSE or NEON as the machine has it. Only products of pairs name a processor's instructions, where
+LLVM would not find them; so the same kernels run everywhere, and only the width that they are written
+for is chosen from the processor.
 
 Functions that make a vector from nothing are made for a number of lanes (``make_...``); all others
 take it from their arguments, of which some may be single numbers. Functions named ``emit_`` write
@@ -109,6 +110,24 @@ def emit_multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c: fmuladd fuses where the processor can; fma would call a slow library function
     where not."""
     return emit_call(builder, "fmuladd", a, b, c)
+
+
+_PAIR_PRODUCTS = {16: "avx512.pmaddw.d.512", 8: "avx2.pmadd.wd", 4: "sse2.pmadd.wd"}
+
+
+def emit_add_pair_products(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """c plus the products of two numbers of 16 bits that each lane of a and b holds."""
+    if platform.machine() in ("x86_64", "AMD64"):
+        pairs = ir.VectorType(ir.IntType(16), 2 * LANES)
+        kind = ir.FunctionType(c.type, [pairs, pairs])
+        name = f"llvm.x86.{_PAIR_PRODUCTS[LANES]}"
+        multiply = cgutils.get_or_insert_function(builder.module, kind, name)
+        products = builder.call(multiply, [builder.bitcast(x, pairs) for x in (a, b)])
+        return builder.add(c, products)
+    half = emit_lanes([16] * LANES, I32)
+    high = builder.mul(*(builder.ashr(x, half) for x in (a, b)))
+    low = builder.mul(*(builder.ashr(builder.shl(x, half), half) for x in (a, b)))
+    return builder.add(c, builder.add(low, high))
 
 
 def _like(*kinds: Any) -> Any:

@@ -21,7 +21,7 @@ from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.registration.features import feature_reuse
-from chronoscene.registration.features.nearest import Descriptors, mutual_matches, subspace
+from chronoscene.registration.features.nearest import Descriptors, mutual_matches
 from chronoscene.registration.features.sift import Features, photos_at_once, sift_features
 
 Item = TypeVar("Item")
@@ -185,9 +185,7 @@ def _match_descriptors(
         ids = {str(image.name): int(image.image_id) for image in opened.read_all_images()}
         wanted = [(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in pairs]
         used = sorted({i for pair in wanted for i in pair})
-        values = {i: np.asarray(opened.read_descriptors(i).data) for i in used}
-        basis = subspace(max(values.values(), key=len))
-        descriptors = {i: Descriptors.of(v, basis) for i, v in values.items()}
+        descriptors = {i: Descriptors.of(opened.read_descriptors(i).data) for i in used}
 
         def matches_of(pair: tuple[int, int]) -> NDArray[np.uint32]:
             return mutual_matches(descriptors[pair[0]], descriptors[pair[1]])

@@ -1,10 +1,7 @@
 """Matches between the descriptors of two images: exact nearest neighbours by matrix products.
 
-Descriptors are bytes, so all sums in a squared distance are whole numbers below 2^24, which float32
-holds exactly: the result is the same with every size of the blocks, library and processor.
-
-Most descriptors have no match, which half of the dimensions can show: a distance within a subspace
-is never larger than the whole one. Only the others are compared in all dimensions.
+Descriptors are bytes, so all products and squared distances are whole numbers: the result is the
+same with every order of the sums, number of threads and processor.
 """
 
 from __future__ import annotations
@@ -14,7 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.float32]
+from chronoscene.kernels.compilation import kernel
+from chronoscene.kernels.matmul import ROW_TILE, pair_product
+from chronoscene.kernels.vectors import LANES
+
+Integers = NDArray[np.int32]
 
 MAX_RATIO = 0.8
 """COLMAP's, of the distance to the nearest descriptor and that to the second nearest."""
@@ -22,35 +23,35 @@ MAX_RATIO = 0.8
 MAX_DISTANCE = 0.7
 """COLMAP's, in lengths of a descriptor, which is 512."""
 
-SUBSPACE = 56  # Dimensions; with fewer, a product is faster but shows less
-ROWS = 96  # Of a block: with 5,000 columns it takes 2 MB, which caches hold
+PAIRS = 64  # Of the 128 numbers of a descriptor
+COLUMNS = 2 * LANES  # Descriptors that a product reads side by side
+NOWHERE = -(2**30)  # Minus the squared length of what fills up the last columns
 
-SLACK = 64.0
-"""Subtracted from squared distances in the subspace: much more than rounding can add to them, and
-much less than they are."""
-
-_FARTHEST = np.float32((512 * MAX_DISTANCE) ** 2)
+_FARTHEST = (512 * MAX_DISTANCE) ** 2
 _RATIO = np.float32(1 / MAX_RATIO**2)
-
-
-def subspace(descriptors: NDArray[np.uint8]) -> Float:
-    """Orthonormal basis of the directions in which descriptors vary most. [128, SUBSPACE]"""
-    centred = descriptors - descriptors.sum(axis=0) / max(len(descriptors), 1)
-    return np.linalg.eigh(centred.T @ centred)[1][:, -SUBSPACE:].astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Descriptors:
-    """Those of an image, and their place in a subspace."""
+    """Those of an image, and the same arranged to be searched."""
 
     values: NDArray[np.uint8]
     """[N, 128]"""
-    projected: Float
-    """With the squared length in a last column. [N, SUBSPACE + 1]"""
+    doubled: Integers
+    """Twice the values, in pairs of int16, by groups of COLUMNS descriptors.
+    [groups, PAIRS, COLUMNS]"""
+    squares: Integers
+    """Minus the squared length of each. [groups * COLUMNS]"""
 
     @classmethod
-    def of(cls, values: NDArray[np.uint8], basis: Float) -> Descriptors:
-        return cls(values, _with_squares(values.astype(np.float32) @ basis))
+    def of(cls, values: NDArray[np.uint8]) -> Descriptors:
+        groups = -(-len(values) // COLUMNS)
+        padded = np.zeros((groups * COLUMNS, 2 * PAIRS), np.int16)
+        padded[: len(values)] = values
+        doubled = (2 * padded).view(np.int32).reshape(groups, COLUMNS, PAIRS)
+        squares = np.full(len(padded), NOWHERE, np.int32)
+        squares[: len(values)] = -_squares(values)
+        return cls(values, np.ascontiguousarray(doubled.transpose(0, 2, 1)), squares)
 
 
 def mutual_matches(first: Descriptors, second: Descriptors) -> NDArray[np.uint32]:
@@ -61,82 +62,69 @@ def mutual_matches(first: Descriptors, second: Descriptors) -> NDArray[np.uint32
 
     Args:
         first: Of one image, N of them.
-        second: Of the other, in the same subspace.
+        second: Of the other.
 
     Returns:
         Indices, sorted by the first. [M, 2]
     """
     if not len(first.values) or not len(second.values):
         return np.zeros((0, 2), np.uint32)
-    rows = _undecided(first, second)
-    columns, clear = _nearest(first.values[rows], second.values)
-    rows, columns = rows[clear], columns[clear]
-    back, clear = _nearest(second.values[columns], first.values)
+    columns, clear = _nearest(first.values, second)
+    rows, columns = np.flatnonzero(clear), columns[clear]
+    back, clear = _nearest(second.values[columns], first)
     mutual = clear & (back == rows)
     return np.column_stack([rows[mutual], columns[mutual]]).astype(np.uint32)
 
 
-def _with_squares(values: Float) -> Float:
-    """Rows with their squared lengths in a last column. [N, D] -> [N, D + 1]"""
-    return np.column_stack([values, np.einsum("ij,ij->i", values, values)])
-
-
-def _distances(queries: Float, searched: Float) -> Float:
-    """|q - d|^2 - |q|^2, as the product (-2 q, 1) (d, |d|^2). [Q, N]"""
-    factors = -2 * queries
-    factors[:, -1] = 1
-    return factors @ searched.T
+def _squares(values: NDArray[np.uint8]) -> Integers:
+    """Squared lengths of rows."""
+    return np.asarray(np.square(values, dtype=np.int32).sum(axis=1, dtype=np.int32))
 
 
 def _nearest(
-    query_values: NDArray[np.uint8], searched_values: NDArray[np.uint8]
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    queries: NDArray[np.uint8], searched: Descriptors
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """Nearest of the searched descriptors, and whether it passes distance and ratio. [Q], [Q]"""
-    queries, searched = (
-        _with_squares(v.astype(np.float32)) for v in (query_values, searched_values)
-    )
-    nearest = np.zeros(len(queries), np.intp)
-    clear = np.zeros(len(queries), bool)
-    for start in range(0, len(queries), ROWS):
-        block = slice(start, start + ROWS)
-        distances = _distances(queries[block], searched)
-        best, least = _pop_least(distances)
-        length = queries[block, -1]
-        nearest[block] = best
-        least, second = least + length, distances.min(axis=1) + length
-        clear[block] = (least <= _FARTHEST) & (_RATIO * least < second)
-    return nearest, clear
+    padded = np.zeros((-(-len(queries) // ROW_TILE) * ROW_TILE, 2 * PAIRS), np.int16)
+    padded[: len(queries)] = queries
+    found = np.empty((3, len(padded)), np.int32)
+    _search(padded.view(np.int32), searched.doubled, searched.squares, *found)
+    index, *largest = found[:, : len(queries)]
+    least, second = (_squares(queries) - score for score in largest)
+    return index, (least <= _FARTHEST) & (_RATIO * least < second)
 
 
-def _pop_least(distances: Float) -> tuple[NDArray[np.intp], Float]:
-    """Column and value of the least of each row, which infinity replaces. [Q], [Q]"""
-    rows, best = np.arange(len(distances)), distances.argmin(axis=1)
-    least = distances[rows, best]
-    distances[rows, best] = np.inf
-    return best, least
+@kernel
+def _search(queries, doubled, squares, index, most, next_most):  # type: ignore[no-untyped-def]
+    """Largest and second largest 2 q d - |d|^2 of each query, and the index of the largest.
 
-
-def _undecided(first: Descriptors, second: Descriptors) -> NDArray[np.intp]:
-    """Rows of the first that may have a match as far as the subspace shows.
-
-    No distance is less than the least in the subspace, and the second least is not more than the
-    larger one of any two: those to the two nearest in the subspace.
+    Args:
+        queries: In pairs of int16. [Q, PAIRS]
+        doubled: See `Descriptors`.
+        squares: See `Descriptors`.
+        index: [Q]
+        most: [Q]
+        next_most: [Q]
     """
-    rows = []
-    for start in range(0, len(first.values), ROWS):
-        block = slice(start, start + ROWS)
-        queries, values = first.projected[block], first.values[block]
-        distances = _distances(queries, second.projected)
-        one, least = _pop_least(distances)
-        two = distances.argmin(axis=1)
-        bound = least + queries[:, -1] - SLACK
-        second_least = np.maximum(*(_between(values, second.values[i]) for i in (one, two)))
-        undecided = (bound <= _FARTHEST) & (_RATIO * bound < second_least)
-        rows.append(start + np.flatnonzero(undecided | (one == two)))
-    return np.concatenate(rows)
-
-
-def _between(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> Float:
-    """Squared distances between rows. [N, 128], [N, 128] -> [N]"""
-    apart = np.subtract(a, b, dtype=np.float32)
-    return np.asarray(np.einsum("ij,ij->i", apart, apart), np.float32)
+    count = len(squares)
+    scores = np.empty((ROW_TILE, count), np.int32)
+    lowest = np.int32(2 * NOWHERE)
+    for top in range(0, len(queries), ROW_TILE):
+        left = (queries, top * PAIRS, PAIRS, 1)
+        for column in range(0, count, COLUMNS):
+            right = (doubled, column * PAIRS, COLUMNS)
+            first, out = (squares, column, 0), (scores, column, count)
+            pair_product(left, right, first, out, ROW_TILE, COLUMNS, PAIRS)
+        for i in range(ROW_TILE):
+            row = scores[i]
+            best = lowest
+            for score in row:
+                best = max(best, score)
+            place = 0
+            while row[place] != best:
+                place += 1
+            row[place] = lowest
+            following = lowest
+            for score in row:
+                following = max(following, score)
+            index[top + i], most[top + i], next_most[top + i] = place, best, following

@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from chronoscene.registration.features import nearest
-from chronoscene.registration.features.nearest import Descriptors, mutual_matches, subspace
+from chronoscene.registration.features.nearest import Descriptors, mutual_matches
 
 
 def found(a: np.ndarray, b: np.ndarray) -> list[tuple[int, int]]:
-    basis = subspace(a if len(a) else b)
-    matches = mutual_matches(Descriptors.of(a, basis), Descriptors.of(b, basis))
+    matches = mutual_matches(Descriptors.of(a), Descriptors.of(b))
     assert matches.dtype == np.uint32
     assert matches.shape[1] == 2
     return [(int(i), int(j)) for i, j in matches]
@@ -98,23 +96,8 @@ def test_an_image_without_features_has_no_matches() -> None:
     assert found(none, some) == found(some, none) == found(none, none) == []
 
 
-@pytest.mark.parametrize("rows", [1, 7, 1000])
-@pytest.mark.parametrize("dimensions", [1, 30, 128])
-def test_blocks_and_subspace_change_nothing(
-    rows: int, dimensions: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rng = np.random.default_rng(3)
-    a = descriptors(rng, 120)
-    b = np.concatenate([disturbed(rng, a[:80], 12.0), descriptors(rng, 60)])
-    wanted = found(a, b)
-    assert 20 < len(wanted) < 81
-    monkeypatch.setattr(nearest, "ROWS", rows)
-    monkeypatch.setattr(nearest, "SUBSPACE", dimensions)
-    assert found(a, b) == wanted
-
-
-def test_the_subspace_never_loses_a_match_at_the_largest_lengths() -> None:
-    """Bytes of any size, where sums come near to what float32 holds exactly."""
+def test_descriptors_of_the_largest_lengths() -> None:
+    """Bytes of any size."""
     rng = np.random.default_rng(5)
     a = rng.integers(200, 256, (150, 128)).astype(np.uint8)
     b = np.concatenate([disturbed(rng, a[:100], 4.0), rng.integers(200, 256, (50, 128))])
