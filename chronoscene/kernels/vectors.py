@@ -5,8 +5,8 @@ the compositing kernels; in matrix products LLVM does not keep a block in regist
 is a Numba type of its own, with any number of lanes; ``+ - * /``, comparisons and bit operations
 emit one or a few instructions of LLVM's portable vector IR, which LLVM turns into AVX-512, AVX2,
 SSE or NEON as the machine has it. Only products of pairs name a processor's instructions, where
-LLVM would not find them; so the same kernels run everywhere, and only the width that they are written
-for is chosen from the processor.
+LLVM would not find them; so the same kernels run everywhere, and only the width that they are
+written for is chosen from the processor.
 
 Functions that make a vector from nothing are made for a number of lanes (``make_...``); all others
 take it from their arguments, of which some may be single numbers. Functions named ``emit_`` write

@@ -161,10 +161,8 @@ def _locked(descriptor: int) -> bool:
 
 
 STEPS = {
-    "features": "chronoscene.registration.features.database:extract",
-    "pairs": "chronoscene.registration.features.pairs:choose_pairs",
-    "matches": "chronoscene.registration.features.database:match",
-    "holdout": "chronoscene.registration.features.holdout:hold_out",
+    "features": "chronoscene.registration.features.extraction:extract",
+    "matches": "chronoscene.registration.features.verification:match_photos",
     "joint": "chronoscene.registration.reconstruct.routes:joint",
     "separate": "chronoscene.registration.reconstruct.routes:separate",
     "frozen": "chronoscene.registration.reconstruct.routes:add_period",

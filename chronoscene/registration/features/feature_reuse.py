@@ -16,8 +16,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import sha256_of, write_text_atomic
 from chronoscene.registration.features import METHOD
@@ -29,7 +27,9 @@ SHA-256 by name."""
 
 
 def record_of(arguments: Mapping[str, Any]) -> Record:
-    """What features are made from, by the arguments of `database.extract`."""
+    """What features are made from, by the arguments of `extraction.extract`."""
+    import cv2  # the process that matches does not need it
+
     folder, groups = Path(arguments["photos"]), arguments["groups"]
     names = sorted(name for group in groups for name in group["names"])
     with ThreadPoolExecutor(arguments["threads"]) as pool:

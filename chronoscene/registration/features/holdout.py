@@ -23,6 +23,7 @@ from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import replacing
 from chronoscene.registration.features.database import keypoints_of, quiet, verified_matches
+from chronoscene.scene.tracks import seen_by_period
 
 MIN_LEFT = 16  # A pair of images keeps at least this many matches: sparse pairs stay useful
 
@@ -91,12 +92,13 @@ def first_at_place(xy: NDArray[np.float64]) -> NDArray[np.int64]:
 
 def eligible_tracks(tracks: Tracks, period_of: Mapping[int, int]) -> NDArray[np.int64]:
     """Tracks of at least two periods without two keypoints in one image, which are mismatched."""
-    import pandas as pd
-
-    table = pd.DataFrame({"track": tracks.track, "image": tracks.image})
-    table["period"] = table.image.map(dict(period_of))
-    several = table.groupby("track").period.nunique() > 1
-    several[table.track[table.duplicated(["track", "image"])]] = False
+    images, slot = np.unique(tracks.image, return_inverse=True)
+    period = np.array([period_of[i] for i in images.tolist()], np.int64)
+    count = int(tracks.track.max(initial=-1)) + 1
+    shape = count, int(period.max(initial=-1)) + 1
+    several = seen_by_period(tracks.track, period[slot], shape).sum(axis=1) > 1
+    views, times = np.unique(tracks.track * len(images) + slot, return_counts=True)
+    several[views[times > 1] // max(len(images), 1)] = False
     return np.flatnonzero(several)
 
 

@@ -38,13 +38,12 @@ class Matched:
 def find_matches(inputs: Inputs, context: Context) -> Matched:
     """Extract, match and hold out; each is done once."""
     features = _features(inputs, context)
-    _matches(inputs, context)
-    held = _hold_out(inputs, context)
+    found = _matches(inputs, context)
     return Matched(
         keypoints=features["keypoints"],
-        partners=held["partners"],
-        pairs_across=held["verified_pairs_across"],
-        matches_across=held["matches_across"],
+        partners=found["partners"],
+        pairs_across=found["verified_pairs_across"],
+        matches_across=found["matches_across"],
     )
 
 
@@ -84,47 +83,40 @@ def _reused(count: int, total: int, what: str) -> list[str]:
     return [f"{count} of {total} {what} reused from the previous run"] if count else []
 
 
-def _matches(inputs: Inputs, context: Context) -> None:
+def _matches(inputs: Inputs, context: Context) -> dict[str, Any]:
+    options = context.options
     centres = inputs.centres()
     taken = {c.name: c.taken.isoformat() for c in inputs.images if c.taken is not None}
     images = [
         {"name": name, "period": period, "enu": centres.get(name), "taken": taken.get(name)}
         for name, period in sorted(inputs.periods.items())
     ]
-    settings = {"images": images, "exhaustive_limit": context.options.exhaustive_limit}
-    database, listing = str(context.database), str(context.work / "pairs.txt")
-
-    def choose() -> tuple[Any, list[str]]:
-        found = context.step("pairs", settings | {"database": database, "out": listing})
-        kinds = ", ".join(f"{n} {kind}" for kind, n in found["kinds"].items())
-        told = f"{found['pairs']} pairs ({kinds}), {found['across_periods']} across periods"
-        return found, [told]
-
-    def match() -> tuple[Any, list[str]]:
-        places = {"database": database, "pairs": listing, "scratch": str(context.work)}
-        found = context.step("matches", places | {"threads": context.threads})
-        pairs, verified, inliers = (found[k] for k in ("pairs", "verified", "inliers"))
-        told = f"{verified} of {pairs} pairs verified, {inliers} matches"
-        return found, [told, *_reused(found["carried"], pairs, "pairs: matches")]
-
-    context.stages.run("pairs", settings, choose)
-    context.stages.run("matches", None, match)
-
-
-def _hold_out(inputs: Inputs, context: Context) -> dict[str, Any]:
-    options = context.options
-    settings = {"periods": inputs.periods, "share": options.held_out, "seed": options.seed}
+    settings = {
+        "images": images,
+        "exhaustive_limit": options.exhaustive_limit,
+        "periods": inputs.periods,
+        "share": options.held_out,
+        "seed": options.seed,
+    }
     places = {
         "database": str(context.database),
+        "pairs": str(context.work / "pairs.txt"),
+        "scratch": str(context.work),
         "out": str(context.mapping_database),
         "held_out": str(context.held_out),
+        "threads": context.threads,
     }
 
-    def hold_out() -> tuple[Any, list[str]]:
-        found = context.step("holdout", settings | places)
+    def match() -> tuple[Any, list[str]]:
+        found = context.step("matches", settings | places)
+        kinds = ", ".join(f"{n} {kind}" for kind, n in found["kinds"].items())
+        pairs, verified, inliers = (found[k] for k in ("pairs", "verified", "inliers"))
         told = [
+            f"{pairs} pairs ({kinds}), {found['across_periods']} across periods",
+            f"{verified} of {pairs} pairs verified, {inliers} matches",
+            *_reused(found["carried"], pairs, "pairs: matches"),
             f"{found['held_out']} of {found['tracks_of_several_periods']} tracks of several "
-            "periods held out"
+            "periods held out",
         ]
         told += [
             f"periods {key}: {count} verified pairs, {found['matches_across'][key]} matches"
@@ -132,7 +124,7 @@ def _hold_out(inputs: Inputs, context: Context) -> dict[str, Any]:
         ]
         return found, told
 
-    return dict(context.stages.run("holdout", settings, hold_out))
+    return dict(context.stages.run("matches", settings, match))
 
 
 def scene_groups(scene: Scene) -> list[dict[str, Any]]:
@@ -153,7 +145,7 @@ def scene_groups(scene: Scene) -> list[dict[str, Any]]:
 def camera_groups(
     captures: Sequence[Capture], model: str, calibration: Calibration = "auto"
 ) -> list[dict[str, Any]]:
-    """Lists of names that share a camera, for `chronoscene.registration.features.database.extract`.
+    """Lists of names that share a camera, for `features.extraction.extract`.
 
     Photos share one if make, model, size and focal length agree. With ``auto``, photos of different
     visits do not, where each has enough of them (`MIN_PHOTOS`). Initial focal lengths are

@@ -38,7 +38,7 @@ Pair = tuple[int, int]
 def choose_pairs(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     """Write the list of pairs to match.
 
-    Arguments: ``database``, ``out`` (list file), ``images`` (each with ``name``, ``period``,
+    Arguments: ``database``, ``pairs`` (list file), ``images`` (each with ``name``, ``period``,
     ``enu`` or null, ``taken`` or null), ``exhaustive_limit``.
     """
     quiet()
@@ -62,7 +62,7 @@ def choose_pairs(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]
             counts[kind] = len(pairs - chosen)
             chosen |= pairs
     ordered = sorted(chosen)
-    write_pairs(Path(arguments["out"]), [(names[i], names[j]) for i, j in ordered])
+    write_pairs(Path(arguments["pairs"]), [(names[i], names[j]) for i, j in ordered])
     across = sum(int(periods[i] != periods[j]) for i, j in ordered)
     return {"pairs": len(ordered), "across_periods": across, "kinds": counts}
 

@@ -23,6 +23,7 @@ from chronoscene.registration.photos.inputs import Inputs
 from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered, Route
 from chronoscene.scene import Camera, Points
 from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.tracks import seen_by_period, track_owners
 
 MIN_CROSS_PAIRS = 3  # Verified pairs of images that connect two periods
 MIN_CROSS_MATCHES = 100  # Matches in these pairs that connect two periods
@@ -218,8 +219,6 @@ def without_twins(points: Points) -> Points:
 
 def read_held_out(path: Path, names: tuple[str, ...], periods: Mapping[str, int]) -> HeldOutTracks:
     """Held-out tracks that registered images of at least two periods see."""
-    import pandas as pd
-
     with np.load(path) as data:
         known: dict[str, str] = json.loads(bytes(data["names"]).decode())
         track, image, xy = data["track"], data["image"], data["xy"]
@@ -231,7 +230,8 @@ def read_held_out(path: Path, names: tuple[str, ...], periods: Mapping[str, int]
     if not len(track):
         return HeldOutTracks.empty()
     period = np.array([periods[name] for name in names])[place]
-    across = pd.Series(period).groupby(track).transform("nunique").to_numpy() > 1
+    shape = int(track.max()) + 1, int(period.max()) + 1
+    across = (seen_by_period(track, period, shape).sum(axis=1) > 1)[track]
     order = np.lexsort((place[across], track[across]))
     track, place, xy = track[across][order], place[across][order], xy[across][order]
     start = np.append(np.flatnonzero(np.diff(track, prepend=-1)), len(track))
@@ -240,22 +240,24 @@ def read_held_out(path: Path, names: tuple[str, ...], periods: Mapping[str, int]
 
 def cross_matches(tracks: HeldOutTracks, periods: NDArray[np.int64]) -> tuple[CrossMatches, ...]:
     """Held-out tracks as matches between images of different periods, by pair of images."""
-    import pandas as pd
-
-    count = np.diff(tracks.start)
-    seen = pd.DataFrame(
-        {
-            "track": np.repeat(np.arange(len(count)), count),
-            "image": tracks.image,
-            "row": np.arange(len(tracks.image)),
-        }
-    )
-    pairs = seen.merge(seen, on="track", suffixes=("_a", "_b"))
-    pairs = pairs[periods[pairs.image_a] < periods[pairs.image_b]]
+    track, count = track_owners(tracks.start), np.diff(tracks.start)
+    # Each observation with every one of its track.
+    a = np.repeat(np.arange(len(track)), count[track])
+    ends = np.cumsum(count[track])
+    b = np.arange(len(a)) + np.repeat(tracks.start[track] - ends + count[track], count[track])
+    across = periods[tracks.image[a]] < periods[tracks.image[b]]
+    a, b = a[across], b[across]
+    order = np.lexsort((tracks.image[b], tracks.image[a]))
+    a, b = a[order], b[order]
+    first, second = tracks.image[a], tracks.image[b]
+    new = (np.diff(first, prepend=-1) != 0) | (np.diff(second, prepend=-1) != 0)
     return tuple(
-        CrossMatches(int(a), int(b), tracks.xy[m.row_a], tracks.xy[m.row_b], m.track.to_numpy())
-        for (a, b), m in pairs.groupby(["image_a", "image_b"])
-    )
+        CrossMatches(
+            int(first[rows[0]]), int(second[rows[0]]), tracks.xy[a[rows]], tracks.xy[b[rows]],
+            track[a[rows]],
+        )
+        for rows in np.split(np.arange(len(a)), np.flatnonzero(new))[1:]
+    )  # fmt: skip
 
 
 def reasons(

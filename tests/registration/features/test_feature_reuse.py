@@ -21,8 +21,10 @@ from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration import stages
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.features import feature_reuse, matching
-from chronoscene.registration.features.database import extract, match, write_pairs
+from chronoscene.registration.features.database import write_pairs
+from chronoscene.registration.features.extraction import extract
 from chronoscene.registration.features.matching import Matched, find_matches
+from chronoscene.registration.features.verification import match
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.photos.inputs import gather
 from chronoscene.registration.stages import Stages, work_folder
@@ -558,31 +560,32 @@ def test_the_command_goes_on_from_the_run_before(
     write_table(captures, "2016", "2016", "2023", "2023")
     first, told, _ = matched(captures)
     assert "reused" not in str(told)
-    assert told["pairs"] == ["6 pairs (6 exhaustive), 4 across periods"]
+    assert told["matches"][0] == "6 pairs (6 exhaustive), 4 across periods"
 
     write_table(captures, "2016", "2023", "2023", "2023")
     moved, told, ran = matched(captures)
     assert (ran.computed.get("features"), ran.computed["pairs"]) == (None, 0)
-    assert told["pairs"] == ["6 pairs (6 exhaustive), 3 across periods"]
+    assert told["matches"][0] == "6 pairs (6 exhaustive), 3 across periods"
     assert moved.partners == first.partners
 
     shutil.copyfile(photos / ALL[4], captures / ALL[4])
     write_table(captures, "2016", "2023", "2023", "2023", "2016")
     more, told, _ = matched(captures)
-    verified = told["matches"][0]
+    verified = told["matches"][1]
     assert told["features"][1:] == ["4 of 5 photos: features reused from the previous run"]
-    assert told["matches"][1:] == ["6 of 10 pairs: matches reused from the previous run"]
+    assert told["matches"][2] == "6 of 10 pairs: matches reused from the previous run"
     assert moved.keypoints.items() <= more.keypoints.items()
 
     # A photo goes, and comes back after a kill: then the record of the stage speaks of matches
     # that the database has no more.
     write_table(captures, "2016", "2023", "2023", "2023")
     with monkeypatch.context() as patch:
-        patch.setitem(stages.STEPS, "pairs", "no_such_module:killed")
+        patch.setitem(stages.STEPS, "matches", "no_such_module:killed")
         with pytest.raises(RegistrationError, match="no_such_module"):
             matched(captures)
     write_table(captures, "2016", "2023", "2023", "2023", "2016")
     again, told, ran = matched(captures, seed=1)
-    assert told["matches"] == [verified, "10 of 10 pairs: matches reused from the previous run"]
+    reused = "10 of 10 pairs: matches reused from the previous run"
+    assert told["matches"][1:3] == [verified, reused]
     assert ran.computed["pairs"] == 0
     assert again.partners == more.partners

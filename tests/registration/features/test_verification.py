@@ -1,4 +1,4 @@
-"""Steps that talk to COLMAP's database."""
+"""Pairs that are matched and verified."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import chronoscene.colmap.model  # noqa: F401  # loads pycolmap safely
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features.database import INLIER_SHARES, _unmatched
+from chronoscene.registration.features.verification import INLIER_SHARES, _unmatched
 
 
 def test_matches_that_a_killed_run_left_are_dropped(tmp_path: Path) -> None:

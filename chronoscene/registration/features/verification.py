@@ -1,0 +1,131 @@
+"""Second step: pairs of photos, their verified matches, and what of them is held out. Worker only.
+
+Matches are ours (`nearest`); COLMAP verifies them by geometry. What is stored is not done again.
+Matches of the same photos in an earlier database are copied; see `feature_reuse`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.io.processes import Report
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.features import feature_reuse
+from chronoscene.registration.features.database import SEED, quiet, read_pairs, write_pairs
+from chronoscene.registration.features.holdout import hold_out
+from chronoscene.registration.features.nearest import Descriptors, mutual_matches
+from chronoscene.registration.features.pairs import choose_pairs
+
+BATCH = 64  # Pairs
+
+INLIER_SHARES = ((45, 1 / 4), (30, 1 / 3), (20, 1 / 2), (0, 3 / 4))
+"""From so many matches on, the share that must be inliers for COLMAP to draw enough samples. A pair
+needs 15 inliers, which of fewer matches are a larger share: most pairs of photos without overlap
+are done ten times as soon."""
+
+
+def match_photos(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Choose pairs, match them, and hold out tracks: one process, because starting three takes
+    longer than what two of them do.
+
+    Arguments and results: those of `choose_pairs`, `match` and `hold_out`.
+    """
+    chosen = choose_pairs(arguments, report)
+    return chosen | match(arguments, report) | hold_out(arguments, report)
+
+
+def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Match and verify pairs of images that are not in the database yet.
+
+    Arguments: ``database``, ``pairs`` (text file with two names a line), ``threads``,
+    ``scratch`` (folder).
+
+    Returns:
+        Number of ``pairs``, of those ``verified``, of their ``inliers``, and of the pairs
+        ``carried`` over from an earlier database.
+    """
+    quiet()
+    database = arguments["database"]
+    pairs = read_pairs(Path(arguments["pairs"]))
+    _drop_others(database, pairs)
+    reused = feature_reuse.reuse_matches(Path(database), pairs)
+    left = _unmatched(database, pairs)
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = threads = arguments["threads"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    listed = Path(arguments["scratch"]) / "batch.txt"
+    for first in range(0, len(left), BATCH):
+        report("pairs", len(pairs) - len(left) + first, len(pairs))
+        found = _match_descriptors(database, left[first : first + BATCH], threads)
+        for least, share in INLIER_SHARES:
+            write_pairs(listed, [pair for pair, count in found.items() if count >= least])
+            found = {pair: count for pair, count in found.items() if count < least}
+            verification.ransac.min_inlier_ratio = share
+            pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
+            # COLMAP takes the matches that are in the database, and verifies them.
+            pycolmap.match_image_pairs(database, options, pairing, verification)
+    listed.unlink(missing_ok=True)
+    report("pairs", len(pairs), len(pairs))
+    with pycolmap.Database.open(database) as opened:
+        counts = [int(n) for n in opened.read_two_view_geometry_num_inliers()[1]]
+    feature_reuse.forget(Path(database))
+    return {
+        "pairs": len(pairs),
+        "verified": sum(n > 0 for n in counts),
+        "inliers": sum(counts),
+        "carried": reused,
+    }
+
+
+def _match_descriptors(
+    database: str, pairs: Sequence[tuple[str, str]], threads: int
+) -> dict[tuple[str, str], int]:
+    """Store matches of pairs of images, in the order of their ids; the number of each pair."""
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): int(image.image_id) for image in opened.read_all_images()}
+        wanted = [(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in pairs]
+        used = sorted({i for pair in wanted for i in pair})
+        descriptors = {i: Descriptors.of(opened.read_descriptors(i).data) for i in used}
+
+        def matches_of(pair: tuple[int, int]) -> NDArray[np.uint32]:
+            return mutual_matches(descriptors[pair[0]], descriptors[pair[1]])
+
+        counts = []
+        with ThreadPoolExecutor(threads) as pool:
+            for pair, found in zip(wanted, pool.map(matches_of, wanted), strict=True):
+                opened.write_matches(*pair, found)
+                counts.append(len(found))
+    return dict(zip(pairs, counts, strict=True))
+
+
+def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:
+    """Drop pairs that are not listed: an earlier list may have had others."""
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): image.image_id for image in opened.read_all_images()}
+        listed = {pycolmap.image_pair_to_pair_id(ids[a], ids[b]) for a, b in pairs}
+        for pair_id in set(opened.read_num_matches()[0]) - listed:
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            opened.delete_matches(a, b)
+            opened.delete_two_view_geometry(a, b)
+
+
+def _unmatched(database: str, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Pairs without a geometry. If such a pair has matches, a killed run left them: COLMAP would
+    verify them and then fail to store them a second time, so they are dropped."""
+    left = []
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): image.image_id for image in opened.read_all_images()}
+        for a, b in pairs:
+            if not opened.exists_two_view_geometry(ids[a], ids[b]):
+                if opened.exists_matches(ids[a], ids[b]):
+                    opened.delete_matches(ids[a], ids[b])
+                left.append((a, b))
+    return left
