@@ -93,7 +93,7 @@ def load_photo(
     except _DECODE_ERRORS as error:
         raise _image_error(path, error) from error
     if mask_path is not None:
-        allowed = _load_mask(mask_path, rgb.size)
+        allowed = load_mask(mask_path, rgb.size)
         mask = allowed if mask is None else mask & allowed
     if size is not None and rgb.size != size:
         rgb = rgb.resize(size, Image.Resampling.BICUBIC)
@@ -101,8 +101,12 @@ def load_photo(
     return np.array(rgb), None if mask is None or mask.all() else mask
 
 
-def _load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where a mask file is not 0. [H, W]"""
+def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Where a mask file is not 0. [H, W]
+
+    Raises:
+        ImageError: If it is missing, damaged, not of one channel, or of another width and height.
+    """
     try:
         with Image.open(path) as image:
             found = f"{image.width} x {image.height} pixels of mode {image.mode}"

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.errors import SceneError
 from chronoscene.formats import chronoscene as our_format
+from chronoscene.images.masks import find_masks
 from chronoscene.images.store import Progress
 from chronoscene.io.staging import check_not_current, needing_space, write_text_atomic
 from chronoscene.registration.quality.certificate import Certificate, certify
@@ -55,12 +56,13 @@ def as_scene(registered: Registered, name: str) -> Scene:
             zip(registered.names, registered.cameras, registered.cam_from_world, strict=True)
         )
     )
+    photos = Path(registered.images_root)
     georeference = registered.georeference
     world = WorldFrame() if georeference is None else WorldFrame("metre", georeference.crs)
     return Scene(
         name=name,
-        root=Path(registered.images_root),
-        images_root=Path(registered.images_root),
+        root=photos,
+        images_root=photos,
         frames=frames,
         points=as_points(registered),
         periods=tuple(
@@ -69,6 +71,7 @@ def as_scene(registered: Registered, name: str) -> Scene:
         split_rule="every 8th image of each period",
         format=our_format.NAME,
         world=world,
+        masks=find_masks(photos.parent, registered.names),
     )
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from chronoscene.errors import RegistrationError
+from chronoscene.errors import DiskFullError, RegistrationError
 from chronoscene.io.processes import Report, run_worker
 from chronoscene.io.staging import write_text_atomic
 
@@ -174,6 +175,10 @@ JSON can hold."""
 ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 """Steps start their own threads; those of a matrix library would wait spinning beside them."""
 
+LEAST_SPACE = 64_000_000
+"""Bytes; if a step dies and there is less, a full disk was the cause. Some of what it wrote is
+already deleted by then."""
+
 LOG_LINES = 4  # Lines of the step's own output in a message
 
 
@@ -195,7 +200,8 @@ def run_step(
         inherited: File descriptors that stay open in the process.
 
     Raises:
-        RegistrationError: If the process dies.
+        DiskFullError: If the process dies and there is hardly any space left.
+        RegistrationError: If it dies otherwise.
         ChronoSceneError: What the step raised, as a `RegistrationError` with the same words.
     """
     with log.open("ab") as file:
@@ -208,6 +214,7 @@ def run_step(
             environment=ENVIRONMENT,
         )
     if outcome.message is None:
+        _check_space(log.parent)
         said = _end_of(log)
         raise RegistrationError(
             f"step {step}",
@@ -219,6 +226,19 @@ def run_step(
     if "error" in outcome.message:
         raise RegistrationError(**outcome.message["error"])
     return outcome.message["result"]
+
+
+def _check_space(folder: Path) -> None:
+    """Raise an error if there is hardly any space: libraries abort where they cannot write, and the
+    log cannot say why."""
+    free = shutil.disk_usage(folder).free
+    if free < LEAST_SPACE:
+        raise DiskFullError(
+            folder,
+            expected="space for what is written there",
+            found=f"{free / 1e6:.1f} MB left",
+            todo="make room on this disk, or choose a place on another one (--work)",
+        )
 
 
 def _end_of(log: Path) -> str:

@@ -148,6 +148,11 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
 ) -> None:
     base = tmp_path / "base"
     shutil.copytree(captures / "2016", tmp_path / "first" / "2016")
+    masked = f"2016/{truth.frames[0].name}"
+    mask = np.full((300, 400), 255, np.uint8)
+    mask[250:] = 0
+    (tmp_path / "masks/2016").mkdir(parents=True)
+    Image.fromarray(mask).save(tmp_path / f"masks/{masked}.png")
     run(read_captures(tmp_path / "first"), base, OPTIONS)
     old = read_scene(base)
     out = tmp_path / "grown"
@@ -162,6 +167,10 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
         assert same.camera == frame.camera
         assert (same.image_id, same.period, same.split) == (frame.image_id, 0, frame.split)
         assert new.image_path(same).read_bytes() == old.image_path(frame).read_bytes()
+    assert list(old.masks) == list(new.masks) == [masked]
+    assert new.masks[masked].read_bytes() == old.masks[masked].read_bytes()
+    seen = old.points.track_xy[old.points.track_frame == old.frame_index[masked]]
+    assert len(seen) > 10 and seen[:, 1].max() < 260  # undistorted since
     kept = np.isin(new.points.ids, old.points.ids)
     assert new.points.xyz[kept].tobytes() == old.points.xyz.tobytes()
     assert len(new.points) > len(old.points)

@@ -1,17 +1,19 @@
 """Stages that are done once, and steps in a process of their own."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from chronoscene.errors import RegistrationError
+from chronoscene.errors import DiskFullError, RegistrationError
 from chronoscene.registration import stages
 from chronoscene.registration.stages import Stages, work_folder
 
@@ -142,6 +144,14 @@ def test_the_death_of_a_step_is_a_message(tmp_path: Path, step: str, found: str)
     with pytest.raises(RegistrationError, match=found) as caught:
         stages.run_step(step, {}, log=tmp_path / "log")
     assert "--threads 1" in caught.value.todo and str(tmp_path / "log") in caught.value.todo
+
+
+def test_the_death_of_a_step_on_a_full_disk_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=250_000))
+    with pytest.raises(DiskFullError, match=r"expected space .*, found 0\.2 MB left.*--work"):
+        stages.run_step("aborts", {}, log=tmp_path / "log")
 
 
 def test_a_refusal_of_a_step_is_the_same_refusal(tmp_path: Path) -> None:

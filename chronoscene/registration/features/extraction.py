@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 
+from chronoscene.images.masks import find_masks
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.registration.features import feature_reuse
@@ -44,7 +44,8 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     left = [name for name, count in keypoint_counts(database).items() if count == 0]
     left = sorted(set(left) & set(names))
     options = (arguments[k] for k in ("max_image_size", "max_features", "threads"))
-    found = _features([Path(photos, name) for name in left], *options)
+    masks = find_masks(Path(photos).parent, left)
+    found = _features([(Path(photos, name), masks.get(name)) for name in left], *options)
     for done, (name, features) in enumerate(zip(left, found, strict=True), len(names) - len(left)):
         report("features", done, len(names))
         _store(database, name, features)
@@ -74,14 +75,17 @@ def _store(database: str, name: str, features: Features) -> None:
 
 
 def _features(
-    paths: Sequence[Path], max_image_size: int, max_features: int, threads: int
+    files: Sequence[tuple[Path, Path | None]], max_image_size: int, max_features: int, threads: int
 ) -> Iterator[Features]:
-    """Features of photos in their order; threads are never far ahead of the caller."""
+    """Features of photos with masks, in their order; threads are never far ahead of the caller."""
     cv2.setNumThreads(1)  # each photo is the work of one thread
-    compute = partial(sift_features, max_image_size=max_image_size, max_features=max_features)
+
+    def compute(file: tuple[Path, Path | None]) -> Features:
+        return sift_features(file[0], max_image_size, max_features, file[1])
+
     with ThreadPoolExecutor(photos_at_once(max_image_size, threads)) as pool:
-        for first in range(0, len(paths), BATCH):
-            yield from pool.map(compute, paths[first : first + BATCH])
+        for first in range(0, len(files), BATCH):
+            yield from pool.map(compute, files[first : first + BATCH])
 
 
 def keypoint_counts(database: str | Path) -> dict[str, int]:

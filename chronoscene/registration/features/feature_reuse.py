@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from chronoscene.images.masks import find_masks
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import sha256_of, write_text_atomic
 from chronoscene.registration.features import METHOD
@@ -23,7 +24,7 @@ from chronoscene.registration.stages import read_record
 
 Record = dict[str, Any]
 """``settings`` that all features depend on, ``groups`` of photos with one camera, and ``photos``:
-SHA-256 by name."""
+SHA-256 by name, and of the mask where there is one."""
 
 
 def record_of(arguments: Mapping[str, Any]) -> Record:
@@ -32,8 +33,10 @@ def record_of(arguments: Mapping[str, Any]) -> Record:
 
     folder, groups = Path(arguments["photos"]), arguments["groups"]
     names = sorted(name for group in groups for name in group["names"])
+    masks = find_masks(folder.parent, names)
+    files = [[folder / name, *([masks[name]] if name in masks else [])] for name in names]
     with ThreadPoolExecutor(arguments["threads"]) as pool:
-        digests = list(pool.map(sha256_of, (folder / name for name in names)))
+        digests = list(pool.map(lambda group: "".join(map(sha256_of, group)), files))
     settings = {key: arguments[key] for key in ("max_image_size", "max_features")}
     made_by = {"method": METHOD, "pycolmap": pycolmap.__version__, "opencv": cv2.__version__}
     return {

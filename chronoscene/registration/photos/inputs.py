@@ -21,6 +21,7 @@ from chronoscene.errors import RegistrationError, SceneError
 from chronoscene.geodesy import Georeference, from_crs
 from chronoscene.images.decoding import image_size, load_photo
 from chronoscene.images.exif import set_upright
+from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.images.store import place_image
 from chronoscene.io.staging import replacing, sha256_of
 from chronoscene.registration.context import Context
@@ -107,11 +108,14 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
     if scene is not None:
         source = _as_new_period(unique.captures, scene, label)
     inputs = [
-        [c.name, str(c.path.resolve()), digests[original.name]]
+        [c.name, str(c.path.resolve()), digests[original.name], *_mask_inputs(c.mask)]
         for c, original in zip(source, unique.captures, strict=True)
     ]
     if scene is not None:
-        inputs += [[f.name, str(scene.image_path(f))] for f in scene.frames]
+        inputs += [
+            [f.name, str(scene.image_path(f)), *_mask_inputs(scene.masks.get(f.name))]
+            for f in scene.frames
+        ]
     names = stages.run("photos", inputs, lambda: _place(source, scene, unique.remarks, context))
     images = renamed(source, names)
     periods = {f.name: f.period for f in (scene.frames if scene else ())}
@@ -136,6 +140,11 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
         positions=positions,
         georeference=georeference,
     )
+
+
+def _mask_inputs(mask: Path | None) -> list[str]:
+    """What the first stage depends on: nothing without a mask."""
+    return [] if mask is None else [str(mask.resolve()), sha256_of(mask)]
 
 
 def _check_enough(
@@ -180,13 +189,21 @@ def _as_new_period(captures: Sequence[Capture], scene: Scene, label: str) -> tup
 def _place(
     captures: Sequence[Capture], scene: Scene | None, remarks: Sequence[str], context: Context
 ) -> tuple[list[str], list[str]]:
-    """Put photos, and those of the scene, where the steps find them."""
-    shutil.rmtree(context.photos, ignore_errors=True)
+    """Put photos, those of the scene, and their masks where the steps find them."""
+    for folder in (context.photos, context.work / MASKS):
+        shutil.rmtree(folder, ignore_errors=True)
     names, told = place_photos(captures, context.photos)
+    masks = dict(zip(names, (c.mask for c in captures), strict=True))
     for frame in scene.frames if scene else ():
         assert scene is not None
         _check_pinhole(scene, frame)
         place_image(scene.image_path(frame), context.photos / frame.name, "symlink")
+        masks[frame.name] = scene.masks.get(frame.name)
+    found = {name: mask for name, mask in masks.items() if mask is not None}
+    for name, mask in found.items():
+        place_image(mask, context.work / mask_place(name), "symlink")
+    if found:
+        told.append(f"masks of {len(found)} photos: no features where they are 0")
     return names, [*remarks, *told]
 
 

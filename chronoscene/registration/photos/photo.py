@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
 from chronoscene.images.exif import ExifData, read_exif, taken_at
+from chronoscene.images.masks import find_masks
 
 GPS_SIGMA = (5.0, 5.0, 10.0)
 """Metres east, north, up, if the photo states none: a consumer receiver under open sky."""
@@ -48,6 +49,8 @@ class Capture:
     exif: ExifData
     taken: datetime | None
     gps: Gps | None
+    mask: Path | None = None
+    """Its mask file, in ``masks/`` beside the folder of the photos."""
 
 
 def open_photo(path: Path, name: str, period: int) -> Capture | str:
@@ -65,6 +68,7 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
     if is_panorama(path) or max(width, height) > MAX_ASPECT * min(width, height):
         return f"{width} x {height} pixels: a panorama, which no perspective camera model describes"
     exif = read_exif(path)
+    beside = path.absolute().parents[len(PurePosixPath(name).parts)]
     return Capture(
         name=name,
         path=path,
@@ -74,6 +78,7 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
         exif=exif,
         taken=taken_at(path, exif),
         gps=_position(exif),
+        mask=find_masks(beside, [name]).get(name),
     )
 
 

@@ -57,6 +57,8 @@ def write_model(model: pycolmap.Reconstruction, folder: Path, photos: str) -> No
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     model.write_binary(str(partial))
+    # COLMAP does not notice a full disk; reading fails where a file refers to what another lacks.
+    pycolmap.Reconstruction(str(partial))
     shutil.rmtree(folder, ignore_errors=True)
     partial.rename(folder)
 

@@ -13,7 +13,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from chronoscene.errors import RegistrationError
 from chronoscene.formats import read_scene
@@ -333,6 +335,24 @@ def test_nothing_is_reused_with_other_settings(work: Work) -> None:
     ran = work.run(ALL, max_features=500)
     assert ran == Ran((0, 0), {"features": 6, "pairs": 15})
     assert work.run(ALL, max_features=500).computed == {"features": 0, "pairs": 0}
+
+
+def test_a_photo_whose_mask_changes_gets_new_features(work: Work) -> None:
+    def draw(covered: int) -> None:
+        mask = np.full((240, 320), 255, np.uint8)
+        mask[:covered] = 0
+        place = work.photos.parent / "masks" / f"{ALL[2]}.png"
+        place.parent.mkdir(exist_ok=True)
+        Image.fromarray(mask).save(place)
+
+    work.photos = Path(shutil.copytree(work.photos, work.folder / "photos"))
+    for covered in (60, 120):
+        draw(covered)
+        assert work.run(ALL) == Ran((5, 10), {"features": 1, "pairs": 5})
+        with pycolmap.Database.open(work.database) as opened:
+            image = opened.read_image_with_name(ALL[2])
+            assert opened.read_keypoints(image.image_id)[:, 1].min() > covered - 1
+    assert work.run(ALL).computed == {"features": 0, "pairs": 0}
 
 
 def test_nothing_is_reused_from_another_pycolmap(

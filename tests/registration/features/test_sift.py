@@ -82,6 +82,7 @@ def test_features_are_as_those_of_colmap(texture: Path, tmp_path: Path) -> None:
         their_descriptors = np.asarray(opened.read_descriptors(1).data).astype(float)
     ours, descriptors = sift_features(texture, 1600, 4096)
     assert ours.shape[1] == theirs.shape[1]
+    assert len(ours) > 2 * len(theirs)  # fainter ones too
     apart = np.linalg.norm((ours[:, None] - theirs[None])[..., [0, 1, 2, 4]], axis=2)
     found = apart.argmin(axis=1)
     same = apart[np.arange(len(ours)), found] < 0.5
@@ -114,6 +115,19 @@ def test_the_largest_are_kept(texture: Path) -> None:
     apart = np.linalg.norm(fewer_descriptors.astype(float) - descriptors[:50], axis=1)
     assert apart.max() < 0.05 * 512
     assert (np.diff(np.hypot(every[:, 2], every[:, 4])) < 1e-4).all()
+
+
+@pytest.mark.parametrize("max_image_size", [1600, 160])
+def test_there_are_no_features_where_the_mask_is_0(
+    texture: Path, tmp_path: Path, max_image_size: int
+) -> None:
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[:, :100] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    whole = sift_features(texture, max_image_size, 4096)[0]
+    kept = sift_features(texture, max_image_size, 4096, tmp_path / "mask.png")[0]
+    assert kept[:, 0].min() > 99 > np.quantile(whole[:, 0], 0.2)
+    assert len(kept) > 0.6 * (whole[:, 0] > 102).sum()
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB"])

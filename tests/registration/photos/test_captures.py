@@ -109,6 +109,18 @@ def test_unusable_photos_are_named_with_reasons(tmp_path: Path) -> None:
     assert "panorama" in reasons["1/sphere.jpg"]
 
 
+def test_masks_lie_beside_the_folder_of_the_photos(tmp_path: Path) -> None:
+    for name in ("images/2016/a.jpg", "images/2023/b.jpg"):
+        photo(tmp_path / name)
+    mask = tmp_path / "masks/2016/a.jpg.png"
+    mask.parent.mkdir(parents=True)
+    mask.touch()
+    assert [c.mask for c in read_captures(tmp_path / "images").images] == [mask, None]
+    (tmp_path / "images/periods.csv").write_text("image,period\n2016/a.jpg,one\n2023/b.jpg,two\n")
+    masks = [c.mask for c in read_captures(tmp_path / "images/periods.csv").images]
+    assert masks == [mask, None]
+
+
 def test_nothing_to_register_is_said(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match="found no image files"):
         read_captures(tmp_path)
