@@ -169,7 +169,8 @@ def test_a_new_period_leaves_the_old_poses_to_the_last_bit(
         assert new.image_path(same).read_bytes() == old.image_path(frame).read_bytes()
     assert list(old.masks) == list(new.masks) == [masked]
     assert new.masks[masked].read_bytes() == old.masks[masked].read_bytes()
-    seen = old.points.track_xy[old.points.track_frame == old.frame_index[masked]]
+    index = [f.name for f in old.frames].index(masked)
+    seen = old.points.track_xy[old.points.track_frame == index]
     assert len(seen) > 10 and seen[:, 1].max() < 260  # undistorted since
     kept = np.isin(new.points.ids, old.points.ids)
     assert new.points.xyz[kept].tobytes() == old.points.xyz.tobytes()
