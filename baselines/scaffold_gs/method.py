@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from baselines.scaffold_gs.config import ScaffoldGSConfig
+from baselines.scaffold_gs.model import ScaffoldModel
 from chronoscene.anchors.method import AnchorMethod
-from chronoscene.anchors.model import AnchorLayout
+from chronoscene.anchors.model import BANK, LAYERS, AnchorLayout
 from chronoscene.methods import TrainingSet
 
 
@@ -21,6 +22,7 @@ class ScaffoldGSPeriod(AnchorMethod):
     """Scaffold-GS whose colour MLP sees a vector of the period: the least that time can be."""
 
     name = "scaffold-gs-period"
+    model_class = ScaffoldModel
     config: ScaffoldGSConfig
 
     def layout(self, train: TrainingSet) -> AnchorLayout:
@@ -28,7 +30,10 @@ class ScaffoldGSPeriod(AnchorMethod):
         return replace(super().layout(train), global_dim=dim, global_heads=("color",))
 
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
-        return super().rates(camera_extent) | {"global_features": self.config.appearance_lr}
+        rates = super().rates(camera_extent) | {"global_features": self.config.appearance_lr}
+        if self.config.feature_bank:
+            rates |= {f"{BANK}.{layer}": self.config.bank_lr for layer in LAYERS}
+        return rates
 
 
 class ScaffoldGS(ScaffoldGSPeriod):

@@ -31,6 +31,9 @@ from chronoscene.training.splatting import Splats, camera_centre_tensor
 PER_ANCHOR = ("offsets", "features", "log_scales")  # Trained tensors with one row per anchor
 
 LAYERS = HeadWeights._fields
+BANK = "bank"  # Name of the MLP that mixes features, where there is one
+_ADDED_LATER = ("near_plane", "antialiased", "distance_heads", "distance_scale", "feature_bank")
+"""Fields of `AnchorLayout` that the files of older models do not have."""
 _OUTPUTS = {"opacity": 1, "covariance": 7, "color": 3}
 
 
@@ -55,6 +58,16 @@ class AnchorLayout:
     visibility: str = "radius"
     near_plane: float = NEAR_PLANE
     antialiased: bool = False
+    distance_heads: tuple[str, ...] = ()
+    """MLPs that see how far from the camera an anchor is."""
+    distance_scale: float = 1.0
+    feature_bank: bool = False
+    """Whether an MLP mixes the features: `baselines.scaffold_gs.model`."""
+
+    @property
+    def mlps(self) -> tuple[str, ...]:
+        """Names of all MLPs."""
+        return (*HEADS, BANK) if self.feature_bank else HEADS
 
     @property
     def feature_dim(self) -> int:
@@ -76,9 +89,10 @@ class AnchorLayout:
     @classmethod
     def from_meta(cls, meta: Mapping[str, Any]) -> AnchorLayout:
         """Read what ``dataclasses.asdict`` stored in ``model.json``."""
-        known = {f.name for f in dataclasses.fields(cls)}
-        values: dict[str, Any] = {"near_plane": NEAR_PLANE, "antialiased": False}  # if not said
+        fields = dataclasses.fields(cls)
+        values: dict[str, Any] = {f.name: f.default for f in fields if f.name in _ADDED_LATER}
         values |= {k: tuple(v) if isinstance(v, list) else v for k, v in meta.items()}
+        known = {f.name for f in fields}
         if set(values) != known:
             raise CheckpointError(
                 "model.json: layout",
@@ -106,7 +120,7 @@ class AnchorModel:
     global_features: Tensor
     """[T, G]"""
     heads: Mapping[str, HeadWeights]
-    """Three two-layer MLPs by name; ``w1`` holds only the inputs that the MLP sees."""
+    """Two-layer MLPs by name; ``w1`` holds only the inputs that the MLP sees."""
 
     def __len__(self) -> int:
         return len(self.anchors)
@@ -126,16 +140,8 @@ class AnchorModel:
         """The model before training. Draws the heads first, so equal layouts start equal."""
         heads = {}
         for name in HEADS:
-            # Weights and biases uniform within 1/sqrt(inputs), as usual for linear layers.
-            inputs, hidden = cls.input_dim(layout, name), layout.hidden_dim
-            outputs = _OUTPUTS[name] * layout.offsets
-            first, second = 1.0 / math.sqrt(max(inputs, 1)), 1.0 / math.sqrt(hidden)
-            heads[name] = HeadWeights(
-                w1=draw_start((hidden, inputs), "uniform", first, generator),
-                b1=draw_start((hidden,), "uniform", first, generator),
-                w2=draw_start((outputs, hidden), "uniform", second, generator),
-                b2=draw_start((outputs,), "uniform", second, generator),
-            )
+            inputs, outputs = cls.input_dim(layout, name), _OUTPUTS[name] * layout.offsets
+            heads[name] = draw_mlp(inputs, layout.hidden_dim, outputs, generator)
         shape = (len(anchors), layout.feature_dim)
         features = draw_start(shape, config.feature_init, config.feature_init_scale, generator)
         shape = (layout.num_periods, layout.global_dim)
@@ -158,14 +164,14 @@ class AnchorModel:
     def tensors(self) -> dict[str, Tensor]:
         """Everything that is stored, by name."""
         named = {name: getattr(self, name) for name in ("anchors", *PER_ANCHOR, "global_features")}
-        for head in HEADS:
-            named |= {f"{head}.{layer}": getattr(self.heads[head], layer) for layer in LAYERS}
+        for name, head in self.heads.items():
+            named |= {f"{name}.{layer}": getattr(head, layer) for layer in LAYERS}
         return named
 
     @classmethod
     def from_tensors(cls, layout: AnchorLayout, tensors: Mapping[str, Tensor]) -> Self:
         """Inverse of `tensors`."""
-        heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in LAYERS)) for h in HEADS}
+        heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in LAYERS)) for h in layout.mlps}
         named = {name: tensors[name] for name in ("anchors", *PER_ANCHOR, "global_features")}
         return cls(layout, **named, heads=heads)
 
@@ -203,11 +209,7 @@ class AnchorModel:
     def _decode_inputs(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
     ) -> DecodeInputs:
-        layout, features, base_dim = self.layout, self.features, self.layout.base_dim
-        if layout.direction == "full":  # a second base feature that nothing trains
-            offset = self.anchors - centre
-            features = torch.cat([features[:, :base_dim], offset, features[:, base_dim:]], dim=1)
-            base_dim += 3
+        features, base_dim = self.seen_features(centre)
         opacity, covariance, color = (self._kernel_head(name) for name in HEADS)
         return DecodeInputs(
             anchors=self.anchors,
@@ -222,8 +224,25 @@ class AnchorModel:
             camera_centre=centre,
             visible=visible,
             base_dim=base_dim,
-            period_dim=layout.period_dim,
+            period_dim=self.layout.period_dim,
         )
+
+    def seen_features(self, centre: Tensor) -> tuple[Tensor, int]:
+        """Features as the MLPs get them in a view, and how many of them all periods share."""
+        features, base_dim = self.features, self.layout.base_dim
+        if self.layout.direction == "full":  # a second base feature that nothing trains
+            offset = self.anchors - centre
+            features = torch.cat([features[:, :base_dim], offset, features[:, base_dim:]], dim=1)
+            base_dim += 3
+        if self.layout.distance_heads:
+            distances = self.layout.distance_scale * self.distances(centre)
+            features = torch.cat([features[:, :base_dim], distances, features[:, base_dim:]], dim=1)
+            base_dim += 1
+        return features, base_dim
+
+    def distances(self, centre: Tensor) -> Tensor:
+        """Of the anchors from a camera. [A, 1]"""
+        return (self.anchors - centre).square().sum(dim=1, keepdim=True).sqrt()
 
     def _scales_in_use(self) -> Tensor:
         """Log-scales with zeros where a rule says that the unit of the frame counts. [A, 6]"""
@@ -237,17 +256,23 @@ class AnchorModel:
 
     @staticmethod
     def input_dim(layout: AnchorLayout, head: str) -> int:
-        """Inputs of the first layer of an MLP: base, period, direction, global side by side."""
+        """Inputs of the first layer of an MLP: base, distance, period, direction, global side by
+        side."""
         direction = 3 if head in layout.direction_heads else 0
         global_dim = layout.global_dim if head in layout.global_heads else 0
-        return layout.base_dim + layout.period_dim + direction + global_dim
+        base_dim = layout.base_dim + (head in layout.distance_heads)
+        return base_dim + layout.period_dim + direction + global_dim
 
     def first_layer(self, head: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Columns of ``w1`` that act on the base, period, direction and global input. [H, ·]"""
+        """Columns of ``w1`` that act on the base (and distance), period, direction and global
+        input. [H, ·]"""
         layout, w1 = self.layout, self.heads[head].w1
         direction = 3 if head in layout.direction_heads else 0
-        dims = [layout.base_dim, layout.period_dim, direction]
+        distance = head in layout.distance_heads
+        dims = [layout.base_dim + distance, layout.period_dim, direction]
         base, period, directions, table = w1.split([*dims, w1.shape[1] - sum(dims)], dim=1)
+        if layout.distance_heads and not distance:
+            base = torch.cat([base, zero_columns(w1, 1)], dim=1)
         if head not in layout.global_heads:
             table = zero_columns(w1, layout.global_dim)
         return base, period, directions, table
@@ -255,14 +280,15 @@ class AnchorModel:
     def _kernel_head(self, name: str) -> HeadWeights:
         """Weights with the inputs of the kernel; one that the MLP does not see has zero columns."""
         layout, head = self.layout, self.heads[name]
-        kernel_inputs = layout.base_dim + layout.period_dim + 3 + layout.global_dim
-        if layout.direction == "unit" and head.w1.shape[1] == kernel_inputs:
-            return head
         base, period, direction, table = self.first_layer(name)
         if direction.shape[1] == 0:
             direction = zero_columns(head.w1, 3)
+        widths = (part.shape[1] for part in (base, period, direction, table))
+        if layout.direction == "unit" and head.w1.shape[1] == sum(widths):
+            return head
         if layout.direction == "full":
-            parts = [base, direction, period, zero_columns(head.w1, 3), table]
+            at = layout.base_dim
+            parts = [base[:, :at], direction, base[:, at:], period, zero_columns(head.w1, 3), table]
         else:
             parts = [base, period, direction, table]
         return head._replace(w1=torch.cat(parts, dim=1))
@@ -271,6 +297,17 @@ class AnchorModel:
 def zero_columns(like: Tensor, count: int) -> Tensor:
     """Zeros beside a matrix. [rows, count]"""
     return like.new_zeros(len(like), count)
+
+
+def draw_mlp(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> HeadWeights:
+    """Weights and biases uniform within 1/sqrt(inputs), as usual for linear layers."""
+    first, second = 1.0 / math.sqrt(max(inputs, 1)), 1.0 / math.sqrt(hidden)
+    return HeadWeights(
+        w1=draw_start((hidden, inputs), "uniform", first, generator),
+        b1=draw_start((hidden,), "uniform", first, generator),
+        w2=draw_start((outputs, hidden), "uniform", second, generator),
+        b2=draw_start((outputs,), "uniform", second, generator),
+    )
 
 
 def draw_start(shape: Sequence[int], rule: str, scale: float, generator: torch.Generator) -> Tensor:

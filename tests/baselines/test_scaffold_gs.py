@@ -15,6 +15,8 @@ from baselines.scaffold_gs.config import ScaffoldGSConfig
 from baselines.scaffold_gs.method import ScaffoldGS, ScaffoldGSPeriod
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
+from chronoscene.errors import ConfigError
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, TrainingView, build_config
 from chronoscene.scene.similarity import Sim3
 
@@ -66,6 +68,138 @@ def test_parameter_counts(train_set: TrainingSet) -> None:
     )
     # The official file has 79 columns, of which 3 normals, 1 opacity and 4 rotations are unused.
     assert anchor == 79 - 8
+
+
+def test_parameter_counts_with_feature_bank_and_distances(train_set: TrainingSet) -> None:
+    """The official MLPs have one input more with a distance; the bank has 4 -> 32 -> 3."""
+    made = ScaffoldGS(ScaffoldGSConfig(feature_bank=True, distance_heads=("opacity", "color")))
+    made.setup(train_set, seed=0, device="cpu")
+    counts = {name: sum(t.numel() for t in head) for name, head in made.model.heads.items()}
+    bank = 4 * 32 + 32 + 32 * 3 + 3
+    assert counts == {"opacity": 1_482 + 32, "covariance": 3_462, "color": 2_142 + 32, "bank": bank}
+
+
+SEEN_BY_ALL = ("opacity", "covariance", "color")
+
+
+def with_inputs(train_set: TrainingSet, **options: Any) -> ScaffoldGS:
+    """Before training, with features that differ."""
+    made = ScaffoldGSPeriod(ScaffoldGSConfig(**GROWING, appearance_dim=4, **options))
+    made.setup(train_set, seed=3, device="cpu")
+    with torch.no_grad():
+        generator = torch.Generator().manual_seed(4)
+        made.model.features.copy_(torch.randn(made.model.features.shape, generator=generator))
+        made.model.offsets.copy_(0.1 * torch.randn(made.model.offsets.shape, generator=generator))
+    return made
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"feature_bank": True},
+        {"distance_heads": SEEN_BY_ALL},
+        {"distance_heads": ("covariance",), "distance_scale": 0.5},
+        {"feature_bank": True, "distance_heads": ("color",), "distance_scale": 7.0},
+        {"feature_bank": True, "distance_heads": ("opacity",), "direction": "full"},
+    ],
+    ids=str,
+)
+def test_feature_bank_and_distances_against_float64(
+    train_set: TrainingSet, options: dict[str, Any]
+) -> None:
+    """Values by the formulas written out, number by number; all gradients."""
+    centre = torch.tensor([0.1, -0.2, -1.5])
+    names = ("means", "opacities", "scales", "colors", "quats")
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        model = with_inputs(train_set, **options).model
+        tensors = {n: t.detach().to(dtype) for n, t in model.tensors().items()}
+        model = type(model).from_tensors(model.layout, tensors).requires_grad()
+        visible = torch.arange(0, len(model), 2)
+        splats = model.decode(torch.ones(1, dtype=dtype), centre.to(dtype), visible)
+        generator = torch.Generator().manual_seed(5)
+        draws = {n: torch.randn(getattr(splats, n).shape, generator=generator) for n in names}
+        sum((getattr(splats, n) * draw.to(dtype)).sum() for n, draw in draws.items()).backward()
+        found.append((splats, {n: t.grad for n, t in model.tensors().items() if n != "anchors"}))
+    (ours, grads), (exact, expected) = found
+    for name, grad in expected.items():
+        assert grad is not None and grads[name] is not None, name
+        scale = grad.abs().max()
+        assert scale > 0, name
+        torch.testing.assert_close(grads[name].double(), grad, rtol=0, atol=2e-5 * scale.item())
+    for m in range(3):
+        raw = {
+            head: plain_mlp(model.heads[head], inputs)
+            for head, inputs in plain_inputs(model, 2 * m, centre.double()).items()
+        }
+        shapes = torch.sigmoid(raw["covariance"].view(10, 7)[:, :3])
+        values = {
+            "opacities": torch.tanh(raw["opacity"]),
+            "scales": shapes * model.log_scales[2 * m, 3:].exp(),
+            "colors": torch.sigmoid(raw["color"]).view(10, 3),
+        }
+        for name, value in values.items():
+            single, double = (getattr(s, name)[10 * m : 10 * m + 10] for s in (ours, exact))
+            torch.testing.assert_close(double, value)
+            torch.testing.assert_close(single.double(), value, rtol=1e-4, atol=1e-5)
+
+
+def plain_mlp(weights: Any, inputs: torch.Tensor) -> torch.Tensor:
+    w1, b1, w2, b2 = weights
+    return w2 @ torch.relu(w1 @ inputs + b1) + b2
+
+
+def plain_inputs(model: Any, row: int, centre: torch.Tensor) -> dict[str, torch.Tensor]:
+    """What each MLP sees of one anchor, in the order of its columns."""
+    layout, feature = model.layout, model.features[row].clone()
+    offset = model.anchors[row] - centre
+    distance = torch.linalg.vector_norm(offset)[None]
+    if layout.feature_bank:
+        sight = torch.cat([offset / distance, layout.distance_scale * distance])
+        weights = torch.exp(plain_mlp(model.heads["bank"], sight))
+        weights = weights / weights.sum()
+        parts = [feature[[step * (c % (32 // step)) for c in range(32)]] for step in (4, 2, 1)]
+        feature = sum(weight * part for weight, part in zip(weights, parts, strict=True))
+    direction = offset if layout.direction == "full" else offset / distance
+    inputs = {}
+    for head in SEEN_BY_ALL:
+        parts = [feature]
+        if head in layout.distance_heads:
+            parts.append(layout.distance_scale * distance)
+        parts.append(direction)
+        if head == "color":
+            parts.append(model.global_features[0])
+        inputs[head] = torch.cat(parts)
+    return inputs
+
+
+@pytest.mark.parametrize("preset", ["paper", "balanced"])
+def test_distances_are_in_the_unit_of_the_lengths(preset: str) -> None:
+    """An MLP sees the distance in the world, as in the official code, or what no unit changes."""
+    config = build_config(SPEC, preset=preset).in_training_frame(0.01)
+    assert config.distance_scale == (100.0 if preset == "paper" else 1.0)
+
+
+def test_a_feature_bank_has_equal_bits_on_any_number_of_threads(train_set: TrainingSet) -> None:
+    models = []
+    for threads in (1, 2):
+        set_threads(threads)
+        made = with_inputs(train_set, feature_bank=True, distance_heads=SEEN_BY_ALL)
+        for index in range(6):
+            made.step(index, index / 20)
+        models.append(made.model.tensors())
+    set_threads()
+    start = with_inputs(train_set, feature_bank=True).model.heads["bank"].w1
+    assert not torch.equal(models[0]["bank.w1"], start)
+    for name, tensor in models[0].items():
+        assert torch.equal(tensor, models[1][name]), name
+
+
+def test_a_feature_bank_needs_a_feature_that_four_divides() -> None:
+    with pytest.raises(ConfigError, match="base_dim: expected a multiple of 4"):
+        ScaffoldGSConfig(feature_bank=True, base_dim=30)
+    with pytest.raises(ConfigError, match=r"distance_heads: .*did you mean 'color'"):
+        ScaffoldGSConfig(distance_heads=("colour",))
 
 
 def test_the_schedule_of_the_official_code() -> None:

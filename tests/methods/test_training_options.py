@@ -18,6 +18,7 @@ OPTIONS = [
     ("3dgs", {"absgrad": True, "densify_interval": 8}),
     ("3dgs", {"antialiased": True}),
     ("scaffold-gs", {"antialiased": True}),
+    ("scaffold-gs", {"feature_bank": True, "distance_heads": ("opacity", "color")}),
     ("scaffold-gs", {"random_background": True, "exposure": "image"}),
     ("chronogs", {"exposure": "period"}),
     ("4dgs", {"exposure": "period"}),

@@ -112,13 +112,13 @@ def decode_reference(x: DecodeInputs) -> Splats:
     )
     factors = torch.exp(x.log_scales.index_select(0, x.visible))[:, None, :]
     offsets = x.offsets.index_select(0, x.visible)
-    covariances = _mlp(inputs, x.covariance_head).reshape(-1, num_offsets, 7)
+    covariances = mlp(inputs, x.covariance_head).reshape(-1, num_offsets, 7)
     return Splats(
         means=(centres[:, None] + offsets * factors[..., :3]).reshape(-1, 3),
         quats=_unit_quats(covariances[..., 3:].reshape(-1, 4)),
         scales=(factors[..., 3:] * torch.sigmoid(covariances[..., :3])).reshape(-1, 3),
-        opacities=torch.tanh(_mlp(inputs, x.opacity_head)).reshape(-1),
-        colors=torch.sigmoid(_mlp(inputs, x.color_head)).reshape(-1, 3),
+        opacities=torch.tanh(mlp(inputs, x.opacity_head)).reshape(-1),
+        colors=torch.sigmoid(mlp(inputs, x.color_head)).reshape(-1, 3),
     )
 
 
@@ -195,7 +195,8 @@ def _check_visible(visible: Tensor, rows: int) -> None:
         )
 
 
-def _mlp(inputs: Tensor, head: HeadWeights) -> Tensor:
+def mlp(inputs: Tensor, head: HeadWeights) -> Tensor:
+    """Outputs before the activation. [M, I] -> [M, O]"""
     return torch.relu(inputs @ head.w1.T + head.b1) @ head.w2.T + head.b2
 
 
