@@ -28,6 +28,11 @@ class Hub(ThreadingHTTPServer):
         self.damaged: set[str] = set()
         """Files that are served with another first byte."""
         self.gated = False
+        self.tokens: set[str | None] = set()
+        """What logins were sent with requests for files."""
+        self.held = threading.Event()
+        """Files wait for it in the middle of their contents."""
+        self.held.set()
         self.asked: list[tuple[str, str | None]] = []
         """Paths of the files that were asked for, with the range."""
 
@@ -82,6 +87,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer_file(self, name: str) -> None:
         hub, asked = self.server, self.headers.get("Range")
         hub.asked.append((name, asked))
+        hub.tokens.add(self.headers.get("Authorization"))
         if hub.gated:
             self._refuse(403, "GatedRepo")
             return
@@ -97,10 +103,10 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         waiting = hub.breaks.get(name)
         stop = waiting.pop(0) if waiting else len(content)
-        self.wfile.write(content[start:stop])
-        if stop < len(content):
-            self.wfile.flush()
-            self.close_connection = True
+        middle = (start + stop) // 2
+        self.wfile.write(content[start:middle])
+        hub.held.wait()
+        self.wfile.write(content[middle:stop])
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from chronoscene.download.archives import ARCHIVES, archive_stem, open_archive, 
 from chronoscene.download.catalogue import Dataset
 from chronoscene.download.hub import list_files, request_headers
 from chronoscene.download.transfer import RemoteFile, check_space, fetch, in_words, missing_bytes
-from chronoscene.errors import DownloadError
+from chronoscene.errors import ConfigError, DownloadError
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import counted, shown
@@ -72,7 +72,8 @@ def download_scenes(
         say: Called with the size before anything is fetched.
 
     Raises:
-        DownloadError: If the host does not answer, a name is unknown, or a file arrives damaged.
+        ConfigError: If there is no scene of this name; lists those that there are.
+        DownloadError: If the host does not answer, a file arrives damaged, or no scene is found.
         DiskFullError: If there is no space for the files and for what is unpacked.
     """
     commit, files = list_files(dataset.repo)
@@ -147,7 +148,7 @@ def _choose(
             dataset.page,
             expected=f"folders of scenes, or archives ({', '.join(ARCHIVES)})",
             found=shown((f.path for f in files), LISTED) or "no files",
-            todo=f"by hand: {dataset.by_hand}",
+            todo="get the dataset by hand",
         )
     known = {*folders, *(archive_stem(archive.path) for archive in archives)}
     known.update(name for a in archives for name in record.archives.get(a.checksum, ()))
@@ -205,7 +206,7 @@ def _unpack(
                 archive.path,
                 expected=f"a scene, known by {dataset.scene_file}",
                 found=shown(member.name for member in members) or "no files",
-                todo=f"by hand: {dataset.by_hand}",
+                todo="get the dataset by hand",
             )
         new = [n for n in _wanted(archive, found, scenes) if not (out / n).exists()]
         for name in new:
@@ -215,7 +216,7 @@ def _unpack(
 
 def _check_names(dataset: Dataset, scenes: Collection[str], known: Collection[str]) -> None:
     if unknown := sorted(set(scenes) - set(known)):
-        raise DownloadError(
+        raise ConfigError(
             dataset.page,
             expected=f"names of scenes: {shown(sorted(known), LISTED)}",
             found=shown(unknown, LISTED),

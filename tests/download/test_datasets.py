@@ -10,7 +10,7 @@ from hub_standin import COMMIT
 
 from chronoscene.download.catalogue import DATASETS
 from chronoscene.download.datasets import download_scenes
-from chronoscene.errors import DownloadError
+from chronoscene.errors import ConfigError, DownloadError
 
 CHRONOSCENE = DATASETS["chronoscene"]
 
@@ -91,7 +91,7 @@ def test_size_is_said_without_what_is_there(hub, tmp_path):
 @LAYOUTS
 def test_unknown_scenes_are_answered_with_the_names(hub, tmp_path, files):
     hub.files = files
-    with pytest.raises(DownloadError, match=r"names of scenes: 'A', .*'B', found 'C', 'a';"):
+    with pytest.raises(ConfigError, match=r"names of scenes: 'A', .*'B', found 'C', 'a';"):
         download(tmp_path, "A", "a", "C")
     hub.asked.clear()
     download(tmp_path, "A", "B")
@@ -140,9 +140,12 @@ def test_damaged_record_counts_as_none(hub, tmp_path):
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ({"README.md": b""}, r"folders of scenes, or archives .* found 'README.md'; by hand: "),
-        ({"a.zip": packed({"b": b""})}, "a.zip: expected a scene, .* found 'b'; by hand: "),
-        ({}, "found no files; by hand"),
+        (
+            {"README.md": b""},
+            r"folders of scenes, or archives .* found 'README.md'; get the dataset by hand",
+        ),
+        ({"a.zip": packed({"b": b""})}, "a.zip: expected a scene, .* found 'b'; get the"),
+        ({}, "found no files; get"),
     ],
 )
 def test_layouts_without_scenes(hub, tmp_path, files, message):

@@ -2,11 +2,13 @@
 
 import hashlib
 from collections import namedtuple
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 from huggingface_hub.utils import are_progress_bars_disabled, enable_progress_bars
 
-from chronoscene.download.hub import list_files
+from chronoscene.download.hub import list_files, request_headers
 from chronoscene.download.transfer import RemoteFile, fetch, in_words, missing_bytes
 from chronoscene.errors import DiskFullError, DownloadError
 
@@ -65,6 +67,36 @@ def test_another_version_of_a_file_is_not_a_continuation(hub, tmp_path):
     hub.files, hub.breaks = {"a": CONTENT[::-1]}, {}
     fetch(files_of(hub), tmp_path, report=no_report)
     assert (tmp_path / "a").read_bytes() == CONTENT[::-1]
+
+
+def test_a_part_that_is_too_long_is_no_beginning(hub, tmp_path):
+    hub.files = {"a": CONTENT}
+    (file,) = files_of(hub)
+    (tmp_path / f"a.{file.checksum[:8]}.part").write_bytes(CONTENT + b"?")
+    fetch([file], tmp_path, report=no_report)
+    assert hub.asked == [("a", None)] and (tmp_path / "a").read_bytes() == CONTENT
+
+
+def test_an_error_ends_the_other_downloads(hub, tmp_path, monkeypatch):
+    def end(pool, wait=True, **options):
+        hub.held.set()  # goes on only now
+        shutdown(pool, wait, **options)
+
+    shutdown = ThreadPoolExecutor.shutdown
+    monkeypatch.setattr(ThreadPoolExecutor, "shutdown", end)
+    hub.files = {"slow": CONTENT}
+    hub.held.clear()
+    (slow,) = files_of(hub)
+    with pytest.raises(DownloadError, match="404"):
+        fetch([slow, replace(slow, path="b", url=slow.url + "b")], tmp_path, report=no_report)
+    assert not (tmp_path / "slow").exists()
+
+
+def test_the_login_is_sent_to_the_hub(hub, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_TOKEN", "hf_secret")
+    hub.files = {"a": CONTENT}
+    fetch(files_of(hub), tmp_path, report=no_report, headers=request_headers())
+    assert hub.tokens == {"Bearer hf_secret"}
 
 
 def test_damaged_files_are_named_together_and_fetched_anew(hub, tmp_path):
