@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import unquote, urlsplit
@@ -28,8 +28,8 @@ class Hub(ThreadingHTTPServer):
         self.damaged: set[str] = set()
         """Files that are served with another first byte."""
         self.gated = False
-        self.tokens: set[str | None] = set()
-        """What logins were sent with requests for files."""
+        self.headers: list[Mapping[str, str]] = []
+        """Of the requests for files."""
         self.held = threading.Event()
         """Files wait for it in the middle of their contents."""
         self.held.set()
@@ -87,7 +87,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer_file(self, name: str) -> None:
         hub, asked = self.server, self.headers.get("Range")
         hub.asked.append((name, asked))
-        hub.tokens.add(self.headers.get("Authorization"))
+        hub.headers.append(self.headers)
         if hub.gated:
             self._refuse(403, "GatedRepo")
             return

@@ -141,8 +141,7 @@ def _choose(
 ) -> _Choice:
     files = [file for file in files if not file.path.endswith(dataset.left_out)]
     folders = find_scenes(dataset, (f.path for f in files), dataset.repo.rpartition("/")[2])
-    inside = tuple(folders.values())
-    archives = [f for f in files if archive_stem(f.path) and not f.path.startswith(inside)]
+    archives = [file for file in files if archive_stem(file.path)]
     if not folders and not archives:
         raise DownloadError(
             dataset.page,

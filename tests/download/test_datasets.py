@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+from collections import namedtuple
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from hub_standin import COMMIT
 
 from chronoscene.download.catalogue import DATASETS
 from chronoscene.download.datasets import download_scenes
-from chronoscene.errors import ConfigError, DownloadError
+from chronoscene.errors import ConfigError, DiskFullError, DownloadError
 
 CHRONOSCENE = DATASETS["chronoscene"]
 
@@ -98,6 +99,16 @@ def test_unknown_scenes_are_answered_with_the_names(hub, tmp_path, files):
     assert (tmp_path / "A").is_dir() and (tmp_path / "B").is_dir()
     assert not any(path == "All.zip" for path, _ in hub.asked)
     assert not (tmp_path / ".download").exists()
+
+
+def test_space_for_what_is_unpacked_is_asked_for_before(hub, tmp_path, monkeypatch):
+    hub.files = dict(ONE_FOR_ALL)
+    (size,) = map(len, hub.files.values())
+    disk = namedtuple("disk", "free")(2 * size - 1)
+    monkeypatch.setattr("chronoscene.download.transfer.shutil.disk_usage", lambda place: disk)
+    with pytest.raises(DiskFullError, match="of free space"):
+        download(tmp_path)
+    assert not hub.asked
 
 
 def test_archive_beside_folders_is_fetched_only_by_its_name(hub, tmp_path):

@@ -92,11 +92,13 @@ def test_an_error_ends_the_other_downloads(hub, tmp_path, monkeypatch):
     assert not (tmp_path / "slow").exists()
 
 
-def test_the_login_is_sent_to_the_hub(hub, tmp_path, monkeypatch):
+def test_login_and_plain_contents_are_asked_for(hub, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_TOKEN", "hf_secret")
     hub.files = {"a": CONTENT}
     fetch(files_of(hub), tmp_path, report=no_report, headers=request_headers())
-    assert hub.tokens == {"Bearer hf_secret"}
+    (headers,) = hub.headers
+    assert headers["Authorization"] == "Bearer hf_secret"
+    assert headers["Accept-Encoding"] == "identity"
 
 
 def test_damaged_files_are_named_together_and_fetched_anew(hub, tmp_path):
