@@ -36,7 +36,7 @@ class Deformation4DGSConfig(GaussianConfig):
     levels: int = 2
     """Resolutions of the planes along the spatial axes."""
     time_cells: int = 150
-    """Cells along the time axis. 0: as many as there are periods, but at least 3."""
+    """Cells along the time axis, 2 or more. 0: as many as there are periods, but at least 3."""
     width: int = 128
     """Hidden units of the trunk, and of each head."""
     deform_opacity: bool = True
@@ -81,6 +81,10 @@ class Deformation4DGSConfig(GaussianConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.time_cells == 1:
+            raise ConfigError(
+                "time_cells", expected="0, or 2 and more", found="1", todo="correct the value"
+            )
         if self.box_quantile >= 0.5:
             raise ConfigError(
                 "box_quantile",

@@ -54,7 +54,7 @@ class Deformation4DGS(GaussianMethod):
             low=low,
             high=high,
             sizes=tuple(config.plane_size << level for level in range(config.levels)),
-            time_cells=max(config.time_cells or periods, 3),
+            time_cells=config.time_cells or max(periods, 3),
             channels=config.channels,
             width=config.width,
             heads=tuple(heads),

@@ -172,6 +172,12 @@ def test_the_released_configuration_trains_in_both_stages() -> None:
     assert not np.array_equal(*(method.render(scene.views[0], p).rgb for p in (0, PERIODS - 1)))
 
 
+@pytest.mark.parametrize(("cells", "rows"), [(0, PERIODS), (2, 2), (9, 9)])
+def test_planes_have_as_many_rows_in_time_as_asked_for(cells: int, rows: int) -> None:
+    method = changed_method(moving_scene(arc), time_cells=cells)
+    assert len(method.model.shared["planes.0.xt"]) == rows
+
+
 def test_the_second_stage_begins_with_a_new_optimiser_and_new_statistics() -> None:
     method = Deformation4DGS(config(densify_interval=1_000, coarse_until=3_000))
     method.setup(toy_scene(), seed=0, device="cpu")
@@ -314,7 +320,7 @@ def test_caps_of_the_released_code_are_in_the_preset_paper_alone(preset: str) ->
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("plane_size", 1), ("levels", 0), ("box_quantile", 0.5)]
+    ("name", "value"), [("plane_size", 1), ("levels", 0), ("box_quantile", 0.5), ("time_cells", 1)]
 )
 def test_impossible_options_are_named(name: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=name):
