@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 
 from chronoscene.arrays import Array
 
+Z_AXIS = np.array([0.0, 0.0, 1.0])
+
 
 def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
     """Rotation matrices of quaternions wxyz, which need not be unit. [..., 4] -> [..., 3, 3]"""
@@ -61,3 +63,14 @@ def camera_centre(cam_from_world: Array) -> Array:
     """Camera centres in the world of poses [..., 4, 4] -> [..., 3]."""
     rotation, translation = cam_from_world[..., :3, :3], cam_from_world[..., :3, 3]
     return -np.einsum("...ji,...j->...i", rotation, translation)
+
+
+def look_at(eye: Array, target: Array, roll: float = 0.0, up: Array = Z_AXIS) -> Array:
+    """cam_from_world of a camera at ``eye`` that looks at ``target``. [4, 4]"""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    c, s = np.cos(roll), np.sin(roll)
+    rotation = np.stack([c * right + s * down, c * down - s * right, forward])
+    return pose_from_rotation_translation(rotation, -rotation @ eye)

@@ -10,7 +10,7 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.errors import ConfigError
 from chronoscene.scene import Camera, Frame, Split
-from chronoscene.scene.geometry import pose_from_rotation_translation
+from chronoscene.scene.geometry import look_at
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.noise import rng_for
 from chronoscene.synth.render.renderer import PeriodRenderer
@@ -51,17 +51,6 @@ def plan_frames(
             name, split = f"p{period}_{i:04d}.jpg", SPLITS[i in tests]
             frames.append(Frame(name, len(frames) + 1, camera, pose, period, split))
     return tuple(frames)
-
-
-def look_at(eye: Array, target: Array, roll: float = 0.0) -> Array:
-    """cam_from_world of a camera at ``eye`` that looks at ``target`` with z up. [4, 4]"""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    c, s = np.cos(roll), np.sin(roll)
-    rotation = np.stack([c * right + s * down, c * down - s * right, forward])
-    return pose_from_rotation_translation(rotation, -rotation @ eye)
 
 
 def _held_out(count: int, rng: np.random.Generator) -> set[int]:

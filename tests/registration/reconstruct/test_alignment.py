@@ -12,8 +12,8 @@ from chronoscene.registration.reconstruct.alignment import (
     cells,
     residual_pixels,
 )
+from chronoscene.scene.geometry import look_at
 from chronoscene.scene.similarity import Sim3
-from chronoscene.synth.flights import look_at
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,8 @@ from chronoscene.registration.reconstruct.gps_alignment import (
     to_gps_frame,
     upright_direction,
 )
-from chronoscene.scene.geometry import camera_centre
+from chronoscene.scene.geometry import camera_centre, look_at
 from chronoscene.scene.similarity import Sim3
-from chronoscene.synth.flights import look_at
 
 Array = NDArray[np.float64]
 
