@@ -6,7 +6,6 @@ names both. `model` holds what is special about it; the rest is shared with Scaf
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from chronogs.config import ChronoGSConfig
@@ -15,8 +14,6 @@ from chronogs.sharing import pack_features, share_periods, unpack_features
 from chronoscene.anchors.method import AnchorMethod
 from chronoscene.anchors.model import AnchorLayout
 from chronoscene.anchors.trainer import AfterUpdate
-from chronoscene.methods import Prediction, View
-from chronoscene.training.splatting import prediction_of
 
 
 class ChronoGS(AnchorMethod):
@@ -43,21 +40,3 @@ class ChronoGS(AnchorMethod):
         self, stored: dict[str, Tensor], layout: AnchorLayout
     ) -> dict[str, Tensor]:
         return unpack_features(stored, layout)
-
-    @torch.no_grad()
-    def render_split(
-        self, view: View, *, geometry_period: float, appearance_period: float
-    ) -> Prediction:
-        """Render the geometry of one period in the colours of another.
-
-        Opacities and shapes come from the first, colours from the second; both may be fractional.
-        """
-        model = self.model
-        seen = model.seen_from(view)
-        geometry, appearance = (
-            torch.from_numpy(self.weights(period)).to(model.device)
-            for period in (geometry_period, appearance_period)
-        )
-        splats, positions = model.decode_active(geometry, *seen)
-        splats = splats._replace(colors=model.decode(appearance, *seen).colors[positions])
-        return prediction_of(self.draw_splats(splats, view))

@@ -20,7 +20,7 @@ import importlib
 import inspect
 import itertools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
+from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.similarity import Sim3
 
 PeriodInput = Literal["none", "label", "continuous"]
@@ -237,6 +238,31 @@ class Method(Protocol):
         """Read what `save` wrote; `render` then gives the same pixels."""
 
     def size(self) -> MethodSize: ...
+
+    def render_split(
+        self, view: View, *, geometry_period: float, appearance_period: float
+    ) -> Prediction:
+        """Render the geometry of one period in the colours of another.
+
+        Only where a method keeps them apart; one that does not has no such function.
+        """
+
+    def to_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
+        """The model as of a period as Gaussians with spherical harmonics, for other programs.
+
+        Only where a method draws Gaussians; one that does not has no such function.
+
+        Args:
+            period: As for `render`.
+            views: Those of the training. What spherical harmonics cannot hold, such as an opacity
+                that depends on the direction, is to be right in these.
+
+        Returns:
+            In the training frame, in float32.
+        """
+
+    def render_gaussians(self, gaussians: GaussianCloud, view: View) -> Prediction:
+        """Render what `to_gaussians` gave."""
 
     def save_training(self, folder: Path) -> None:
         """Write everything that the steps to come depend on into an existing empty folder.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -11,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from chronoscene.anchors.baking import bake
 from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.density import initial_anchors, resolve_voxel_size
 from chronoscene.anchors.model import LAYERS, AnchorLayout, AnchorModel
@@ -18,6 +20,7 @@ from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
+from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
 from chronoscene.training.periods import period_weights
 from chronoscene.training.splatting import Splats, SplattingMethod, draw, finite_rows
@@ -100,14 +103,22 @@ class AnchorMethod(SplattingMethod):
             after_update=self.after_update(),
         )
 
-    def draw(self, view: View, period: float) -> Rasterization:
+    def splats(self, view: View, period: float, appearance_period: float) -> Splats:
         model = self.model
-        weights = torch.from_numpy(self.weights(period)).to(model.device)
-        splats, _ = model.decode_active(weights, *model.seen_from(view))
-        return self.draw_splats(splats, view)
+        seen = model.seen_from(view)
+        splats, places = model.decode_active(self._weights(period), *seen)
+        if appearance_period == period:
+            return splats
+        others = model.decode(self._weights(appearance_period), *seen)
+        return splats._replace(colors=others.colors[places])
+
+    def _weights(self, period: float) -> Tensor:
+        return torch.from_numpy(self.weights(period)).to(self._model.device)
+
+    def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
+        return bake(self.model, self._weights(period), views, self.background)
 
     def draw_splats(self, splats: Splats, view: View) -> Rasterization:
-        """Decoded Gaussians as the model's layout says, with depth."""
         layout = self._model.layout
         return draw(
             splats,

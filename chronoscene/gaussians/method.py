@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from chronoscene.errors import CheckpointError
 from chronoscene.gaussians.config import GaussianConfig
-from chronoscene.gaussians.model import SHAPES, GaussianModel, initialise
+from chronoscene.gaussians.model import SHAPES, GaussianModel, initialise, opacities_of, scales_of
 from chronoscene.gaussians.trainer import Due, GaussianTrainer
 from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
+from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import META_FILE
-from chronoscene.training.splatting import SplattingMethod, draw
+from chronoscene.training.splatting import Splats, SplattingMethod, draw
 
 
 class GaussianMethod(SplattingMethod):
@@ -68,9 +70,23 @@ class GaussianMethod(SplattingMethod):
             learning_rates=self.learning_rates,
         )
 
-    def draw(self, view: View, period: float) -> Rasterization:
+    def splats(self, view: View, period: float, appearance_period: float) -> Splats:
+        splats = self.model.splats(view, period)
+        if appearance_period == period:
+            return splats
+        return splats._replace(colors=self.model.splats(view, appearance_period).colors)
+
+    def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
+        p = self.model.at_period(period)
+        sh_coeffs = torch.cat([p["sh_dc"][:, None], p["sh_rest"]], dim=1)
+        sh_coeffs[:, (self.model.sh_degree + 1) ** 2 :] = 0.0
+        scales, opacities = scales_of(p["log_scales"]), opacities_of(p["logit_opacities"])
+        tensors = (p["means"], p["quats"], scales, opacities, sh_coeffs)
+        return GaussianCloud(*(tensor.cpu().numpy() for tensor in tensors))
+
+    def draw_splats(self, splats: Splats, view: View) -> Rasterization:
         return draw(
-            self.model.splats(view, period),
+            splats,
             view,
             self.background,
             near_plane=self.config.near_plane,

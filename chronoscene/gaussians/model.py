@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chronoscene.gaussians.spherical_harmonics import NUM_BASES, dc_from_rgb, evaluate
 from chronoscene.methods import TrainingSet, View
 from chronoscene.training.devices import exp
+from chronoscene.training.spherical_harmonics import NUM_BASES, dc_from_rgb, evaluate
 from chronoscene.training.splatting import Splats, camera_centre_tensor, finite_rows, rms_spacing
 
 SHAPES: dict[str, tuple[int, ...]] = {

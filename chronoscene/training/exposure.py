@@ -26,6 +26,7 @@ from chronoscene.training import devices
 from chronoscene.training.adam import DenseTable
 from chronoscene.training.periods import period_weights
 from chronoscene.training.schedule import log_linear
+from chronoscene.training.spherical_harmonics import C0
 
 KINDS = ("none", "image", "period")
 """``none``: no transforms; else what has one of its own."""
@@ -103,6 +104,21 @@ def transformed(image: Tensor, transform: Tensor) -> Tensor:
     Gradients have equal bits for any number of threads.
     """
     return _Transform.apply(image, transform)
+
+
+def exposed(sh_coeffs: NDArray[np.float32], transform: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Spherical harmonics of Gaussians whose image need not be `transformed` any more.
+
+    Equal where the Gaussians are opaque together: what is behind them stays as it is.
+
+    Args:
+        sh_coeffs: [N, K, 3]
+        transform: [3, 4]
+    """
+    matrix, shift = transform[:, :3], transform[:, 3]
+    result = sh_coeffs @ matrix.T
+    result[:, 0] += (matrix.sum(axis=1) / 2 + shift - 0.5) / C0  # without coefficients: 1/2
+    return result
 
 
 class _Transform(torch.autograd.Function):

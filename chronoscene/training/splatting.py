@@ -8,8 +8,8 @@ trainer that changes its tensors.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -23,12 +23,14 @@ from chronoscene.checks import check_choice
 from chronoscene.errors import CheckpointError, ConfigError, SceneError, ShapeError
 from chronoscene.methods import MethodSize, Prediction, Skipped, StepReport, TrainingSet, View
 from chronoscene.rasterizer import NEAR_PLANE, RasterInfo, Rasterization, rasterize
+from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.adam import Adam, DenseTable, all_finite
 from chronoscene.training.checkpoint import TRAINING, TrainingState, load_tensors, save_tensors
 from chronoscene.training.devices import to_device
-from chronoscene.training.exposure import KINDS, of_period, transformed
+from chronoscene.training.exposure import KINDS, exposed, of_period, transformed
 from chronoscene.training.row_adam import RowAdam
+from chronoscene.training.spherical_harmonics import MAX_DEGREE, evaluate
 
 _EXPOSURE = "exposure"  # Name of the stored transforms
 _BACKGROUND_STREAM = 3  # Keeps the colours of `step_background` apart from other random choices
@@ -288,8 +290,16 @@ class SplattingMethod(ABC):
         """
 
     @abstractmethod
-    def draw(self, view: View, period: float) -> Rasterization:
-        """Render a view as of a period, with depth."""
+    def draw_splats(self, splats: Splats, view: View) -> Rasterization:
+        """Render Gaussians by the rules of the model, with depth."""
+
+    @abstractmethod
+    def splats(self, view: View, period: float, appearance_period: float) -> Splats:
+        """What is drawn in a view: the geometry of one period in the colours of another."""
+
+    @abstractmethod
+    def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
+        """`to_gaussians` without the exposure."""
 
     @abstractmethod
     def stored_tensors(self) -> dict[str, Tensor]:
@@ -318,10 +328,35 @@ class SplattingMethod(ABC):
         return self.trainer.step(index, progress)
 
     def render(self, view: View, period: float) -> Prediction:
+        return self.render_split(view, geometry_period=period, appearance_period=period)
+
+    @torch.no_grad()
+    def render_split(
+        self, view: View, *, geometry_period: float, appearance_period: float
+    ) -> Prediction:
+        """Opacities and shapes come from the first period, colours from the second."""
         transforms = self.exposure()
-        with torch.no_grad():
-            exposure = None if transforms is None else of_period(transforms, period)
-            return prediction_of(self.draw(view, period), exposure)
+        exposure = None if transforms is None else of_period(transforms, appearance_period)
+        splats = self.splats(view, geometry_period, appearance_period)
+        return prediction_of(self.draw_splats(splats, view), exposure)
+
+    @torch.no_grad()
+    def to_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
+        gaussians, transforms = self.static_gaussians(period, views), self.exposure()
+        if transforms is None:
+            return gaussians
+        exposure = of_period(transforms, period).cpu().numpy()
+        return replace(gaussians, sh_coeffs=exposed(gaussians.sh_coeffs, exposure))
+
+    @torch.no_grad()
+    def render_gaussians(self, gaussians: GaussianCloud, view: View) -> Prediction:
+        device = self.background.device
+        arrays = (getattr(gaussians, field.name) for field in fields(gaussians))
+        means, quats, scales, opacities, sh = (torch.from_numpy(a).to(device) for a in arrays)
+        centre = camera_centre_tensor(view, device)
+        colors = evaluate(sh[:, 0], sh[:, 1:], means, centre, MAX_DEGREE)
+        splats = Splats(means, quats, scales, opacities, colors)
+        return prediction_of(self.draw_splats(splats, view))
 
     def exposure(self) -> Tensor | None:
         """The transform of colours of each period, if the training learns any. [T, 3, 4]"""

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from math import prod
 from typing import NamedTuple
 
-from chronoscene.gaussians.spherical_harmonics import NUM_BASES
 from chronoscene.kernels.matmul import PADDING
 from chronoscene.kernels.vectors import LANES
+from chronoscene.training.spherical_harmonics import NUM_BASES
 
 PAIRS = ("xy", "xz", "xt", "yz", "yt", "zt")
 """Axes of the six planes of a level: that of the columns, that of the rows."""
