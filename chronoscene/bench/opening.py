@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from chronoscene.bench.job import Job
+from chronoscene.bench.job import Job, check_device
+from chronoscene.bench.provenance import scene_hash
 from chronoscene.bench.results import (
     CHECKPOINT,
     SOURCE_FILE,
@@ -20,7 +21,7 @@ from chronoscene.bench.results import (
     read_config,
     read_run,
 )
-from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.errors import CheckpointError, ConfigError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.methods import (
@@ -94,15 +95,8 @@ class OpenRun:
             ConfigError: If it is outside of those of the scene, or fractional where the method
                 takes whole ones only.
         """
-        last = self.num_periods - 1
-        if not 0 <= period <= last:
-            labels = ", ".join(f"{i} ({name})" for i, name in self.record.period_labels.items())
-            raise ConfigError(
-                f"period {period:g}",
-                expected=f"one from 0 to {last}",
-                found="none of this scene",
-                todo=f"choose among {labels}",
-            )
+        if not 0 <= period <= self.num_periods - 1:
+            raise self._no_period(f"{period:g}")
         if period != int(period) and not self.is_continuous:
             raise ConfigError(
                 f"period {period:g}",
@@ -111,6 +105,36 @@ class OpenRun:
                 found="a fraction",
                 todo=f"choose {int(period)} or {int(period) + 1}",
             )
+
+    def parse_period(self, text: str) -> float:
+        """The period that a label or a number names.
+
+        Raises:
+            ConfigError: If none has the label, or the models do not claim the number.
+        """
+        for number, label in self.record.period_labels.items():
+            if label == text:
+                return float(number)
+        try:
+            period = float(text)
+        except ValueError:
+            raise self._no_period(repr(text)) from None
+        self.check_period(period)
+        return period
+
+    def parse_periods(self, text: str) -> tuple[float, ...]:
+        """One period, or both ends of a range ``FROM:TO``; errors as for `parse_period`."""
+        parts = [text] if text in self.record.period_labels.values() else text.split(":", 1)
+        return tuple(self.parse_period(part) for part in parts)
+
+    def _no_period(self, name: str) -> ConfigError:
+        labels = ", ".join(f"{i} ({name})" for i, name in self.record.period_labels.items())
+        return ConfigError(
+            f"period {name}",
+            expected=f"one from 0 to {self.num_periods - 1}",
+            found="none of this scene",
+            todo=f"choose among {labels}",
+        )
 
     def model(self, period: float) -> Method:
         """The model that answers for a period, loaded at its first use."""
@@ -131,8 +155,22 @@ class OpenRun:
         method.load(folder, device=self.device)
         return method
 
+    def told(self, period: float) -> float:
+        """What a model is told that is to show a period."""
+        return float(period) if self.record.strategy == "joint" else 0.0
+
+    def view(self, camera: Camera, cam_from_world: NDArray[np.float64]) -> View:
+        """A camera without distortion as the models see it; its pose is in the world. [4, 4]"""
+        pose = self.training_from_world.apply_to_pose(cam_from_world)
+        return View(camera.K, camera.width, camera.height, pose)
+
     def render(
-        self, camera: Camera, cam_from_world: NDArray[np.float64], period: float
+        self,
+        camera: Camera,
+        cam_from_world: NDArray[np.float64],
+        period: float,
+        *,
+        appearance_period: float | None = None,
     ) -> Prediction:
         """Render what a camera sees as of a period.
 
@@ -140,29 +178,60 @@ class OpenRun:
             camera: Without distortion.
             cam_from_world: Pose in the world of the scene. [4, 4]
             period: From 0 to the last; fractional only if `is_continuous`.
+            appearance_period: The one whose colours the geometry of the other is to have.
 
         Returns:
             The image; depth, where the method gives it, in units of the world.
 
         Raises:
-            ConfigError: If no model claims the period.
+            ConfigError: If no model claims the period, or can take the colours of another.
         """
         self.check_period(period)
-        pose = self.training_from_world.apply_to_pose(cam_from_world)
-        view = View(camera.K, camera.width, camera.height, pose)
-        told = float(period) if self.record.strategy == "joint" else 0.0
-        prediction = self.model(period).render(view, told)
+        view, model = self.view(camera, cam_from_world), self.model(period)
+        if appearance_period is None:
+            prediction = model.render(view, self.told(period))
+        else:
+            self.check_appearance(appearance_period)
+            prediction = model.render_split(
+                view, geometry_period=period, appearance_period=appearance_period
+            )
         if prediction.depth is None:
             return prediction
         return replace(prediction, depth=prediction.depth / self.training_from_world.scale)
+
+    def check_appearance(self, period: float) -> None:
+        """Refuse the colours of another period where the model does not have them apart.
+
+        Raises:
+            ConfigError: If it does not, or does not claim the period.
+        """
+        self.check_period(period)
+        if self.record.strategy != "joint" or not hasattr(self.model(period), "render_split"):
+            raise ConfigError(
+                f"appearance of period {period:g}",
+                expected="one model of all periods that keeps geometry and colours apart",
+                found=f"{self.spec.title} under strategy {self.record.strategy}",
+                todo="leave it out, or open a run of chronogs under strategy joint",
+            )
 
     def scene(self, root: Path | None = None) -> Scene:
         """The scene that the run was trained on, or ``root`` where it has moved.
 
         Raises:
-            SceneError: If it is not there, or cannot be read.
+            SceneError: If it is not there, cannot be read, or is another one.
         """
-        return read_scene(root or Path(self.source.scene_root), format=self.source.scene_format)
+        place, found = root or Path(self.source.scene_root), "nothing"
+        if place.exists():
+            scene = read_scene(place, format=self.source.scene_format)
+            if scene_hash(scene) == self.record.scene_hash:
+                return scene
+            found = "another scene, or a changed one"
+        raise SceneError(
+            place,
+            expected="the scene that the run was trained on",
+            found=found,
+            todo="name the folder where it is with --scene",
+        )
 
 
 def open_run(folder: Path, *, device: str = "cpu", plugin_path: Path | None = None) -> OpenRun:
@@ -178,7 +247,9 @@ def open_run(folder: Path, *, device: str = "cpu", plugin_path: Path | None = No
     Raises:
         CheckpointError: If the folder has no finished run, or a file is damaged.
         ConfigError: If the method is not installed.
+        BackendError: If there is no such device.
     """
+    check_device(device)
     record = read_run(folder)
     if not (folder / CHECKPOINT).is_dir():
         raise CheckpointError(
@@ -191,7 +262,15 @@ def open_run(folder: Path, *, device: str = "cpu", plugin_path: Path | None = No
     for path in filter(None, (plugin_path, source.plugin_path)):
         if str(path) not in sys.path:
             sys.path.append(str(path))
-    spec = load_spec(source.method)
+    try:
+        spec = load_spec(source.method)
+    except ConfigError as error:
+        raise ConfigError(
+            source.method,
+            expected=f"the method of the run, from {source.plugin_path or record.method_version}",
+            found=error.found,
+            todo="install it, or put the folder of its module into PYTHONPATH",
+        ) from error
     if spec.runner is not None:
         raise CheckpointError(
             folder,

@@ -19,6 +19,7 @@ COMMANDS = {
     "download": "chronoscene.cli.download:command",
     "methods": "chronoscene.cli.methods:command",
     "register": "chronoscene.cli.register:command",
+    "render": "chronoscene.cli.render:command",
     "score": "chronoscene.cli.results:score",
     "score-images": "chronoscene.cli.score_images:command",
     "split": "chronoscene.cli.split:command",

@@ -205,3 +205,18 @@ def finished_bench(
 def runs(finished_bench: tuple[Path, BenchOutcome, list[str]], tmp_path: Path) -> Path:
     """A copy of the finished bench, to be changed at will."""
     return Path(shutil.copytree(finished_bench[0], tmp_path / "copied-runs"))
+
+
+@pytest.fixture(scope="session")
+def trained(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of three real methods, of a few steps: one model of all periods, or one for each."""
+    runs = tmp_path_factory.mktemp("trained")
+    common: dict[str, Any] = {"scenes": (scene_folder,), "runs": runs, "preset": "fast"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("chronoscene.bench.worker.warm_up", lambda *args, **options: None)
+        for methods, strategy in ((("chronogs", "3dgs-period"), "joint"), (("4dgs",), "separate")):
+            settings = BenchSettings(
+                **common, methods=methods, strategies=(strategy,), iterations=12
+            )
+            assert not run_bench(settings, lambda line: None, execute=execute_here).failures
+    return runs / "ring"

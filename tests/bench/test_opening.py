@@ -1,5 +1,7 @@
 """An opened run renders what the run rendered, and refuses what its models do not claim."""
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +12,7 @@ from chronoscene.bench.opening import OpenRun, open_run
 from chronoscene.bench.predictions import load_image, read_manifest, to_bytes
 from chronoscene.bench.results import CONFIG_FILE, PREDICTIONS, SOURCE_FILE
 from chronoscene.bench.runner import BenchSettings, run_bench
-from chronoscene.errors import CheckpointError, ConfigError
-from chronoscene.formats import read_scene
+from chronoscene.errors import CheckpointError, ConfigError, SceneError
 
 STRATEGIES = ("joint", "pooled", "separate")
 
@@ -56,7 +57,38 @@ def test_a_run_of_gaussians_renders_its_predictions_with_depth_in_world_units(
 
 def test_the_scene_may_have_moved(runs, scene_folder, tmp_path):
     run = open_run(folder_of(runs))
-    assert run.scene(scene_folder).name == read_scene(scene_folder).name
+    run = replace(run, source=run.source.model_copy(update={"scene_root": str(tmp_path / "old")}))
+    with pytest.raises(SceneError, match=r"old: expected the scene .* found nothing; .* --scene"):
+        run.scene()
+    moved = shutil.copytree(scene_folder, tmp_path / "moved")
+    assert run.scene(moved).name == "moved"
+    (moved / "images/a/0.png").write_bytes((moved / "images/a/1.png").read_bytes())
+    with pytest.raises(SceneError, match=r"found another scene, or a changed one; .* --scene"):
+        run.scene(moved)
+
+
+def test_the_method_may_be_gone(runs):
+    file = folder_of(runs) / SOURCE_FILE
+    source = json.loads(file.read_text())
+    file.write_text(json.dumps(source | {"method": "moved:SPEC", "plugin_path": "/old/place"}))
+    with pytest.raises(ConfigError, match=r"moved:SPEC: expected .* from /old/place, .*PYTHONPATH"):
+        open_run(folder_of(runs))
+    file.write_text(json.dumps(source | {"method": "gone", "plugin_path": None}))
+    with pytest.raises(ConfigError, match="gone: expected the method of the run, from unpackaged"):
+        open_run(folder_of(runs))
+
+
+@pytest.mark.parametrize(
+    ("text", "periods"), [("autumn", (1,)), ("1", (1,)), ("spring:1", (0, 1)), ("1:0", (1, 0))]
+)
+def test_periods_have_numbers_and_labels(runs, text, periods):
+    assert open_run(folder_of(runs)).parse_periods(text) == periods
+
+
+def test_a_label_is_a_label_whatever_it_looks_like(runs):
+    run = open_run(folder_of(runs))
+    run.record.period_labels = {"0": "1", "1": "12:30"}
+    assert (run.parse_periods("1"), run.parse_periods("12:30")) == ((0,), (1,))
 
 
 @pytest.mark.parametrize(
