@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.bench.job import Job
-from chronoscene.bench.results import Failure
+from chronoscene.bench.results import Failure, read_run
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, put_in_place, run_bench
 from chronoscene.bench.worker import execute
 from chronoscene.formats import chronoscene as scene_format
@@ -208,9 +208,9 @@ def runs(finished_bench: tuple[Path, BenchOutcome, list[str]], tmp_path: Path) -
 
 
 @pytest.fixture(scope="session")
-def trained(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Runs of three real methods, of a few steps: one model of all periods, or one for each."""
-    runs = tmp_path_factory.mktemp("trained")
+def trained(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Runs of a few steps by method: ``chronogs`` and ``3dgs-period`` joint, ``4dgs`` separate."""
+    runs, finished = tmp_path_factory.mktemp("trained"), []
     common: dict[str, Any] = {"scenes": (scene_folder,), "runs": runs, "preset": "fast"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("chronoscene.bench.worker.warm_up", lambda *args, **options: None)
@@ -218,5 +218,5 @@ def trained(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
             settings = BenchSettings(
                 **common, methods=methods, strategies=(strategy,), iterations=12
             )
-            assert not run_bench(settings, lambda line: None, execute=execute_here).failures
-    return runs / "ring"
+            finished += run_bench(settings, lambda line: None, execute=execute_here).finished
+    return {read_run(folder).method: folder for folder in finished}

@@ -23,9 +23,9 @@ def render(folder, out, *options):
     assert f"wrote {out}" in result.stderr
 
 
-@pytest.mark.parametrize("name", ["chronogs-joint", "4dgs-separate"])
+@pytest.mark.parametrize("name", ["chronogs", "4dgs"])
 def test_pictures_of_the_test_views_are_the_predictions(trained, tmp_path, name):
-    folder = trained / f"{name}-fast" / "seed0"
+    folder = trained[name]
     render(folder, tmp_path / "out")
     entries = read_manifest(folder / PREDICTIONS).images
     assert len(entries) == 3
@@ -37,7 +37,7 @@ def test_pictures_of_the_test_views_are_the_predictions(trained, tmp_path, name)
 def test_an_orbit_through_the_periods_as_a_film(trained, tmp_path):
     out = tmp_path / "film.mp4"
     options = ("--cameras", "orbit", "--period", "spring:autumn", "--frames", 5, "--fps", 10)
-    render(trained / "chronogs-joint-fast" / "seed0", out, *options)
+    render(trained["chronogs"], out, *options)
     with av.open(str(out)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert len(frames) == 5 and frames[0].shape == (16, 24, 3)
@@ -45,7 +45,7 @@ def test_an_orbit_through_the_periods_as_a_film(trained, tmp_path):
 
 @pytest.mark.parametrize("name", ["chronogs", "3dgs-period"])
 def test_the_geometry_of_a_period_in_the_light_of_another(trained, name):
-    run = open_run(trained / f"{name}-joint-fast" / "seed0")
+    run = open_run(trained[name])
     frame = run.scene().frames[0]
     shown = {
         (p, q): run.render(frame.camera, frame.cam_from_world, p, appearance_period=q)
@@ -60,7 +60,7 @@ def test_the_geometry_of_a_period_in_the_light_of_another(trained, name):
 
 def test_methods_without_geometry_of_their_own_refuse_another_light(runs, trained, tmp_path):
     message = "appearance of period 1: expected one model of all periods"
-    for folder in (runs / "ring/mean-joint-balanced/seed0", trained / "4dgs-separate-fast/seed0"):
+    for folder in (runs / "ring/mean-joint-balanced/seed0", trained["4dgs"]):
         with pytest.raises(ConfigError, match=message):
             render(folder, tmp_path / "out", "--appearance-period", "autumn")
 
@@ -76,12 +76,12 @@ def test_methods_without_geometry_of_their_own_refuse_another_light(runs, traine
 )
 def test_what_a_run_cannot_show(trained, tmp_path, options, message):
     with pytest.raises(ConfigError, match=message):
-        render(trained / "4dgs-separate-fast/seed0", tmp_path / "out", *options)
+        render(trained["4dgs"], tmp_path / "out", *options)
     assert not list(tmp_path.iterdir())
 
 
 def test_a_film_has_one_size(trained, tmp_path, monkeypatch):
-    folder = trained / "chronogs-joint-fast/seed0"
+    folder = trained["chronogs"]
     sizes = iter([(24, 16), (12, 8)] * 9)
     monkeypatch.setattr(
         "chronoscene.images.store.evaluation_size", lambda *size_and_limit: next(sizes)
@@ -91,7 +91,7 @@ def test_a_film_has_one_size(trained, tmp_path, monkeypatch):
 
 
 def test_places_that_are_refused(trained, scene_folder, tmp_path):
-    folder = trained / "chronogs-joint-fast/seed0"
+    folder = trained["chronogs"]
     with pytest.raises(ConfigError, match="a place outside the scene"):
         render(folder, scene_folder / "out")
     (tmp_path / "out").mkdir()

@@ -18,12 +18,12 @@ from chronoscene.scene.geometry import camera_centre
 
 @pytest.fixture
 def run(trained):
-    return open_run(trained / "chronogs-joint-fast" / "seed0")
+    return open_run(trained["chronogs"])
 
 
 @pytest.fixture
 def one_each(trained):
-    return open_run(trained / "4dgs-separate-fast" / "seed0")
+    return open_run(trained["4dgs"])
 
 
 def shots_of(run, source, frames=5):

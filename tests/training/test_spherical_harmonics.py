@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.special import sph_harm_y
 
-from chronoscene.gaussians import spherical_harmonics as sh
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.rasterizer import gsplat_backend
+from chronoscene.training import spherical_harmonics as sh
 
 
 def random_inputs(count, *, seed=0, dtype=torch.float32):
