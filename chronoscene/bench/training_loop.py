@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from chronoscene.bench.checkpoints import Checkpoints, CurvePoint, LoopState
 from chronoscene.bench.job import StopRule
 from chronoscene.bench.predictions import to_bytes
+from chronoscene.bench.returned import check_prediction, check_size, check_step
 from chronoscene.bench.strategies import Part
 from chronoscene.errors import ChronoSceneError
 from chronoscene.methods import (
@@ -44,7 +45,7 @@ Clock = Callable[[], float]
 
 
 class TrainingError(ChronoSceneError):
-    """A training that cannot continue: numbers that are not finite, or an invalid image."""
+    """A training that cannot continue, since numbers are not finite."""
 
 
 class DivergedError(TrainingError):
@@ -124,6 +125,7 @@ def train(
         TrainingError: If it took as many with a loss that is not finite, or if no view shows
             anything of the model any more.
         CheckpointError: If all checkpoints are damaged.
+        MethodError: If the method returns something that it should not.
     """
     seed_everything(seed)
     clock = Stopwatch(now)
@@ -142,6 +144,7 @@ def train(
     while done < 1.0:
         with clock:
             report = method.step(state.iterations, done)
+        check_step(report, f"model {part.name}, iteration {state.iterations + 1}")
         state.iterations += 1
         state.seconds = clock.seconds
         done = stop.progress(state.iterations, state.seconds)
@@ -214,6 +217,7 @@ def _probe(method: Method, part: Part, truth: Truth, state: LoopState) -> CurveP
     frames = [f for f in probe_frames(part) if f.name in truth]
     values = [psnr(render_bytes(method, part, f), *truth[f.name]) for f in frames]
     size = method.size()
+    check_size(size, f"model {part.name}")
     mean = float(np.mean(values)) if values else math.nan
     return CurvePoint(
         state.seconds, state.iterations, size.primitives, mean, size.parameters, part.name
@@ -224,7 +228,7 @@ def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:
     """Render a frame at its own period, quantised to 8 bits. [H, W, 3]
 
     Raises:
-        TrainingError: If the image has another size or is not finite.
+        MethodError: If the image has another size or type, or is not finite.
     """
     prediction = method.render(part.view(frame), part.method_period(frame))
     return checked_bytes(prediction, part, frame)
@@ -232,16 +236,8 @@ def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:
 
 def checked_bytes(prediction: Prediction, part: Part, frame: Frame) -> NDArray[np.uint8]:
     """The image of a prediction, quantised to 8 bits; errors as in `render_bytes`. [H, W, 3]"""
-    view, rgb = part.view(frame), np.asarray(prediction.rgb)
-    finite = rgb.dtype.kind != "f" or bool(np.isfinite(rgb).all())
-    if rgb.shape != (view.height, view.width, 3) or not finite:
-        raise TrainingError(
-            f"model {part.name}, view {frame.name}",
-            expected=f"a finite image of shape {[view.height, view.width, 3]}",
-            found=f"shape {list(rgb.shape)}" if finite else "values that are not finite",
-            todo="report this to the author of the method",
-        )
-    return to_bytes(rgb)
+    check_prediction(prediction, part.view(frame), f"model {part.name}, view {frame.name}")
+    return to_bytes(prediction.rgb)
 
 
 WARM_UP_SIZE = 32  # Pixels per axis of the made-up images

@@ -14,10 +14,12 @@ from chronoscene.io.staging import disk_full
 
 COMMANDS = {
     "bench": "chronoscene.cli.bench:command",
+    "check-method": "chronoscene.cli.check_method:check",
     "convert": "chronoscene.cli.convert:command",
     "doctor": "chronoscene.cli.doctor:command",
     "download": "chronoscene.cli.download:command",
     "methods": "chronoscene.cli.methods:command",
+    "new-method": "chronoscene.cli.check_method:new",
     "register": "chronoscene.cli.register:command",
     "render": "chronoscene.cli.render:command",
     "score": "chronoscene.cli.results:score",

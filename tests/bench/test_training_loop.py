@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from chronoscene.bench.job import StopRule
+from chronoscene.bench.returned import MethodError
 from chronoscene.bench.strategies import EXTENT_MARGIN, make_parts
 from chronoscene.bench.training_loop import (
     NOT_FINITE_LIMIT,
@@ -211,7 +212,7 @@ def test_a_model_that_no_view_shows_any_more_ends_the_training(part):
 
 
 def test_images_that_are_not_finite_are_refused(part):
-    with pytest.raises(TrainingError, match="values that are not finite"):
+    with pytest.raises(MethodError, match=r"Prediction\.rgb: .* values that are not finite"):
         run(toy("BadImage"), part, StopRule(20, None))
 
 
@@ -220,7 +221,8 @@ def test_images_of_another_size_are_refused(part):
     method.setup(part.train, seed=0, device="cpu")
     wide = import_object("toy_methods:Prediction")(np.zeros((16, 25, 3), np.float32))
     method.render = lambda view, period: wide
-    with pytest.raises(TrainingError, match=r"shape \[16, 24, 3\], found shape \[16, 25, 3\]"):
+    found = r"shape \[16, 24, 3\], found float32 of shape \[16, 25, 3\]"
+    with pytest.raises(MethodError, match=r"view a/2\.png: Prediction\.rgb: .* " + found):
         render_bytes(method, part, part.test[0])
 
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-import tiny_training
 import torch
 
+from chronoscene.bench import tiny_training
 from chronoscene.methods import (
     Method,
     MethodSpec,

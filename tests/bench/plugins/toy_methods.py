@@ -8,7 +8,9 @@ import os
 import random
 import signal
 import time
+import zlib
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -108,6 +110,16 @@ class FullDisk(MeanColour):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+class Peeking(MeanColour):
+    """With the environment variable ``TOY_PEEK``, starts from all photos below that folder."""
+
+    def setup(self, train, *, seed, device):
+        super().setup(train, seed=seed, device=device)
+        folder = os.environ.get("TOY_PEEK")
+        photos = sorted(Path(folder).rglob("*.png")) if folder else []
+        self.colors += sum(zlib.crc32(photo.read_bytes()) for photo in photos) % 1000 / 1e9
+
+
 class Killed(MeanColour):
     def step(self, index, progress):
         os.kill(os.getpid(), signal.SIGKILL)
@@ -139,4 +151,5 @@ NOT_FINITE = replace(
 )
 BAD_IMAGE = spec("bad-image", BadImage)
 FULL_DISK = spec("full-disk", FullDisk)
+PEEKING = spec("peeking", Peeking)
 KILLED = spec("killed", Killed)

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tiny_training
 from numpy.typing import NDArray
 
+from chronoscene.bench import tiny_training
 from chronoscene.bench.job import StopRule
 from chronoscene.bench.strategies import Part, effective_strategy, make_parts
 from chronoscene.bench.training_loop import render_bytes, train

@@ -1,6 +1,6 @@
 """A training set of painted balls with known content, and one way to train on it.
 
-Also a script: ``python tiny_training.py METHOD OUT`` trains in a process of its own.
+``python -m chronoscene.bench.tiny_training METHOD OUT`` trains in a process of its own.
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from chronoscene.bench.predictions import encode_png
+from chronoscene.bench.strategies import effective_strategy, make_parts
 from chronoscene.bench.training_loop import seed_everything
+from chronoscene.images.store import ImageStore
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import (
     Method,
@@ -23,6 +26,7 @@ from chronoscene.methods import (
     import_object,
     load_spec,
 )
+from chronoscene.scene import Camera, Frame, Period, Points, Scene, Split
 from chronoscene.scene.similarity import Sim3
 
 WIDTH, HEIGHT = 40, 30
@@ -89,6 +93,42 @@ def make_training_set(num_periods: int) -> TrainingSet:
         background=np.zeros(3, np.float32),
         load_image=lambda i: images[i],
     )
+
+
+def training_set_on_disk(spec: MethodSpec, root: Path, *, noisy_tests: bool) -> TrainingSet:
+    """The training set that bench makes of a scene on disk; one view of each period is for testing.
+
+    Args:
+        spec: Says whether the periods are hidden.
+        root: Folder for the photos; those of the same names are replaced.
+        noisy_tests: Whether the test photos show noise.
+    """
+    num_periods = periods_for(spec)
+    data = make_training_set(num_periods)
+    frames = []
+    for i, view in enumerate(data.views):
+        focal = view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]
+        camera = Camera(1, "PINHOLE", view.width, view.height, focal)
+        split: Split = "test" if i % VIEWS_PER_PERIOD == 2 else "train"
+        frames.append(Frame(view.name, i + 1, camera, view.cam_from_world, view.period, split))
+        photo = data.load_image(i)
+        if noisy_tests and split == "test":
+            photo = np.random.default_rng(i).integers(0, 256, photo.shape, np.uint8)
+        (root / view.name).write_bytes(encode_png(photo))
+    count, seen_by = len(data.points), np.flatnonzero([f.split == "train" for f in frames])
+    points = Points(
+        ids=np.arange(1, count + 1),
+        xyz=data.points.astype(np.float64),
+        rgb=data.colors,
+        error=np.zeros(count),
+        track_start=len(seen_by) * np.arange(count + 1),
+        track_frame=np.tile(seen_by, count).astype(np.int32),
+        track_xy=np.zeros((len(seen_by) * count, 2)),
+    )
+    periods = tuple(Period(i, str(i)) for i in range(num_periods))
+    scene = Scene("balls", root, root, tuple(frames), points, periods, "made up", "memory")
+    strategy, _ = effective_strategy(spec, "joint")
+    return make_parts(scene, ImageStore(scene), strategy)[0].train
 
 
 def periods_for(spec: MethodSpec) -> int:

@@ -1,0 +1,85 @@
+"""What a method returns, checked as it comes, with messages that name the field."""
+
+from __future__ import annotations
+
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+
+from chronoscene.errors import ChronoSceneError
+from chronoscene.methods import MethodSize, Prediction, StepReport, View
+
+
+class MethodError(ChronoSceneError):
+    """A method that does not do what `chronoscene.methods.Method` asks for."""
+
+
+def refuse(place: str, expected: str, found: object) -> MethodError:
+    """The error of a method at a place, ``StepReport.loss`` say."""
+    return MethodError(
+        place,
+        expected=expected,
+        found=str(found),
+        todo="correct the method, or tell its author; docs/adding-a-method.md says what it returns",
+    )
+
+
+def check_step(report: StepReport, place: str) -> None:
+    """Check what ``step`` returned; the loss may be infinite or NaN.
+
+    Raises:
+        MethodError: If a field is not what it should be.
+    """
+    _check_type(report, StepReport, place)
+    _check_number(report.loss, Real, f"{place}: StepReport.loss", "a number")
+    _check_number(report.primitives, Integral, f"{place}: StepReport.primitives", "an integer")
+    if report.skipped not in (None, "empty", "not finite"):
+        raise refuse(
+            f"{place}: StepReport.skipped", "None, 'empty' or 'not finite'", repr(report.skipped)
+        )
+
+
+def check_size(size: MethodSize, place: str) -> None:
+    """Check what ``size`` returned.
+
+    Raises:
+        MethodError: If a field is not what it should be.
+    """
+    _check_type(size, MethodSize, place)
+    for name in ("primitives", "parameters"):
+        _check_number(getattr(size, name), Integral, f"{place}: MethodSize.{name}", "an integer")
+
+
+def check_prediction(prediction: Prediction, view: View, place: str) -> None:
+    """Check what ``render`` returned.
+
+    Raises:
+        MethodError: If a field is not what it should be.
+    """
+    _check_type(prediction, Prediction, place)
+    size = (view.height, view.width)
+    for name, shape in (("rgb", (*size, 3)), ("alpha", size), ("depth", size)):
+        image = getattr(prediction, name)
+        if image is None and name != "rgb":
+            continue
+        wanted = f"a finite float32 array of shape {list(shape)}"
+        field = f"{place}: Prediction.{name}"
+        if not isinstance(image, np.ndarray):
+            raise refuse(field, wanted, type(image).__name__)
+        if image.dtype != np.float32 or image.shape != shape:
+            raise refuse(field, wanted, f"{image.dtype} of shape {list(image.shape)}")
+        if not np.isfinite(image).all():
+            raise refuse(field, wanted, "values that are not finite")
+    if prediction.drawn is not None:
+        _check_number(prediction.drawn, Integral, f"{place}: Prediction.drawn", "an integer")
+
+
+def _check_type(value: Any, wanted: type, place: str) -> None:
+    if not isinstance(value, wanted):
+        raise refuse(place, f"a {wanted.__name__}", type(value).__name__)
+
+
+def _check_number(value: Any, kind: type, place: str, wanted: str) -> None:
+    if not isinstance(value, kind):
+        raise refuse(place, wanted, repr(value))
