@@ -134,7 +134,7 @@ def draw(
     background: Tensor,
     *,
     near_plane: float,
-    antialiased: bool,
+    antialiased: bool = False,
     render_depth: bool = False,
     absgrad: bool = False,
     check_finite: bool = True,
