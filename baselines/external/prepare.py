@@ -23,6 +23,8 @@ from chronoscene.scene.geometry import camera_centre
 
 OFF_CENTRE = 0.5  # Pixels of the principal point from the centre that are told
 
+SAME_FOCAL = 1e-3  # Relative difference of focal lengths that is told
+
 PUBLISHED_ITERATIONS = "40_000"
 """Iterations, and the ends of schedules, as the config file of ChronoGS writes them."""
 
@@ -53,6 +55,13 @@ def four_d_gaussians(data: Path, output: Path, config: FourDGaussiansConfig) -> 
     of view come from the sizes in the camera files.
     """
     scene = read_scene(data, format="nerfstudio")
+    if len(sizes := {frame.camera.size for frame in scene.frames}) > 1:
+        raise ProgramError(
+            data,
+            expected="images of one size, as the program takes the field of view from the first",
+            found=", ".join(f"{width} x {height}" for width, height in sorted(sizes)),
+            todo="use another program, or images of one camera",
+        )
     stems = {frame.name: Path(frame.name).stem for frame in scene.frames}
     tests = [stems[frame.name] for frame in scene.select(split="test")]
     # Times are divided by the largest of them.
@@ -83,7 +92,10 @@ def four_d_gaussians(data: Path, output: Path, config: FourDGaussiansConfig) -> 
         f"_base_ = [{str(base)!r}]\nOptimizationParams = dict(iterations={config.iterations})\n",
         encoding="utf-8",
     )
-    return _ignored(scene)
+    ratios = [f.camera.K[1, 1] / f.camera.K[0, 0] - 1 for f in scene.frames]
+    worst = max(ratios, key=abs)
+    one = f"the program has one focal length per image, here {worst:+.1%} off in y"
+    return [*_ignored(scene), *([one] if abs(worst) > SAME_FOCAL else [])]
 
 
 def _nerfies_camera(frame: Frame) -> dict[str, Any]:
