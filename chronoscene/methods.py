@@ -109,7 +109,8 @@ class MethodSpec:
     method: str
     """``module:Class`` that fulfils `Method`; empty where there is a `runner`."""
     config: str
-    """``module:Class``, a frozen dataclass with a field ``iterations``, like `ProgramConfig`."""
+    """``module:Class``, a frozen dataclass with a field ``iterations``. With a `runner`, it
+    is a `ProgramConfig`."""
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Preset name to the values that differ from the defaults of the config class."""
     resumable: bool = False

@@ -22,7 +22,7 @@ from chronoscene.bench.predictions import (
 from chronoscene.bench.provenance import code_version, config_hash, library_versions, scene_hash
 from chronoscene.bench.scoring import score_run
 from chronoscene.bench.strategies import check_scene
-from chronoscene.errors import ConfigError, ImageError
+from chronoscene.errors import ConfigError, ImageError, SceneError
 from chronoscene.formats.shared.grouping import read_table
 from chronoscene.images.decoding import image_size, load_rgb
 from chronoscene.images.store import ImageStore
@@ -165,11 +165,19 @@ def score_images(
         max_width: Of the evaluation, in pixels.
 
     Raises:
+        SceneError: If there are no test views.
         ConfigError: If there is such a run, or the folder of runs has another scene of this name,
             or other sizes.
         ImageError: If images are missing, too many, or of another size.
     """
     check_scene(scene)
+    if not scene.select(split="test"):
+        raise SceneError(
+            scene.root,
+            expected="test views to score",
+            found=f"none ({scene.split_rule})",
+            todo=f"choose some (chronoscene split {scene.root} --scene-out NEW), and use NEW",
+        )
     method = re.sub(r"[^\w.+-]+", "-", name)
     out = runs / safe_name(scene.name) / f"{method}-{STRATEGY}-{PRESET}" / f"seed{seed}"
     if out.exists():

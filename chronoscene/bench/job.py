@@ -18,7 +18,7 @@ from chronoscene.bench.results import Failure
 from chronoscene.checks import check_choice
 from chronoscene.errors import BackendError, ConfigError
 from chronoscene.formats import writable_formats
-from chronoscene.methods import MethodSpec, Runner, as_typed, build_config
+from chronoscene.methods import MethodSpec, ProgramConfig, Runner, as_typed, build_config
 
 _UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
 
@@ -254,8 +254,16 @@ def check_runner(job: Job, spec: MethodSpec, runner: Runner) -> None:
         ConfigError: If a command names a value that does not exist or is not set, or the program
             cannot be stopped by the clock.
     """
-    options = dataclasses.asdict(job.method_config(spec))
-    used = used_values(runner, options["prefix"])
+    config = job.method_config(spec)
+    if not isinstance(config, ProgramConfig):
+        raise ConfigError(
+            f"{spec.name}: {spec.config}",
+            expected="a ProgramConfig, or a class made from it",
+            found=type(config).__name__,
+            todo="correct the specification of the method",
+        )
+    options = dataclasses.asdict(config)
+    used = used_values(runner, config.prefix)
     for name in sorted(used):
         check_choice(f"{spec.name}: commands", name, {*VALUES, *options})
         if options.get(name) == "":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -87,6 +88,10 @@ def describe(spec: MethodSpec, runs: Path) -> Iterator[str]:
         f"devices: {', '.join(spec.devices)}; can be resumed: {'yes' if spec.resumable else 'no'}"
     )
     yield f"presets: {', '.join(spec.presets)}"
+    if spec.runner is not None:
+        yield f"external program, installed apart from ChronoScene; {spec.runner.tested}; commands:"
+        for words in (spec.runner.train, *spec.runner.render):
+            yield indent(click.wrap_text(shlex.join(words), width=90), "    ")
     yield "\nOptions, with their defaults; --set NAME=VALUE changes one:\n"
     for option in options_of(spec):
         yield describe_option(option)

@@ -158,6 +158,12 @@ def test_a_second_run_of_the_name_is_refused(score):
     assert (score(seed=1).parent / "seed0/run.json").read_bytes() == before
 
 
+def test_a_scene_without_test_views_is_refused(score, scene):
+    frames = [replace(frame, split="train") for frame in scene.frames]
+    with pytest.raises(SceneError, match="expected test views to score, found none"):
+        score(scene=scene.with_frames(frames))
+
+
 def test_there_is_no_model_to_open(score):
     from chronoscene.bench.opening import open_run
 

@@ -1,7 +1,9 @@
 """The recipes of `baselines.external`, run with stand-ins that have the programs' command lines."""
 
+import re
 import subprocess
 import sys
+import venv
 from dataclasses import replace
 from pathlib import Path
 
@@ -100,6 +102,36 @@ def test_the_version_is_the_commit_of_the_source(bench_here, installed):
     assert read_run(outcome.finished[0]).method_version == f"unpackaged; {commit.strip()}"
 
 
+MINE = """
+import os, shutil, sys
+command, data, *others = sys.argv[1:]
+if command == "train":
+    assert others == "--iterations 500 --seconds 0 --seed 0".split()
+    open("model.pt", "w").write("learned")
+else:
+    os.mkdir("renders")
+    for test in open(f"{data}/sparse/0/test.txt").read().split():
+        shutil.copy(f"{data}/images/00000.png", f"renders/{test}")
+"""
+
+
+def test_the_recipe_of_the_page_runs(bench_here, tmp_path, monkeypatch):
+    """As it is printed, with a program in an environment without packages."""
+    page = Path(__file__).parents[2] / "docs/other-programs.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "recipe.py").write_text(code)
+    (tmp_path / "mine.py").write_text(MINE)
+    venv.create(tmp_path / "environment", with_pip=False, symlinks=True)
+    monkeypatch.syspath_prepend(tmp_path)
+    path = f"{tmp_path}/environment/bin:/usr/bin:/bin"
+    overrides = {"source": str(tmp_path), "prefix": f"env PATH={path}"}
+    outcome, _ = bench_here("recipe:SPEC", preset="fast", overrides=overrides)
+    assert outcome.failures == ()
+    record = read_run(outcome.finished[0])
+    assert (record.title, record.iterations, record.checkpoint_bytes) == ("Mine", 500, 7)
+    assert record.aggregates["micro"]["psnr"] > 10 and record.primitives is None
+
+
 @pytest.fixture
 def prepared(make_scene, tmp_path):
     """Call a preparation on the scene with other cameras."""
@@ -157,6 +189,14 @@ def test_the_list_of_methods_tells_programs_apart(monkeypatch):
     assert "3dgs" in methods and "official" not in methods
     for spec in names.values():
         assert spec.name in programs and load_spec(f"baselines.external:{_variable(spec)}") is spec
+
+
+def test_a_program_is_described_with_its_commands():
+    arguments = ["baselines.external:CHRONOGS"]
+    text = CliRunner().invoke(methods_module.command, arguments, catch_exceptions=False).output
+    assert "external program, installed apart from ChronoScene; untested but for" in text
+    assert "python '{source}/train.py' --config '{output}/config.yaml'" in text
+    assert "prefix=\n    Words before each command" in text
 
 
 def _variable(spec):

@@ -59,6 +59,7 @@ NAMED = replace(
 FROM_SOURCE = replace(
     PROGRAM, name="from-source", runner=replace(PROGRAM.runner, train=("{source}/x", "{data}"))
 )
+OTHER_CONFIG = replace(PROGRAM, name="other-config", config="toy_methods:Config")
 LEAVES_NOTHING = replace(
     PROGRAM, name="leaves-nothing", runner=replace(PROGRAM.runner, model="elsewhere/*")
 )
