@@ -31,7 +31,7 @@ from chronoscene.bench.results import (
 )
 from chronoscene.errors import CheckpointError, ChronoSceneError, ShapeError
 from chronoscene.io.wording import shown
-from chronoscene.metrics.registry import METRICS, Scorers
+from chronoscene.metrics.registry import Scorers, all_metrics
 
 NO_TESTS = "trained on all photos: there are no test views"
 
@@ -68,7 +68,7 @@ def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Sco
         periods = entry.camera_period, entry.rendered_period
         rows += [Row(entry.view, *periods, "all", name, value) for name, value in values.items()]
     if not pairs:
-        skipped = dict.fromkeys(METRICS, NO_TESTS)
+        skipped = dict.fromkeys(all_metrics(), NO_TESTS)
     elif len(unscored) == len(pairs):
         skipped |= dict.fromkeys(
             scorers.functions, "the masks of all test views ignore every pixel"
@@ -161,7 +161,7 @@ def aggregate(rows: Iterable[Row]) -> tuple[dict[str, Values], dict[str, Values]
     periods: dict[str, Values] = {}
     for metric, by_period in groups.items():
         means = {period: float(np.mean(by_period[period])) for period in sorted(by_period)}
-        worst = min if METRICS[metric].higher_is_better else max
+        worst = min if all_metrics()[metric].higher_is_better else max
         aggregates["macro"][metric] = float(np.mean(list(means.values())))
         aggregates["micro"][metric] = float(np.mean([v for p in by_period.values() for v in p]))
         aggregates["worst"][metric] = worst(means.values())
@@ -174,7 +174,7 @@ def changes(before: Mapping[str, Values], after: Mapping[str, Values]) -> list[s
     """What differs between two sets of aggregates, in words, one line per metric."""
     old, new = before.get("macro", {}), after.get("macro", {})
     lines = []
-    for name in (n for n in METRICS if n in old or n in new):
+    for name in (n for n in all_metrics() if n in old or n in new):
         if name not in old:
             lines.append(f"{name} new: {new[name]:.6g}")
         elif name not in new:

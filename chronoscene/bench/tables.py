@@ -14,7 +14,7 @@ from chronoscene.bench.results import Failure, RunRecord, read_failures, read_ru
 from chronoscene.errors import CheckpointError
 from chronoscene.io import tables
 from chronoscene.io.tables import Table
-from chronoscene.metrics.registry import METRICS, MetricInfo, metric_info
+from chronoscene.metrics.registry import MetricInfo, all_metrics, metric_info
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -43,10 +43,6 @@ COSTS = (
     Cost("peak_memory_bytes", "peak memory [MB]", 1e-6, 0),
     Cost("peak_device_memory_bytes", "peak GPU memory [MB]", 1e-6, 0),
 )
-
-DISPLAY = {name: (1.0, info.decimals) for name, info in METRICS.items()}
-DISPLAY |= {cost.name: (cost.factor, cost.decimals) for cost in COSTS}
-"""Quantity to its factor from the stored to the shown unit, and to its decimals."""
 
 ENTRY_COLUMNS = (
     *("scene", "method", "strategy", "preset", "variant", "config_hash"),
@@ -158,9 +154,12 @@ def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> Data
 
 def _with_text(entries: DataFrame) -> DataFrame:
     """Entries with ``text``, ``mean`` or ``mean ± sd``, and ``shown``, the mean as it reads."""
+    # Quantity to its factor from the stored to the shown unit, and to its decimals
+    display = {name: (1.0, info.decimals) for name, info in all_metrics().items()}
+    display |= {cost.name: (cost.factor, cost.decimals) for cost in COSTS}
     texts, shown = [], []
     for quantity, value, sd, n in entries[["quantity", "mean", "sd", "n"]].itertuples(index=False):
-        factor, decimals = DISPLAY[quantity]
+        factor, decimals = display[quantity]
         spread = "" if n == 1 else f" ± {sd * factor:.{decimals}f}"
         texts.append(f"{value * factor:.{decimals}f}{spread}")
         shown.append(round(value * factor, decimals))
@@ -219,7 +218,7 @@ def metric_names(records: Iterable[RunRecord], wanted: Sequence[str] = ()) -> li
     """The metrics to show, in the order of the table of names: those wanted, or all there are."""
     known = [metric_info(name).name for name in wanted]
     there = {name for run in records for name in run.aggregates.get("macro", {})}
-    return [name for name in METRICS if name in there and (not known or name in known)]
+    return [name for name in all_metrics() if name in there and (not known or name in known)]
 
 
 def readable_tables(

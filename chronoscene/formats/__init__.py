@@ -1,4 +1,4 @@
-"""Dataset formats, one module each; `FORMATS` lists them.
+"""Dataset formats, one module each; `FORMATS` lists ours, an entry point each of the others.
 
 A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and where it makes sense
 
@@ -12,7 +12,9 @@ A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and wher
 
 from __future__ import annotations
 
+from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +32,10 @@ FORMATS = {
     "neusc": "chronoscene.formats.neusc",
     "wat": "chronoscene.formats.wat",
 }
-"""Format name to the module that reads it."""
+"""Format name to the module that reads it, for those that come with ChronoScene."""
+
+ENTRY_POINT_GROUP = "chronoscene.formats"
+"""Other packages name modules in it."""
 
 USUAL = ("sparse/0", "sparse")  # Where everybody looks for a COLMAP model
 
@@ -41,9 +46,15 @@ FAR_UP = 4
 """How far above a wrong folder the right one may be: ``dense/0/sparse/0`` has four folders."""
 
 
+@cache
+def installed_formats() -> dict[str, str]:
+    """`FORMATS` and those of other packages."""
+    return {e.name: e.value for e in entry_points(group=ENTRY_POINT_GROUP)} | FORMATS
+
+
 def format_names() -> tuple[str, ...]:
     """Names of all formats, sorted."""
-    return tuple(sorted(FORMATS))
+    return tuple(sorted(installed_formats()))
 
 
 def load_format(name: str) -> Any:
@@ -52,8 +63,8 @@ def load_format(name: str) -> Any:
     Raises:
         ConfigError: If the format is unknown; lists the known ones.
     """
-    check_choice("dataset format", name, FORMATS)
-    return import_module(FORMATS[name])
+    check_choice("dataset format", name, installed_formats())
+    return import_module(installed_formats()[name])
 
 
 def detect_format(path: Path, *, period_by: str | None = None) -> str:

@@ -1,13 +1,19 @@
-"""The one table of metrics, and their functions. A name carries the variant of the metric."""
+"""The one table of metrics, and their functions. A name carries the variant of the metric.
+
+Other packages add metrics through the entry-point group ``chronoscene.metrics``, each a
+`MetricInfo` with its function.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from chronoscene.checks import check_choice
-from chronoscene.errors import MetricUnavailableError
+from chronoscene.errors import ConfigError, MetricUnavailableError
 from chronoscene.metrics.lpips_weights import check_available
 from chronoscene.metrics.psnr_ssim import IMAGE_METRICS
 
@@ -24,7 +30,11 @@ class MetricInfo:
     higher_is_better: bool
     decimals: int
     """Digits after the point in tables."""
+    function: Callable[..., float] | None = None
+    """``f(image, reference, mask)``, as in `Scorers`; None for the metrics here."""
 
+
+ENTRY_POINT_GROUP = "chronoscene.metrics"
 
 METRICS = {
     info.name: info
@@ -70,7 +80,28 @@ METRICS = {
         ),
     )
 }
-"""Metric name to its description, in the order of tables."""
+"""Metric name to its description, for those that come with ChronoScene."""
+
+
+@cache
+def all_metrics() -> dict[str, MetricInfo]:
+    """`METRICS` and those of other packages, in the order of tables.
+
+    Raises:
+        ConfigError: If one of these is not what it should be.
+    """
+    found = dict(METRICS)
+    for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda e: e.name):
+        info = entry.load()
+        if not isinstance(info, MetricInfo) or info.function is None or info.name != entry.name:
+            raise ConfigError(
+                f"{ENTRY_POINT_GROUP}: {entry.name}",
+                expected=f"a MetricInfo of the name {entry.name}, with a function",
+                found=repr(info),
+                todo="correct the package, or uninstall it",
+            )
+        found.setdefault(info.name, info)
+    return found
 
 
 def metric_info(name: str) -> MetricInfo:
@@ -79,7 +110,7 @@ def metric_info(name: str) -> MetricInfo:
     Raises:
         ConfigError: If there is no such metric; the message lists the known ones.
     """
-    return METRICS[check_choice("--metric", name, METRICS)]
+    return all_metrics()[check_choice("--metric", name, all_metrics())]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,21 +125,22 @@ class Scorers:
 
 
 def make_scorers(
-    names: Iterable[str] = tuple(METRICS), *, lpips_weights: Path | None = None
+    names: Iterable[str] | None = None, *, lpips_weights: Path | None = None
 ) -> Scorers:
     """Prepare metrics; torch is imported only if LPIPS can be computed.
 
     Args:
-        names: Metrics wanted.
+        names: Metrics wanted; None for all.
         lpips_weights: Folder or file that the user named; then its absence is an error.
 
     Raises:
         ConfigError: If there is no such metric.
         MetricUnavailableError: If the user named weights that cannot be used.
     """
-    wanted = [metric_info(name).name for name in names]
-    functions = {name: IMAGE_METRICS[name] for name in wanted if name in IMAGE_METRICS}
-    perceptual = [name for name in wanted if name not in functions]
+    wanted = [metric_info(name) for name in (all_metrics() if names is None else names)]
+    known = ((info.name, info.function or IMAGE_METRICS.get(info.name)) for info in wanted)
+    functions = {name: function for name, function in known if function is not None}
+    perceptual = [info.name for info in wanted if info.name not in functions]
     if not perceptual:
         return Scorers(functions, {})
     try:

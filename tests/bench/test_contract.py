@@ -5,7 +5,6 @@ import pytest
 from chronoscene.bench import contract
 from chronoscene.bench.contract import CHECKS, check_method
 from chronoscene.bench.returned import MethodError
-from chronoscene.methods import PROGRAM_GROUP, method_names
 
 
 @pytest.fixture
@@ -72,4 +71,4 @@ def test_a_failing_method_fails_check_by_check(problems):
 
 def test_other_programs_are_refused():
     with pytest.raises(MethodError, match="expected a method with a class, found another program"):
-        next(check_method(method_names(PROGRAM_GROUP)[0]))
+        next(check_method("baselines.external:SPLATFACTO"))
