@@ -69,7 +69,8 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
     trained = []
     with ProgressDisplay(job.label) as display:
         for part, stop in zip(parts, stops, strict=True):
-            display.wait(f"{spec.title} trains model {part.name}: {staging / LOG}")
+            model = "" if part.name == "all" else f" {part.name}"
+            display.wait(f"{spec.title} trains{model}; what it prints goes to {staging / LOG}")
             trained.append(_run_part(job, spec, runner, scene, part, stop, writer))
         writer.close(
             kind="predictions",

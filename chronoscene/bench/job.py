@@ -150,11 +150,9 @@ class Job:
 
         ``iterations=20+50`` is a training of 20 iterations that went on to 50.
         """
-        preset = dataclasses.asdict(build_config(spec, preset=self.preset))
-        config = dataclasses.asdict(self.method_config(spec))
+        preset = deciding_options(build_config(spec, preset=self.preset))
+        config = deciding_options(self.method_config(spec))
         differ = {name: value for name, value in config.items() if value != preset[name]}
-        if spec.runner is not None:  # where a program is, and not what it does
-            differ = {name: v for name, v in differ.items() if name not in ("prefix", "source")}
         if self.continued_from:
             lengths = [*self.continued_from, config["iterations"]]
             differ["iterations"] = "+".join(map(str, lengths))
@@ -196,11 +194,10 @@ class Job:
 
     def document(self, spec: MethodSpec) -> dict[str, Any]:
         """Everything that decides the result, merged; written beside it as ``config.json``."""
-        method_config = dataclasses.asdict(self.method_config(spec))
         config = {
             "method": self.method_name,
             "preset": self.preset,
-            "method_config": method_config,
+            "method_config": deciding_options(self.method_config(spec)),
             "strategy": self.strategy,
             "stop": dataclasses.asdict(self.stop_rule(spec)),
             "separate_iterations": self.separate_iterations,
@@ -216,6 +213,13 @@ class Job:
             "seed": self.seed,
             "device": self.device,
         }
+
+
+def deciding_options(config: Any) -> dict[str, Any]:
+    """The options of a method that its result depends on: all, but the places of a program."""
+    options = dataclasses.asdict(config)
+    places = ("prefix", "source") if isinstance(config, ProgramConfig) else ()
+    return {name: value for name, value in options.items() if name not in places}
 
 
 def check_device(device: str) -> None:

@@ -122,6 +122,13 @@ def test_a_program_in_another_environment_gets_a_row(bench_here, scene_folder, o
     assert not (folder / "work").exists()
 
 
+def test_where_a_program_is_makes_no_other_run(bench_here):
+    """The prefix names an environment: the run is the same, and finished."""
+    bench_here("toy_programs:PROGRAM")
+    _, said = bench_here("toy_programs:PROGRAM", overrides={"prefix": "env X=1", "source": "/src"})
+    assert "1 of 1 runs are finished and kept" in said
+
+
 def test_one_model_per_period(bench_here):
     outcome, _ = bench_here("toy_programs:PROGRAM", strategies=("separate",))
     (folder,) = outcome.finished
