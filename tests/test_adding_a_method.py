@@ -1,0 +1,60 @@
+"""docs/adding-a-method.md: its package works, its dataclasses and rules are those of the code."""
+
+import ast
+import dataclasses
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from chronoscene import methods
+from chronoscene.bench.contract import CHECKS
+from chronoscene.scene.similarity import Sim3
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs/adding-a-method.md").read_text(encoding="utf-8")
+EXAMPLE = ROOT / "examples/tinted-gaussians"
+
+
+def shown_files():
+    """Content of each file that the page shows, by its path."""
+    return dict(re.findall(r"^`([\w./-]+)`:\n\n```\w+\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
+
+
+def test_the_package_on_the_page_keeps_all_rules(tmp_path):
+    files = shown_files()
+    for name, text in files.items():
+        assert text == (EXAMPLE / name).read_text(encoding="utf-8"), f"{name} is not the example's"
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert len(files) == 3
+    done = subprocess.run(
+        [sys.executable, "-m", "chronoscene", "check-method", "tinted_gaussians:SPEC"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"tinted_gaussians:SPEC: 0 of {len(CHECKS)} rules broken" in done.stdout
+
+
+def test_the_dataclasses_on_the_page_have_all_fields():
+    (block,) = (
+        b for b in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "class View:" in b
+    )
+    shown = {
+        node.name: [n.target.id for n in node.body if isinstance(n, ast.AnnAssign)]
+        for node in ast.parse(block).body
+        if isinstance(node, ast.ClassDef)
+    }
+    shown["TrainingView"] = shown["View"] + shown["TrainingView"]
+    for name, fields in shown.items():
+        found = Sim3 if name == "Sim3" else getattr(methods, name)
+        assert fields == [field.name for field in dataclasses.fields(found)], name
+
+
+def test_the_rules_on_the_page_are_those_that_are_checked():
+    rules = [" ".join(check.__doc__.split("\n\n")[0].split()) for check in CHECKS]
+    assert re.findall(r"^- (.*)$", PAGE.partition("## 4. The rules")[2], re.MULTILINE) == rules
