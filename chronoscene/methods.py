@@ -71,7 +71,8 @@ class Runner:
     """What these are: ``Gaussians``, ``anchors``."""
     prepare: str | None = None
     """``module:function``, called with ``{data}``, ``{output}`` and the config before the training:
-    it writes there what the export lacks for this program, and returns notices for the user."""
+    it writes there what the export lacks for this program, and returns notices for the user, which
+    go on after the title of the method: ``ignores principal points``."""
     version: tuple[str, ...] = ()
     """Command whose last line of output is the version of the program."""
     tested: str = "untested"

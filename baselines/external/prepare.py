@@ -1,7 +1,7 @@
 """What exported training sets lack for programs that do not read them as they are.
 
 A function gets the folder of the training set, that of the output, and the config, and returns what
-the user must know of the scene.
+the program does with the scene that the user must know.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def four_d_gaussians(data: Path, output: Path, config: FourDGaussiansConfig) -> 
     )
     ratios = [f.camera.K[1, 1] / f.camera.K[0, 0] - 1 for f in scene.frames]
     worst = max(ratios, key=abs)
-    one = f"the program has one focal length per image, here {worst:+.1%} off in y"
+    one = f"has one focal length per image, here {worst:+.1%} off in y"
     return [*_ignored(scene), *([one] if abs(worst) > SAME_FOCAL else [])]
 
 
@@ -131,8 +131,8 @@ def _ignored(scene: Scene) -> list[str]:
     if max(offsets) <= OFF_CENTRE:
         return []
     return [
-        f"the program ignores principal points, here up to {max(offsets):.1f} pixels off the "
-        "centre: chronoscene undistort --center makes a scene without"
+        f"ignores principal points, here up to {max(offsets):.1f} pixels off the centre: "
+        "chronoscene undistort --center moves them there"
     ]
 
 

@@ -150,7 +150,8 @@ def _run_part(
         notices = []
         if runner.prepare is not None:
             chosen = replace(config, iterations=values["iterations"])
-            notices = import_object(runner.prepare)(data, output, chosen)
+            told = import_object(runner.prepare)(data, output, chosen)
+            notices = [f"{spec.title} {notice}" for notice in told]
         usage = run(runner.train)
         peaks = [usage.peak_memory_bytes, *(run(c).peak_memory_bytes for c in runner.render)]
         images = _find_images(runner, output, part.test, names, values)
