@@ -273,8 +273,9 @@ def _keep_model(
     if runner.primitives is not None:
         primitives = count_vertices(output / runner.primitives.format(**values))
     checkpoint = Path(job.staging) / results.CHECKPOINT
-    target = checkpoint if part.name == "all" else checkpoint / part.name
-    target.mkdir(parents=True)
     for path in files:
-        os.replace(path, target / path.name)
+        inside = path.relative_to(output)
+        target = checkpoint / ("" if part.name == "all" else part.name) / inside
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(path, target)
     return primitives

@@ -113,10 +113,10 @@ def test_a_program_in_another_environment_gets_a_row(bench_here, scene_folder, o
     assert record.seconds > 0 and record.peak_memory_bytes > 0
     assert record.render_seconds is None and "render_seconds" in record.absent
     assert record.method_version.startswith("unpackaged; Python 3")
-    model = {path.name: path.stat().st_size for path in (folder / "checkpoint").iterdir()}
+    model = {p.name: p.stat().st_size for p in (folder / "checkpoint/model").iterdir()}
     assert set(model) == {"points.ply", "seed.txt"}
     assert record.checkpoint_bytes == sum(model.values())
-    assert (folder / "checkpoint/seed.txt").read_text() == "4"
+    assert (folder / "checkpoint/model/seed.txt").read_text() == "4"
     log = (folder / "program.log").read_text()
     assert log.count("$ ") == 3 and "training 9 0 4" in log
     assert not (folder / "work").exists()
@@ -151,6 +151,7 @@ def test_the_budget_is_passed_on(bench_here):
     [
         ("FAILING", r"found exit status 3; program\.log ends with: .*CUDA error: no device; corr"),
         ("ABSENT", r"no-such-program .*: expected a program that can be started, found No such"),
+        ("NO_POINTS", r"model/cloud\.ply: expected a PLY file, found No such file"),
         ("LEAVES_NOTHING", r"elsewhere/\*: expected files of a model .* found none; look at"),
     ],
 )

@@ -45,8 +45,11 @@ def count_vertices(path: Path) -> int:
     Raises:
         SceneError: If it is no such file.
     """
-    with path.open("rb") as file:
-        return _read_header(path, file)[1]
+    try:
+        with path.open("rb") as file:
+            return _read_header(path, file)[1]
+    except OSError as error:
+        raise _error(path, "a PLY file", error.strerror or "an error") from error
 
 
 def write_points(path: Path, points: Points) -> None:

@@ -59,6 +59,9 @@ NAMED = replace(
 FROM_SOURCE = replace(
     PROGRAM, name="from-source", runner=replace(PROGRAM.runner, train=("{source}/x", "{data}"))
 )
+NO_POINTS = replace(
+    PROGRAM, name="no-points", runner=replace(PROGRAM.runner, primitives="model/cloud.ply")
+)
 OTHER_CONFIG = replace(PROGRAM, name="other-config", config="toy_methods:Config")
 LEAVES_NOTHING = replace(
     PROGRAM, name="leaves-nothing", runner=replace(PROGRAM.runner, model="elsewhere/*")
