@@ -18,6 +18,7 @@ COMMANDS = {
     "convert": "chronoscene.cli.convert:command",
     "doctor": "chronoscene.cli.doctor:command",
     "download": "chronoscene.cli.download:command",
+    "export": "chronoscene.cli.export:command",
     "methods": "chronoscene.cli.methods:command",
     "new-method": "chronoscene.cli.check_method:new",
     "register": "chronoscene.cli.register:command",

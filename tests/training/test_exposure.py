@@ -12,7 +12,8 @@ from chronoscene.errors import ConfigError
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, TrainingView
 from chronoscene.scene.similarity import Sim3
-from chronoscene.training.exposure import LEARNING_RATE, Exposure, of_period, transformed
+from chronoscene.training.exposure import LEARNING_RATE, Exposure, exposed, of_period, transformed
+from chronoscene.training.spherical_harmonics import basis
 from chronoscene.training.splatting import SplattingConfig
 
 SIZE = 32
@@ -52,6 +53,20 @@ def test_gradients_are_those_of_the_definition():
     np.testing.assert_allclose(found.detach(), expected.detach(), rtol=1e-5, atol=1e-5)
     for mine, theirs in zip(ours, plain, strict=True):
         np.testing.assert_allclose(mine.grad, theirs.grad, rtol=1e-5, atol=1e-4)
+
+
+def test_spherical_harmonics_with_an_exposure_give_its_colours():
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(50, 3, generator=generator))
+    sh_coeffs = 0.2 * torch.randn(50, 16, 3, generator=generator)
+    transform = torch.randn(3, 4, generator=generator)
+
+    def colors(coeffs):
+        return (basis(directions, 3)[..., None] * coeffs).sum(1) + 0.5
+
+    found = colors(torch.from_numpy(exposed(sh_coeffs.numpy(), transform.numpy())))
+    expected = transformed(colors(sh_coeffs)[None], transform)[0]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_bits_do_not_depend_on_the_threads():
