@@ -144,6 +144,10 @@ def no_mask(index: int) -> None:
     """`TrainingSet.load_mask` of sets whose images count everywhere."""
 
 
+def nothing_ahead(indices: Sequence[int]) -> None:
+    """`TrainingSet.expect` of sets whose images are at hand."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingSet:
     """Everything that a method may learn from, in the normalised training frame.
@@ -172,6 +176,9 @@ class TrainingSet:
     load_mask: Callable[[int], NDArray[np.bool_] | None] = no_mask
     """Where the image of ``views[i]`` counts; None where all of it does. What the others show must
     not change the model. [H, W]"""
+    expect: Callable[[Sequence[int]], None] = nothing_ahead
+    """Takes the views whose images will be loaded next, in their order: they are decoded while the
+    method does something else. A method that never calls it waits for each image."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

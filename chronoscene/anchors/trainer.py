@@ -87,7 +87,7 @@ class AnchorTrainer:
         self._seen_layout = replace(layout, num_periods=1)
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
-        self.sampler = ViewSampler(len(train.views), seed)
+        self.sampler = ViewSampler(len(train.views), seed, train.expect)
         self.exposure = Exposure(self.config.exposure, train, model.device)
         points = train.points[finite_rows(train.points)]
         self._middle = points.astype(np.float64).mean(axis=0)

@@ -54,6 +54,8 @@ class LoopState(BaseModel):
     seconds: float = 0.0
     """On the training clock."""
     setup_seconds: float = 0.0
+    waited_seconds: float = 0.0
+    """For photos; not on the training clock."""
     empty_steps: int = 0
     """Whose view showed no primitive."""
     skipped_steps: int = 0

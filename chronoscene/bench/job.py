@@ -20,6 +20,9 @@ from chronoscene.errors import BackendError, ConfigError
 from chronoscene.formats import writable_formats
 from chronoscene.methods import MethodSpec, ProgramConfig, Runner, as_typed, build_config
 
+PHOTO_MEMORY = 2 * 10**9
+PHOTO_DISK = 20 * 10**9
+
 _UNITS = {"h": 3600.0, "m": 60.0, "s": 1.0}
 
 
@@ -108,6 +111,10 @@ class Job:
     notices: list[str] = field(default_factory=list)
     staging: str = ""
     """Where the worker writes; renamed to `folder` when it has ended."""
+    photo_memory: int = PHOTO_MEMORY
+    """Bytes that training photos may take in memory, those that are being decoded included."""
+    photo_disk: int = PHOTO_DISK
+    """Bytes that decoded photos may take on disk."""
     checkpoint_seconds: float = 300.0
     """Time from one checkpoint of the training to the next."""
     keep_training: bool = False

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from chronoscene.bench import results
-from chronoscene.bench.job import Job, check_job
+from chronoscene.bench.job import PHOTO_DISK, PHOTO_MEMORY, Job, check_job
+from chronoscene.bench.photos import check_room
 from chronoscene.bench.predictions import freeze_ground_truth
 from chronoscene.bench.provenance import code_version, scene_hash
 from chronoscene.bench.strategies import check_scene, effective_strategy
@@ -50,6 +51,9 @@ class BenchSettings:
     keep_training: bool = False
     """Whether finished runs keep what it takes to train them further."""
     max_width: int = MAX_WIDTH
+    photo_memory: int = PHOTO_MEMORY
+    photo_disk: int = PHOTO_DISK
+    """Bytes that training photos may take in memory, and decoded on disk."""
     threads: int | None = None
     device: str = "auto"
     lpips_weights: Path | None = None
@@ -77,6 +81,7 @@ def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]
     for scene in scenes:
         check_scene(scene)
         say(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
+        unfinished = 0
         for job, spec in _scene_jobs(settings, scene, commit, specs):
             check_job(job, spec)
             job = job.with_variant(spec)
@@ -84,7 +89,10 @@ def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]
                 job = continued(job, spec, settings.continue_to)
             plan.setdefault(job.folder, (job, spec))
             notices.update(dict.fromkeys(job.notices))
-        store = ImageStore(scene, max_width=settings.max_width)
+            unfinished += spec.runner is None and not is_finished(job, spec, settings.overwrite)
+        if unfinished:
+            say(check_room(scene, job, unfinished))
+        store = ImageStore(scene, max_width=settings.max_width, memory_limit=settings.photo_memory)
         freeze_ground_truth(settings.runs, scene, job.scene_hash, store, settings.max_width)
     for notice in notices:
         say(f"note: {notice}")
@@ -181,6 +189,8 @@ def _scene_jobs(
             separate_iterations=settings.separate_iterations,
             seed=seed,
             max_width=settings.max_width,
+            photo_memory=settings.photo_memory,
+            photo_disk=settings.photo_disk,
             checkpoint_seconds=settings.checkpoint_seconds,
             keep_training=settings.keep_training or settings.continue_to is not None,
             threads=settings.threads,

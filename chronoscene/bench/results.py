@@ -31,6 +31,7 @@ CHECKPOINT = "checkpoint"
 TRAINING = "training"
 PREDICTIONS = "predictions"
 GROUND_TRUTH = "ground_truth"
+PHOTOS = "photos"
 FIGURES = "figures"
 
 Values = dict[str, float]
@@ -92,6 +93,8 @@ class RunRecord(BaseModel):
     """Steps that changed nothing since their loss or a gradient was not finite."""
     resumed: int = 0
     """How often the training went on from a checkpoint."""
+    waited_seconds: float = 0.0
+    """Waiting for photos that were not decoded yet; not part of `seconds`."""
     setup_seconds: float | None
     """Share of `seconds` before the first step."""
     render_seconds: float | None

@@ -156,6 +156,7 @@ def _training_set(
         background=np.zeros(3, np.float32),
         load_image=lambda i: store.load(frames[i]),
         load_mask=lambda i: store.load_mask(frames[i]),
+        expect=lambda indices: store.expect([frames[i] for i in indices]),
     )
 
 

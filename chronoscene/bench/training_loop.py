@@ -106,7 +106,7 @@ def train(
     now: Clock = time.perf_counter,
     checkpoints: Checkpoints | None = None,
 ) -> LoopState:
-    """Train one model. Probes, checkpoints and the observer run off the clock.
+    """Train one model. Probes, checkpoints, the observer and waiting for photos are off the clock.
 
     Args:
         method: An empty method.
@@ -128,12 +128,14 @@ def train(
         MethodError: If the method returns something that it should not.
     """
     seed_everything(seed)
-    clock = Stopwatch(now)
-    with clock:
+    clock, waiting = Stopwatch(now), Stopwatch(lambda: part.store.waited)
+    with clock, waiting:
         method.setup(part.train, seed=seed, device=device)
-    state = LoopState(seconds=clock.seconds, setup_seconds=clock.seconds)
+    seconds = clock.seconds - waiting.seconds
+    state = LoopState(seconds=seconds, setup_seconds=seconds, waited_seconds=waiting.seconds)
     if checkpoints is not None and (restored := checkpoints.restore(method)) is not None:
-        state, clock.seconds = restored, restored.seconds
+        state, waiting.seconds = restored, restored.waited_seconds
+        clock.seconds = state.seconds + state.waited_seconds
     done = stop.progress(state.iterations, state.seconds)
     due = [share for share in PROBE_SHARES if share > done]
     last_good = state.iterations
@@ -142,11 +144,12 @@ def train(
     unseen = deque[float](maxlen=max(NOT_FINITE_LIMIT, 2 * len(part.train.views)))
     latest = None
     while done < 1.0:
-        with clock:
+        with clock, waiting:
             report = method.step(state.iterations, done)
         check_step(report, f"model {part.name}, iteration {state.iterations + 1}")
         state.iterations += 1
-        state.seconds = clock.seconds
+        state.seconds = clock.seconds - waiting.seconds
+        state.waited_seconds = waiting.seconds
         done = stop.progress(state.iterations, state.seconds)
         if _was_finite(report, state):
             last_good = state.iterations

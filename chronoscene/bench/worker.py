@@ -23,6 +23,7 @@ from chronoscene.bench.display import ProgressDisplay
 from chronoscene.bench.external import run_external
 from chronoscene.bench.job import Job, StopRule, check_device
 from chronoscene.bench.opening import write_source
+from chronoscene.bench.photos import open_store
 from chronoscene.bench.predictions import (
     ImageWriter,
     ground_truth_folder,
@@ -49,7 +50,6 @@ from chronoscene.bench.training_loop import (
 )
 from chronoscene.errors import ChronoSceneError, DiskFullError
 from chronoscene.formats import read_scene
-from chronoscene.images.store import ImageStore
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
@@ -90,7 +90,7 @@ def run_job(job: Job) -> None:
     machine = Machine(pick_device(job.device, spec), set_threads(job.threads))
     write_text_atomic(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
     scene = read_scene(job.scene_root, format=job.scene_format)
-    parts = make_parts(scene, ImageStore(scene, max_width=job.max_width), job.strategy)
+    parts = make_parts(scene, open_store(scene, job), job.strategy)
     write_source(job, parts[0].train.training_from_world)
     writer = ImageWriter(staging / results.PREDICTIONS)
     outcomes = []
@@ -281,6 +281,7 @@ def _record(
         period_labels={str(p.id): p.label for p in scene.periods},
         parameters=sum(o.size.parameters for o in outcomes),
         warmup_seconds=0.0,
+        waited_seconds=sum(o.trained.waited_seconds for o in outcomes),
         setup_seconds=sum(o.trained.setup_seconds for o in outcomes),
         render_seconds=sum(o.render_seconds for o in outcomes) / tests if tests else None,
         peak_device_memory_bytes=peaks[1],

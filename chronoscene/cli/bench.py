@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from chronoscene.bench.job import check_device, parse_duration
+from chronoscene.bench.job import PHOTO_DISK, PHOTO_MEMORY, check_device, parse_duration
 from chronoscene.bench.results import read_failures
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.strategies import STRATEGIES
@@ -93,6 +93,20 @@ EXISTING = click.Path(path_type=Path, exists=True)
     help="Scale wider images down to this width in pixels, for training and evaluation.",
 )
 @click.option(
+    "--photo-memory",
+    type=click.FloatRange(min=0),
+    default=PHOTO_MEMORY / 1e9,
+    show_default=True,
+    help="Memory for training photos in GB, the decoding of them included.",
+)
+@click.option(
+    "--photo-disk",
+    type=click.FloatRange(min=0),
+    default=PHOTO_DISK / 1e9,
+    show_default=True,
+    help="Disk space below --out in GB for decoded photos, if they do not fit into memory.",
+)
+@click.option(
     "--threads", type=click.IntRange(min=1), help="Number of threads.  [default: one per processor]"
 )
 @click.option(
@@ -114,6 +128,8 @@ def command(
     strategies: str,
     budget: str | None,
     checkpoint_every: str,
+    photo_memory: float,
+    photo_disk: float,
     seeds: int,
     seed: int,
     assignments: tuple[str, ...],
@@ -139,6 +155,8 @@ def command(
         overrides=parse_assignments(assignments),
         budget_seconds=None if budget is None else parse_duration(budget),
         checkpoint_seconds=parse_duration(checkpoint_every, "--checkpoint-every"),
+        photo_memory=round(photo_memory * 1e9),
+        photo_disk=round(photo_disk * 1e9),
         seeds=tuple(range(seed, seed + seeds)),
         **options,
     )

@@ -110,7 +110,7 @@ class GaussianTrainer:
 
     def __post_init__(self) -> None:
         self.timeline = self.timeline_class(self.config)
-        self.sampler = ViewSampler(len(self.train.views), self.seed)
+        self.sampler = ViewSampler(len(self.train.views), self.seed, self.train.expect)
         self.exposure = Exposure(self.config.exposure, self.train, self.background.device)
         self.begin()
 

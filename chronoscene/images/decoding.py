@@ -47,6 +47,10 @@ _DECODE_ERRORS = (
 )
 
 
+Photo = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
+"""What `load_photo` gives: colours, and where they count. [H, W, 3], [H, W]"""
+
+
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of the stored pixels; reads only the header.
 
@@ -69,7 +73,7 @@ def load_rgb(path: Path, *, size: tuple[int, int] | None = None) -> NDArray[np.u
 
 def load_photo(
     path: Path, mask_path: Path | None = None, *, size: tuple[int, int] | None = None
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
+) -> Photo:
     """Decode any image to RGB, and find out which of its pixels count.
 
     Args:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.methods import TrainingView
+from chronoscene.methods import TrainingView, nothing_ahead
+
+AHEAD = 32
+"""Draws that are known before they are made; those who prepare them choose how many they want."""
 
 
 class ViewSampler:
@@ -21,27 +25,37 @@ class ViewSampler:
     Args:
         count: Number of views to draw from.
         seed: Seed of the run.
+        expect: Called in each draw with the views of the next ones: `TrainingSet.expect`.
     """
 
-    def __init__(self, count: int, seed: int) -> None:
+    def __init__(
+        self, count: int, seed: int, expect: Callable[[Sequence[int]], None] = nothing_ahead
+    ) -> None:
         if count < 1:
             raise ValueError(f"count must be at least 1, not {count}")
         self.count = count
         self.seed = seed
         self.drawn = 0
         """Draws done so far; may be set to continue an interrupted run."""
-        self._pool_number = -1
-        self._pool: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._expect = expect
+        self._pools: dict[int, NDArray[np.int64]] = {}
 
     def next(self) -> int:
         """Index of the next view, 0..count-1."""
-        pool_number, position = divmod(self.drawn, self.count)
-        if pool_number != self._pool_number:
-            generator = np.random.default_rng((self.seed, pool_number))
-            self._pool = generator.permutation(self.count)
-            self._pool_number = pool_number
+        draws = range(self.drawn, self.drawn + min(1 + AHEAD, self.count))
+        number, *others = [self._view(draw) for draw in draws]
         self.drawn += 1
-        return int(self._pool[position])
+        self._expect(others)
+        return number
+
+    def _view(self, draw: int) -> int:
+        """Index of the view of a draw, counted from 0."""
+        pool, position = divmod(draw, self.count)
+        if pool not in self._pools:
+            generator = np.random.default_rng((self.seed, pool))
+            self._pools.pop(pool - 2, None)  # Draws that are known at one time are of two pools
+            self._pools[pool] = generator.permutation(self.count)
+        return int(self._pools[pool][position])
 
 
 def downscale_view(view: TrainingView, factor: int) -> TrainingView:

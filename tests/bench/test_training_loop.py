@@ -66,6 +66,8 @@ def clock():
 
 
 def run(method, part, stop, observer=lambda *step: None, **changes):
+    for index in range(len(part.train.views)):
+        part.train.load_image(index)  # so that no test depends on how long that takes
     truth = {f.name: (part.store.load(f), part.store.load_mask(f)) for f in part.test}
     return train(method, part, stop, truth, seed=0, device="cpu", observer=observer, **changes)
 
@@ -148,6 +150,22 @@ def test_probes_observers_and_rendering_are_off_the_clock(part, clock):
     observer = clock.takes(20.0, lambda *step: None)
     trained = run(method, part, StopRule(10, None), observer, now=clock)
     assert trained.seconds == 2.5 and clock.seconds > 700
+
+
+def test_waiting_for_photos_is_off_the_clock_and_counted(part, clock):
+    def waiting(function):
+        def waits(*args, **options):
+            clock.seconds += 3.0
+            part.store.waited += 3.0
+            return function(*args, **options)
+
+        return waits
+
+    method = toy()
+    method.setup = waiting(clock.takes(2.0, method.setup))
+    method.step = waiting(clock.takes(0.25, method.step))
+    trained = run(method, part, StopRule(10, None), now=clock)
+    assert (trained.setup_seconds, trained.seconds, trained.waited_seconds) == (2.0, 4.5, 33.0)
 
 
 def test_the_clock_is_that_of_the_machine(part):

@@ -12,7 +12,9 @@ from PIL import Image
 
 from chronoscene.errors import ImageError, SceneError
 from chronoscene.formats import read_scene
-from chronoscene.images.store import ImageStore, evaluation_size, resize_camera
+from chronoscene.images.decoding import load_photo, load_rgb
+from chronoscene.images.disk_cache import DiskCache
+from chronoscene.images.store import AHEAD, ImageStore, evaluation_size, resize_camera
 from chronoscene.scene import Camera
 from chronoscene.scene.cameras import to_pycolmap
 
@@ -163,6 +165,103 @@ def test_many_threads(scene):
 
 
 def test_a_damaged_image_of_a_scene_names_its_file(scene):
+    """Also when it was decoded ahead."""
     scene.image_path(scene.frames[1]).write_bytes(b"not an image")
-    with pytest.raises(ImageError, match=r"images/1\.png: expected an image that can be decoded"):
-        ImageStore(scene).load(scene.frames[1])
+    for ahead in ((), scene.frames[:3]):
+        store = ImageStore(scene)
+        store.expect(ahead)
+        with pytest.raises(ImageError, match=r"images/1\.png: expected an image that can be"):
+            store.load(scene.frames[1])
+
+
+class Decoder:
+    """Takes the place of the decoder: notes what it decodes, and waits where it is told to."""
+
+    def __init__(self):
+        self.names, self.threads = [], set()
+        self.may_go_on = threading.Event()
+        self.may_go_on.set()
+
+    def __call__(self, path, *args, **options):
+        assert self.may_go_on.wait(60)
+        self.names.append(path.name)
+        self.threads.add(threading.current_thread().name.split("_")[0])
+        return load_photo(path, *args, **options)
+
+
+@pytest.fixture
+def decoder(monkeypatch):
+    decoder = Decoder()
+    monkeypatch.setattr("chronoscene.images.store.load_photo", decoder)
+    return decoder
+
+
+def finish(store):
+    """Wait for what is under way."""
+    for future in list(store._coming.values()):
+        future.exception(60)
+
+
+def test_expected_images_are_decoded_in_the_background(scene, decoder):
+    store = ImageStore(scene)
+    store.expect(scene.frames)
+    finish(store)
+    assert decoder.names == [f"{i}.png" for i in range(AHEAD)]
+    assert decoder.threads == {"decoder"} and store.cached_bytes == AHEAD * IMAGE_BYTES
+    for frame in scene.frames[:AHEAD]:
+        np.testing.assert_array_equal(store.load(frame), load_rgb(scene.image_path(frame)))
+    assert store.waited == 0.0 and len(decoder.names) == AHEAD
+    store.load(scene.frames[5])
+    assert store.waited > 0.0
+
+
+def test_an_image_on_its_way_is_waited_for_and_decoded_once(scene, decoder):
+    store = ImageStore(scene)
+    decoder.may_go_on.clear()
+    store.expect(scene.frames[:1])
+    store.expect(scene.frames[:2])
+    timer = threading.Timer(0.1, decoder.may_go_on.set)
+    timer.start()
+    assert store.load(scene.frames[0]).shape == (48, 64, 3)
+    finish(store)
+    assert decoder.names == ["0.png", "1.png"] and store.waited > 0.0
+
+
+def test_no_more_is_decoded_ahead_than_fits_beside_the_image_in_use(scene, decoder):
+    store = ImageStore(scene, memory_limit=3 * IMAGE_BYTES, decoders=2)
+    first = store.load(scene.frames[0])
+    store.expect(scene.frames[1:])
+    finish(store)
+    assert sorted(decoder.names) == ["0.png", "1.png", "2.png"]
+    assert store.load(scene.frames[0]) is first
+    assert ImageStore(scene, memory_limit=0).expect(scene.frames) is None
+    assert len(decoder.names) == 3
+
+
+def test_an_expected_image_stays_until_it_is_used(scene, decoder):
+    store = ImageStore(scene, memory_limit=3 * IMAGE_BYTES)
+    for frame in scene.frames[:3]:
+        store.load(frame)
+    store.expect([scene.frames[0], scene.frames[3]])
+    finish(store)
+    store.load(scene.frames[0])
+    assert decoder.names == [f"{i}.png" for i in range(4)]
+
+
+def test_masks_and_images_come_from_the_disk_cache(scene, tmp_path, monkeypatch):
+    Image.new("L", (64, 48), 0).save(tmp_path / "mask.png")
+    masked = replace(scene, masks={scene.frames[0].name: tmp_path / "mask.png"})
+    folder = tmp_path / "photos"
+
+    def make():
+        return ImageStore(masked, memory_limit=2 * IMAGE_BYTES, disk=DiskCache(folder, 10**6))
+
+    before = make()
+    expected = [(before.load(f), before.load_mask(f)) for f in masked.frames]
+    monkeypatch.setattr("chronoscene.images.disk_cache.load_photo", None)  # not called again
+    store = make()
+    for frame, (image, mask) in zip(masked.frames, expected, strict=True):
+        store.expect([frame])
+        np.testing.assert_array_equal(store.load(frame), image)
+        np.testing.assert_array_equal(store.load_mask(frame), mask)
+    assert expected[0][1] is not None and expected[1][1] is None

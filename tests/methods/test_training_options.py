@@ -74,6 +74,18 @@ def test_a_training_with_options_ends_the_same_when_interrupted(name, options, t
     assert saved(loaded, tmp_path / "again") == saved(whole, tmp_path / "and again")
 
 
+@pytest.mark.parametrize("name", ["3dgs", "chronogs"])
+def test_the_next_photos_are_named_before_they_are_loaded(name):
+    data, said, loaded = tiny_training.make_training_set(1), [], []
+
+    def load(index):
+        loaded.append(index)
+        return data.load_image(index)
+
+    train(start(name, replace(data, load_image=load, expect=said.append)), 0, 4)
+    assert len(said) == 4 and [views[0] for views in said[:3]] == loaded[1:]
+
+
 @pytest.mark.parametrize("name", ["3dgs", "scaffold-gs"])
 def test_a_random_background_leaves_no_hole_where_photos_are_as_dark_as_it(name):
     """Black photos need no Gaussians before black; before any colour they need opaque ones."""

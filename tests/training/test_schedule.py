@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from chronoscene.methods import TrainingView
 from chronoscene.training.schedule import (
+    AHEAD,
     ViewSampler,
     downscale_image,
     downscale_mask,
@@ -31,6 +32,18 @@ def test_a_resumed_sampler_continues_the_order(count, seed, done):
     resumed = ViewSampler(count, seed)
     resumed.drawn = done
     assert [resumed.next() for _ in range(15)] == expected
+
+
+@given(st.integers(1, 100), st.integers(0, 100), st.integers(0, 250))
+def test_each_draw_says_what_the_next_ones_will_be(count, seed, done):
+    """Up to one pass ahead, also where a new pool begins and where a training goes on."""
+    said = []
+    sampler = ViewSampler(count, seed, said.append)
+    sampler.drawn = done
+    drawn = [sampler.next() for _ in range(3 * AHEAD)]
+    for i in range(AHEAD):
+        assert said[i] == drawn[i + 1 : i + 1 + min(AHEAD, count - 1)]
+    assert len(sampler._pools) <= 2
 
 
 def test_the_order_depends_on_the_seed_and_changes_between_pools():

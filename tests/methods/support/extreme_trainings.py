@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,6 +88,8 @@ class Outcome:
 class Photos:
     """Takes the place of the store of images: pictures in memory."""
 
+    waited = 0.0
+
     def __init__(self, images: dict[str, NDArray[np.uint8]]) -> None:
         self.images = images
 
@@ -98,6 +101,9 @@ class Photos:
 
     def load_mask(self, frame: Frame) -> None:
         return None
+
+    def expect(self, frames: Sequence[Frame]) -> None:
+        """All are at hand."""
 
 
 def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
