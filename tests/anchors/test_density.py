@@ -10,8 +10,19 @@ import torch
 
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
+from chronoscene.training import devices
 
 CONFIG = AnchorConfig(random_growth=False)
+
+
+@pytest.fixture(params=["compiled", "torch"])
+def code(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The code of a CPU, and that of a GPU."""
+    if request.param == "torch":
+        monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
+
+
+both_codes = pytest.mark.usefixtures("code")
 
 
 def grown(
@@ -142,6 +153,7 @@ def test_the_paper_prunes_anchors_that_do_not_move() -> None:
     assert prune_mask(statistics, rules).tolist() == [False, True]
 
 
+@both_codes
 def test_statistics_of_a_view() -> None:
     statistics = DensityStatistics(3, 2)
     positions = torch.tensor([0, 2, 3])  # the second Gaussian of the first anchor is off
@@ -158,6 +170,7 @@ def test_statistics_of_a_view() -> None:
     )
 
 
+@both_codes
 def test_a_view_does_not_count_for_anchors_in_what_its_mask_ignores() -> None:
     """No visit of the anchor; a Gaussian of it that lies elsewhere is hit all the same."""
     statistics = DensityStatistics(2, 2)
@@ -171,6 +184,7 @@ def test_a_view_does_not_count_for_anchors_in_what_its_mask_ignores() -> None:
     assert statistics.hits.tolist() == [[1, 0], [1, 1]]
 
 
+@both_codes
 def test_statistics_of_many_anchors() -> None:
     """As counted one by one, whatever the anchors that a task takes together."""
     rng = np.random.default_rng(0)

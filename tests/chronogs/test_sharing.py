@@ -11,11 +11,17 @@ import torch
 
 from chronogs.method import ChronoGS
 from chronogs.sharing import changing_anchors, pack_features, share_periods, unpack_features
+from chronoscene.training import devices
 
 Make = Callable[..., ChronoGS]
 
 
-def test_the_proximal_step_of_one_anchor(method: Make) -> None:
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_proximal_step_of_one_anchor(
+    method: Make, compiled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not compiled:
+        monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
     model = method(2, base_dim=1, period_dim=2).model
     with torch.no_grad():
         model.features[0] = torch.tensor([9.0, 1.0, 5.0, 3.0, 1.0])

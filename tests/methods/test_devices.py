@@ -26,12 +26,12 @@ from chronoscene.training import devices
 
 STEPS = 3
 """Few, since Adam makes whole steps of differences that are rounding."""
-LOSS_TOLERANCE = 1e-4
-"""Of the losses, relatively. Measured on a CPU in plain torch: 7e-7. Not measured on a GPU."""
-IMAGE_TOLERANCE = 1e-3
-"""Of images after `STEPS`. Measured on a CPU in plain torch: 6e-5. Not measured on a GPU."""
-RENDER_TOLERANCE = 1e-4
-"""Of images of one model. Measured on a CPU in plain torch: 8e-7. Not measured on a GPU."""
+LOSS_TOLERANCE = {"cpu": 3e-6, "cuda": 1e-4}
+"""Of the losses, relatively. Measured on a CPU: 7e-7. Not yet measured on a GPU, nor are these:"""
+IMAGE_TOLERANCE = {"cpu": 3e-4, "cuda": 1e-3}
+"""Of images after `STEPS`. Measured on a CPU: 8e-5."""
+RENDER_TOLERANCE = {"cpu": 3e-6, "cuda": 1e-4}
+"""Of images of one model. Measured on a CPU: 6e-7."""
 QUESTIONS = 3
 """To tensors in a step: what is in view, what of it is switched on; and how the step went."""
 
@@ -102,8 +102,8 @@ def test_first_steps_are_those_of_the_compiled_code(
     losses, image = first_steps
     method = compiled.method(device)
     found = [method.step(i, i / tiny_training.STEPS).loss for i in range(STEPS)]
-    np.testing.assert_allclose(found, losses, rtol=LOSS_TOLERANCE)
-    np.testing.assert_allclose(compiled.image(method), image, atol=IMAGE_TOLERANCE)
+    np.testing.assert_allclose(found, losses, rtol=LOSS_TOLERANCE[device])
+    np.testing.assert_allclose(compiled.image(method), image, atol=IMAGE_TOLERANCE[device])
 
 
 def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
@@ -122,7 +122,7 @@ def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
     monkeypatch.undo()
     here = import_object(compiled.spec.method)(method.config)
     here.load(folders[0], device="cpu")
-    np.testing.assert_allclose(compiled.image(here), image, atol=RENDER_TOLERANCE)
+    np.testing.assert_allclose(compiled.image(here), image, atol=RENDER_TOLERANCE[device])
     here.save(folders[1])
     for name in ("model.json", "model.safetensors"):
         assert (folders[1] / name).read_bytes() == (folders[0] / name).read_bytes()
@@ -130,7 +130,7 @@ def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
         without_kernels(monkeypatch)
     back = import_object(compiled.spec.method)(method.config)
     back.load(folders[1], device=device)
-    np.testing.assert_allclose(compiled.image(back), image, atol=RENDER_TOLERANCE)
+    np.testing.assert_allclose(compiled.image(back), image, atol=RENDER_TOLERANCE[device])
 
 
 def test_a_training_goes_on_where_it_was_saved(compiled: Compiled, device: str, tmp_path) -> None:
@@ -143,7 +143,7 @@ def test_a_training_goes_on_where_it_was_saved(compiled: Compiled, device: str, 
     resumed.load_training(tmp_path)
     reports = [m.step(63, 63 / tiny_training.STEPS) for m in (method, resumed)]
     assert reports[0].primitives == reports[1].primitives
-    assert reports[1].loss == pytest.approx(reports[0].loss, rel=LOSS_TOLERANCE)
+    assert reports[1].loss == pytest.approx(reports[0].loss, rel=LOSS_TOLERANCE[device])
 
 
 def test_a_step_asks_a_gpu_little_and_gets_no_table(

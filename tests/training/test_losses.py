@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
 from chronoscene.errors import ShapeError
+from chronoscene.training import devices
 from chronoscene.training.losses import (
     mean_volume,
     photometric_loss,
@@ -28,6 +29,16 @@ GRADIENT_TOLERANCE = 3e-6
 # differences of equal numbers, wrong by 1e-7, and stand beside C2 = 9e-4.
 FLAT_VALUE_TOLERANCE = 2e-4
 FLAT_GRADIENT_TOLERANCE = 2e-3
+
+
+@pytest.fixture(params=["compiled", "torch"])
+def code(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The code of a CPU, and that of a GPU."""
+    if request.param == "torch":
+        monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
+
+
+both_codes = pytest.mark.usefixtures("code")
 
 
 def random_images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -92,6 +103,7 @@ def random_mask(height: int, width: int) -> torch.Tensor:
     return mask
 
 
+@both_codes
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_ignored_pixels_are_equal_constants_and_the_loss_is_a_mean_over_the_others(
     weight: float,
@@ -156,10 +168,13 @@ def test_equals_definition(
     assert_equals_reference(image, target.float() / 255 if as_float else target, weight)
 
 
-def test_training_size() -> None:
-    assert_equals_reference(*random_images(240, 320), 0.2)
+@both_codes
+@pytest.mark.parametrize("size", [(240, 320), (1, 1), (1, 9), (23, 2), (16, 16)])
+def test_sizes(size: tuple[int, int]) -> None:
+    assert_equals_reference(*random_images(*size), 0.2)
 
 
+@both_codes
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (23, 2), (16, 16)])
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
 def test_constant_images_are_finite(size: tuple[int, int], level: float) -> None:
@@ -182,6 +197,7 @@ def test_equal_images_cost_nothing(height: int, width: int) -> None:
     assert float(gradient.abs().max()) < 1e-5
 
 
+@both_codes
 def test_bright_images_stay_finite() -> None:
     """Far above 1 the variances are all rounding."""
     image = 3e3 + torch.rand(20, 20, 3, generator=torch.Generator().manual_seed(0))
@@ -191,6 +207,7 @@ def test_bright_images_stay_finite() -> None:
     assert bool(gradient.isfinite().all())
 
 
+@both_codes
 def test_not_a_number_is_not_hidden() -> None:
     image, target = random_images(20, 20)
     image[10, 10, 1] = float("nan")
@@ -211,6 +228,7 @@ def test_same_bits_for_any_thread_count() -> None:
     assert torch.equal(results[0][1], results[1][1])
 
 
+@both_codes
 def test_gradient_scales_with_what_follows() -> None:
     image, target = random_images(12, 13)
     _, once = value_and_gradient(photometric_loss, image, target, 0.2)
@@ -227,6 +245,7 @@ def test_no_gradient_wanted() -> None:
     assert float(value) == pytest.approx(float(truth), abs=VALUE_TOLERANCE)
 
 
+@both_codes
 def test_strided_and_double_images() -> None:
     image, target = random_images(9, 14)
     turned, turned_target = image.transpose(0, 1), target.transpose(0, 1)
@@ -250,6 +269,7 @@ def test_wrong_images(image: torch.Tensor, target: torch.Tensor, message: str) -
         photometric_loss(image, target)
 
 
+@both_codes
 def test_mean_volume_is_the_mean_over_what_is_on() -> None:
     generator = torch.Generator().manual_seed(0)
     scales = torch.rand(10_000, 3, generator=generator).requires_grad_()
@@ -262,3 +282,11 @@ def test_mean_volume_is_the_mean_over_what_is_on() -> None:
     (reference,) = torch.autograd.grad(expected, scales)
     (grad,) = torch.autograd.grad(2.0 * value, scales)
     torch.testing.assert_close(grad, 2.0 * reference, rtol=1e-5, atol=1e-12)
+
+
+@both_codes
+def test_mean_volume_of_nothing_is_zero() -> None:
+    scales = torch.rand(5, 3).requires_grad_()
+    value = mean_volume(scales, torch.zeros(5))
+    value.backward()
+    assert value.item() == 0 and not scales.grad.any()
