@@ -20,19 +20,11 @@ import chronoscene  # noqa: F401
 # isort: split
 import numpy as np
 import torch
-from scenes import surfaces
+from generated_training import PROGRESS, make, training_set
 
 from chronoscene.bench.provenance import code_version, processor_name
 from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
-from chronoscene.methods import (
-    Method,
-    TrainingSet,
-    TrainingView,
-    build_config,
-    import_object,
-    load_spec,
-)
-from chronoscene.scene.similarity import Sim3
+from chronoscene.methods import Method
 
 PLAIN = {"deform_opacity": False, "deform_color": False}
 CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -42,41 +34,6 @@ CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "4dgs balanced, shape only": ("4dgs", "balanced", PLAIN),
 }
 """Name: method, preset, options."""
-PERIODS = 3
-
-
-def training_set(count: int, width: int, height: int) -> TrainingSet:
-    """Points on spheres, seen by a few cameras side by side in each period."""
-    scene, generator = surfaces(count, width, height), np.random.default_rng(0)
-    means, colors = (scene.gaussians[i].detach().numpy() for i in (0, 4))
-    views = []
-    for number in range(4 * PERIODS):
-        pose = scene.viewmats[0].double().numpy().copy()
-        pose[:3, 3] += generator.normal(0, 0.2, 3)
-        K = scene.Ks[0].double().numpy()
-        views.append(TrainingView(K, width, height, pose, f"{number}.png", number % PERIODS))
-    images = generator.integers(0, 256, (len(views), height, width, 3), np.uint8)
-    return TrainingSet(
-        views=tuple(views),
-        num_periods=PERIODS,
-        points=means.astype(np.float32),
-        colors=(255 * colors).astype(np.uint8),
-        point_periods=np.ones((count, PERIODS), bool),
-        training_from_world=Sim3.identity(),
-        camera_extent=1.1,
-        background=np.zeros(3, np.float32),
-        load_image=lambda index: images[index],
-    )
-
-
-def make(train: TrainingSet, name: str, preset: str, options: dict[str, Any]) -> Method:
-    """A method at the beginning of a training, without density control."""
-    spec = load_spec(name)
-    still = {"densify_interval": 10**9, "reset_interval": 10**9, "initial_opacity": 0.5}
-    config = build_config(spec, preset=preset, overrides={**still, **options})
-    method: Method = import_object(spec.method)(config)
-    method.setup(train, seed=0, device="cpu")
-    return method
 
 
 def measure(methods: dict[str, Method], steps: int) -> dict[str, list[tuple[float, float]]]:
@@ -85,8 +42,7 @@ def measure(methods: dict[str, Method], steps: int) -> dict[str, list[tuple[floa
     for index in range(steps):
         for name, method in methods.items():
             wall, processor = time.perf_counter(), time.process_time()
-            # Late enough for all colours and the second stage, and statistics are collected.
-            method.step(index, 0.3 + 0.1 * index / steps)
+            method.step(index, PROGRESS + 0.1 * index / steps)
             spent = time.perf_counter() - wall, time.process_time() - processor
             found[name].append((1e3 * spent[0], 1e3 * spent[1]))
     return found
