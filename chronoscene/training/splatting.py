@@ -396,7 +396,7 @@ class SplattingMethod(ABC):
                 folder,
                 expected=f"a training that {self.name} {self.version} can go on with",
                 found=f"{type(error).__name__}: {error}",
-                todo="go on with the version of the software that began it",
+                todo="go on with the version of the software, and on the device, that began it",
             ) from error
 
     def size(self) -> MethodSize:

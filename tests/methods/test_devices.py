@@ -8,12 +8,13 @@ import dataclasses
 import sys
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from chronoscene.bench import tiny_training
+from chronoscene.bench from chronoscene.errors import CheckpointError
 from chronoscene.methods import (
     Method,
     MethodSpec,
@@ -107,7 +108,7 @@ def test_first_steps_are_those_of_the_compiled_code(
 
 
 def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
-    compiled: Compiled, device: str, tmp_path, monkeypatch: pytest.MonkeyPatch
+    compiled: Compiled, device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Trained on the device, saved; loaded on a CPU with its kernels, saved; loaded again."""
     method = compiled.method(device)
@@ -133,7 +134,9 @@ def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
     np.testing.assert_allclose(compiled.image(back), image, atol=RENDER_TOLERANCE[device])
 
 
-def test_a_training_goes_on_where_it_was_saved(compiled: Compiled, device: str, tmp_path) -> None:
+def test_a_training_goes_on_where_it_was_saved(
+    compiled: Compiled, device: str, tmp_path: Path
+) -> None:
     if not compiled.spec.resumable:
         pytest.skip("the method cannot be resumed")
     method, resumed = compiled.method(device), compiled.method(device)
@@ -144,6 +147,39 @@ def test_a_training_goes_on_where_it_was_saved(compiled: Compiled, device: str, 
     reports = [m.step(63, 63 / tiny_training.STEPS) for m in (method, resumed)]
     assert reports[0].primitives == reports[1].primitives
     assert reports[1].loss == pytest.approx(reports[0].loss, rel=LOSS_TOLERANCE[device])
+
+
+def test_a_training_of_another_device_goes_on_or_is_refused(
+    compiled: Compiled, device: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not compiled.spec.resumable:
+        pytest.skip("the method cannot be resumed")
+    method = compiled.method(device)
+    for i in range(5):
+        method.step(i, i / tiny_training.STEPS)
+    method.save_training(tmp_path)
+    report = method.step(5, 5 / tiny_training.STEPS)
+    monkeypatch.undo()
+    here = compiled.method()
+    try:
+        here.load_training(tmp_path)
+    except CheckpointError as error:
+        assert "on the device, that began it" in str(error)
+    else:
+        found = here.step(5, 5 / tiny_training.STEPS).loss
+        assert found == pytest.approx(report.loss, rel=LOSS_TOLERANCE[device])
+
+
+def test_a_view_of_nothing_is_an_empty_step(compiled: Compiled, device: str) -> None:
+    away = np.diag([1.0, 1.0, 1.0, 1.0])
+    away[2, 3] = -50.0  # everything far behind
+    views = [dataclasses.replace(view, cam_from_world=away) for view in compiled.data.views]
+    data = dataclasses.replace(compiled.data, views=tuple(views))
+    method = Compiled(compiled.spec, data).method(device)
+    before = compiled.image(method)
+    reports = [method.step(i, i / tiny_training.STEPS) for i in range(STEPS)]
+    assert [report.skipped for report in reports] == ["empty"] * STEPS
+    np.testing.assert_array_equal(compiled.image(method), before)
 
 
 def test_a_step_asks_a_gpu_little_and_gets_no_table(
