@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from chronoscene.bench from chronoscene.errors import CheckpointError
+from chronoscene.bench import tiny_training
+from chronoscene.errors import CheckpointError
 from chronoscene.methods import (
     Method,
     MethodSpec,
