@@ -164,6 +164,8 @@ class Job:
             lengths = [*self.continued_from, config["iterations"]]
             differ["iterations"] = "+".join(map(str, lengths))
         if self.budget_seconds is not None:
+            if self.iterations is not None:
+                differ["iterations"] = self.iterations
             differ["budget"] = f"{self.budget_seconds:g}s"
         if self.separate_iterations != SHARING[0]:
             differ["separate_iterations"] = self.separate_iterations

@@ -96,3 +96,19 @@ def test_folders_have_names_that_file_systems_take():
     one, other = (replace(JOB, variant=f"a={'9' * 300}{i}").folder.parent.name for i in (1, 2))
     assert len(one) < 200 and one[:180] == other[:180] and one != other
     assert replace(JOB, variant="path=/a").folder.parent.name.endswith("-path=%2Fa")
+
+
+@pytest.mark.parametrize(
+    ("changes", "variant"),
+    [
+        ({"iterations": 20}, ""),
+        ({"iterations": 9, "overrides": {"rate": "0.25", "sleep": "0"}}, "iterations=9,rate=0.25"),
+        ({"iterations": None, "budget_seconds": 90.0}, "budget=90s"),
+        ({"iterations": 20, "budget_seconds": 1.5}, "iterations=20,budget=1.5s"),
+        ({"iterations": 9, "continued_from": [3, 5]}, "iterations=3+5+9"),
+        ({"iterations": 20, "separate_iterations": "each"}, "separate_iterations=each"),
+    ],
+    ids=str,
+)
+def test_variants_are_named_by_what_differs_from_the_preset(changes, variant):
+    assert replace(JOB, **changes).with_variant(load_spec("toy_methods:MEAN")).variant == variant
