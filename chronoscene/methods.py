@@ -84,6 +84,7 @@ class ProgramConfig:
     """Options of another program. A class of its own with more fields is possible."""
 
     iterations: int = 30_000
+    """Training steps."""
     prefix: str = ""
     """Words before each command: ``conda run -n ENVIRONMENT``, or ``docker run ... IMAGE``."""
     source: str = ""

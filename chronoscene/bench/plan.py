@@ -118,8 +118,8 @@ def _check_lengths(settings: BenchSettings) -> None:
         raise ConfigError(
             options[0],
             expected=f"no {' and no '.join(options[1:])} beside it",
-            found="both",
-            todo="leave one of them out",
+            found=" and ".join(options[1:]),
+            todo="leave all of them but one out",
         )
 
 
@@ -246,8 +246,9 @@ def _lengths(job: Job, spec: MethodSpec) -> Iterator[Job]:
     for file in sorted(job.folder.parent.parent.glob(f"*/{job.folder.name}/{results.RUN_FILE}")):
         config = results.read_config(file.parent)["config"]
         earlier = config.get("continued_from", [])
-        same = replace(job, iterations=config["stop"]["iterations"], continued_from=earlier)
-        if same.iterations is not None and same.with_variant(spec).folder == file.parent:
+        length = config.get("stop", {}).get("iterations")  # images of other programs have none
+        same = replace(job, iterations=length, continued_from=earlier)
+        if length is not None and same.with_variant(spec).folder == file.parent:
             found.append(same.with_variant(spec))
     yield from sorted(found, key=lambda done: len(done.continued_from))
 

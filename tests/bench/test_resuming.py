@@ -148,7 +148,11 @@ def test_finished_runs_are_trained_further(bench_here, tmp_path, strategy):
     names = [p.name for p in sorted((runs / "ring").iterdir())]
     variants = ["", "-iterations=20+30", "-iterations=20+30+42"]
     assert names == [f"drawing-{strategy}-balanced{variant}" for variant in variants]
+    foreign = runs / "ring/other-external-images/seed0"
+    shutil.copytree(run_of(runs), foreign)
+    (foreign / "config.json").write_text('{"config": {"method_config": {}}}')
     again, _ = bench_here(TOY, runs=runs, continue_to=42, **options)
+    shutil.rmtree(foreign)
     assert again.skipped == 1
     with pytest.raises(ConfigError, match=r"rate=0[.]25.* at most 50 iterations, found none"):
         bench_here(TOY, runs=runs, continue_to=50, overrides={"rate": "0.25"}, **options)

@@ -8,7 +8,8 @@ import json
 import numpy as np
 import pytest
 
-from chronoscene.bench.contract import CHECKS, PAUSE, NotApplicableError, Subject
+from chronoscene.bench.contract import CHECKS
+from chronoscene.bench.contract.subject import PAUSE, NotApplicableError, Subject
 from chronoscene.bench.tiny_training import STEPS
 from chronoscene.methods import method_names
 from chronoscene.training.losses import _PhotometricLoss

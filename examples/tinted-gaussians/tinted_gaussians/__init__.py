@@ -13,8 +13,8 @@ SPEC = MethodSpec(
     method="tinted_gaussians.method:TintedGaussians",
     config="tinted_gaussians.method:Config",
     presets={  # balanced and fast are asked for; what they leave out has its default
-        "balanced": {"iterations": 3_000},
-        "fast": {"iterations": 1_000},
+        "balanced": {"iterations": 3_000, "reset_interval": 8_000},
+        "fast": {"iterations": 1_000, "reset_interval": 30_000},
     },
     resumable=True,
 )
