@@ -236,6 +236,7 @@ def test_cuda_agrees(tools: SimpleNamespace, check_agreement: Check) -> None:
         for seed in range(3):
             scene = tools.random_scene(200, 48, 40, seed=seed, render_depth=True)
             check_agreement(scene, "cuda", "cuda")
+            check_agreement(scene.with_(options=ANTIALIASED), "cuda", "cuda")
         opaque = tools.random_scene(400, 40, 40, seed=7)
         opaque = opaque.with_(opacities=np.linspace(0.9, 1.0, 400, dtype=np.float32))
         check_agreement(opaque, "cuda", "cuda")
