@@ -31,7 +31,7 @@ class Options:
     """Whether an earlier registration at the output path may be replaced."""
     max_image_size: int = 1600
     """Pixels; larger photos are downscaled for feature extraction."""
-    max_features: int = 4800
+    max_features: int = 5000
     """Of each photo."""
     exhaustive_limit: int = EXHAUSTIVE_LIMIT
     """Up to so many photos, all pairs are matched."""
