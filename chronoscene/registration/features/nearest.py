@@ -25,6 +25,7 @@ MAX_DISTANCE = 0.7
 
 PAIRS = 64  # Of the 128 numbers of a descriptor
 COLUMNS = 2 * LANES  # Descriptors that a product reads side by side
+CHUNK = 512  # Descriptors that a cache holds while all queries pass by; a multiple of COLUMNS
 NOWHERE = -(2**30)  # Minus the squared length of what fills up the last columns
 
 _FARTHEST = (512 * MAX_DISTANCE) ** 2
@@ -106,25 +107,30 @@ def _search(queries, doubled, squares, index, most, next_most):  # type: ignore[
         most: [Q]
         next_most: [Q]
     """
-    count = len(squares)
-    scores = np.empty((ROW_TILE, count), np.int32)
+    scores = np.empty((ROW_TILE, CHUNK), np.int32)
     lowest = np.int32(2 * NOWHERE)
-    for top in range(0, len(queries), ROW_TILE):
-        left = (queries, top * PAIRS, PAIRS, 1)
-        for column in range(0, count, COLUMNS):
-            right = (doubled, column * PAIRS, COLUMNS)
-            first, out = (squares, column, 0), (scores, column, count)
-            pair_product(left, right, first, out, ROW_TILE, COLUMNS, PAIRS)
-        for i in range(ROW_TILE):
-            row = scores[i]
-            best = lowest
-            for score in row:
-                best = max(best, score)
-            place = 0
-            while row[place] != best:
-                place += 1
-            row[place] = lowest
-            following = lowest
-            for score in row:
-                following = max(following, score)
-            index[top + i], most[top + i], next_most[top + i] = place, best, following
+    most[:] = next_most[:] = lowest
+    for start in range(0, len(squares), CHUNK):
+        count = min(CHUNK, len(squares) - start)
+        for top in range(0, len(queries), ROW_TILE):
+            left = (queries, top * PAIRS, PAIRS, 1)
+            for column in range(0, count, COLUMNS):
+                right = (doubled, (start + column) * PAIRS, COLUMNS)
+                first, out = (squares, start + column, 0), (scores, column, CHUNK)
+                pair_product(left, right, first, out, ROW_TILE, COLUMNS, PAIRS)
+            for i in range(top, top + ROW_TILE):
+                row = scores[i - top, :count]
+                best = lowest
+                for score in row:
+                    best = max(best, score)
+                if best <= most[i]:
+                    next_most[i] = max(next_most[i], best)
+                    continue
+                place = 0
+                while row[place] != best:
+                    place += 1
+                row[place] = lowest
+                following = most[i]
+                for score in row:
+                    following = max(following, score)
+                index[i], most[i], next_most[i] = start + place, best, following

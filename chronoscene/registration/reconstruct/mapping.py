@@ -116,6 +116,7 @@ def pipeline_options(job: Job) -> pycolmap.IncrementalPipelineOptions:
     options.random_seed = SEED
     options.num_threads = job.threads
     options.image_path = job.photos
+    options.extract_colors = False  # those of the final model are extracted when it is written
     options.ba_global_frames_ratio = 1.2
     options.ba_global_points_ratio = 1.2
     return options
