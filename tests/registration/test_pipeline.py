@@ -216,7 +216,7 @@ def test_a_killed_command_goes_on(
     assert not out.exists()
     again = started([str(captures), str(out)])
     assert again.wait() == 0, again.stderr and again.stderr.read()
-    assert {"features", "pairs"} <= check_finished(out, joint[0])
+    assert "features" in check_finished(out, joint[0])
 
 
 @pytest.mark.slow
