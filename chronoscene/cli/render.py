@@ -77,9 +77,10 @@ def command(
     scene: Path | None,
     device: str,
 ) -> None:
-    """Render the finished run in the folder RUN, such as runs/plaza/chronogs-joint-balanced/seed0.
+    """Render the finished run in the folder RUN.
 
-    An orbit goes around the middle of the sparse points, at the height and distance of the cameras.
+    RUN is a folder such as runs/plaza/chronogs-joint-balanced/seed0. An orbit goes around the
+    middle of the sparse points, at the height and distance of the cameras.
     """
     run = open_run(folder, device=device)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")

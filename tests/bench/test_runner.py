@@ -270,7 +270,7 @@ def test_wrong_settings_end_before_anything_is_trained(bench, tmp_path, changes,
 
 def test_wrong_weights_end_before_anything_is_trained(bench, tmp_path):
     (tmp_path / "w").mkdir()
-    with pytest.raises(MetricUnavailableError, match="vgg16-397923af"):
+    with pytest.raises(MetricUnavailableError, match="expected VGG16 and the LPIPS heads"):
         bench("MEAN", lpips_weights=tmp_path / "w")
 
 

@@ -163,7 +163,7 @@ def test_a_folder_without_runs(tmp_path):
 def test_weights_that_are_none(tmp_path):
     (tmp_path / "weights").mkdir()
     arguments = ["score", str(tmp_path), "--lpips-weights", str(tmp_path / "weights")]
-    with pytest.raises(MetricUnavailableError, match="vgg16"):
+    with pytest.raises(MetricUnavailableError, match="expected VGG16 and the LPIPS heads"):
         CliRunner().invoke(cli, arguments, catch_exceptions=False)
     missing = CliRunner().invoke(cli, [*arguments[:-1], str(Path(tmp_path) / "absent")])
     assert missing.exit_code == 2 and "does not exist" in missing.output
