@@ -30,10 +30,11 @@ from chronoscene.io.wording import counted
 @SCENE
 @DEVICE
 def command(folder: Path, period: str, out: Path, scene: Path | None, device: str) -> None:
-    """Write a period of the finished run in RUN as Gaussians.
+    """Write a period of a finished run as Gaussians.
 
-    The file is the PLY of 3DGS, in the world of the scene. What changes with the direction is
-    fitted to the training views; the PSNR lost by that on the test views is printed.
+    RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. The file has the PLY format
+    of 3DGS, in the world of the scene. What changes with the direction is fitted to the training
+    views; the PSNR lost by that on the test views is printed.
     """
     run = open_run(folder, device=device)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
