@@ -79,7 +79,8 @@ def command(
 ) -> None:
     """Render a finished run from any camera.
 
-    RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. An orbit goes around the middle of the sparse points, at the height and distance of the cameras.
+    RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. An orbit goes around the
+    middle of the sparse points, at the height and distance of the cameras.
     """
     run = open_run(folder, device=device)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
