@@ -74,7 +74,8 @@ def test_unknown_method_names_the_known_ones():
 def test_listing_methods_imports_nothing_heavy():
     code = (
         "import sys; from chronoscene.methods import load_spec, method_names\n"
-        "for name in method_names(): load_spec(name)\n"
+        "from chronoscene.methods import PROGRAM_GROUP\n"
+        "for name in method_names() + method_names(PROGRAM_GROUP): load_spec(name)\n"
         "heavy = {'torch', 'numba', 'open3d', 'cv2', 'matplotlib', 'pycolmap'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )

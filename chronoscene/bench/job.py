@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import shlex
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -276,7 +277,16 @@ def check_runner(job: Job, spec: MethodSpec, runner: Runner) -> None:
             todo="correct the specification of the method",
         )
     options = dataclasses.asdict(config)
-    used = used_values(runner, config.prefix)
+    try:
+        shlex.split(config.prefix)
+        used = used_values(runner, config.prefix)
+    except ValueError as error:
+        raise ConfigError(
+            f"{spec.name} --set prefix",
+            expected="words as for a shell, with {work} and the like for values, {{ for a brace",
+            found=str(error),
+            todo="correct the prefix",
+        ) from error
     for name in sorted(used):
         check_choice(f"{spec.name}: commands", name, {*VALUES, *options})
         if options.get(name) == "":

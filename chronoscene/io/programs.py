@@ -12,6 +12,7 @@ from subprocess import DEVNULL, STDOUT, Popen, TimeoutExpired
 
 from chronoscene.errors import ProgramError
 from chronoscene.io.processes import Outcome, end_processes, process_tree, stoppable
+from chronoscene.io.wording import printable
 
 END_OF_LOG = 300  # Characters that an error repeats
 FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0
@@ -76,7 +77,7 @@ def run_program(command: Sequence[str], *, folder: Path, log: Path) -> Usage:
             shlex.join(command)[:80],
             expected="the program to succeed",
             found=f"{Outcome(process.returncode, None).cause}; {log.name} ends with: "
-            + " | ".join(log_lines(log))[-END_OF_LOG:],
+            + printable(" | ".join(log_lines(log))[-END_OF_LOG:]),
             todo="correct what it says",
         )
     return Usage(seconds, peak or None)

@@ -182,6 +182,8 @@ def test_a_view_without_an_image_is_named(bench_here, monkeypatch):
             {"overrides": {"source": "x"}, "budget_seconds": 9.0},
             "--budget: expected",
         ),
+        ("PROGRAM", {"overrides": {"prefix": "env 'A=1"}}, "prefix: .* found No closing quotation"),
+        ("PROGRAM", {"overrides": {"prefix": "env {A"}}, "prefix: .* found expected '}' before"),
         ("OTHER_CONFIG", {}, "toy_methods:Config: expected a ProgramConfig, .* found Config"),
         ("PROGRAM", {"keep_training": True}, "expected methods that can be trained further"),
     ],

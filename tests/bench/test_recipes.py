@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import tomllib
 import venv
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from chronoscene.images.decoding import load_rgb
 from chronoscene.methods import MethodSpec, build_config, load_spec
 from chronoscene.metrics.psnr_ssim import psnr
 
+ROOT = Path(__file__).parents[2]
 STAND_INS = Path(__file__).parent / "plugins/foreign_programs.py"
 SPECS = {name: spec for name, spec in vars(external).items() if isinstance(spec, MethodSpec)}
 
@@ -117,7 +119,7 @@ else:
 
 def test_the_recipe_of_the_page_runs(bench_here, tmp_path, monkeypatch):
     """As it is printed, with a program in an environment without packages."""
-    page = Path(__file__).parents[2] / "docs/other-programs.md"
+    page = ROOT / "docs/other-programs.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "recipe.py").write_text(code)
     (tmp_path / "mine.py").write_text(MINE)
@@ -189,6 +191,14 @@ def test_the_list_of_methods_tells_programs_apart(monkeypatch):
     assert "3dgs" in methods and "official" not in methods
     for spec in names.values():
         assert spec.name in programs and load_spec(f"baselines.external:{_variable(spec)}") is spec
+
+
+def test_recipes_are_registered_under_their_names():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    registered = project["entry-points"]["chronoscene.programs"]
+    assert {name: load_spec(place).name for name, place in registered.items()} == {
+        spec.name: spec.name for spec in SPECS.values()
+    }
 
 
 def test_a_program_is_described_with_its_commands():

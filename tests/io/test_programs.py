@@ -54,8 +54,10 @@ def test_the_memory_is_that_of_all_processes(tmp_path):
 
 
 def test_a_failure_ends_in_the_last_lines_of_the_log(tmp_path):
-    code = "import sys; print(*range(20), sep='\\n'); sys.exit('no GPU here')"
-    message = r"to succeed, found exit status 1; log\.txt ends with: .*18 \| 19 \| no GPU here; "
+    code = "import sys; print(*range(20), sep='\\n'); sys.exit('\\x1b[31mno GPU here')"
+    message = (
+        r"to succeed, found exit status 1; log\.txt ends with: .*19 \| \\x1b\[31mno GPU here; "
+    )
     with pytest.raises(ProgramError, match=message):
         run(python(code), tmp_path)
     with pytest.raises(ProgramError, match="signal SIGABRT"):
