@@ -14,7 +14,7 @@ from pathlib import Path
 from chronoscene.bench.job import Job
 from chronoscene.bench.results import PHOTOS
 from chronoscene.errors import ConfigError
-from chronoscene.images.disk_cache import DiskCache
+from chronoscene.images.disk_cache import DiskCache, files_of
 from chronoscene.images.store import ImageStore
 from chronoscene.io.wording import counted
 from chronoscene.kernels.runtime import available_threads
@@ -64,7 +64,7 @@ def photo_needs(scene: Scene, job: Job) -> PhotoNeeds:
     frames = scene.select(split="train")
     photos = [sizes.bytes_of(frame) for frame in frames]
     total, largest = sum(photos), max(photos)
-    # Copies of the result: as it is decoded, and as it goes into memory or to the disk.
+    # With two copies of the result: as it is decoded, and as it goes into memory.
     decoding = _DECODING * max(_pixels(frame) for frame in frames) + 2 * largest
     # Files that are being decoded take half of the memory, or there is one at a time.
     threads = job.threads or available_threads()
@@ -149,7 +149,7 @@ def _check_memory(scene: Scene, needs: PhotoNeeds) -> None:
 def _check_disk(job: Job, needs: PhotoNeeds, images: int) -> None:
     """Whether decoded photos, and test images of so many bytes, have room."""
     folder = Path(job.runs)
-    kept = sum(file.stat().st_size for file in (folder / PHOTOS).glob("*"))
+    kept = sum(stat.st_size for stat in files_of(folder / PHOTOS).values())
     while not folder.exists():
         folder = folder.parent
     free = shutil.disk_usage(folder).free + kept

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from zipfile import BadZipFile
@@ -83,15 +84,23 @@ class DiskCache:
 
     def _make_room(self, size: int) -> bool:
         """Delete files for one of this size; whether it has room."""
-        with os.scandir(self.folder) as entries:
-            files = [(entry.stat(), entry.path) for entry in entries]
-        total = sum(stat.st_size for stat, _ in files)
-        for stat, path in sorted(files, key=lambda item: item[0].st_mtime):
+        files = files_of(self.folder)
+        total = sum(stat.st_size for stat in files.values())
+        for path, stat in sorted(files.items(), key=lambda item: item[1].st_mtime):
             if total + size <= self._limit or stat.st_mtime >= self._made:
                 break
-            Path(path).unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
             total -= stat.st_size
         return total + size <= self._limit
+
+
+def files_of(folder: Path) -> dict[Path, os.stat_result]:
+    """The files of a cache, without those that another process deletes meanwhile."""
+    files = {}
+    for path in folder.glob("*"):
+        with suppress(FileNotFoundError):
+            files[path] = path.stat()
+    return files
 
 
 def _read(file: Path, size: tuple[int, int]) -> Photo | None:

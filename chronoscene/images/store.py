@@ -154,15 +154,14 @@ class ImageStore:
     def expect(self, frames: Sequence[Frame]) -> None:
         """Decode images in the background that will be needed next, in their order.
 
-        As many as the decoders may be ahead, and as fit into memory beside the one in use. An image
-        that cannot be decoded raises its error when it is loaded.
+        That is the first one and as many as the decoders may be ahead, but no more than fit into
+        memory. An image that cannot be decoded raises its error when it is loaded.
         """
         room = self._limit
         with self._lock:
-            for frame in frames[: self._ahead]:
-                size = self.bytes_of(frame)
-                room -= size
-                if room < size:
+            for frame in frames[: 1 + self._ahead]:
+                room -= self.bytes_of(frame)
+                if room < 0:
                     break
                 if frame.name in self._cache:
                     self._cache.move_to_end(frame.name)  # it must not leave before it is used

@@ -25,7 +25,7 @@ class ViewSampler:
     Args:
         count: Number of views to draw from.
         seed: Seed of the run.
-        expect: Called in each draw with the views of the next ones: `TrainingSet.expect`.
+        expect: Called in each draw with its view and those of the next draws: `TrainingSet.expect`.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class ViewSampler:
     def next(self) -> int:
         """Index of the next view, 0..count-1."""
         draws = range(self.drawn, self.drawn + min(1 + AHEAD, self.count))
-        number, *others = [self._view(draw) for draw in draws]
+        views = [self._view(draw) for draw in draws]
+        self._expect(views)
         self.drawn += 1
-        self._expect(others)
-        return number
+        return views[0]
 
     def _view(self, draw: int) -> int:
         """Index of the view of a draw, counted from 0."""

@@ -42,7 +42,7 @@ def test_each_draw_says_what_the_next_ones_will_be(count, seed, done):
     sampler.drawn = done
     drawn = [sampler.next() for _ in range(3 * AHEAD)]
     for i in range(AHEAD):
-        assert said[i] == drawn[i + 1 : i + 1 + min(AHEAD, count - 1)]
+        assert said[i] == drawn[i : i + min(1 + AHEAD, count)]
     assert len(sampler._pools) <= 2
 
 
