@@ -104,7 +104,7 @@ def test_gaussians_that_are_off_leave_the_background(method: Make, noise_set: Ca
     decoded = decode_all(made.model, [1.0, 0.0, 0.0])
     volume = mean_volume(decoded.scales, decoded.opacities)
     assert float(volume.detach()) == 0.0
-    raster = draw(decoded, view, torch.zeros(3), near_plane=NEAR_PLANE, antialiased=False)
+    raster = draw(decoded, view, torch.zeros(3), near_plane=NEAR_PLANE)
     (raster.image.sum() + volume).backward()
     for name in ("features", "offsets", "log_scales"):
         grad = getattr(made.model, name).grad

@@ -283,13 +283,15 @@ def test_a_near_plane_is_trained_stored_and_rendered_with(
     assert usual.depth[usual.alpha > 0].min() < 2.0
 
 
-def test_models_from_before_the_near_plane_was_stored_have_the_default(
+def test_models_from_before_all_rules_were_stored_have_the_defaults(
     noise_set: Callable[[int], TrainingSet], method: Make, tmp_path: Path
 ) -> None:
     made = method(length_unit="training")
     made.save(tmp_path)
     meta = json.loads((tmp_path / "model.json").read_text())
     del meta["layout"]["near_plane"], meta["config"]["near_plane"]
+    for name in ("antialiased", "distance_heads", "distance_scale", "feature_bank"):
+        del meta["layout"][name]
     (tmp_path / "model.json").write_text(json.dumps(meta))
     loaded = ChronoGS(ChronoGSConfig(near_plane=1.0))
     loaded.load(tmp_path, device="cpu")
