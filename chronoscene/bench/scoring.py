@@ -174,7 +174,7 @@ def changes(before: Mapping[str, Values], after: Mapping[str, Values]) -> list[s
     """What differs between two sets of aggregates, in words, one line per metric."""
     old, new = before.get("macro", {}), after.get("macro", {})
     lines = []
-    for name in (n for n in all_metrics() if n in old or n in new):
+    for name in dict.fromkeys([*old, *new]):
         if name not in old:
             lines.append(f"{name} new: {new[name]:.6g}")
         elif name not in new:

@@ -161,6 +161,8 @@ def test_changes_are_told_in_words():
     assert changes(before, after) == ["psnr 20 -> 21 (macro)", "lpips_vgg dropped, was 0.1"]
     assert changes(after, before)[-1] == "lpips_vgg new: 0.1"
     assert changes(before, before) == []
+    gone = "mae dropped, was 0.1"  # its package is not installed any more
+    assert changes(kinds(mae=0.1), kinds()) == [gone]
     after = kinds(psnr=20.0, ssim=0.5, lpips_vgg=0.1)
     after["worst"]["ssim"] = 0.4
     assert changes(before, after) == ["ssim 0.5 -> 0.5 (macro)"]
