@@ -24,7 +24,7 @@ from chronoscene.kernels.compilation import kernel
 from chronoscene.methods import View
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, NUM_BASES, basis
-from chronoscene.training.splatting import Splats, draw
+from chronoscene.training.splatting import Splats, camera_centre_tensor, draw
 
 RIDGE = 0.01
 """Penalty on the squares of all coefficients but the constant one, as a share of all weights."""
@@ -61,7 +61,7 @@ def bake(
         log_scales[at] += w[:, None] * splats.scales.log()
         dyads[at] += w[:, None, None] * splats.quats[:, :, None] * splats.quats[:, None, :]
         light[at] += w / splats.opacities
-        directions = torch.nn.functional.normalize(splats.means - model.seen_from(view)[0].cpu())
+        directions = torch.nn.functional.normalize(splats.means - camera_centre_tensor(view))
         arrays = (at, w, basis(directions, MAX_DEGREE), splats.colors - 0.5, normal, moments)
         _add(*(array.numpy() for array in arrays))
     total = totals[kept]

@@ -63,11 +63,18 @@ def find_shots(source: str, run: OpenRun, scene_root: Path | None, frames: int) 
         frames: Number of pictures of an orbit.
 
     Raises:
-        ConfigError: If the source is none of these.
+        ConfigError: If the source is none of these, or has no camera.
         SceneError: If the scene or the file is missing, damaged, or of an unknown kind.
     """
     if source in VIEWS:
         scene = run.scene(scene_root)
+        if source == "test" and not scene.select(split="test"):
+            raise ConfigError(
+                f"--cameras {source}",
+                expected="a scene with test views",
+                found=f"none in {scene.root}",
+                todo="use --cameras all",
+            )
         return _around(run, scene, frames) if source == "orbit" else _of_scene(run, scene, source)
     path = Path(source)
     if path.is_dir():
@@ -91,7 +98,7 @@ def with_periods(
         shots: Those of a path go through a range of periods on their way; each of the others shows
             the whole range.
         run: Says whether there is something between two periods.
-        periods: None, so that each camera shows its own; one; or both ends of a range.
+        periods: Empty, so that each camera shows its own; one; or both ends of a range.
         frames: Number of pictures of a range.
 
     Raises:

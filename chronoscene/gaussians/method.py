@@ -79,7 +79,6 @@ class GaussianMethod(SplattingMethod):
     def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
         p = self.model.at_period(period)
         sh_coeffs = torch.cat([p["sh_dc"][:, None], p["sh_rest"]], dim=1)
-        sh_coeffs[:, (self.model.sh_degree + 1) ** 2 :] = 0.0
         scales, opacities = scales_of(p["log_scales"]), opacities_of(p["logit_opacities"])
         tensors = (p["means"], p["quats"], scales, opacities, sh_coeffs)
         return GaussianCloud(*(tensor.cpu().numpy() for tensor in tensors))

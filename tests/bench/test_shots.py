@@ -129,6 +129,15 @@ def test_a_camera_path_that_is_none(run, tmp_path, changes, message):
         shots_of(run, tmp_path / "path.json")
 
 
+def test_a_scene_without_test_views(run, monkeypatch):
+    scene = run.scene()
+    frames = [replace(frame, split="train") for frame in scene.frames]
+    monkeypatch.setattr(type(run), "scene", lambda self, root: scene.with_frames(frames))
+    assert len(shots_of(run, "all").shots) == 8
+    with pytest.raises(ConfigError, match="--cameras test: expected a scene with test views"):
+        shots_of(run, "test")
+
+
 def test_a_source_that_is_none(run):
     with pytest.raises(ConfigError, match="--cameras tent: expected test, all, orbit, the folder"):
         shots_of(run, "tent")
