@@ -2,7 +2,7 @@
 
     python benchmarks/training_step.py SCENE [--train 1500] [--anchors 31000] [--steps 200]
     python benchmarks/training_step.py SCENE --model RUN/checkpoint
-    python benchmarks/training_step.py --generated 1200000 --size 1600 1200 --method chronogs
+    python benchmarks/training_step.py --generated 1200000 --size 1600 1200 --device cuda
 
 The first two are of ChronoGS on a CPU: it trains on a scene until the model is of a realistic size,
 then every part of ordinary steps is timed, neither the rounds that grow and prune, nor the reading
@@ -13,10 +13,10 @@ look at the minimum.
 The parts are timed inside real steps; what torch's autograd and Python need between them is the
 line "rest".
 
-The last is of any method on a GPU, on so many generated points: each becomes an anchor or a
-Gaussian. Steps are timed as they are. Then once more with the host waiting for the GPU before and
-after each part, which takes longer but says what the parts take. Then under torch's profiler, which
-says for how long the GPU does anything, what is copied, and how often the host waits.
+The last is of any method, on so many generated points: each becomes an anchor or a Gaussian. Steps
+are timed as they are. Then once more by parts, with the host waiting for the GPU before and after
+each, which takes longer but says what the parts take. Then under torch's profiler, which says for
+how long the GPU does anything, what is copied, and how often the host waits.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.anchors.model import AnchorModel
 from chronoscene.anchors.trainer import AnchorTrainer
+from chronoscene.bench.job import check_device
 from chronoscene.bench.provenance import code_version, library_versions, processor_name
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.formats import read_scene
@@ -211,8 +212,9 @@ def report(columns: dict[str, dict[str, list[float]]], parts: Sequence[Timed] = 
             continue
         cells = []
         for found in columns.values():
-            times = sorted(found.get(part, [0.0]))
-            cells.append(f"{times[len(times) // 2]:10.2f}{times[0]:10.2f}")
+            times = sorted(found.get(part, []))
+            numbers = f"{times[len(times) // 2]:10.2f}{times[0]:10.2f}" if times else ""
+            cells.append(f"{numbers:>20}")
         print(f"{part:<30}" + "".join(cells))
 
 
@@ -230,26 +232,27 @@ def profiled(steps: Sequence[Callable[[], object]]) -> Summary:
         return summary(json.loads(trace.read_text())["traceEvents"], len(steps))
 
 
-def time_on_gpu(name: str, preset: str, points: int, size: tuple[int, int], steps: int) -> None:
+def time_generated(
+    name: str, preset: str, points: int, size: tuple[int, int], *, steps: int, device: str
+) -> None:
     """Time a method on generated points and print where the time goes."""
-    method = make(training_set(points, *size), name, preset, device="cuda")
+    on_gpu = device == "cuda"
+    parts, settle = (GPU_PARTS, torch.cuda.synchronize) if on_gpu else (PARTS, lambda: None)
+    method = make(training_set(points, *size), name, preset, device=device)
 
     def some(how_many: int) -> list[Callable[[], object]]:
         return [lambda i=i: method.step(i, PROGRESS) for i in range(100, 100 + how_many)]
 
-    print(f"{gpu_name()}, {library_versions()}, commit {code_version()}")
+    machine = gpu_name() if on_gpu else f"{processor_name()}, {available_threads()} threads"
+    print(f"{machine}, {library_versions()}, commit {code_version()}")
     print(f"{name} {preset}, {method.size().primitives} primitives, {size[0]}x{size[1]}")
     measure(some(10), ())  # build kernels, touch memory
-    torch.cuda.reset_peak_memory_stats()
     free = measure(some(steps), ())
-    peak = torch.cuda.max_memory_allocated()
-    columns = {
-        "as it is": {"step": free["step"]},
-        "parts waited for": measure(some(steps), GPU_PARTS, torch.cuda.synchronize),
-    }
-    report(columns, GPU_PARTS)
-    seen = profiled(some(20))
-    whole = sorted(free["step"])[steps // 2]
+    by_part = measure(some(steps), parts, settle)
+    report({"as it is": {"step": free["step"]}, "by parts": by_part}, parts)
+    if not on_gpu:
+        return
+    seen, whole = profiled(some(20)), sorted(free["step"])[steps // 2]
     print(f"GPU busy {seen.busy_ms:.2f} ms per step: {100 * seen.busy_ms / whole:.0f} % of it")
     print(
         f"to the host {seen.bytes_to_host:.0f} bytes in {seen.copies_to_host:.1f} copies per step"
@@ -257,7 +260,7 @@ def time_on_gpu(name: str, preset: str, points: int, size: tuple[int, int], step
     print(
         f"from the host {seen.bytes_from_host:.0f} bytes; it waits {seen.waits:.1f} times per step"
     )
-    print(f"peak memory of the GPU {peak / 1e6:.0f} MB")
+    print(f"peak memory of the GPU {torch.cuda.max_memory_allocated() / 1e6:.0f} MB")
 
 
 def gpu_name() -> str:
@@ -271,7 +274,7 @@ def gpu_name() -> str:
 
 
 def main() -> None:
-    """Train, or load; then time the parts with one thread and with all. Or time on a GPU."""
+    """Train, load or generate; then time the parts."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("scene", type=Path, nargs="?")
     parser.add_argument("--model", type=Path, help="checkpoint folder to start from")
@@ -280,17 +283,18 @@ def main() -> None:
     parser.add_argument("--anchors", type=int, default=31_000, help="limit, without --model")
     parser.add_argument("--steps", type=int, default=200, help="timed steps")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--generated", type=int, metavar="POINTS", help="without a scene, on a GPU")
+    parser.add_argument("--generated", type=int, metavar="POINTS", help="instead of a scene")
     parser.add_argument("--method", default="chronogs", choices=method_names())
     parser.add_argument("--size", type=int, nargs=2, default=(800, 600), metavar=("W", "H"))
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     args = parser.parse_args()
     if (args.scene is None) == (args.generated is None):
         parser.error("name a scene, or --generated")
     keep_freed_memory()
     if args.generated:
-        if not torch.cuda.is_available():
-            parser.error("--generated: torch sees no CUDA device")
-        time_on_gpu(args.method, args.preset, args.generated, tuple(args.size), args.steps)
+        check_device(args.device)
+        sizes = args.generated, tuple(args.size)
+        time_generated(args.method, args.preset, *sizes, steps=args.steps, device=args.device)
         return
     scene = read_scene(args.scene)
     (part,) = make_parts(scene, ImageStore(scene), "joint")
