@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,6 @@ from chronoscene.gaussians.model import GaussianModel
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, TrainingView, build_config
 from chronoscene.scene.similarity import Sim3
-from chronoscene.training import devices
 
 Path3D = Callable[[float], tuple[float, float, float]]
 RED = torch.tensor([0.95, 0.2, 0.1])
@@ -303,7 +303,9 @@ def test_what_a_gpu_runs_trains_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, found = moving_scene(arc), []
     for compiled in (True, False):
         if not compiled:
-            monkeypatch.setattr(devices, "has_kernels", lambda *tensors: False)
+            plain = SimpleNamespace(has_kernels=lambda *tensors: False)
+            for module in ("field", "field.smoothness"):
+                monkeypatch.setattr(f"baselines.deformation_4dgs.{module}.devices", plain)
         method = Deformation4DGS(config(coarse_until=0))
         method.setup(scene, seed=0, device="cpu")
         losses = [method.step(index, 0.1).loss for index in range(3)]
