@@ -78,7 +78,7 @@ def measure_loss(
 
 def _own_period(run: OpenRun, period: float) -> int | None:
     """The one period that a model was trained on; None for all of them."""
-    return int(period) if run.record.strategy == "separate" else None
+    return int(period) if run.strategy.model_per_period else None
 
 
 def _views(run: OpenRun, scene: Scene, frames: Iterable[Frame]) -> Iterable[View]:

@@ -21,6 +21,7 @@ from chronoscene.bench.results import (
     read_config,
     read_run,
 )
+from chronoscene.bench.strategies import STRATEGIES, Strategy
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import write_text_atomic
@@ -79,6 +80,11 @@ class OpenRun:
     _models: dict[str, Method] = field(default_factory=dict)
 
     @property
+    def strategy(self) -> Strategy:
+        """What its models know of the periods."""
+        return STRATEGIES[self.record.strategy]
+
+    @property
     def num_periods(self) -> int:
         """Periods of the scene, numbered from 0."""
         return len(self.record.period_labels)
@@ -86,7 +92,7 @@ class OpenRun:
     @property
     def is_continuous(self) -> bool:
         """Whether periods in between, such as 0.5, can be rendered."""
-        return self.spec.period_input == "continuous" and self.record.strategy == "joint"
+        return self.spec.period_input == "continuous" and self.strategy.tells_period
 
     def check_period(self, period: float) -> None:
         """Refuse a period that the models do not claim.
@@ -138,7 +144,7 @@ class OpenRun:
 
     def model(self, period: float) -> Method:
         """The model that answers for a period, loaded at its first use."""
-        part = f"period-{int(period)}" if self.record.strategy == "separate" else ""
+        part = f"period-{int(period)}" if self.strategy.model_per_period else ""
         if part not in self._models:
             self._models[part] = self._load(self.folder / CHECKPOINT / part)
         return self._models[part]
@@ -157,7 +163,7 @@ class OpenRun:
 
     def told(self, period: float) -> float:
         """What a model is told that is to show a period."""
-        return float(period) if self.record.strategy == "joint" else 0.0
+        return float(period) if self.strategy.tells_period else 0.0
 
     def view(self, camera: Camera, cam_from_world: NDArray[np.float64]) -> View:
         """A camera without distortion as the models see it; its pose is in the world. [4, 4]"""
@@ -206,7 +212,7 @@ class OpenRun:
             ConfigError: If it does not, or does not claim the period.
         """
         self.check_period(period)
-        if self.record.strategy != "joint" or not hasattr(self.model(period), "render_split"):
+        if not self.strategy.tells_period or not hasattr(self.model(period), "render_split"):
             raise ConfigError(
                 f"appearance of period {period:g}",
                 expected="one model of all periods that keeps geometry and colours apart",

@@ -13,7 +13,7 @@ from chronoscene.bench.job import PHOTO_DISK, PHOTO_MEMORY, Job, check_job
 from chronoscene.bench.photos import check_room
 from chronoscene.bench.predictions import freeze_ground_truth
 from chronoscene.bench.provenance import code_version, scene_hash
-from chronoscene.bench.strategies import check_scene, effective_strategy
+from chronoscene.bench.strategies import STRATEGIES, check_scene, effective_strategy
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import MAX_WIDTH, ImageStore
@@ -169,10 +169,10 @@ def _scene_jobs(
     for (reference, spec), wanted, seed in product(specs, settings.strategies, settings.seeds):
         strategy, notice = effective_strategy(spec, wanted)
         notices = [notice] if notice else []
-        if strategy == "separate":
+        if STRATEGIES[strategy].model_per_period:
             each = settings.separate_iterations == "each"
             has = "each model has all" if each else "the models of a run share the"
-            notices.append(f"separate: {has} iterations and time")
+            notices.append(f"{strategy}: {has} iterations and time")
         job = Job(
             scene_root=str(scene.root.resolve()),
             scene_format=scene.format,

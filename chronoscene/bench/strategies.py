@@ -17,7 +17,22 @@ from chronoscene.scene.cameras import PINHOLE_MODELS
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3
 
-STRATEGIES = ("joint", "pooled", "separate")
+
+@dataclass(frozen=True, slots=True)
+class Strategy:
+    """What distinguishes a strategy from the others."""
+
+    tells_period: bool
+    """Whether models are told the period; else they are asked for period 0 whatever it is."""
+    model_per_period: bool
+    """Whether each period has a model of its own."""
+
+
+STRATEGIES = {
+    "joint": Strategy(tells_period=True, model_per_period=False),
+    "pooled": Strategy(tells_period=False, model_per_period=False),
+    "separate": Strategy(tells_period=False, model_per_period=True),
+}
 """``joint``: one model, told the period. ``pooled``: one model, the period hidden from it.
 ``separate``: one model per period, which sees the images and points of that period alone."""
 
@@ -29,7 +44,7 @@ class Part:
     """One model to train, and the test views that it answers for."""
 
     name: str
-    """``all``, or ``period-<id>`` under the strategy separate."""
+    """``all``, or ``period-<id>`` of a model of one period."""
     train: TrainingSet
     test: tuple[Frame, ...]
     store: ImageStore
@@ -50,8 +65,8 @@ class Part:
 def effective_strategy(spec: MethodSpec, strategy: str) -> tuple[str, str | None]:
     """The strategy that a method can follow, and a notice where it is not the one asked for."""
     check_choice("--strategy", strategy, STRATEGIES)
-    if strategy == "joint" and spec.period_input == "none":
-        notice = f"{spec.name} takes no period: joint is run and recorded as pooled"
+    if STRATEGIES[strategy].tells_period and spec.period_input == "none":
+        notice = f"{spec.name} takes no period: {strategy} is run and recorded as pooled"
         return "pooled", notice
     return strategy, None
 
@@ -68,14 +83,16 @@ def make_parts(scene: Scene, store: ImageStore, strategy: str) -> tuple[Part, ..
     check_choice("--strategy", strategy, STRATEGIES)
     check_scene(scene)
     to_training = training_frame(scene)
-    if strategy != "separate":
-        train = _training_set(scene, store, to_training, None, hide_period=strategy == "pooled")
-        return (Part("all", train, scene.select(split="test"), store, strategy == "pooled"),)
+    kind = STRATEGIES[strategy]
+    hide = not kind.tells_period
+    if not kind.model_per_period:
+        train = _training_set(scene, store, to_training, None, hide_period=hide)
+        return (Part("all", train, scene.select(split="test"), store, hide),)
     parts = []
     for period in scene.periods:
         test = scene.select(split="test", period=period.id)
-        train = _training_set(scene, store, to_training, period.id, hide_period=True)
-        parts.append(Part(f"period-{period.id}", train, test, store, True))
+        train = _training_set(scene, store, to_training, period.id, hide_period=hide)
+        parts.append(Part(f"period-{period.id}", train, test, store, hide))
     return tuple(parts)
 
 
