@@ -37,6 +37,7 @@ TAKEN = {
     "no distortion": lambda scene: scene.write(CAMERAS, "1 OPENCV 64 48 50 50 32 24 0 0 0 0"),
     "one image without points": lambda scene: without_points(scene, [1]),
     "no test image in one period": lambda scene: scene.write(TEST, "a003.png"),
+    "no test image": lambda scene: scene.write(TEST, ""),
 }
 
 REFUSED = {
@@ -44,7 +45,6 @@ REFUSED = {
     "little distortion": lambda scene: scene.write(CAMERAS, "1 SIMPLE_RADIAL 64 48 50 32 24 1e-9"),
     "fisheye": lambda scene: scene.write(CAMERAS, "1 OPENCV_FISHEYE 64 48 50 50 32 24 0 0 0 0"),
     "division": lambda scene: scene.write(CAMERAS, "1 SIMPLE_DIVISION 64 48 50 32 24 0"),
-    "no test image": lambda scene: scene.write(TEST, "nobody"),
     "no training image": lambda scene: scene.write(
         TEST, [f"{p}{i:03d}.png" for p in "ab" for i in range(7)]
     ),

@@ -111,13 +111,14 @@ def single_period(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
         yield Hit(scene.period_place, "two or more periods", "one")
 
 
-@rule.error(
+@rule.warning(
     "CS407",
     bad="an empty `test.txt`",
-    remedy="list images of every period in sparse/0/test.txt, or delete it for the default split",
+    remedy="list images of every period in sparse/0/test.txt, or delete it for the default split; "
+    "nothing to do where all photos are for training",
 )
 def no_test_view(scene: RawScene, tests: set[str]) -> Iterator[Hit]:
-    """There is no test view at all, so nothing can be measured. Benchmarks refuse the scene."""
+    """There is no test view at all, so trainings on the scene are not scored."""
     if scene.periods and not tests:
         yield Hit(TEST, "test views", "none that is an image of the model")
 
