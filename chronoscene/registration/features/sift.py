@@ -25,8 +25,8 @@ CONTRAST_THRESHOLD = 0.004
 """A fifth of COLMAP's: what dark photos have in common with others lies below that."""
 
 STRONG = 0.0133
-"""Contrast from which a feature goes before all fainter ones, however large those are. Two thirds of
-COLMAP's threshold, by which OpenCV finds as many features as COLMAP does."""
+"""Contrast from which a feature goes before all fainter ones, however large those are. Two thirds
+of COLMAP's threshold, by which OpenCV finds as many features as COLMAP does."""
 
 EDGE_THRESHOLD = 10.0  # COLMAP's
 LENGTH = 512.0  # Of a descriptor, as COLMAP stores it
@@ -75,8 +75,8 @@ def sift_features(
     )
     found = sift.detect(grey, None if mask is None else mask.astype(np.uint8))
     # OpenCV divides thresholds, and so responses, by the layers of an octave.
-    faint = [k.response < STRONG / sift.getNOctaveLayers() for k in found]
-    kept = np.lexsort([[-k.size for k in found], faint])[:max_features]
+    faint = np.array([k.response for k in found]) < STRONG / sift.getNOctaveLayers()
+    kept = np.lexsort((np.array([-k.size for k in found]), faint))[:max_features]
     if not len(kept):
         return np.zeros((0, 6), np.float32), np.zeros((0, 128), np.uint8)
     # Another pyramid takes less time than descriptors of all that detailed photos have.
