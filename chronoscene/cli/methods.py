@@ -72,7 +72,7 @@ def _program_table(names: tuple[str, ...]) -> Table:
     """Methods that are other programs, which are installed on their own."""
     table = Table(title="External programs, installed apart from ChronoScene")
     for column in ("name", "title", "period input", "tested", "paper"):
-        table.add_column(column)
+        table.add_column(column, no_wrap=column == "name")
     for spec in map(load_spec, names):
         tested = spec.runner.tested if spec.runner else ""
         table.add_row(spec.name, spec.title, spec.period_input, tested, spec.paper)
