@@ -26,9 +26,9 @@ from chronoscene.bench.display import ProgressDisplay
 from chronoscene.bench.foreign_images import add_images, foreign_record
 from chronoscene.bench.job import Job, StopRule, used_values
 from chronoscene.bench.opening import write_source
-from chronoscene.bench.predictions import ImageWriter, encode_png, ground_truth_folder
+from chronoscene.bench.predictions import ImageWriter, encode_png
 from chronoscene.bench.provenance import method_version, processor_name
-from chronoscene.bench.scoring import score_run
+from chronoscene.bench.scoring import score_job
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.errors import ImageError, ProgramError
 from chronoscene.formats import load_format, read_scene
@@ -38,7 +38,6 @@ from chronoscene.io.programs import Usage, log_lines, run_program
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import shown
 from chronoscene.methods import MethodSpec, Runner, import_object
-from chronoscene.metrics.registry import make_scorers
 from chronoscene.scene import Frame, Period, Scene
 
 LOG = "program.log"
@@ -69,8 +68,8 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
     trained = []
     with ProgressDisplay(job.label) as display:
         for part, stop in zip(parts, stops, strict=True):
-            model = "" if part.name == "all" else f" {part.name}"
-            display.wait(f"{spec.title} trains{model}; what it prints goes to {staging / LOG}")
+            model = " ".join(filter(None, ("trains", part.subfolder)))
+            display.wait(f"{spec.title} {model}; what it prints goes to {staging / LOG}")
             trained.append(_run_part(job, spec, runner, scene, part, stop, writer))
         writer.close(
             kind="predictions",
@@ -78,9 +77,6 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
             scene_hash=job.scene_hash,
             details={"method": spec.name, "strategy": job.strategy, "seed": job.seed},
         )
-        display.wait("scores")
-        weights = Path(job.lpips_weights) if job.lpips_weights else None
-        scorers = make_scorers(lpips_weights=weights)
     primitives = [model.primitives for model in trained]
     iterations = [stop.iterations for stop in stops]
     saved = (staging / results.CHECKPOINT).rglob("*")
@@ -109,7 +105,9 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
     )
     if job.seed and "seed" not in used_values(runner, ""):
         record.notices.append(f"{record.label}: {spec.title} takes no seed")
-    score_run(staging, record, ground_truth_folder(Path(job.runs), scene.name), scorers)
+    with ProgressDisplay(job.label) as display:
+        display.wait("scores")
+        score_job(job, record)
 
 
 def _run_part(
@@ -275,7 +273,7 @@ def _keep_model(
     checkpoint = Path(job.staging) / results.CHECKPOINT
     for path in files:
         inside = path.relative_to(output)
-        target = checkpoint / ("" if part.name == "all" else part.name) / inside
+        target = checkpoint / part.subfolder / inside
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(path, target)
     return primitives

@@ -21,7 +21,7 @@ from chronoscene.bench.results import (
     read_config,
     read_run,
 )
-from chronoscene.bench.strategies import STRATEGIES, Strategy
+from chronoscene.bench.strategies import STRATEGIES, Strategy, period_part
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import write_text_atomic
@@ -144,7 +144,7 @@ class OpenRun:
 
     def model(self, period: float) -> Method:
         """The model that answers for a period, loaded at its first use."""
-        part = f"period-{int(period)}" if self.strategy.model_per_period else ""
+        part = period_part(int(period)) if self.strategy.model_per_period else ""
         if part not in self._models:
             self._models[part] = self._load(self.folder / CHECKPOINT / part)
         return self._models[part]

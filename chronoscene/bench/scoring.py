@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.bench.job import Job
 from chronoscene.bench.predictions import (
     ImageEntry,
     Manifest,
@@ -31,7 +32,7 @@ from chronoscene.bench.results import (
 )
 from chronoscene.errors import CheckpointError, ChronoSceneError, ShapeError
 from chronoscene.io.wording import shown
-from chronoscene.metrics.registry import Scorers, all_metrics
+from chronoscene.metrics.registry import Scorers, all_metrics, make_scorers
 
 NO_TESTS = "trained on all photos: there are no test views"
 
@@ -89,6 +90,13 @@ def score_run(staging: Path, record: RunRecord, truth: Path, scorers: Scorers) -
             f"{record.label}: not scored, as their masks ignore every pixel: {views}"
         )
     write_run(staging, record, scores.rows)
+
+
+def score_job(job: Job, record: RunRecord) -> None:
+    """`score_run` of a job, by all metrics that can be computed here."""
+    weights = Path(job.lpips_weights) if job.lpips_weights else None
+    truth = ground_truth_folder(Path(job.runs), job.scene)
+    score_run(Path(job.staging), record, truth, make_scorers(lpips_weights=weights))
 
 
 def score_pair(

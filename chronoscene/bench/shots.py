@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -115,19 +115,15 @@ def with_periods(
         return shots.shots
     if shots.is_path:
         along = _range(run, periods, len(shots.shots))
-        return tuple(_at(shot, p) for shot, p in zip(shots.shots, along, strict=True))
+        return tuple(replace(shot, period=p) for shot, p in zip(shots.shots, along, strict=True))
     if len(periods) == 1:
-        return tuple(_at(shot, periods[0]) for shot in shots.shots)
+        return tuple(replace(shot, period=periods[0]) for shot in shots.shots)
     along = _range(run, periods, frames)
     return tuple(
-        _at(shot, period, f"{Path(shot.name).with_suffix('')}/{i:04}.png")
+        replace(shot, name=f"{Path(shot.name).with_suffix('')}/{i:04}.png", period=period)
         for shot in shots.shots
         for i, period in enumerate(along)
     )
-
-
-def _at(shot: Shot, period: float, name: str | None = None) -> Shot:
-    return Shot(name or shot.name, shot.camera, shot.cam_from_world, period)
 
 
 def _range(run: OpenRun, periods: tuple[float, ...], count: int) -> Iterable[float]:

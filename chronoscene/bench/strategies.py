@@ -44,12 +44,17 @@ class Part:
     """One model to train, and the test views that it answers for."""
 
     name: str
-    """``all``, or ``period-<id>`` of a model of one period."""
+    """``all``, or that of `period_part`."""
     train: TrainingSet
     test: tuple[Frame, ...]
     store: ImageStore
     hides_period: bool
     """Whether the model is asked for period 0 whatever the view's period is."""
+
+    @property
+    def subfolder(self) -> str:
+        """Where its model is among those of the run; empty if it is the only one."""
+        return "" if self.name == "all" else self.name
 
     def view(self, frame: Frame) -> View:
         """The camera of a frame at the evaluation size, in the training frame."""
@@ -60,6 +65,11 @@ class Part:
     def method_period(self, frame: Frame) -> float:
         """The period to ask the model for to predict a frame."""
         return 0.0 if self.hides_period else float(frame.period)
+
+
+def period_part(period: int) -> str:
+    """Name of the part that is the model of one period."""
+    return f"period-{period}"
 
 
 def effective_strategy(spec: MethodSpec, strategy: str) -> tuple[str, str | None]:
@@ -92,7 +102,7 @@ def make_parts(scene: Scene, store: ImageStore, strategy: str) -> tuple[Part, ..
     for period in scene.periods:
         test = scene.select(split="test", period=period.id)
         train = _training_set(scene, store, to_training, period.id, hide_period=hide)
-        parts.append(Part(f"period-{period.id}", train, test, store, hide))
+        parts.append(Part(period_part(period.id), train, test, store, hide))
     return tuple(parts)
 
 

@@ -37,7 +37,7 @@ from chronoscene.bench.provenance import (
     method_version,
     peak_memory_bytes,
 )
-from chronoscene.bench.scoring import NO_TESTS, score_run
+from chronoscene.bench.scoring import NO_TESTS, score_job
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.bench.training_loop import (
     DivergedError,
@@ -55,7 +55,6 @@ from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
-from chronoscene.metrics.registry import make_scorers
 from chronoscene.scene import Scene
 
 
@@ -119,15 +118,12 @@ def run_job(job: Job) -> None:
     columns = [f.name for f in fields(CurvePoint)]
     points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
     write_text_atomic(staging / results.CURVE_FILE, csv_text(columns, points))
-    truth = ground_truth_folder(Path(job.runs), scene.name)
     with ProgressDisplay(job.label) as display:
         display.wait("scores")
-        weights = Path(job.lpips_weights) if job.lpips_weights else None
-        scorers = make_scorers(lpips_weights=weights)
         record = _record(job, spec, scene, machine, outcomes, peaks, started)
         record.warmup_seconds = warmup_seconds
         record.notices = [*job.notices, *([notice] if notice else []), *_skips(job, record)]
-        score_run(staging, record, truth, scorers)
+        score_job(job, record)
 
 
 def pick_device(wanted: str, spec: MethodSpec) -> str:
@@ -220,7 +216,7 @@ def _probe_truth(job: Job, part: Part) -> Truth:
 
 def _save(method: Method, checkpoint: Path, part: Part) -> Path:
     """Save into ``checkpoint``, or a folder below it for each of several models."""
-    target = checkpoint if part.name == "all" else checkpoint / part.name
+    target = checkpoint / part.subfolder
     partial = target.with_name(f"{target.name}.partial")
     partial.mkdir(parents=True)
     method.save(partial)

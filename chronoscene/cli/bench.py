@@ -15,7 +15,7 @@ from chronoscene.checks import check_choice
 from chronoscene.cli.convert import format_option
 from chronoscene.cli.methods import look_here_for
 from chronoscene.cli.output import check_place
-from chronoscene.cli.results import print_runs, split_list
+from chronoscene.cli.results import LPIPS_WEIGHTS, RUNS_OUT, print_runs, split_list
 from chronoscene.errors import ConfigError
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.staging import check_outside
@@ -23,7 +23,6 @@ from chronoscene.io.staging import check_outside
 SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
-EXISTING = click.Path(path_type=Path, exists=True)
 
 
 @click.command("bench")
@@ -116,10 +115,8 @@ EXISTING = click.Path(path_type=Path, exists=True)
     show_default=True,
     help="Device to train and render on.",
 )
-@click.option("--lpips-weights", type=EXISTING, help="Folder or file with the weights of LPIPS.")
-@click.option(
-    "--out", type=FOLDER, default=Path("runs"), show_default=True, help="Folder for the runs."
-)
+@LPIPS_WEIGHTS
+@RUNS_OUT
 @click.option(
     "--overwrite", is_flag=True, help="Replace finished runs that were made with other settings."
 )

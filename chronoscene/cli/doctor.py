@@ -17,9 +17,9 @@ import click
 
 from chronoscene import __version__
 from chronoscene.cli.output import emit
-from chronoscene.download.transfer import in_words
 from chronoscene.errors import ChronoSceneError
 from chronoscene.io.tables import Table, plain_text
+from chronoscene.io.wording import in_words
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.metrics.lpips_weights import candidate_files, check_available
 

@@ -20,13 +20,23 @@ from chronoscene.metrics.registry import make_scorers, metric_info
 SOME_FAILED = 1  # Exit status when a run could not be scored
 
 
-@click.command("score")
-@click.argument("runs", type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.option(
+LPIPS_WEIGHTS = click.option(
     "--lpips-weights",
     type=click.Path(path_type=Path, exists=True),
     help="Folder or file with the weights of LPIPS.",
 )
+RUNS_OUT = click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("runs"),
+    show_default=True,
+    help="Folder for the runs.",
+)
+
+
+@click.command("score")
+@click.argument("runs", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@LPIPS_WEIGHTS
 def score(runs: Path, lpips_weights: Path | None) -> None:
     """Score the finished runs in RUNS again and print what changed.
 

@@ -11,7 +11,7 @@ from chronoscene.bench.results import write_summary
 from chronoscene.cli.convert import format_option
 from chronoscene.cli.output import check_place
 from chronoscene.cli.progress import progress_bar
-from chronoscene.cli.results import print_runs
+from chronoscene.cli.results import LPIPS_WEIGHTS, RUNS_OUT, print_runs
 from chronoscene.formats import read_scene
 from chronoscene.images.store import MAX_WIDTH
 from chronoscene.io.staging import check_outside
@@ -43,18 +43,8 @@ from chronoscene.metrics.registry import make_scorers
     show_default=True,
     help="Scale wider images down to this width in pixels, as bench does.",
 )
-@click.option(
-    "--lpips-weights",
-    type=click.Path(path_type=Path, exists=True),
-    help="Folder or file with the weights of LPIPS.",
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, file_okay=False),
-    default=Path("runs"),
-    show_default=True,
-    help="Folder for the runs.",
-)
+@LPIPS_WEIGHTS
+@RUNS_OUT
 def command(
     scene: Path,
     folder: Path,

@@ -16,11 +16,11 @@ from pathlib import Path
 from chronoscene.download.archives import ARCHIVES, archive_stem, open_archive, unpack_scene
 from chronoscene.download.catalogue import Dataset
 from chronoscene.download.hub import list_files, request_headers
-from chronoscene.download.transfer import RemoteFile, check_space, fetch, in_words, missing_bytes
+from chronoscene.download.transfer import RemoteFile, check_space, fetch, missing_bytes
 from chronoscene.errors import ConfigError, DownloadError
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import write_text_atomic
-from chronoscene.io.wording import counted, shown
+from chronoscene.io.wording import counted, in_words, shown
 
 UNFINISHED = ".download"
 """Folder beside the scenes where files are until a scene is complete."""

@@ -16,7 +16,7 @@ from typing import Any
 from chronoscene.errors import DiskFullError, DownloadError
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import disk_full, needing_space, sha256_of
-from chronoscene.io.wording import shown
+from chronoscene.io.wording import in_words, shown
 
 WORKERS = 8
 """Files at a time: of a photo, waiting for the host takes longer than the transfer."""
@@ -103,14 +103,6 @@ def check_space(folder: Path, needed: int) -> None:
             found=in_words(free),
             todo="make room on this disk, choose a place on another one, or name fewer scenes",
         )
-
-
-def in_words(size: int) -> str:
-    """``1.2 GB``, ``340 kB``."""
-    for unit, bytes_each in (("GB", 10**9), ("MB", 10**6)):
-        if size >= bytes_each:
-            return f"{size / bytes_each:,.1f} {unit}"
-    return f"{size / 1000:.1f} kB"
 
 
 @contextmanager

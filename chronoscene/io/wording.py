@@ -29,3 +29,11 @@ def shown(items: Iterable[str], limit: int = 3) -> str:
 def counted(number: int, noun: str) -> str:
     """``1 image``, ``2 images``."""
     return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
+def in_words(size: int) -> str:
+    """``1.2 GB``, ``340 kB``."""
+    for unit, bytes_each in (("GB", 10**9), ("MB", 10**6)):
+        if size >= bytes_each:
+            return f"{size / bytes_each:,.1f} {unit}"
+    return f"{size / 1000:.1f} kB"

@@ -7,11 +7,15 @@ TF32.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from chronoscene.training.ssim_kernel import C1, C2, RADIUS, SIGMA
+from chronoscene.training.devices import to_device
+from chronoscene.training.ssim_kernel import C1, C2, RADIUS, TAPS
+
+_TAPS = np.array(TAPS, np.float32)
 
 
 def l1_ssim(image: Tensor, target: Tensor, weights: tuple[float, float]) -> tuple[Tensor, Tensor]:
@@ -48,9 +52,7 @@ def l1_ssim(image: Tensor, target: Tensor, weights: tuple[float, float]) -> tupl
 
 def _blur(maps: Tensor) -> Tensor:
     """Gaussian window of each map with zero padding. [M, 3, H, W]"""
-    places = torch.arange(-RADIUS, RADIUS + 1, device=maps.device, dtype=torch.float64)
-    taps = torch.exp(-places.square() / (2 * SIGMA**2))
-    taps = (taps / taps.sum()).to(maps.dtype)
+    taps = to_device(_TAPS, maps.device)
     planes = maps.flatten(0, 1)[None]
     count = planes.shape[1]
     with torch.backends.cudnn.flags(enabled=False):
