@@ -106,7 +106,12 @@ def load_photo(
 
 
 def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where a mask file is not 0. [H, W]
+    """Where a mask file is not 0; errors as for `load_grey`. [H, W]"""
+    return load_grey(path, size) != 0
+
+
+def load_grey(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """The values of a mask file. [H, W]
 
     Raises:
         ImageError: If it is missing, damaged, not of one channel, or of another width and height.
@@ -115,7 +120,7 @@ def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
         with Image.open(path) as image:
             found = f"{image.width} x {image.height} pixels of mode {image.mode}"
             if image.size == size and image.mode in MODES:
-                return np.asarray(image) != 0
+                return np.asarray(image, np.uint8)
     except _DECODE_ERRORS as error:
         raise _image_error(path, error) from error
     raise ImageError(

@@ -54,8 +54,8 @@ def psnr(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None) 
         reference: [H, W, C]
         mask: Pixels that count. [H, W] bool
     """
-    a, b = _pair(image, reference)
-    mse = _masked_mean((a - b) ** 2, mask)
+    a, b = unit_pair(image, reference)
+    mse = masked_mean((a - b) ** 2, mask)
     return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))
 
 
@@ -67,7 +67,7 @@ def ssim(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None) 
         reference: [H, W, C]
         mask: Pixels that count. [H, W] bool
     """
-    return _masked_mean(ssim_map(image, reference), mask)
+    return masked_mean(ssim_map(image, reference), mask)
 
 
 def ssim_valid(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None) -> float:
@@ -91,12 +91,12 @@ def ssim_valid(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = 
         )
     inside = slice(WINDOW // 2, -(WINDOW // 2))
     if mask is None:
-        return _masked_mean(values[inside, inside], None)
+        return masked_mean(values[inside, inside], None)
     import cv2
 
-    counted = _checked_mask(mask, values).astype(np.uint8)
+    counted = checked_mask(mask, values).astype(np.uint8)
     windows = cv2.erode(counted, np.ones((WINDOW, WINDOW), np.uint8))
-    return _masked_mean(values[inside, inside], windows[inside, inside])
+    return masked_mean(values[inside, inside], windows[inside, inside])
 
 
 def ssim_map(image: ArrayLike, reference: ArrayLike) -> Array:
@@ -107,7 +107,7 @@ def ssim_map(image: ArrayLike, reference: ArrayLike) -> Array:
 
     Source: Wang et al. 2004, eq. 13.
     """
-    a, b = _pair(image, reference)
+    a, b = unit_pair(image, reference)
     mu_a, mu_b = _blur(a), _blur(b)
     var_a = _blur(a * a) - mu_a * mu_a
     var_b = _blur(b * b) - mu_b * mu_b
@@ -134,22 +134,29 @@ def _blur(image: Array) -> Array:
     return np.asarray(blurred, dtype=np.float64).reshape(image.shape)
 
 
-def _pair(image: ArrayLike, reference: ArrayLike) -> tuple[Array, Array]:
+def unit_pair(image: ArrayLike, reference: ArrayLike) -> tuple[Array, Array]:
+    """Two images of one shape by `unit_float`."""
     a, b = unit_float(image), unit_float(reference)
     check_shape("image", a, b.shape)
     return a, b
 
 
-def _checked_mask(mask: ArrayLike, values: Array) -> NDArray[np.bool_]:
+def checked_mask(mask: ArrayLike, values: Array) -> NDArray[np.bool_]:
+    """A mask of the height and width of an image or a map. [H, W]"""
     mask = np.asarray(mask)
     check_shape("mask", mask, values.shape[:2])
     return mask.astype(bool)
 
 
-def _masked_mean(values: Array, mask: ArrayLike | None) -> float:
+def masked_mean(values: Array, mask: ArrayLike | None) -> float:
+    """Mean of a map over the pixels that count.
+
+    Raises:
+        ShapeError: If none does.
+    """
     if mask is None:
         return float(values.mean())
-    selected = values[_checked_mask(mask, values)]
+    selected = values[checked_mask(mask, values)]
     if not selected.size:
         raise ShapeError(
             "mask", expected="at least one pixel", found="none", todo="leave the region out"

@@ -10,10 +10,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError, MetricUnavailableError
+from chronoscene.metrics.color_correction import psnr_cc, ssim_cc
+from chronoscene.metrics.flip import flip
 from chronoscene.metrics.lpips_weights import check_available
 from chronoscene.metrics.psnr_ssim import IMAGE_METRICS
 
@@ -31,7 +34,11 @@ class MetricInfo:
     decimals: int
     """Digits after the point in tables."""
     function: Callable[..., float] | None = None
-    """``f(image, reference, mask)``, as in `Scorers`; None for the metrics here."""
+    """``f(image, reference, mask)``, as in `Scorers`; None for `IMAGE_METRICS` and LPIPS."""
+    on_request: bool = False
+    """Whether it is computed only where it is named."""
+    package: str = ""
+    """Package that it needs and that may be missing, as it is imported."""
 
 
 ENTRY_POINT_GROUP = "chronoscene.metrics"
@@ -78,6 +85,35 @@ METRICS = {
             False,
             4,
         ),
+        MetricInfo(
+            "psnr_cc",
+            "PSNR (colours fitted) [dB]",
+            "as psnr, after the affine map (3x4) of the colours of each image that brings it "
+            "nearest to its photo",
+            True,
+            2,
+            psnr_cc,
+            on_request=True,
+        ),
+        MetricInfo(
+            "ssim_cc",
+            "SSIM (colours fitted)",
+            "as ssim, after the same map of the colours",
+            True,
+            4,
+            ssim_cc,
+            on_request=True,
+        ),
+        MetricInfo(
+            "flip",
+            "FLIP",
+            "mean LDR-FLIP at 67 pixels per degree, by the package of its authors",
+            False,
+            4,
+            flip,
+            on_request=True,
+            package="flip_evaluator",
+        ),
     )
 }
 """Metric name to its description, for those that come with ChronoScene."""
@@ -122,6 +158,8 @@ class Scorers:
     [H, W], is None where all pixels count. Where it ignores, the images are equal."""
     skipped: dict[str, str]
     """Metric name to the reason for its absence."""
+    unasked: frozenset[str] = frozenset()
+    """Metrics that were not wanted: values of an earlier scoring hold."""
 
 
 def make_scorers(
@@ -130,19 +168,28 @@ def make_scorers(
     """Prepare metrics; torch is imported only if LPIPS can be computed.
 
     Args:
-        names: Metrics wanted; None for all.
+        names: Metrics wanted; None for all but those on request.
         lpips_weights: Folder or file that the user named; then its absence is an error.
 
     Raises:
         ConfigError: If there is no such metric.
         MetricUnavailableError: If the user named weights that cannot be used.
     """
-    wanted = [metric_info(name) for name in (all_metrics() if names is None else names)]
-    known = ((info.name, info.function or IMAGE_METRICS.get(info.name)) for info in wanted)
-    functions = {name: function for name, function in known if function is not None}
-    perceptual = [info.name for info in wanted if info.name not in functions]
+    known = all_metrics()
+    if names is None:
+        names = [name for name, info in known.items() if not info.on_request]
+    wanted = [metric_info(name) for name in names]
+    unasked = frozenset(known) - {info.name for info in wanted}
+    skipped = {
+        info.name: f"not installed: pip install {info.package}"
+        for info in wanted
+        if info.package and find_spec(info.package) is None
+    }
+    found = ((info.name, info.function or IMAGE_METRICS.get(info.name)) for info in wanted)
+    functions = {name: f for name, f in found if f is not None and name not in skipped}
+    perceptual = [info.name for info in wanted if info.name not in functions | skipped]
     if not perceptual:
-        return Scorers(functions, {})
+        return Scorers(functions, skipped, unasked)
     try:
         check_available(lpips_weights)
         from chronoscene.metrics.lpips import lpips_metrics
@@ -151,7 +198,8 @@ def make_scorers(
     except MetricUnavailableError as error:
         if lpips_weights is not None:
             raise
-        found = f"{error.fields['place']}: {error.fields['found']}"
-        reason = f"{found}; run chronoscene download lpips-weights"
-        return Scorers(functions, dict.fromkeys(perceptual, reason))
-    return Scorers(functions | {name: available[name] for name in perceptual}, {})
+        place = f"{error.fields['place']}: {error.fields['found']}"
+        reason = f"{place}; run chronoscene download lpips-weights"
+        return Scorers(functions, skipped | dict.fromkeys(perceptual, reason), unasked)
+    functions |= {name: available[name] for name in perceptual}
+    return Scorers(functions, skipped, unasked)

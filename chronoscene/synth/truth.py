@@ -13,12 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.images.decoding import load_rgb
+from chronoscene.images.truth import APPEARANCE, GEOMETRY, UNCHANGED, truth_place
 from chronoscene.scene import Frame, Period, Scene
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.renderer import PeriodRenderer, PixelMaps
 
-UNCHANGED, APPEARANCE, GEOMETRY = 0, 127, 255
-"""Pixel values of change masks."""
 DEPTH_TOLERANCE = 1e-3  # Relative difference of depth that counts as a change of geometry
 ALBEDO_TOLERANCE = 0.02  # Linear difference of albedo that counts as a change of appearance
 SHEET_COLUMNS = 6
@@ -73,24 +72,20 @@ def write_truth(
     for frame in tests:
         view = frame.camera, frame.cam_from_world
         here = renderers[frame.period].maps(*view)
-        _save_depth(folder / "depth" / f"{Path(frame.name).stem}.npz", here)
+        _save_depth(folder / truth_place("depth", frame.name), here)
         for other, renderer in enumerate(renderers):
             if other == frame.period:
                 continue
-            name = _cross_name(frame, other)
             there = renderer.maps(*view)
-            _save_depth(folder / "cross_depth" / f"{name}.npz", there)
-            save_image(folder / "cross_rgb" / f"{name}.jpg", renderer.image(*view))
-            save_image(folder / "change" / f"{name}.png", change_mask(here, there))
+            _save_depth(folder / truth_place("cross_depth", frame.name, other), there)
+            image = renderer.image(*view)
+            save_image(folder / truth_place("cross_rgb", frame.name, other), image)
+            mask = change_mask(here, there)
+            save_image(folder / truth_place("change", frame.name, other), mask)
             advance("ground truth")
     save_image(folder / "contact_sheet.png", _contact_sheet(folder, scene, tests))
     text = json.dumps(_story(world, scene.periods), indent=1)
     (folder / "periods.json").write_text(text + "\n", encoding="utf-8", newline="\n")
-
-
-def _cross_name(frame: Frame, period: int) -> str:
-    """Stem of the files of a test view at another period."""
-    return f"{Path(frame.name).stem}__p{period}"
 
 
 def _save_depth(path: Path, maps: PixelMaps) -> None:
@@ -123,7 +118,7 @@ def _contact_sheet(folder: Path, scene: Scene, tests: Sequence[Frame]) -> NDArra
         row = []
         for frame in (tests[int(i)] for i in pick):
             own = frame.period == period
-            cross = folder / "cross_rgb" / f"{_cross_name(frame, period)}.jpg"
+            cross = folder / truth_place("cross_rgb", frame.name, period)
             small = _shrunk(load_rgb(scene.image_path(frame) if own else cross))
             if own:
                 height, width = small.shape[:2]

@@ -18,9 +18,17 @@ MAE = MetricInfo("mae", "MAE", "mean absolute error", False, 4, mae)
 
 
 def test_names_carry_their_variant():
-    assert list(METRICS) == ["psnr", "ssim", "ssim_valid", "lpips_vgg", "lpips_vgg_3dgs"]
+    usual = ["psnr", "ssim", "ssim_valid", "lpips_vgg", "lpips_vgg_3dgs"]
+    assert list(METRICS) == [*usual, "psnr_cc", "ssim_cc", "flip"]
     assert all(info.name == name and info.variant for name, info in METRICS.items())
     assert not metric_info("lpips_vgg").higher_is_better
+
+
+def test_some_are_computed_only_where_they_are_named():
+    usual, one = make_scorers(), make_scorers(["psnr_cc"])
+    on_request = {"psnr_cc", "ssim_cc", "flip"}
+    assert usual.unasked == on_request and not on_request & {*usual.functions, *usual.skipped}
+    assert list(one.functions) == ["psnr_cc"] and one.unasked == {*METRICS} - {"psnr_cc"}
 
 
 def test_unknown_metrics_name_the_known_ones():

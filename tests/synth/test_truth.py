@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
+from chronoscene.images.truth import APPEARANCE, GEOMETRY, UNCHANGED
 from chronoscene.synth.city.buildings import SLAB
 from chronoscene.synth.render.renderer import PixelMaps
-from chronoscene.synth.truth import APPEARANCE, GEOMETRY, UNCHANGED, change_mask, save_image
+from chronoscene.synth.truth import change_mask, save_image
 
 
 def stem(name: str) -> str:
