@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from chronoscene.arrays import Array
-from chronoscene.registration.quality.misalignment import (
-    NOISE_FLOOR,
-    generators,
-    rotation_angle,
-    transfer_variance,
-)
+from chronoscene.arrays import Array, Ints
+from chronoscene.registration.quality.misalignment import generators, rotation_angle
 from chronoscene.registration.quality.rays import Placed, Rays, project
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.similarity import SIGMA
 
 MIN_POINTS = 12  # Points of the other period that an image must see
 
-MAX_POINTS = 400
 MAX_IMAGES = 60
 
 INLIER_PIXELS = 6.0
@@ -66,28 +62,28 @@ def localise(rays: Rays, placed: Placed) -> Localisation | str:
     if not len(images):
         return f"no image sees {MIN_POINTS} points that the other period places"
     images = images[:: len(images) // MAX_IMAGES + 1]
-    found_poses = [_localise_one(rays.where(rays.image == i), xyz[rays.image == i]) for i in images]
-    spread = placed.covariance[slot]
-    poses, differences = [], []
-    for i, pose in zip(images, found_poses, strict=True):
-        if pose is not None:
-            mine = rays.image == i
-            poses.append((rays.pose[np.flatnonzero(mine)[0]], pose))
-            differences.append(_expected(rays.where(mine), xyz[mine], spread[mine], pose))
+    poses, noise = [], []
+    for i in images:
+        mine = np.flatnonzero(rays.image == i)
+        found_pose = _localise_one(rays.where(mine), xyz[mine])
+        if found_pose is not None:
+            pose, used = found_pose
+            poses.append((rays.pose[mine[0]], pose))
+            noise.append(_variance(rays.where(mine[used]), xyz[mine[used]], pose))
     if not poses:
         return f"none of {len(images)} images could be localised from the other period"
     angle = np.array([rotation_angle(new[:3, :3] @ old[:3, :3].T) for old, new in poses])
     moved = np.array(
         [np.linalg.norm(camera_centre(new) - camera_centre(old)) for old, new in poses]
     )
-    noise = np.array(differences)
+    turn, place = np.array(noise).T
     return Localisation(
         images=len(poses),
         tried=len(images),
         rotation=float(np.median(angle)),
         centre=float(np.median(moved)),
-        rotation_excess=_excess(angle, noise[:, 0]),
-        centre_excess=_excess(moved, noise[:, 1]),
+        rotation_excess=_excess(angle, turn),
+        centre_excess=_excess(moved, place),
     )
 
 
@@ -106,50 +102,63 @@ def _excess(size: Array, noise: Array) -> Excess:
     )
 
 
-def _expected(rays: Rays, xyz: Array, spread: Array, pose: Array) -> tuple[float, float]:
-    """Variance of the pose that noise causes: rotation in degrees squared, centre in squared units.
+def _variance(rays: Rays, xyz: Array, pose: Array) -> tuple[float, float]:
+    """Variance of a pose by least squares: rotation in degrees squared, centre in squared units.
 
-    Least squares with equal weights on points of unequal certainty: ``N^-1 M N^-1`` with
-    ``N = J^T J`` and ``M = J^T V J``.
+    It is that of a sandwich estimator, ``N^-1 M N^-1`` with ``N = sum J^T J`` and
+    ``M = sum J^T r r^T J`` over the points that the pose was fitted to: their certainty differs,
+    and residuals have heavier tails than normal ones.
+
+    Source: White 1980.
     """
-    rays = replace(rays, pose=np.broadcast_to(pose, (len(rays), 4, 4)))
-    residual, by_point, _ = project(rays, xyz)
-    variance = transfer_variance(by_point, spread)
-    square = (residual**2).sum(axis=1) / variance
-    good = np.isfinite(square) & (np.linalg.norm(residual, axis=1) < INLIER_PIXELS)
+    residual, by_point, _ = _project(rays, xyz, pose)
     local = xyz @ pose[:3, :3].T + pose[:3, 3]
     motion = generators(local)[:, :, :6]
-    jacobian = np.einsum("nki,ji,njm->nkm", by_point, pose[:3, :3], motion)[good]
-    noise = max(float(np.median(square[good])) / 1.1774**2, NOISE_FLOOR**2)
-    normal = np.einsum("nki,nkj->ij", jacobian, jacobian)
-    middle = np.einsum("nki,n,nkj->ij", jacobian, variance[good] * noise, jacobian)
-    inverse = np.linalg.pinv(normal)
-    covariance = inverse @ middle @ inverse
+    jacobian = np.nan_to_num(np.einsum("nki,ji,njm->nkm", by_point, pose[:3, :3], motion))
+    score = np.einsum("nki,nk->ni", jacobian, np.nan_to_num(residual))
+    inverse = np.linalg.pinv(np.einsum("nki,nkj->ij", jacobian, jacobian))
+    left = 1 - 3 / len(rays)  # Degrees of freedom: six unknowns, two coordinates of each point
+    covariance = inverse @ (score.T @ score) @ inverse / left
     turn = float(np.trace(covariance[3:, 3:])) * np.degrees(1.0) ** 2
     return turn, float(np.trace(covariance[:3, :3]))
 
 
-def _localise_one(rays: Rays, xyz: Array) -> Array | None:
-    """Pose by PnP with RANSAC, refined on its inliers; the pose in the model is not used."""
+def _project(rays: Rays, xyz: Array, pose: Array) -> tuple[Array, Array, Array]:
+    """As `project`, by a camera at another pose."""
+    return project(replace(rays, pose=np.broadcast_to(pose, (len(rays), 4, 4))), xyz)
+
+
+def _localise_one(rays: Rays, xyz: Array) -> tuple[Array, Ints] | None:
+    """Pose by PnP with RANSAC, refined on its inliers, and which they are.
+
+    The pose in the model is not used. Inliers are those of the pose that RANSAC returns: those of
+    the few points it was drawn from would pull the pose to them.
+    """
     import cv2
 
-    step = len(rays) // MAX_POINTS + 1
     middle = xyz.mean(axis=0)
-    points = np.ascontiguousarray(xyz[::step] - middle)
+    points = np.ascontiguousarray(xyz - middle)
     focal = rays.focal[0]
-    pixels = np.ascontiguousarray(rays.uv[::step] * focal)
+    pixels = np.ascontiguousarray(rays.uv * focal)
     K = np.diag([focal[0], focal[1], 1.0])
+
+    def pose_of(turn: NDArray[Any], shift: NDArray[Any]) -> Array:
+        rotation = cv2.Rodrigues(turn)[0]
+        return pose_from_rotation_translation(rotation, shift.ravel() - rotation @ middle)
+
     try:
-        good, turn, shift, inliers = cv2.solvePnPRansac(
+        good, turn, shift, _ = cv2.solvePnPRansac(
             points, pixels, K, None,
             flags=cv2.SOLVEPNP_SQPNP, reprojectionError=INLIER_PIXELS,
             iterationsCount=300, confidence=0.999,
         )  # fmt: skip
-        if not good or inliers is None or len(inliers) < MIN_POINTS // 2:
+        if not good:
             return None
-        rows = inliers.ravel()
+        residual = _project(rays, xyz, pose_of(turn, shift))[0]
+        rows = np.flatnonzero(np.linalg.norm(residual, axis=1) < INLIER_PIXELS)
+        if len(rows) < MIN_POINTS // 2:
+            return None
         turn, shift = cv2.solvePnPRefineLM(points[rows], pixels[rows], K, None, turn, shift)
-        rotation = cv2.Rodrigues(turn)[0]
+        return pose_of(turn, shift), rows
     except cv2.error:  # degenerate points
         return None
-    return pose_from_rotation_translation(rotation, shift.ravel() - rotation @ middle)

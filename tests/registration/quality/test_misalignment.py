@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from chronoscene.registration.quality.localisation import Localisation, localise
 from chronoscene.registration.quality.misalignment import (
     measure,
     rotation_angle,
@@ -172,19 +171,6 @@ def test_twelve_tracks_are_enough(exact: Generated) -> None:
         some = rays.where(np.isin(rays.track, tracks[:count]))
         found = measure(*transfers(some, model.periods, 0, 1), camera_centre(model.cam_from_world))
         assert (found is not None) == (count == 12)
-
-
-def test_an_image_is_localised_by_twelve_points(exact: Generated) -> None:
-    model = exact.model
-    rays = held_out_rays(model)
-    placed = place(rays.where(model.periods[rays.image] == 0))
-    image = rays.where(rays.image == np.flatnonzero(model.periods == 1)[0])
-    image = image.where(np.isin(image.track, placed.track))
-    assert localise(image.where(np.arange(len(image)) < 11), placed) == (
-        "no image sees 12 points that the other period places"
-    )
-    found = localise(image.where(np.arange(len(image)) < 12), placed)
-    assert isinstance(found, Localisation) and found.images == 1
 
 
 def test_epipolar_errors_are_zero_for_the_truth_and_grow_with_a_turn(exact: Generated) -> None:
