@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 
 from chronoscene.metrics.psnr_ssim import masked_mean, unit_pair
 
-PIXELS_PER_DEGREE = 67.02064
-"""The authors' default: a screen 0.7 m wide with 3840 pixels, seen from 0.7 m."""
+VIEWING = (0.7, 3840.0, 0.7)
+"""The authors' default, 67 pixels per degree: distance in metres, width in pixels and in metres."""
 
 
 def flip(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None) -> float:
@@ -24,6 +24,6 @@ def flip(image: ArrayLike, reference: ArrayLike, mask: ArrayLike | None = None) 
     from flip_evaluator import evaluate
 
     test, photo = (x.astype(np.float32) for x in unit_pair(image, reference))
-    settings = {"ppd": PIXELS_PER_DEGREE}
+    settings = {"vc": list(VIEWING)}
     errors, _, _ = evaluate(photo, test, "LDR", applyMagma=False, parameters=settings)
     return masked_mean(errors.astype(np.float64), mask)
