@@ -49,6 +49,10 @@ class ImageEntry(BaseModel):
     """Path below the folder of the mask of a photo, 0 where the photo does not count; None where
     all of it does."""
     mask_sha256: str | None = None
+    changed_file: str | None = None
+    """Path below the folder of where the view differs from other periods, which is where it is not
+    0; None where nobody said."""
+    changed_sha256: str | None = None
 
 
 class Manifest(BaseModel):
@@ -110,6 +114,20 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
     return data.tobytes()
 
 
+def to_grey(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A mask as an image: 255 where it is true. [H, W]"""
+    return 255 * mask.astype(np.uint8)
+
+
+def write_png(folder: Path, file: str, pixels: NDArray[np.uint8]) -> str:
+    """Write one PNG file below a folder; returns its SHA-256."""
+    target, data = folder / file, encode_png(pixels)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(target) as partial:
+        partial.write_bytes(data)
+    return hashlib.sha256(data).hexdigest()
+
+
 class ImageWriter:
     """Writes images one by one; `close` makes the folder complete."""
 
@@ -133,27 +151,19 @@ class ImageWriter:
         if mask is not None:
             mask_file = image_file(f"{view}.mask")
             masked = {"mask_file": mask_file}
-            masked["mask_sha256"] = self._write(mask_file, 255 * mask.astype(np.uint8))
+            masked["mask_sha256"] = write_png(self.folder, mask_file, to_grey(mask))
         self._entries.append(
             ImageEntry(
                 view=view,
                 camera_period=camera_period,
                 rendered_period=rendered_period,
                 file=file,
-                sha256=self._write(file, pixels),
+                sha256=write_png(self.folder, file, pixels),
                 width=pixels.shape[1],
                 height=pixels.shape[0],
                 **masked,
             )
         )
-
-    def _write(self, file: str, pixels: NDArray[np.uint8]) -> str:
-        """Write one PNG file; returns its SHA-256."""
-        target, data = self.folder / file, encode_png(pixels)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(target) as partial:
-            partial.write_bytes(data)
-        return hashlib.sha256(data).hexdigest()
 
     def close(
         self,
@@ -172,9 +182,14 @@ class ImageWriter:
             details=dict(details),
             images=tuple(sorted(self._entries, key=lambda e: e.view)),
         )
-        text = manifest.model_dump_json(indent=1, exclude_none=True)
-        write_text_atomic(self.folder / MANIFEST, f"{text}\n")
+        write_manifest(self.folder, manifest)
         return manifest
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write the manifest of a folder, in one go."""
+    text = manifest.model_dump_json(indent=1, exclude_none=True)
+    write_text_atomic(folder / MANIFEST, f"{text}\n")
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -198,9 +213,9 @@ def read_manifest(folder: Path) -> Manifest:
     if len(set(views)) != len(views):
         raise _untrusted(path, "a view twice")
     for entry in manifest.images:
-        _inside(entry.file)
-        if entry.mask_file is not None:
-            _inside(entry.mask_file)
+        for file in (entry.file, entry.mask_file, entry.changed_file):
+            if file is not None:
+                _inside(file)
     return manifest
 
 
@@ -216,10 +231,22 @@ def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
 
 def load_mask(folder: Path, entry: ImageEntry) -> NDArray[np.bool_] | None:
     """Where an image counts; None where all of it does. Errors as for `load_image`. [H, W]"""
-    if entry.mask_file is None or entry.mask_sha256 is None:
+    return _load_grey(folder, entry, entry.mask_file, entry.mask_sha256)
+
+
+def load_changed(folder: Path, entry: ImageEntry) -> NDArray[np.bool_] | None:
+    """Where a view differs from other periods; None if nobody said. Otherwise as `load_mask`."""
+    return _load_grey(folder, entry, entry.changed_file, entry.changed_sha256)
+
+
+def _load_grey(
+    folder: Path, entry: ImageEntry, file: str | None, sha256: str | None
+) -> NDArray[np.bool_] | None:
+    if file is None or sha256 is None:
         return None
-    size = entry.height, entry.width
-    return np.asarray(_load_png(folder, entry.mask_file, entry.mask_sha256, size, color=False) != 0)
+    return np.asarray(
+        _load_png(folder, file, sha256, (entry.height, entry.width), color=False) != 0
+    )
 
 
 def _load_png(

@@ -52,6 +52,11 @@ class RunRecord(BaseModel):
     """``macro`` (mean over periods), ``micro`` (mean over views), ``worst`` (worst period)."""
     periods: dict[str, Values]
     """Mean over the views of each period, by period id."""
+    regions: dict[str, dict[str, dict[str, Values]]] = {}
+    """``changed`` and ``invariant`` to ``aggregates`` and ``periods`` of these parts of the images;
+    empty where there are no change masks."""
+    change_masks: str | None = None
+    """Fingerprint of these masks."""
     seconds: float | None
     """Training clock: setup and steps, without probes, rendering and scoring. What is None here and
     below was not measured; see `absent`."""
@@ -137,7 +142,7 @@ class Row:
     camera_period: int
     rendered_period: int
     region: str
-    """``all``; parts of the image have their own names."""
+    """One of `chronoscene.bench.regions.REGIONS`."""
     metric: str
     value: float
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Set
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,9 @@ from chronoscene.bench.predictions import (
     Manifest,
     ground_truth_folder,
     load_image,
-    load_mask,
     read_manifest,
 )
+from chronoscene.bench.regions import ALL, REGIONS, change_masks_hash, regions_of
 from chronoscene.bench.results import (
     PREDICTIONS,
     Row,
@@ -46,6 +46,8 @@ class Scores:
     """Metric to the reason for its absence."""
     unscored: tuple[str, ...] = ()
     """Views whose masks ignore every pixel: they have no values."""
+    change_masks: str | None = None
+    """Fingerprint of the masks that say what the regions are."""
 
 
 def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Scores:
@@ -60,30 +62,43 @@ def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Sco
     skipped, unscored = dict(scorers.skipped), []
     for entry, target in pairs:
         image, reference = load_image(predictions, entry), load_image(ground_truth, target)
-        mask = load_mask(ground_truth, target)
-        if mask is not None and not mask.any():
-            unscored.append(entry.view)
-            continue
-        values, refused = score_pair(image, reference, scorers, mask)
-        skipped |= {name: f"{entry.view}: {reason}" for name, reason in refused.items()}
         periods = entry.camera_period, entry.rendered_period
-        rows += [Row(entry.view, *periods, "all", name, value) for name, value in values.items()]
+        for region, mask in regions_of(ground_truth, target):
+            if mask is not None and not mask.any():
+                if region == ALL:
+                    unscored.append(entry.view)
+                continue
+            values, refused = score_pair(image, reference, scorers, mask)
+            if region == ALL:
+                skipped |= {name: f"{entry.view}: {reason}" for name, reason in refused.items()}
+            rows += [Row(entry.view, *periods, region, *value) for value in values.items()]
     if not pairs:
-        skipped = dict.fromkeys(all_metrics(), NO_TESTS)
+        skipped = dict.fromkeys([*scorers.functions, *scorers.skipped], NO_TESTS)
     elif len(unscored) == len(pairs):
         skipped |= dict.fromkeys(
             scorers.functions, "the masks of all test views ignore every pixel"
         )
     # A metric that fails on one view has no mean over the test set.
     kept = tuple(row for row in rows if row.metric not in skipped)
-    return Scores(kept, skipped, tuple(unscored))
+    return Scores(kept, skipped, tuple(unscored), change_masks_hash(truth))
+
+
+def put_scores(record: RunRecord, scores: Scores) -> None:
+    """Put the means of scores into the record of their run."""
+    record.aggregates, record.periods = aggregate(scores.rows)
+    record.skipped, record.change_masks = scores.skipped, scores.change_masks
+    parts = {region: aggregate(scores.rows, region) for region in REGIONS if region != ALL}
+    record.regions = {
+        region: {"aggregates": aggregates, "periods": periods}
+        for region, (aggregates, periods) in parts.items()
+        if periods
+    }
 
 
 def score_run(staging: Path, record: RunRecord, truth: Path, scorers: Scorers) -> None:
     """Score the predictions in the folder of a run, and write its record with the scores."""
     scores = score_folder(staging / PREDICTIONS, truth, scorers)
-    record.aggregates, record.periods = aggregate(scores.rows)
-    record.skipped = scores.skipped
+    put_scores(record, scores)
     if scores.unscored:
         views = shown(scores.unscored)
         record.notices.append(
@@ -153,8 +168,10 @@ def _mismatch(folder: Path, expected: str, found: str) -> CheckpointError:
     )
 
 
-def aggregate(rows: Iterable[Row]) -> tuple[dict[str, Values], dict[str, Values]]:
-    """Means of the rows of region ``all``.
+def aggregate(
+    rows: Iterable[Row], region: str = ALL
+) -> tuple[dict[str, Values], dict[str, Values]]:
+    """Means of the rows of a region.
 
     Returns:
         aggregates: ``macro`` (mean over periods of their means), ``micro`` (mean over views) and
@@ -163,7 +180,7 @@ def aggregate(rows: Iterable[Row]) -> tuple[dict[str, Values], dict[str, Values]
     """
     groups: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
-        if row.region == "all":
+        if row.region == region:
             groups[row.metric][row.camera_period].append(row.value)
     aggregates: dict[str, Values] = {"macro": {}, "micro": {}, "worst": {}}
     periods: dict[str, Values] = {}
@@ -237,25 +254,40 @@ def _rescore_one(runs: Path, folder: Path, scorers: Scorers) -> Rescored:
         record = read_run(folder)
         truth = ground_truth_folder(runs, record.scene)
         scores = score_folder(folder / PREDICTIONS, truth, scorers)
-        kept, scores = keep_earlier(folder, record, scores)
+        kept, scores = keep_earlier(folder, record, scores, scorers.unasked)
     except ChronoSceneError as error:
         return Rescored(folder, [], [], str(error))
-    before = record.aggregates
-    record.aggregates, record.periods = aggregate(scores.rows)
-    record.skipped = scores.skipped
+    before, parts = record.aggregates, record.regions
+    put_scores(record, scores)
     write_run(folder, record, scores.rows)
-    return Rescored(folder, changes(before, record.aggregates), kept)
+    told = changes(before, record.aggregates)
+    for region, part in record.regions.items():
+        old = parts.get(region, {}).get("aggregates", {})
+        told += [f"{region}: {line}" for line in changes(old, part["aggregates"])]
+    return Rescored(folder, told, kept)
 
 
-def keep_earlier(folder: Path, record: RunRecord, scores: Scores) -> tuple[list[str], Scores]:
-    """Keep earlier values of metrics that this machine cannot compute.
+def keep_earlier(
+    folder: Path, record: RunRecord, scores: Scores, unasked: Set[str]
+) -> tuple[list[str], Scores]:
+    """Keep earlier values of metrics that this machine cannot compute, or was not asked for.
 
     Hashes prove that the images are the same, so the values of a machine with the weights hold.
+    Values of regions hold if the change masks are the same.
+
+    Returns:
+        Names of the kept metrics that cannot be computed, and all scores.
     """
-    kept = [name for name in scores.skipped if name in record.aggregates.get("macro", {})]
-    if not kept:
+    there = record.aggregates.get("macro", {})
+    kept = [name for name in scores.skipped if name in there]
+    if not kept and unasked.isdisjoint(there):
         return [], scores
-    earlier = tuple(row for row in read_rows(folder) if row.metric in kept)
+    holds = record.change_masks == scores.change_masks
+    earlier = tuple(
+        row
+        for row in read_rows(folder)
+        if (row.metric in kept or row.metric in unasked) and (holds or row.region == ALL)
+    )
     skipped = {name: reason for name, reason in scores.skipped.items() if name not in kept}
     rows = sorted(scores.rows + earlier, key=lambda row: row.view)
-    return kept, Scores(tuple(rows), skipped, scores.unscored)
+    return kept, replace(scores, rows=tuple(rows), skipped=skipped)

@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from chronoscene.bench.comparison_figure import draw_figures
+from chronoscene.bench.regions import freeze_change_masks
 from chronoscene.bench.results import RESULTS_FILE, ROWS_FILE
 from chronoscene.bench.scoring import rescore
 from chronoscene.bench.tables import format_runs, read_runs
@@ -15,7 +16,7 @@ from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.io.tables import FORMATS
-from chronoscene.metrics.registry import make_scorers, metric_info
+from chronoscene.metrics.registry import METRICS, make_scorers, metric_info
 
 SOME_FAILED = 1  # Exit status when a run could not be scored
 
@@ -36,14 +37,34 @@ RUNS_OUT = click.option(
 
 @click.command("score")
 @click.argument("runs", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option(
+    "--metric",
+    "metrics",
+    multiple=True,
+    help="Metrics to compute, as NAME[,NAME...]; the others keep their values. May be repeated.  "
+    "[default: all but those on request: "
+    f"{', '.join(name for name, info in METRICS.items() if info.on_request)}]",
+)
+@click.option(
+    "--truth",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="Also score what changes between periods, and what does not, apart: by the change masks "
+    "in this folder, which is laid out like the gt/ of a generated scene; or in SCENE/gt/ of a "
+    "folder of scenes.",
+)
 @LPIPS_WEIGHTS
-def score(runs: Path, lpips_weights: Path | None) -> None:
+def score(
+    runs: Path, metrics: tuple[str, ...], truth: Path | None, lpips_weights: Path | None
+) -> None:
     """Score the finished runs in RUNS again and print what changed.
 
     Only the predictions of each run and the frozen ground truth are read; their hashes are checked.
+    Change masks are frozen with the ground truth, and later runs in RUNS are scored by them, too.
     """
     with progress_bar("load the metrics") as bar:
-        scorers = make_scorers(lpips_weights=lpips_weights)
+        scorers = make_scorers(parse_metrics(metrics) or None, lpips_weights=lpips_weights)
+        if truth is not None:
+            freeze_change_masks(runs, truth)
         outcomes = rescore(runs, scorers, progress=partial(bar, "runs"))
     for outcome in outcomes:
         name = outcome.folder.relative_to(runs)
@@ -103,10 +124,18 @@ def table(
     over views) and the worst period. Several seeds give the mean, the sample standard deviation and
     the number of runs.
     """
-    wanted = [metric_info(m).name for text in metrics for m in split_list("--metric", text)]
     records, failures = read_runs(folders)
-    text = format_runs(records, failures, style, wanted)
+    text = format_runs(records, failures, style, parse_metrics(metrics))
     emit(text, out)
+
+
+def parse_metrics(texts: tuple[str, ...]) -> list[str]:
+    """Names of metrics from comma-separated lists.
+
+    Raises:
+        ConfigError: If there is no such metric.
+    """
+    return [metric_info(name).name for text in texts for name in split_list("--metric", text)]
 
 
 def split_list(option: str, text: str) -> tuple[str, ...]:

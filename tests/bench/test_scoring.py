@@ -47,7 +47,12 @@ def test_infinite_values_stay_infinite():
 
 def test_parts_of_the_image_do_not_enter_the_means():
     part = Row("0.png", 0, 0, "changed", "psnr", 1.0)
-    assert aggregate([*rows("psnr", [(0, 9.0)]), part])[0]["micro"]["psnr"] == 9.0
+    both = [*rows("psnr", [(0, 9.0)]), part]
+    assert aggregate(both)[0]["micro"]["psnr"] == 9.0
+    assert aggregate(both, "changed") == (
+        {kind: {"psnr": 1.0} for kind in ("macro", "micro", "worst")},
+        {"0": {"psnr": 1.0}},
+    )
 
 
 def write(folder, images, *, scene_hash="h", periods=None, masks=None):

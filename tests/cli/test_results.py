@@ -118,7 +118,7 @@ def score(monkeypatch, tmp_path):
 
     def run(*outcomes, skipped=None):
         monkeypatch.setattr(
-            results_module, "make_scorers", lambda lpips_weights: Scorers({}, skipped or {})
+            results_module, "make_scorers", lambda names, lpips_weights: Scorers({}, skipped or {})
         )
         monkeypatch.setattr(
             results_module, "rescore", lambda runs, scorers, progress: list(outcomes)
@@ -167,3 +167,14 @@ def test_weights_that_are_none(tmp_path):
         CliRunner().invoke(cli, arguments, catch_exceptions=False)
     missing = CliRunner().invoke(cli, [*arguments[:-1], str(Path(tmp_path) / "absent")])
     assert missing.exit_code == 2 and "does not exist" in missing.output
+
+
+def test_metrics_and_truth_are_passed_on(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(results_module, "freeze_change_masks", lambda *a: asked.append(a))
+    monkeypatch.setattr(
+        results_module, "rescore", lambda runs, scorers, progress: asked.append(scorers) or []
+    )
+    arguments = ["score", str(tmp_path), "--metric", "ssim_cc,psnr", "--truth", str(tmp_path)]
+    assert CliRunner().invoke(cli, arguments, catch_exceptions=False).exit_code == 0
+    assert asked[0] == (tmp_path, tmp_path) and set(asked[1].functions) == {"psnr", "ssim_cc"}
