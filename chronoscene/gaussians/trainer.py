@@ -125,7 +125,7 @@ class GaussianTrainer:
         self.model.sh_degree = due.sh_degree
         number = self.sampler.next()
         view = self.train.views[number]
-        splats = self.model.splats(view, view.period)
+        splats = self.splats(number)
         config = self.config
         background = step_background(
             self.background, config, seed=self.seed, number=self.sampler.drawn
@@ -193,12 +193,20 @@ class GaussianTrainer:
         self.timeline.last_moment = state.values["last_moment"]
         model.sh_degree = state.values["sh_degree"]
 
+    def splats(self, number: int) -> Splats:
+        """What is drawn in training view ``number``; methods may look at its photo."""
+        view = self.train.views[number]
+        return self.model.splats(view, view.period)
+
     def loss(self, raster: Rasterization, number: int, mask: Tensor | None) -> Tensor:
         """Photometric loss against the photo of view ``number``; methods may add terms."""
         # A copy, as cached images are not ours to write to, which torch cannot promise.
         photo = to_device(self.train.load_image(number).copy(), raster.image.device)
-        image, weight = self.exposure.apply(raster.image[0], number), self.config.ssim_weight
-        return photometric_loss(image, photo, ssim_weight=weight, mask=mask)
+        return self.compare(self.exposure.apply(raster.image[0], number), photo, mask)
+
+    def compare(self, image: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
+        """Photometric loss; arguments as of `photometric_loss`."""
+        return photometric_loss(image, photo, ssim_weight=self.config.ssim_weight, mask=mask)
 
     def _regulariser(self, splats: Splats) -> Tensor | float:
         """What else keeps Gaussians faint and small, so that they can move elsewhere."""
