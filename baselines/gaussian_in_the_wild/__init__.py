@@ -27,8 +27,8 @@ SPEC = MethodSpec(
     title="GS-W",
     paper="Zhang et al., Gaussian in the Wild: 3D Gaussian Splatting for Unconstrained Image "
     "Collections, ECCV 2024",
-    licence="Apache-2.0 (written from the paper; the official code names none, and derives from that "
-    "of 3DGS, which is for non-commercial use only)",
+    licence="Apache-2.0 (written from the paper; the official code names no licence, and derives "
+    "from that of 3DGS, which is for non-commercial use only)",
     period_input="label",
     outputs=("rgb", "alpha", "depth"),
     devices=("cpu", "cuda"),
