@@ -19,6 +19,7 @@ COMMANDS = {
     "doctor": "chronoscene.cli.doctor:command",
     "download": "chronoscene.cli.download:command",
     "export": "chronoscene.cli.export:command",
+    "leakage": "chronoscene.cli.leakage:command",
     "methods": "chronoscene.cli.methods:command",
     "new-method": "chronoscene.cli.check_method:new",
     "register": "chronoscene.cli.register:command",

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from chronoscene.images.truth import APPEARANCE, GEOMETRY, UNCHANGED
+from chronoscene.images.truth import APPEARANCE, GEOMETRY, UNCHANGED, changed_at_all
 from chronoscene.synth.city.buildings import SLAB
 from chronoscene.synth.render.renderer import PixelMaps
 from chronoscene.synth.truth import change_mask, save_image
@@ -162,3 +162,10 @@ def test_a_picture_that_cannot_be_written_says_why(tmp_path: Path) -> None:
     (tmp_path / "a.png").mkdir()
     with pytest.raises(IsADirectoryError):
         save_image(tmp_path / "a.png", np.zeros((2, 2), np.uint8))
+
+
+def test_masks_are_found_by_those_who_read_them(made) -> None:  # type: ignore[no-untyped-def]
+    for frame, other in pairs(made):  # two periods, so there is one other
+        changed = changed_at_all(made.folder / "gt", frame.name, [other], frame.camera.size, 1600)
+        path = made.folder / f"gt/change/{stem(frame.name)}__p{other}.png"
+        np.testing.assert_array_equal(changed, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) > 0)
