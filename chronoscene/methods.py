@@ -160,9 +160,9 @@ class TrainingSet:
 
     views: tuple[TrainingView, ...]
     num_periods: int
-    """1 where the harness hides the period."""
+    """1 where the harness hides the period; those so far where they arrive one after the other."""
     points: NDArray[np.float32]
-    """Sparse points. [P, 3]"""
+    """Sparse points that a training view of these periods sees. [P, 3]"""
     colors: NDArray[np.uint8]
     """[P, 3]"""
     point_periods: NDArray[np.bool_]
@@ -286,9 +286,20 @@ class Method(Protocol):
         """
 
     def load_training(self, folder: Path) -> None:
-        """Go on from what `save_training` wrote; `setup` was called as before it.
+        """Go on from what `save_training` wrote; `setup` or `extend` was called as before it.
 
         On a CPU the steps to come then give the same bits as without the interruption.
+        """
+
+    def extend(self, train: TrainingSet) -> None:
+        """Go on from the model at the end of a training, with the views of the next period.
+
+        Called instead of `setup` under the strategy ``sequential``; seed and device are those of
+        `setup`, and steps and progress count from 0 again. Only where a method can; one that cannot
+        has no such function.
+
+        Args:
+            train: Its views are of the new period alone, its periods are those so far.
         """
 
 

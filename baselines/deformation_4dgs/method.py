@@ -67,6 +67,12 @@ class Deformation4DGS(GaussianMethod):
         shared = {name: tensor.to(device) for name, tensor in tensors.items()}
         return DeformedModel(parameters, shared, field=field, times=tuple(times.tolist()))
 
+    def extended_model(self, train: TrainingSet) -> DeformedModel:
+        model = self.model
+        while len(model.times) < train.num_periods:
+            model = model.with_new_period()
+        return model
+
     def restore_model(self, tensors: dict[str, Tensor]) -> DeformedModel:
         return DeformedModel(
             {name: tensor for name, tensor in tensors.items() if name in SHAPES},

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from math import sqrt
+from typing import Self
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from baselines.deformation_4dgs.field import Corner, Field, deform
+from baselines.deformation_4dgs.field.function import time_cell
 from chronoscene.gaussians.model import GaussianModel
 
 _SPACE_START = (0.1, 0.5)  # Numbers in planes without time, at first
@@ -35,6 +37,23 @@ class DeformedModel(GaussianModel):
             return self.parameters
         time = float(np.interp(period, range(len(self.times)), self.times))
         return self.parameters | deform(self.parameters, self.shared, self.field, time)
+
+    def with_new_period(self) -> Self:
+        """The same model with a row for one more period at the end of the planes with time.
+
+        The row holds what the planes hold at the last period; earlier ones keep their rows.
+        """
+        cell, share = time_cell(self.field, self.times[-1])
+        shared = {name: tensor.detach() for name, tensor in self.shared.items()}
+        for name, plane in shared.items():
+            if name.startswith("planes.") and name.endswith("t"):
+                row = torch.lerp(plane[cell], plane[cell + 1], share)
+                shared[name] = torch.cat([plane, row[None]])
+        rows = self.field.time_cells
+        times = (*(time * (rows - 1) / rows for time in self.times), 1.0)
+        return replace(
+            self, shared=shared, field=replace(self.field, time_cells=rows + 1), times=times
+        )
 
 
 def find_box(points: NDArray[np.floating], quantile: float) -> tuple[Corner, Corner]:

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from baselines.scaffold_gs.config import ScaffoldGSConfig
 from baselines.scaffold_gs.model import ScaffoldModel
@@ -52,6 +53,10 @@ class ScaffoldGS(ScaffoldGSPeriod):
     def feature_rows(self, train: TrainingSet) -> NDArray[np.int64]:
         count = len(train.views)
         return np.arange(count) if self.config.appearance_dim else np.zeros(count, np.int64)
+
+    def extended_table(self, table: Tensor, count: int) -> Tensor:
+        """Vectors of other training images, which start at the mean of those before."""
+        return table.detach().mean(dim=0, keepdim=True).repeat(count, 1)
 
     def weights(self, period: float) -> NDArray[np.float32]:
         return np.full(self.num_periods, 1 / self.num_periods, np.float32)

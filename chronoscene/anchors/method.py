@@ -23,7 +23,13 @@ from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
 from chronoscene.training.periods import period_weights
-from chronoscene.training.splatting import Splats, SplattingMethod, draw, finite_rows
+from chronoscene.training.splatting import (
+    Splats,
+    SplattingMethod,
+    draw,
+    finite_rows,
+    with_new_periods,
+)
 
 
 class AnchorMethod(SplattingMethod):
@@ -62,6 +68,11 @@ class AnchorMethod(SplattingMethod):
         """What a method does to the features after each optimiser step; here nothing."""
         return None
 
+    def extended_table(self, table: Tensor, count: int) -> Tensor:
+        """Global features for another training set; here those of a new period are copies of the
+        last one's. [R, G] -> [count, G]"""
+        return with_new_periods(table, count)
+
     def restored_tensors(
         self, stored: dict[str, Tensor], layout: AnchorLayout
     ) -> dict[str, Tensor]:
@@ -91,12 +102,35 @@ class AnchorMethod(SplattingMethod):
         )
         layout, generator = self.layout(train), torch.Generator().manual_seed(seed)
         self._model = self.model_class.start(layout, config, anchors, generator).to(device)
-        self.meta |= {"layout": dataclasses.asdict(layout), "voxel_size": size}
+        self.meta["voxel_size"] = size
+        return self._make_trainer(train, seed)
+
+    def extend(self, train: TrainingSet) -> None:
+        """Train the anchors there are further: schedules, density control and moments begin anew.
+
+        The features of a new period start as copies of the last one's. Its sparse points are not
+        used.
+        """
+        assert self.trainer is not None, "setup comes first"
+        layout, tensors = self.layout(train), self.model.tensors()
+        tensors = {name: tensor.detach() for name, tensor in tensors.items()}
+        features, table = tensors["features"], tensors["global_features"]
+        blocks = features[:, layout.base_dim :].reshape(
+            len(features), self.num_periods, layout.period_dim
+        )
+        blocks = with_new_periods(blocks.transpose(0, 1), layout.num_periods).transpose(0, 1)
+        tensors["features"] = torch.cat([features[:, : layout.base_dim], blocks.flatten(1)], dim=1)
+        tensors["global_features"] = self.extended_table(table, layout.num_periods)
+        self._model = self.model_class.from_tensors(layout, tensors)
+        self.go_on(train, self._make_trainer(train, self.trainer.seed))
+
+    def _make_trainer(self, train: TrainingSet, seed: int) -> AnchorTrainer:
+        self.meta["layout"] = dataclasses.asdict(self._model.layout)
         return AnchorTrainer(
-            config,
+            self.config,
             self._model,
             train,
-            voxel_size=size,
+            voxel_size=self.meta["voxel_size"],
             seed=seed,
             rates=self.rates(train.camera_extent),
             feature_rows=self.feature_rows(train),

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,20 @@ def make_training_set(num_periods: int) -> TrainingSet:
         camera_extent=1.1,
         background=np.zeros(3, np.float32),
         load_image=lambda i: images[i],
+    )
+
+
+def make_stage(period: int, *, hide_period: bool) -> TrainingSet:
+    """One of two periods, as the strategy ``sequential`` gives them."""
+    data = make_training_set(2)
+    own = [i for i, view in enumerate(data.views) if view.period == period]
+    known = 1 if hide_period else period + 1
+    return replace(
+        data,
+        views=tuple(replace(data.views[i], period=known - 1) for i in own),
+        num_periods=known,
+        point_periods=data.point_periods[:, :known],
+        load_image=lambda i: data.load_image(own[i]),
     )
 
 

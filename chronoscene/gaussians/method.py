@@ -40,6 +40,10 @@ class GaussianMethod(SplattingMethod):
         """The model before training; ``parameters`` are on the device of the training."""
         return GaussianModel(parameters)
 
+    def extended_model(self, train: TrainingSet) -> GaussianModel:
+        """The model at the end of a training, with what it needs for further periods."""
+        return self.model
+
     def restore_model(self, tensors: dict[str, Tensor]) -> GaussianModel:
         """The model from what was stored, with its `meta`."""
         return GaussianModel(tensors, sh_degree=self.meta["sh_degree"])
@@ -61,6 +65,18 @@ class GaussianMethod(SplattingMethod):
         config = self.config
         parameters = initialise(train, opacity=config.initial_opacity, scale=config.initial_scale)
         self.model = self.make_model({k: v.to(device) for k, v in parameters.items()}, train, seed)
+        return self._make_trainer(train, seed)
+
+    def extend(self, train: TrainingSet) -> None:
+        """Train the Gaussians there are further: schedules, density control and moments begin anew.
+
+        The sparse points of the new period are not used.
+        """
+        assert self.trainer is not None, "setup comes first"
+        self.model = self.extended_model(train)
+        self.go_on(train, self._make_trainer(train, self.trainer.seed))
+
+    def _make_trainer(self, train: TrainingSet, seed: int) -> GaussianTrainer:
         return self.trainer_class(
             self.config,
             self.model,

@@ -122,7 +122,8 @@ class GaussianTrainer:
     def step(self, index: int, progress: float) -> StepReport:
         """Render one training view, learn from it, and change the set of Gaussians where due."""
         due = self.timeline.at(index, progress)
-        self.model.sh_degree = due.sh_degree
+        # Higher than what is due at the start of a training that goes on with a model.
+        self.model.sh_degree = max(due.sh_degree, self.model.sh_degree)
         number = self.sampler.next()
         view = self.train.views[number]
         splats = self.splats(number)

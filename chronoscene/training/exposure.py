@@ -46,13 +46,20 @@ class Exposure:
 
     def __init__(self, kind: str, train: TrainingSet, device: str | torch.device) -> None:
         periods = np.array([view.period for view in train.views])
-        self._periods = torch.from_numpy(periods).to(device)
-        self._identity = torch.eye(3, 4, device=device).repeat(train.num_periods, 1, 1)
+        self._kind, self._periods = kind, torch.from_numpy(periods).to(device)
         own = torch.arange(len(train.views), device=device)
         self._rows = own if kind == "image" else self._periods
-        count = 0 if kind == "none" else 1 + int(self._rows.max())
-        table = DenseTable(self._identity[:1].repeat(count, 1, 1))
-        self.tables = [table] if count else []
+        self.begin(torch.eye(3, 4, device=device).repeat(train.num_periods, 1, 1))
+
+    def begin(self, by_period: Tensor) -> None:
+        """Start anew from other transforms than the identity.
+
+        Args:
+            by_period: Those of all periods. [T, 3, 4]
+        """
+        self._start = by_period
+        starts = by_period[self._periods] if self._kind == "image" else by_period.clone()
+        self.tables = [] if self._kind == "none" else [DenseTable(starts)]
         """The transforms, a row for each; no table with kind ``none``. [R, 3, 4]"""
 
     def apply(self, image: Tensor, number: int) -> Tensor:
@@ -67,10 +74,10 @@ class Exposure:
             table.step(log_linear(progress, *LEARNING_RATE))
 
     def by_period(self) -> Tensor | None:
-        """The transform of each period, the identity where it has no training image. [T, 3, 4]"""
+        """The transform of each period, as at first where it has no training image. [T, 3, 4]"""
         if not self.tables:
             return None
-        result = self._identity.clone()
+        result = self._start.clone()
         for period in self._periods.unique().tolist():
             rows = self._rows[self._periods == period].unique()
             result[period] = self.tables[0].value[rows].mean(0)

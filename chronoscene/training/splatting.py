@@ -255,6 +255,11 @@ def camera_centre_tensor(view: View, device: str | torch.device = "cpu") -> Tens
     return to_device(centre.astype(np.float32), device)
 
 
+def with_new_periods(rows: Tensor, count: int) -> Tensor:
+    """A row for each period: new ones start as copies of the last. [S, ...] -> [count, ...]"""
+    return rows.detach()[[min(period, len(rows) - 1) for period in range(count)]]
+
+
 class SplattingMethod(ABC):
     """Fulfils `chronoscene.methods.Method`; a subclass says how a model starts and is drawn.
 
@@ -322,6 +327,17 @@ class SplattingMethod(ABC):
             "background": background.tolist(),
         }
         self.trainer = self.start(train, seed=seed, device=device)
+
+    def go_on(self, train: TrainingSet, trainer: Any) -> None:
+        """Put another trainer in place of the one before: the last part of `extend`.
+
+        Exposures go on, too; a new period starts with that of the last one.
+        """
+        exposure = self.exposure()
+        self.meta["num_periods"] = train.num_periods
+        self.trainer = trainer
+        if exposure is not None:
+            trainer.exposure.begin(with_new_periods(exposure, train.num_periods))
 
     def step(self, index: int, progress: float) -> StepReport:
         assert self.trainer is not None, "setup comes first"

@@ -125,7 +125,7 @@ def _gaussians(field: Field, tensors: Sequence[Tensor]) -> Gaussians:
     return Gaussians(**dict(zip(field.changed, addresses, strict=True)))
 
 
-def _time_cell(field: Field, time: float) -> tuple[int, float]:
+def time_cell(field: Field, time: float) -> tuple[int, float]:
     """Row of the planes with time that a time is in, and how far towards the next."""
     row = min(max(time, 0.0), 1.0) * (field.time_cells - 1)
     cell = min(int(row), field.time_cells - 2)
@@ -134,7 +134,7 @@ def _time_cell(field: Field, time: float) -> tuple[int, float]:
 
 def _planes_at(field: Field, time: float, tensors: Mapping[str, Tensor]) -> Tensor:
     """`Planes.values`."""
-    cell, share = _time_cell(field, time)
+    cell, share = time_cell(field, time)
     parts = []
     for level in range(len(field.sizes)):
         planes = {pair: tensors[f"planes.{level}.{pair}"] for pair in PAIRS}
@@ -147,7 +147,7 @@ def _planes_at(field: Field, time: float, tensors: Mapping[str, Tensor]) -> Tens
 
 def _plane_gradients(field: Field, time: float, sums: Tensor) -> dict[str, Tensor]:
     """Gradients of the planes from those of `Planes.values`."""
-    cell, share = _time_cell(field, time)
+    cell, share = time_cell(field, time)
     found, start = {}, 0
     for level, size in enumerate(field.sizes):
         for pair in ("xy", "xz", "yz", "xt", "yt", "zt"):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from chronoscene.bench.contract import description, rendering, storage, training
+from chronoscene.bench.contract import description, extension, rendering, storage, training
 from chronoscene.bench.contract.subject import NotApplicableError, Subject, demand
 from chronoscene.errors import ChronoSceneError
 
@@ -24,6 +24,7 @@ CHECKS: tuple[Check, ...] = (
     *training.CHECKS,
     *storage.CHECKS,
     *rendering.CHECKS,
+    *extension.CHECKS,
 )
 
 

@@ -55,9 +55,14 @@ def the_unit_of_the_scene_does_not_matter(subject: Subject) -> None:
 
 def views_are_learned_at_their_periods(subject: Subject) -> None:
     """The error on training views is well below that of the best constant image of each."""
-    for i in (0, len(subject.data.views) - 1):
-        view, photo = subject.data.views[i], subject.data.load_image(i) / 255.0
-        image = subject.method.render(view, float(view.period)).rgb
+    below_a_constant_image(subject.method, subject.data)
+
+
+def below_a_constant_image(method: Method, data: TrainingSet) -> None:
+    """Demand that the first and the last view of a training are learned."""
+    for i in (0, len(data.views) - 1):
+        view, photo = data.views[i], data.load_image(i) / 255.0
+        image = method.render(view, float(view.period)).rgb
         constant = ((photo - photo.mean(axis=(0, 1))) ** 2).mean()
         error = ((image - photo) ** 2).mean()
         demand(

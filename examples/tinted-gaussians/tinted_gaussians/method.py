@@ -13,6 +13,7 @@ from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.gaussians.model import GaussianModel
 from chronoscene.gaussians.trainer import Due
 from chronoscene.methods import TrainingSet
+from chronoscene.training.splatting import with_new_periods
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,11 @@ class TintedGaussians(GaussianMethod):
         """The model before the training: a Gaussian for each sparse point, and no tint."""
         tints = torch.zeros(train.num_periods, 3, device=parameters["means"].device)
         return Model(parameters, {"tints": tints})
+
+    def extended_model(self, train: TrainingSet) -> Model:
+        """The model with a tint for each new period, which starts as that of the last one."""
+        tints = with_new_periods(self.model.shared["tints"], train.num_periods)
+        return Model(self.model.parameters, {"tints": tints}, sh_degree=self.model.sh_degree)
 
     def restore_model(self, tensors: dict[str, Tensor]) -> Model:
         """The model from its stored tensors."""
