@@ -44,6 +44,7 @@ def export_gaussians(run: OpenRun, scene: Scene, period: float) -> GaussianCloud
             todo="export a run of another method",
         )
     frames = scene.select(split="train", period=_own_period(run, period))
+    frames = tuple(frame for frame in frames if frame.period < run.num_periods)
     gaussians = model.to_gaussians(run.told(period), list(_views(run, scene, frames)))
     return gaussians.transformed(run.training_from_world.inverse())
 

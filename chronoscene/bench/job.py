@@ -16,10 +16,18 @@ from typing import Any
 from chronoscene.bench.predictions import safe_name
 from chronoscene.bench.provenance import config_hash
 from chronoscene.bench.results import Failure
+from chronoscene.bench.strategies import STRATEGIES
 from chronoscene.checks import check_choice
 from chronoscene.errors import BackendError, ConfigError
 from chronoscene.formats import writable_formats
-from chronoscene.methods import MethodSpec, ProgramConfig, Runner, as_typed, build_config
+from chronoscene.methods import (
+    MethodSpec,
+    ProgramConfig,
+    Runner,
+    as_typed,
+    build_config,
+    import_object,
+)
 
 PHOTO_MEMORY = 2 * 10**9
 PHOTO_DISK = 20 * 10**9
@@ -78,7 +86,8 @@ class StopRule:
 LONGEST_NAME = 180  # Characters; file systems allow 255 bytes, and special ones become longer
 
 SHARING = ("total", "each")
-"""Under the strategy separate: the models share iterations and time, or each get all of them."""
+"""The models of ``separate``, or the stages of ``sequential``, share iterations and time, or each
+get all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +200,7 @@ class Job:
         return StopRule(int(self.method_config(spec).iterations), self.budget_seconds)
 
     def stop_rules(self, spec: MethodSpec, parts: int) -> tuple[StopRule, ...]:
-        """Stop rule of each model of the strategy."""
+        """Stop rule of each model or stage of the strategy."""
         rule = self.stop_rule(spec)
         return (rule,) * parts if self.separate_iterations == "each" else rule.split(parts)
 
@@ -306,6 +315,28 @@ def check_runner(job: Job, spec: MethodSpec, runner: Runner) -> None:
     check_choice(f"{spec.name}: exports", runner.exports, writable_formats())
 
 
+def check_stages(job: Job, spec: MethodSpec) -> None:
+    """Check that a method can be trained in stages.
+
+    Raises:
+        ConfigError: If it cannot, or is to be trained further after the last one.
+    """
+    if spec.runner is not None or not hasattr(import_object(spec.method), "extend"):
+        raise ConfigError(
+            f"{spec.name} --strategy {job.strategy}",
+            expected="a method that can be trained on one period after the other",
+            found="one without extend",
+            todo="use another strategy, or write the function: docs/adding-a-method.md",
+        )
+    if job.keep_training:
+        raise ConfigError(
+            f"--keep-training, --continue-to with --strategy {job.strategy}",
+            expected="neither, as a stage ends for good when the next one begins",
+            found="one of them",
+            todo="train anew with --iterations",
+        )
+
+
 def check_job(job: Job, spec: MethodSpec) -> None:
     """Check the settings before anything is trained.
 
@@ -320,6 +351,8 @@ def check_job(job: Job, spec: MethodSpec) -> None:
             todo="run this method without",
         )
     check_choice("--separate-iterations", job.separate_iterations, SHARING)
+    if STRATEGIES[job.strategy].in_order:
+        check_stages(job, spec)
     if spec.runner is not None:
         check_runner(job, spec, spec.runner)
     if job.device != "auto":

@@ -71,6 +71,7 @@ class OpenRun:
 
     folder: Path
     record: RunRecord
+    """Of an earlier stage: its periods are those so far."""
     spec: MethodSpec
     source: RunSource
     config: Any
@@ -86,19 +87,24 @@ class OpenRun:
 
     @property
     def num_periods(self) -> int:
-        """Periods of the scene, numbered from 0."""
+        """Periods that its models know, numbered from 0."""
         return len(self.record.period_labels)
+
+    @property
+    def tells_period(self) -> bool:
+        """Whether its models are told the period."""
+        return self.strategy.tells(self.spec)
 
     @property
     def is_continuous(self) -> bool:
         """Whether periods in between, such as 0.5, can be rendered."""
-        return self.spec.period_input == "continuous" and self.strategy.tells_period
+        return self.spec.period_input == "continuous" and self.tells_period
 
     def check_period(self, period: float) -> None:
         """Refuse a period that the models do not claim.
 
         Raises:
-            ConfigError: If it is outside of those of the scene, or fractional where the method
+            ConfigError: If it is outside of those that they know, or fractional where the method
                 takes whole ones only.
         """
         if not 0 <= period <= self.num_periods - 1:
@@ -138,13 +144,15 @@ class OpenRun:
         return ConfigError(
             f"period {name}",
             expected=f"one from 0 to {self.num_periods - 1}",
-            found="none of this scene",
+            found="another",
             todo=f"choose among {labels}",
         )
 
     def model(self, period: float) -> Method:
         """The model that answers for a period, loaded at its first use."""
-        part = period_part(int(period)) if self.strategy.model_per_period else ""
+        last = self.num_periods - 1 if self.strategy.in_order else int(period)
+        split = self.strategy.model_per_period or self.strategy.in_order
+        part = period_part(last) if split else ""
         if part not in self._models:
             self._models[part] = self._load(self.folder / CHECKPOINT / part)
         return self._models[part]
@@ -163,7 +171,7 @@ class OpenRun:
 
     def told(self, period: float) -> float:
         """What a model is told that is to show a period."""
-        return float(period) if self.strategy.tells_period else 0.0
+        return float(period) if self.tells_period else 0.0
 
     def view(self, camera: Camera, cam_from_world: NDArray[np.float64]) -> View:
         """A camera without distortion as the models see it; its pose is in the world. [4, 4]"""
@@ -212,7 +220,7 @@ class OpenRun:
             ConfigError: If it does not, or does not claim the period.
         """
         self.check_period(period)
-        if not self.strategy.tells_period or not hasattr(self.model(period), "render_split"):
+        if not self.tells_period or not hasattr(self.model(period), "render_split"):
             raise ConfigError(
                 f"appearance of period {period:g}",
                 expected="one model of all periods that keeps geometry and colours apart",
@@ -240,7 +248,9 @@ class OpenRun:
         )
 
 
-def open_run(folder: Path, *, device: str = "cpu", plugin_path: Path | None = None) -> OpenRun:
+def open_run(
+    folder: Path, *, device: str = "cpu", plugin_path: Path | None = None, stage: int | None = None
+) -> OpenRun:
     """Open the folder of a finished run, ``RUNS/<scene>/<method>-<strategy>-<preset>/seed<k>``.
 
     Models are loaded when they are first asked for. The scene need not be there.
@@ -249,14 +259,18 @@ def open_run(folder: Path, *, device: str = "cpu", plugin_path: Path | None = No
         folder: With ``run.json``.
         device: ``cpu`` or ``cuda``.
         plugin_path: Where ``module:SPEC`` is now, if it has moved.
+        stage: Number of the period after which the model of a ``sequential`` run is wanted; None
+            for the last.
 
     Raises:
         CheckpointError: If the folder has no finished run, or a file is damaged.
-        ConfigError: If the method is not installed.
+        ConfigError: If the method is not installed, or there is no such stage.
         BackendError: If there is no such device.
     """
     check_device(device)
     record = read_run(folder)
+    if stage is not None:
+        record = _at_stage(record, stage)
     if not (folder / CHECKPOINT).is_dir():
         raise CheckpointError(
             folder,
@@ -293,6 +307,20 @@ def open_run(folder: Path, *, device: str = "cpu", plugin_path: Path | None = No
         training_from_world=Sim3.from_matrix(source.training_from_world),
         device=device,
     )
+
+
+def _at_stage(record: RunRecord, stage: int) -> RunRecord:
+    """The record with the periods of a stage and those before."""
+    stages = len(record.period_labels) if STRATEGIES[record.strategy].in_order else 0
+    if stage not in range(stages):
+        raise ConfigError(
+            f"stage {stage}",
+            expected=f"one from 0 to {stages - 1}" if stages else "a run in stages",
+            found="another" if stages else f"strategy {record.strategy}",
+            todo="choose one of these" if stages else "leave it out",
+        )
+    labels = dict(list(record.period_labels.items())[: stage + 1])
+    return record.model_copy(update={"period_labels": labels})
 
 
 def _read_source(path: Path) -> RunSource:

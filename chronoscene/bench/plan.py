@@ -169,9 +169,10 @@ def _scene_jobs(
     for (reference, spec), wanted, seed in product(specs, settings.strategies, settings.seeds):
         strategy, notice = effective_strategy(spec, wanted)
         notices = [notice] if notice else []
-        if STRATEGIES[strategy].model_per_period:
-            each = settings.separate_iterations == "each"
-            has = "each model has all" if each else "the models of a run share the"
+        kind, sharing = STRATEGIES[strategy], "total"
+        if kind.model_per_period or kind.in_order:
+            sharing, unit = settings.separate_iterations, "stage" if kind.in_order else "model"
+            has = f"each {unit} has all" if sharing == "each" else f"the {unit}s of a run share the"
             notices.append(f"{strategy}: {has} iterations and time")
         job = Job(
             scene_root=str(scene.root.resolve()),
@@ -186,7 +187,7 @@ def _scene_jobs(
             overrides=overrides[spec.name],
             iterations=settings.iterations,
             budget_seconds=budget,
-            separate_iterations=settings.separate_iterations,
+            separate_iterations=sharing,
             seed=seed,
             max_width=settings.max_width,
             photo_memory=settings.photo_memory,

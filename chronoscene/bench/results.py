@@ -30,6 +30,8 @@ SOURCE_FILE = "source.json"
 CHECKPOINT = "checkpoint"
 TRAINING = "training"
 PREDICTIONS = "predictions"
+STAGES = "stages"
+UNTRAINED = "untrained"
 GROUND_TRUTH = "ground_truth"
 PHOTOS = "photos"
 FIGURES = "figures"
@@ -57,6 +59,11 @@ class RunRecord(BaseModel):
     empty where there are no change masks."""
     change_masks: str | None = None
     """Fingerprint of these masks."""
+    stages: dict[str, dict[str, Values]] = {}
+    """`periods` after each stage of ``sequential``, by the name of the stage; before the first one
+    under `UNTRAINED`. A stage has the periods so far and the next one."""
+    transfer: dict[str, Values] = {}
+    """What the stages do to earlier and later periods: `chronoscene.bench.stages.transfer`."""
     seconds: float | None
     """Training clock: setup and steps, without probes, rendering and scoring. What is None here and
     below was not measured; see `absent`."""

@@ -21,6 +21,8 @@ from chronoscene.bench.predictions import (
 from chronoscene.bench.regions import ALL, REGIONS, change_masks_hash, regions_of
 from chronoscene.bench.results import (
     PREDICTIONS,
+    STAGES,
+    UNTRAINED,
     Row,
     RunRecord,
     Values,
@@ -30,6 +32,8 @@ from chronoscene.bench.results import (
     write_run,
     write_summary,
 )
+from chronoscene.bench.stages import transfer
+from chronoscene.bench.strategies import period_part
 from chronoscene.errors import CheckpointError, ChronoSceneError, ShapeError
 from chronoscene.io.wording import shown
 from chronoscene.metrics.registry import Scorers, all_metrics, make_scorers
@@ -50,14 +54,22 @@ class Scores:
     """Fingerprint of the masks that say what the regions are."""
 
 
-def score_folder(predictions: Path, ground_truth: Path, scorers: Scorers) -> Scores:
+def score_folder(
+    predictions: Path, ground_truth: Path, scorers: Scorers, *, stage: bool = False
+) -> Scores:
     """Score every predicted view that shows the period of its photo.
+
+    Args:
+        predictions: Of a run, or of one of its stages.
+        ground_truth: The frozen photos.
+        scorers: The metrics.
+        stage: Whether some views may be missing, and others show the last period that is known.
 
     Raises:
         CheckpointError: If a manifest or an image is damaged, or the two do not belong together.
     """
     predicted, truth = read_manifest(predictions), read_manifest(ground_truth)
-    pairs = match_views(predictions, predicted, truth)
+    pairs = match_views(predictions, predicted, truth, stage=stage)
     rows: list[Row] = []
     skipped, unscored = dict(scorers.skipped), []
     for entry, target in pairs:
@@ -99,12 +111,30 @@ def score_run(staging: Path, record: RunRecord, truth: Path, scorers: Scorers) -
     """Score the predictions in the folder of a run, and write its record with the scores."""
     scores = score_folder(staging / PREDICTIONS, truth, scorers)
     put_scores(record, scores)
+    score_stages(staging, record, truth, scorers)
     if scores.unscored:
         views = shown(scores.unscored)
         record.notices.append(
             f"{record.label}: not scored, as their masks ignore every pixel: {views}"
         )
     write_run(staging, record, scores.rows)
+
+
+def score_stages(folder: Path, record: RunRecord, truth: Path, scorers: Scorers) -> None:
+    """Score the stages of a run, if it has any; its record has the scores of the last one.
+
+    Earlier values of metrics that are not computed now are kept.
+    """
+    stages: dict[str, dict[str, Values]] = {}
+    *names, last = UNTRAINED, *map(period_part, range(len(record.period_labels)))
+    for name in names if (folder / STAGES).is_dir() else ():
+        scores = score_folder(folder / STAGES / name, truth, scorers, stage=True)
+        _, stages[name] = aggregate(scores.rows)
+        for period, earlier in record.stages.get(name, {}).items():
+            stages[name][period] = earlier | stages[name].get(period, {})
+    if stages:
+        stages[last] = record.periods
+        record.stages, record.transfer = stages, transfer(stages)
 
 
 def score_job(job: Job, record: RunRecord) -> None:
@@ -141,17 +171,17 @@ def score_pair(
 
 
 def match_views(
-    folder: Path, predicted: Manifest, truth: Manifest
+    folder: Path, predicted: Manifest, truth: Manifest, *, stage: bool = False
 ) -> list[tuple[ImageEntry, ImageEntry]]:
-    """Pair every test view with its prediction.
+    """Pair every test view, or those of a stage, with its prediction.
 
     Raises:
         CheckpointError: If the scene, a view or a size differs.
     """
     if predicted.scene_hash != truth.scene_hash:
         raise _mismatch(folder, f"scene {truth.scene_hash[:12]}", predicted.scene_hash[:12])
-    by_view = {e.view: e for e in predicted.images if e.rendered_period == e.camera_period}
-    targets = {e.view: e for e in truth.images}
+    by_view = {e.view: e for e in predicted.images if stage or e.rendered_period == e.camera_period}
+    targets = {e.view: e for e in truth.images if not stage or e.view in by_view}
     if missing := sorted(targets.keys() ^ by_view.keys()):
         raise _mismatch(folder, "one prediction per test view", f"a difference at {missing[0]!r}")
     for view, target in targets.items():
@@ -252,13 +282,14 @@ def rescore(
 def _rescore_one(runs: Path, folder: Path, scorers: Scorers) -> Rescored:
     try:
         record = read_run(folder)
+        before, parts = record.aggregates, record.regions
         truth = ground_truth_folder(runs, record.scene)
         scores = score_folder(folder / PREDICTIONS, truth, scorers)
         kept, scores = keep_earlier(folder, record, scores, scorers.unasked)
+        put_scores(record, scores)
+        score_stages(folder, record, truth, scorers)
     except ChronoSceneError as error:
         return Rescored(folder, [], [], str(error))
-    before, parts = record.aggregates, record.regions
-    put_scores(record, scores)
     write_run(folder, record, scores.rows)
     told = changes(before, record.aggregates)
     for region, part in record.regions.items():

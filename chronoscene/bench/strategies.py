@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,22 +26,31 @@ class Strategy:
     """Whether models are told the period; else they are asked for period 0 whatever it is."""
     model_per_period: bool
     """Whether each period has a model of its own."""
+    in_order: bool = False
+    """Whether one model learns the periods one after the other, in stages."""
+
+    def tells(self, spec: MethodSpec) -> bool:
+        """Whether the models of a method are told the period."""
+        return self.tells_period and spec.period_input != "none"
 
 
 STRATEGIES = {
     "joint": Strategy(tells_period=True, model_per_period=False),
     "pooled": Strategy(tells_period=False, model_per_period=False),
     "separate": Strategy(tells_period=False, model_per_period=True),
+    "sequential": Strategy(tells_period=True, model_per_period=False, in_order=True),
 }
 """``joint``: one model, told the period. ``pooled``: one model, the period hidden from it.
-``separate``: one model per period, which sees the images and points of that period alone."""
+``separate``: one model per period, which sees the images and points of that period alone.
+``sequential``: one model, which sees the images of one period after the other, and is told the
+period if it takes one."""
 
 EXTENT_MARGIN = 1.1  # Factor of 3DGS between the farthest camera and the camera extent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """One model to train, and the test views that it answers for."""
+    """A model to train, or a stage of its training, and the test views that it answers for."""
 
     name: str
     """``all``, or that of `period_part`."""
@@ -50,6 +59,12 @@ class Part:
     store: ImageStore
     hides_period: bool
     """Whether the model is asked for period 0 whatever the view's period is."""
+    last: int
+    """The last period whose images it was trained on."""
+    extends: bool = False
+    """Whether the training begins with the model of the part before."""
+    ahead: tuple[Frame, ...] = ()
+    """Test views of the period that the next stage learns."""
 
     @property
     def subfolder(self) -> str:
@@ -64,7 +79,11 @@ class Part:
 
     def method_period(self, frame: Frame) -> float:
         """The period to ask the model for to predict a frame."""
-        return 0.0 if self.hides_period else float(frame.period)
+        return 0.0 if self.hides_period else float(self.shown_period(frame))
+
+    def shown_period(self, frame: Frame) -> int:
+        """The period that a prediction of a frame shows: its own, or the last that is known."""
+        return min(frame.period, self.last)
 
 
 def period_part(period: int) -> str:
@@ -75,34 +94,50 @@ def period_part(period: int) -> str:
 def effective_strategy(spec: MethodSpec, strategy: str) -> tuple[str, str | None]:
     """The strategy that a method can follow, and a notice where it is not the one asked for."""
     check_choice("--strategy", strategy, STRATEGIES)
-    if STRATEGIES[strategy].tells_period and spec.period_input == "none":
+    kind = STRATEGIES[strategy]
+    if kind.tells_period and not kind.tells(spec) and not kind.in_order:
         notice = f"{spec.name} takes no period: {strategy} is run and recorded as pooled"
         return "pooled", notice
     return strategy, None
 
 
-def make_parts(scene: Scene, store: ImageStore, strategy: str) -> tuple[Part, ...]:
-    """The training sets of a strategy.
+def make_parts(
+    scene: Scene, store: ImageStore, strategy: str, *, takes_period: bool = True
+) -> tuple[Part, ...]:
+    """The training sets of a strategy, in the order of the trainings.
 
-    The training frame comes from all training cameras of the scene under every strategy, so that
-    learning rates and voxel sizes mean the same length whatever the strategy.
+    The training frame comes from all training cameras of the scene, so that learning rates and
+    voxel sizes mean the same length whatever the strategy. Under ``sequential`` it comes from those
+    of the first period, as no others are known when the training begins.
+
+    Args:
+        scene: What is trained on.
+        store: Its images.
+        strategy: One of `STRATEGIES`.
+        takes_period: Whether the method takes the period.
 
     Raises:
         SceneError: If a camera is distorted, or images or points are missing that are needed.
     """
     check_choice("--strategy", strategy, STRATEGIES)
     check_scene(scene)
-    to_training = training_frame(scene)
     kind = STRATEGIES[strategy]
-    hide = not kind.tells_period
-    if not kind.model_per_period:
-        train = _training_set(scene, store, to_training, None, hide_period=hide)
-        return (Part("all", train, scene.select(split="test"), store, hide),)
+    hide, everything = not (kind.tells_period and takes_period), range(scene.num_periods)
+    to_training = training_frame(scene, everything[:1] if kind.in_order else everything)
+    if not kind.model_per_period and not kind.in_order:
+        train = _training_set(scene, store, to_training, everything, everything, hide_period=hide)
+        return (Part("all", train, scene.select(split="test"), store, hide, everything[-1]),)
     parts = []
-    for period in scene.periods:
-        test = scene.select(split="test", period=period.id)
-        train = _training_set(scene, store, to_training, period.id, hide_period=hide)
-        parts.append(Part(period_part(period.id), train, test, store, hide))
+    for period in everything:
+        own = everything[period : period + 1]
+        known = everything[: period + 1] if kind.in_order else own
+        train = _training_set(scene, store, to_training, own, known, hide_period=hide)
+        test = tuple(f for f in scene.select(split="test") if f.period in known)
+        part = Part(period_part(period), train, test, store, hide, period)
+        if kind.in_order:
+            ahead = scene.select(split="test", period=period + 1)
+            part = replace(part, extends=period > 0, ahead=ahead)
+        parts.append(part)
     return tuple(parts)
 
 
@@ -131,19 +166,46 @@ def check_scene(scene: Scene) -> None:
         )
 
 
-def training_frame(scene: Scene) -> Sim3:
+def training_frame(scene: Scene, periods: range | None = None) -> Sim3:
     """``training_from_world``: mean training camera at the origin, the farthest at distance 1.
 
     Where all cameras stand at one place, the median distance of the points becomes 1 instead.
+
+    Args:
+        scene: With training images.
+        periods: Those whose cameras and points count; None for all.
     """
-    centres = _centres(scene.select(split="train"))
+    periods = range(scene.num_periods) if periods is None else periods
+    centres = _centres(_training_frames(scene, periods))
     centre = centres.mean(axis=0)
     radius = float(np.linalg.norm(centres - centre, axis=1).max())
     if radius <= 1e-9 * max(1.0, float(np.abs(centre).max())):
-        distances = np.linalg.norm(scene.points.xyz - centre, axis=1)
+        points = scene.points.xyz
+        if len(periods) < scene.num_periods:
+            points = points[_seen(scene, periods).any(axis=1)]
+        distances = np.linalg.norm(points - centre, axis=1)
         radius = float(np.median(distances)) if distances.size else 1.0
     scale = 1.0 / radius if radius > 0 else 1.0
     return Sim3(scale, np.eye(3), -scale * centre)
+
+
+def _training_frames(scene: Scene, periods: range) -> tuple[Frame, ...]:
+    """Training images of some periods."""
+    frames = tuple(f for f in scene.select(split="train") if f.period in periods)
+    if not frames:
+        raise SceneError(
+            f"{scene.root}: period {periods[-1]}",
+            expected="at least one training image",
+            found="none",
+            todo="move one from test to train, or use another strategy",
+        )
+    return frames
+
+
+def _seen(scene: Scene, periods: range) -> NDArray[np.bool_]:
+    """Whether a training image of a period sees the point; no image of other periods. [P, T]"""
+    counts = [f.split == "train" and f.period in periods for f in scene.frames]
+    return scene.point_periods(np.array(counts))
 
 
 def _centres(frames: Sequence[Frame]) -> NDArray[np.float64]:
@@ -151,30 +213,27 @@ def _centres(frames: Sequence[Frame]) -> NDArray[np.float64]:
 
 
 def _training_set(
-    scene: Scene, store: ImageStore, to_training: Sim3, period: int | None, *, hide_period: bool
+    scene: Scene,
+    store: ImageStore,
+    to_training: Sim3,
+    periods: range,
+    known: range,
+    *,
+    hide_period: bool,
 ) -> TrainingSet:
-    """Training set of all periods, or of one."""
-    frames = scene.select(split="train", period=period)
-    if not frames:
-        raise SceneError(
-            f"{scene.root}: period {period}",
-            expected="at least one training image",
-            found="none",
-            todo="move one from test to train, or use another strategy",
-        )
-    trained_on = [f.split == "train" and period in (None, f.period) for f in scene.frames]
-    seen = scene.point_periods(np.array(trained_on))
+    """Training set of some periods, with the points of those that are known by then."""
+    frames, seen = _training_frames(scene, periods), _seen(scene, known)[:, : known.stop]
     kept = seen.any(axis=1)
     if not kept.any():
         raise SceneError(
-            scene.root if period is None else f"{scene.root}: period {period}",
+            f"{scene.root}: period {known[-1]}" if len(known) == 1 else scene.root,
             expected="sparse points that a training image sees",
             found="none",
             todo="triangulate points with COLMAP",
         )
     return TrainingSet(
         views=tuple(_training_view(f, store, to_training, hide_period) for f in frames),
-        num_periods=1 if hide_period else scene.num_periods,
+        num_periods=1 if hide_period else known.stop,
         points=to_training.apply(scene.points.xyz[kept]).astype(np.float32),
         colors=scene.points.rgb[kept],
         point_periods=np.ones((int(kept.sum()), 1), bool) if hide_period else seen[kept],

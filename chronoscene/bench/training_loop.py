@@ -106,10 +106,11 @@ def train(
     now: Clock = time.perf_counter,
     checkpoints: Checkpoints | None = None,
 ) -> LoopState:
-    """Train one model. Probes, checkpoints, the observer and waiting for photos are off the clock.
+    """Train a model, or a stage of it. Probes, checkpoints, the observer and waits for photos are
+    off the clock.
 
     Args:
-        method: An empty method.
+        method: An empty method; at a later stage, that of the stage before.
         part: What to train on and what to probe.
         stop: When to end.
         truth: Ground truth of the probe views.
@@ -130,7 +131,10 @@ def train(
     seed_everything(seed)
     clock, waiting = Stopwatch(now), Stopwatch(lambda: part.store.waited)
     with clock, waiting:
-        method.setup(part.train, seed=seed, device=device)
+        if part.extends:
+            method.extend(part.train)
+        else:
+            method.setup(part.train, seed=seed, device=device)
     seconds = clock.seconds - waiting.seconds
     state = LoopState(seconds=seconds, setup_seconds=seconds, waited_seconds=waiting.seconds)
     if checkpoints is not None and (restored := checkpoints.restore(method)) is not None:

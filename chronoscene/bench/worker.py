@@ -10,6 +10,7 @@ import os
 import sys
 import time
 import traceback
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from datetime import UTC, datetime
 from importlib.util import find_spec
@@ -38,13 +39,14 @@ from chronoscene.bench.provenance import (
     peak_memory_bytes,
 )
 from chronoscene.bench.scoring import NO_TESTS, score_job
-from chronoscene.bench.strategies import Part, make_parts
+from chronoscene.bench.strategies import STRATEGIES, Part, make_parts
 from chronoscene.bench.training_loop import (
     DivergedError,
     Truth,
     checked_bytes,
     forget_peak_memory,
     probe_frames,
+    seed_everything,
     train,
     warm_up,
 )
@@ -55,14 +57,16 @@ from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads
 from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
-from chronoscene.scene import Scene
+from chronoscene.scene import Frame, Scene
 
 
 @dataclass(frozen=True, slots=True)
 class PartOutcome:
-    """What training and rendering one model gave."""
+    """What training and rendering one model, or one stage of it, gave."""
 
     trained: LoopState
+    folder: Path
+    """Of the saved model."""
     size: MethodSize
     render_seconds: float
     """For all its test views together, by the model as it was saved and loaded again."""
@@ -89,10 +93,14 @@ def run_job(job: Job) -> None:
     machine = Machine(pick_device(job.device, spec), set_threads(job.threads))
     write_text_atomic(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
     scene = read_scene(job.scene_root, format=job.scene_format)
-    parts = make_parts(scene, open_store(scene, job), job.strategy)
+    takes_period = spec.period_input != "none"
+    parts = make_parts(scene, open_store(scene, job), job.strategy, takes_period=takes_period)
     write_source(job, parts[0].train.training_from_world)
-    writer = ImageWriter(staging / results.PREDICTIONS)
-    outcomes = []
+    # All stages but the last have folders of their own, as they predict the same views.
+    stages = [part.name for part in parts[:-1]] if STRATEGIES[job.strategy].in_order else []
+    writers = {name: ImageWriter(staging / results.STAGES / name) for name in stages}
+    final = ImageWriter(staging / results.PREDICTIONS)
+    method, outcomes = _new_method(job, spec), []
     with ProgressDisplay(job.label) as display:
         display.wait("warm-up: kernels compile at first use, for a minute or more")
         before = time.perf_counter()
@@ -101,20 +109,29 @@ def run_job(job: Job) -> None:
         notice = warm_up(spec, config, num_periods=periods, device=machine.device)
         forget_peak_memory()
         warmup_seconds = time.perf_counter() - before
+        if stages:
+            writers[results.UNTRAINED] = ImageWriter(staging / results.STAGES / results.UNTRAINED)
+            _render_untrained(job, spec, parts, machine, writers[results.UNTRAINED])
         for part, stop in zip(parts, job.stop_rules(spec, len(parts)), strict=True):
             display.begin(part.name, stop)
+            if not part.extends:
+                method = _new_method(job, spec)
             checkpoints = None
             if spec.resumable:
                 checkpoints = _checkpoints(job, spec, part, len(parts), display)
-            outcomes.append(_run_part(job, spec, part, stop, machine, writer, display, checkpoints))
+            writer = writers.get(part.name, final)
+            outcomes.append(
+                _run_part(job, spec, method, part, stop, machine, writer, display, checkpoints)
+            )
     found = (peak_memory_bytes() or 0, *(o.trained.peak_memory_bytes for o in outcomes))
     peaks = max(found) or None, _peak_device_memory(machine.device)
-    writer.close(
-        kind="predictions",
-        scene=scene.name,
-        scene_hash=job.scene_hash,
-        details={"method": spec.name, "strategy": job.strategy, "seed": job.seed},
-    )
+    for writer in (*writers.values(), final):
+        writer.close(
+            kind="predictions",
+            scene=scene.name,
+            scene_hash=job.scene_hash,
+            details={"method": spec.name, "strategy": job.strategy, "seed": job.seed},
+        )
     columns = [f.name for f in fields(CurvePoint)]
     points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
     write_text_atomic(staging / results.CURVE_FILE, csv_text(columns, points))
@@ -141,9 +158,40 @@ def pick_device(wanted: str, spec: MethodSpec) -> str:
     return "cuda" if "cuda" in spec.devices and (ready or "cpu" not in spec.devices) else "cpu"
 
 
+def _new_method(job: Job, spec: MethodSpec) -> Method:
+    """An empty method."""
+    method: Method = import_object(spec.method)(job.method_config(spec))
+    return method
+
+
+def _render_untrained(
+    job: Job, spec: MethodSpec, parts: Sequence[Part], machine: Machine, writer: ImageWriter
+) -> None:
+    """Render what the first stage does not learn, with the model that it begins with."""
+    method, first = _new_method(job, spec), parts[0]
+    seed_everything(job.seed)
+    method.setup(first.train, seed=job.seed, device=machine.device)
+    for part in parts:
+        for frame in part.ahead:
+            _render_view(method, first, frame, writer)
+
+
+def _render_view(
+    method: Method, part: Part, frame: Frame, writer: ImageWriter
+) -> tuple[float, int | None]:
+    """Render a test view and write it; returns the seconds of the rendering, and what it drew."""
+    before = time.perf_counter()
+    prediction = method.render(part.view(frame), part.method_period(frame))
+    seconds = time.perf_counter() - before
+    image, shown = checked_bytes(prediction, part, frame), part.shown_period(frame)
+    writer.add(frame.name, image, camera_period=frame.period, rendered_period=shown)
+    return seconds, prediction.drawn
+
+
 def _run_part(
     job: Job,
     spec: MethodSpec,
+    method: Method,
     part: Part,
     stop: StopRule,
     machine: Machine,
@@ -151,8 +199,7 @@ def _run_part(
     display: ProgressDisplay,
     checkpoints: Checkpoints | None,
 ) -> PartOutcome:
-    """Train one model, save it, and render the test views that it answers for."""
-    method: Method = import_object(spec.method)(job.method_config(spec))
+    """Train a method, save its model, and render the test views that it answers for."""
     checkpoint = Path(job.staging) / results.CHECKPOINT
     try:
         trained = train(
@@ -171,20 +218,20 @@ def _run_part(
     display.wait(f"{len(part.test)} test views")
     saved = _save(method, checkpoint, part)
     # What is scored is what the checkpoint holds, and nothing that only the training knows.
-    method = import_object(spec.method)(job.method_config(spec))
-    method.load(saved, device=machine.device)
+    loaded = _new_method(job, spec)
+    loaded.load(saved, device=machine.device)
     for frame in part.test[:1]:
-        method.render(part.view(frame), part.method_period(frame))  # the first time takes longer
+        loaded.render(part.view(frame), part.method_period(frame))  # the first time takes longer
     seconds = 0.0
     drawn: list[Any] = []
     for frame in part.test:
-        before = time.perf_counter()
-        prediction = method.render(part.view(frame), part.method_period(frame))
-        seconds += time.perf_counter() - before
-        image = checked_bytes(prediction, part, frame)
-        writer.add(frame.name, image, camera_period=frame.period, rendered_period=frame.period)
-        drawn.append(prediction.drawn)
-    return PartOutcome(trained, method.size(), seconds, None if None in drawn else sum(drawn))
+        spent, touching = _render_view(loaded, part, frame, writer)
+        seconds += spent
+        drawn.append(touching)
+    for frame in part.ahead:
+        _render_view(loaded, part, frame, writer)
+    total = None if None in drawn else sum(drawn)
+    return PartOutcome(trained, saved, loaded.size(), seconds, total)
 
 
 def _checkpoints(
@@ -244,8 +291,10 @@ def _record(
     """The record of the run, without its scores."""
     tests = len(scene.select(split="test"))
     code = [commit for outcome in outcomes for commit in outcome.trained.commits]
-    drawn = [outcome.drawn for outcome in outcomes]
-    saved = (Path(job.staging) / results.CHECKPOINT).rglob("*")
+    # The stages of a training leave one model.
+    models = outcomes[-1:] if STRATEGIES[job.strategy].in_order else outcomes
+    drawn = [model.drawn for model in models]
+    saved = [path for model in models for path in model.folder.rglob("*")]
     return results.RunRecord(
         method=spec.name,
         strategy=job.strategy,
@@ -258,7 +307,7 @@ def _record(
         empty_steps=sum(o.trained.empty_steps for o in outcomes),
         skipped_steps=sum(o.trained.skipped_steps for o in outcomes),
         resumed=max(o.trained.resumed for o in outcomes),
-        primitives=sum(o.size.primitives for o in outcomes),
+        primitives=sum(model.size.primitives for model in models),
         primitive=outcomes[0].size.unit,
         drawn=None if None in drawn or not tests else sum(filter(None, drawn)) / tests,
         checkpoint_bytes=sum(path.stat().st_size for path in saved if path.is_file()),
@@ -275,11 +324,11 @@ def _record(
         scene_hash=job.scene_hash,
         split_hash=job.split_hash,
         period_labels={str(p.id): p.label for p in scene.periods},
-        parameters=sum(o.size.parameters for o in outcomes),
+        parameters=sum(model.size.parameters for model in models),
         warmup_seconds=0.0,
         waited_seconds=sum(o.trained.waited_seconds for o in outcomes),
         setup_seconds=sum(o.trained.setup_seconds for o in outcomes),
-        render_seconds=sum(o.render_seconds for o in outcomes) / tests if tests else None,
+        render_seconds=sum(m.render_seconds for m in models) / tests if tests else None,
         peak_device_memory_bytes=peaks[1],
         threads=machine.threads,
         max_width=job.max_width,

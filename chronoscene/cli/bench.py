@@ -66,7 +66,8 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
     type=click.Choice(["total", "each"]),
     default="total",
     show_default=True,
-    help="Whether the models of strategy separate share iterations and budget or each get them.",
+    help="Whether the models of strategy separate, or the stages of strategy sequential, share "
+    "iterations and budget or each get them.",
 )
 @click.option(
     "--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Number of seeds."

@@ -10,7 +10,7 @@ from chronoscene.bench.export import export_gaussians, measure_loss
 from chronoscene.bench.opening import open_run
 from chronoscene.cli.output import check_file, emit, tell_written
 from chronoscene.cli.progress import announce
-from chronoscene.cli.render import DEVICE, RUN, SCENE
+from chronoscene.cli.render import DEVICE, RUN, SCENE, STAGE
 from chronoscene.formats.shared.gaussian_ply import write_gaussians
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted
@@ -28,15 +28,18 @@ from chronoscene.io.wording import counted
     help="The PLY file to write.",
 )
 @SCENE
+@STAGE
 @DEVICE
-def command(folder: Path, period: str, out: Path, scene: Path | None, device: str) -> None:
+def command(
+    folder: Path, period: str, out: Path, scene: Path | None, stage: int | None, device: str
+) -> None:
     """Write a period of a finished run as Gaussians.
 
     RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. The file has the PLY format
     of 3DGS, in the world of the scene. What changes with the direction is fitted to the training
     views; the PSNR lost by that on the test views is printed.
     """
-    run = open_run(folder, device=device)
+    run = open_run(folder, device=device, stage=stage)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
     check_file("--out", out)
     wanted = run.parse_period(period)

@@ -19,6 +19,12 @@ SCENE = click.option(
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     help="Where the scene of the run is now, if it has moved.",
 )
+STAGE = click.option(
+    "--stage",
+    type=click.IntRange(min=0),
+    help="For a run under strategy sequential: use its model as it was after the period with this "
+    "number.  [default: the last]",
+)
 DEVICE = click.option(
     "--device",
     type=click.Choice(["cpu", "cuda"]),
@@ -65,6 +71,7 @@ DEVICE = click.option(
     help="Pictures per second of a file.",
 )
 @SCENE
+@STAGE
 @DEVICE
 def command(
     folder: Path,
@@ -75,6 +82,7 @@ def command(
     frames: int,
     fps: float,
     scene: Path | None,
+    stage: int | None,
     device: str,
 ) -> None:
     """Render a finished run from any camera.
@@ -82,7 +90,7 @@ def command(
     RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. An orbit goes around the
     middle of the sparse points, at the height and distance of the cameras.
     """
-    run = open_run(folder, device=device)
+    run = open_run(folder, device=device, stage=stage)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
     if is_animation(out):
         check_file("--out", out)

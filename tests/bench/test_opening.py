@@ -138,6 +138,34 @@ def test_missing_and_damaged_files(runs, name, text, message):
         open_run(folder).model(0)
 
 
+@pytest.mark.parametrize("stage", [None, 0])
+def test_each_stage_of_a_sequential_run_can_be_opened(bench_here, stage):
+    outcome, _ = bench_here("chronogs", strategies=("sequential",), preset="fast", iterations=12)
+    folder = outcome.finished[0]
+    run = open_run(folder, stage=stage)
+    if stage is None:
+        assert_renders_its_predictions(run)
+        assert run.num_periods == 2
+        return
+    with pytest.raises(ConfigError, match=r"period 1: expected one from 0 to 0.*0 .spring."):
+        run.render(run.scene().frames[0].camera, np.eye(4), 1)
+    place = folder / "stages/period-0"
+    frames = {frame.name: frame for frame in run.scene().frames}
+    for entry in read_manifest(place).images:
+        frame = frames[entry.view]
+        image = run.render(frame.camera, frame.cam_from_world, entry.rendered_period).rgb
+        np.testing.assert_array_equal(to_bytes(image), load_image(place, entry))
+    with pytest.raises(ConfigError, match="stage 2: expected one from 0 to 1"):
+        open_run(folder, stage=2)
+
+
+def test_a_run_that_is_not_in_stages_has_none(runs):
+    with pytest.raises(
+        ConfigError, match="stage 0: expected a run in stages, found strategy joint"
+    ):
+        open_run(folder_of(runs), stage=0)
+
+
 def test_a_run_without_its_model(runs):
     folder = folder_of(runs, "separate")
     (folder / "checkpoint" / "period-1").rename(folder / "elsewhere")

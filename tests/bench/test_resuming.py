@@ -11,6 +11,7 @@ import time
 
 import pytest
 
+from chronoscene.bench import worker
 from chronoscene.bench.checkpoints import Checkpoints
 from chronoscene.bench.results import read_run
 from chronoscene.errors import ConfigError
@@ -30,14 +31,15 @@ run_bench(
         iterations=int(sys.argv[4]),
         preset=sys.argv[5],
         checkpoint_seconds=0.03,
+        strategies=(sys.argv[6],),
     ),
     lambda line: print(line, flush=True),
 )
 """
 
 
-def start(scene, method, runs, iterations, preset="balanced"):
-    arguments = [str(scene), method, str(runs), str(iterations), preset]
+def start(scene, method, runs, iterations, preset="balanced", strategy="joint"):
+    arguments = [str(scene), method, str(runs), str(iterations), preset, strategy]
     return subprocess.Popen([sys.executable, "-c", SCRIPT, *arguments], stderr=subprocess.PIPE)
 
 
@@ -51,7 +53,7 @@ def outcome(runs):
     """Everything of a run that does not depend on the time that it took."""
     folder = run_of(runs)
     found = {}
-    for name in ("checkpoint", "predictions"):
+    for name in ("checkpoint", "predictions", "stages"):
         for path in sorted((folder / name).rglob("*")):
             found[str(path.relative_to(folder))] = path.read_bytes() if path.is_file() else None
     with (folder / "curve.csv").open(newline="") as file:
@@ -60,16 +62,16 @@ def outcome(runs):
     return found
 
 
-def checkpoint_of(runs):
+def checkpoint_of(runs, part="all"):
     """Iterations of the newest checkpoint; 0 before the first."""
-    found = [int(p.name) for p in runs.glob("ring/*/.seed0.training/all/*") if p.name.isdigit()]
+    found = [int(p.name) for p in runs.glob(f"ring/*/.seed0.training/{part}/*") if p.name.isdigit()]
     return max(found, default=0)
 
 
-def kill_later(process, runs, seconds):
+def kill_later(process, runs, seconds, part="all"):
     """Kill a bench, some time after the next checkpoint; whether it was still running."""
-    before = checkpoint_of(runs)
-    while checkpoint_of(runs) in (0, before) and process.poll() is None:
+    before = checkpoint_of(runs, part)
+    while checkpoint_of(runs, part) in (0, before) and process.poll() is None:
         time.sleep(0.01)
     time.sleep(seconds)
     process.send_signal(signal.SIGKILL)
@@ -77,17 +79,43 @@ def kill_later(process, runs, seconds):
     return process.returncode == -signal.SIGKILL
 
 
-def test_a_killed_training_ends_as_an_undisturbed_one(bench, scene_folder, tmp_path):
+@pytest.mark.parametrize(("strategy", "part"), [("joint", "all"), ("sequential", "period-1")])
+def test_a_killed_training_ends_as_an_undisturbed_one(
+    bench, scene_folder, tmp_path, strategy, part
+):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    bench("DRAWING", runs=whole, iterations=150)
-    process = start(scene_folder, TOY, killed, 150, "slow")
-    assert kill_later(process, killed, random.Random(1).uniform(0, 0.3))
-    assert 0 < checkpoint_of(killed) < 150
-    bench("DRAWING", runs=killed, iterations=150, preset="slow")
+    options = {"iterations": 150, "strategies": (strategy,)}
+    bench("DRAWING", runs=whole, **options)
+    process = start(scene_folder, TOY, killed, 150, "slow", strategy)
+    assert kill_later(process, killed, random.Random(1).uniform(0, 0.3), part)
+    assert 0 < checkpoint_of(killed, part) < 150
+    bench("DRAWING", runs=killed, preset="slow", **options)
     assert outcome(killed) == outcome(whole)
     record = read_run(run_of(killed))
     assert (record.resumed, record.iterations) == (1, 150)
     assert not list(killed.glob("ring/*/.*"))
+
+
+@pytest.mark.parametrize("stage", [0, 1])
+def test_a_training_in_stages_that_ends_with_one_goes_on(bench_here, tmp_path, monkeypatch, stage):
+    """It dies when the stage is over, before its model is saved."""
+    whole, runs = tmp_path / "whole", tmp_path / "runs"
+    options = {"strategies": ("sequential",), "preset": "fast", "iterations": 16}
+    bench_here("chronogs", runs=whole, **options)
+    save = worker._save
+
+    def dying_save(method, checkpoint, part):
+        if part.name == f"period-{stage}":
+            raise SystemExit
+        return save(method, checkpoint, part)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(worker, "_save", dying_save)
+        bench_here("chronogs", runs=runs, **options)
+    bench_here("chronogs", runs=runs, **options)
+    assert read_run(run_of(runs)).resumed == 1
+    assert outcome(runs) == outcome(whole)
+    assert not list(runs.glob("ring/*/.*"))
 
 
 @pytest.mark.slow

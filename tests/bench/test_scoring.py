@@ -245,3 +245,19 @@ def test_metrics_that_this_machine_lacks_keep_their_values(runs, scorers):
 def test_a_folder_without_runs(tmp_path, scorers):
     with pytest.raises(CheckpointError, match="no finished run in it; run bench first"):
         rescore(tmp_path, scorers)
+
+
+def test_stages_are_scored_again_and_keep_what_cannot_be_computed(bench_here, tmp_path):
+    outcome, _ = bench_here("toy_methods:MEAN", strategies=("sequential",))
+    folder, runs = outcome.finished[0], tmp_path / "runs"
+    record = read_run(folder)
+    right = record.stages["period-0"]["0"]["psnr"]
+    record.stages["period-0"]["0"] |= {"psnr": 1.0, "lpips_vgg": 0.5}
+    write_run(folder, record, read_rows(folder))
+    rescore(runs, make_scorers())
+    again = read_run(folder)
+    assert again.stages["period-0"]["0"]["psnr"] == right
+    assert again.stages["period-0"]["0"]["lpips_vgg"] == 0.5
+    (folder / "stages/period-0/a/2.png.png").unlink()
+    (rescored,) = rescore(runs, make_scorers())
+    assert "2.png.png: expected an image" in rescored.error

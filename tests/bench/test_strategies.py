@@ -77,6 +77,59 @@ def test_separate_gives_each_model_its_period_alone(make_scene):
         assert {part.method_period(f) for f in part.test} == {0.0}
 
 
+def test_sequential_gives_one_model_the_periods_in_order(make_scene):
+    scene = make_scene()
+    first, second = parts_of(scene, "sequential")
+    assert (first.name, second.name) == ("period-0", "period-1")
+    assert (first.extends, second.extends) == (False, True)
+    assert [v.name for v in first.train.views] == TRAIN[:3]
+    assert [v.name for v in second.train.views] == TRAIN[3:]
+    assert [{v.period for v in part.train.views} for part in (first, second)] == [{0}, {1}]
+    assert (first.train.num_periods, second.train.num_periods) == (1, 2)
+    np.testing.assert_allclose(world_points(first), scene.points.xyz[[0, 1, 2, 3, 8, 9]], atol=1e-6)
+    kept = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11]
+    np.testing.assert_allclose(world_points(second), scene.points.xyz[kept], atol=1e-6)
+    assert first.train.point_periods.shape == (6, 1) and second.train.point_periods.shape == (11, 2)
+    assert [f.name for f in first.test] == ["a/2.png"]
+    assert [f.name for f in second.test] == ["a/2.png", "b/1.png", "b/2.png"]
+    assert [f.name for f in first.ahead] == ["b/1.png", "b/2.png"] and second.ahead == ()
+    assert [first.method_period(f) for f in first.ahead] == [0.0, 0.0]
+    assert [second.method_period(f) for f in second.test] == [0.0, 1.0, 1.0]
+
+
+def test_sequential_hides_the_period_from_methods_that_take_none(make_scene):
+    scene = make_scene()
+    _, second = make_parts(scene, ImageStore(scene), "sequential", takes_period=False)
+    assert second.train.num_periods == 1 and {v.period for v in second.train.views} == {0}
+    assert {second.method_period(f) for f in second.test} == {0.0}
+
+
+@pytest.mark.parametrize("at_one_place", [False, True])
+def test_a_stage_knows_nothing_of_later_periods(make_scene, at_one_place):
+    """Cameras, images and points of period 1 are others; the first stage stays as it is."""
+    scene = make_scene()
+    frames = list(scene.frames)
+    if at_one_place:
+        for i in range(4):
+            pose = frames[i].cam_from_world.copy()
+            pose[:3, 3] = -pose[:3, :3] @ [1.0, 2.0, 3.0]
+            frames[i] = replace(frames[i], cam_from_world=pose)
+    scene = scene.with_frames(frames)
+    far = np.eye(4)
+    far[:3, 3] = 1000
+    later = [replace(f, cam_from_world=far) if f.period == 1 else f for f in scene.frames]
+    xyz = scene.points.xyz.copy()
+    xyz[[4, 5, 6, 7]] += 100
+    other = replace(scene.with_frames(later), points=replace(scene.points, xyz=xyz))
+    one, two = (parts_of(s, "sequential")[0].train for s in (scene, other))
+    for field in ("points", "colors", "point_periods", "camera_extent"):
+        np.testing.assert_array_equal(getattr(one, field), getattr(two, field))
+    frames = [train.training_from_world.to_matrix() for train in (one, two)]
+    np.testing.assert_array_equal(*frames)
+    for a, b in zip(one.views, two.views, strict=True):
+        np.testing.assert_array_equal(a.cam_from_world, b.cam_from_world)
+
+
 def test_no_model_sees_a_test_image(make_scene):
     scene = make_scene()
     tests = {f.name for f in scene.select(split="test")}
@@ -95,11 +148,12 @@ def test_images_are_those_of_the_views(make_scene):
             assert part.train.load_image(i).shape == (view.height, view.width, 3)
 
 
-def test_every_strategy_uses_one_training_frame(make_scene):
+def test_every_strategy_but_sequential_uses_one_training_frame(make_scene):
     scene = make_scene()
     frames = [
         part.train.training_from_world.to_matrix()
         for strategy in STRATEGIES
+        if strategy != "sequential"
         for part in parts_of(scene, strategy)
     ]
     assert all(np.array_equal(frames[0], other) for other in frames)
@@ -214,6 +268,7 @@ def test_methods_without_period_run_pooled_with_a_notice():
     strategy, notice = effective_strategy(blind, "joint")
     assert strategy == "pooled" and "blind takes no period" in notice
     assert effective_strategy(blind, "separate") == ("separate", None)
+    assert effective_strategy(blind, "sequential") == ("sequential", None)
     assert effective_strategy(mean, "joint") == ("joint", None)
     with pytest.raises(ConfigError, match="joint, pooled, separate"):
         effective_strategy(mean, "together")

@@ -10,7 +10,7 @@ from PIL import Image
 from chronoscene.bench.results import read_run
 from chronoscene.bench.tables import format_runs, read_runs
 from chronoscene.formats import chronoscene as scene_format
-from chronoscene.methods import method_names
+from chronoscene.methods import load_spec, method_names
 from chronoscene.training import losses
 from chronoscene.training.checkpoint import load_tensors
 
@@ -29,6 +29,41 @@ def test_a_photo_that_shows_nothing_is_an_empty_step(make_scene, tmp_path, bench
     assert np.isfinite(record.aggregates["macro"]["psnr"])
     tables = format_runs(*read_runs([tmp_path / "runs"]), "table")
     assert "3 of 15 steps empty: their photos show nothing of the model" in tables
+
+
+@pytest.mark.parametrize("method", method_names())
+def test_every_method_learns_one_period_after_the_other(bench_here, method):
+    options = {"strategies": ("sequential",), "preset": "fast", "iterations": 16}
+    outcome, said = bench_here(method, **options)
+    assert outcome.failures == ()
+    assert "note: sequential: the stages of a run share the iterations and time" in said
+    folder, record = outcome.finished[0], read_run(outcome.finished[0])
+    assert (record.strategy, record.iterations) == ("sequential", 16)
+    assert {stage: set(periods) for stage, periods in record.stages.items()} == {
+        "untrained": {"1"}, "period-0": {"0", "1"}, "period-1": {"0", "1"}
+    }  # fmt: skip
+    assert record.stages["period-1"] == record.periods
+    assert set(record.transfer) == {"forgetting", "backward_transfer", "forward_transfer"}
+    assert set(record.transfer["forgetting"]) == set(record.aggregates["macro"])
+    models = [folder / "checkpoint" / name for name in ("period-0", "period-1")]
+    sizes = [sum(path.stat().st_size for path in model.iterdir()) for model in models]
+    assert record.checkpoint_bytes == sizes[1]
+    periods = [load_tensors(model)[1]["num_periods"] for model in models]
+    assert periods == ([1, 1] if load_spec(method).period_input == "none" else [1, 2])
+
+
+def test_no_stage_looks_at_later_photos(scene_folder, tmp_path, bench_here):
+    models = []
+    for k in range(2):
+        folder = shutil.copytree(scene_folder, tmp_path / f"{k}/ring")
+        for path in (folder / "images/b").glob("*.png") if k else ():
+            Image.effect_noise((24, 16), 90).convert("RGB").save(path)
+        options = {"preset": "fast", "iterations": 16, "runs": tmp_path / f"runs{k}"}
+        outcome, _ = bench_here("3dgs", scenes=(folder,), strategies=("sequential",), **options)
+        saved = outcome.finished[0] / "checkpoint"
+        files = sorted(saved.glob("*/model.safetensors"))
+        models.append([path.read_bytes() for path in files])
+    assert models[0][0] == models[1][0] and models[0][1] != models[1][1]
 
 
 def test_a_scene_with_masks_is_trained_and_scored_by_what_counts(

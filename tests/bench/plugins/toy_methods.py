@@ -42,6 +42,11 @@ class MeanColour:
         held, _, file = os.environ.get("TOY_HOLD", "").partition(":")
         self.hold = file if held == str(seed) else ""
 
+    def extend(self, train):
+        self.train = train
+        new = train.num_periods - len(self.colors)
+        self.colors = np.concatenate([self.colors, np.repeat(self.colors[-1:], new, axis=0)])
+
     def step(self, index, progress):
         time.sleep(self.config.sleep)
         while self.hold and os.path.exists(self.hold):
