@@ -23,7 +23,7 @@ LAYERS = (
     ("chronoscene.images",),
     ("chronoscene.colmap",),
     ("chronoscene.scene",),
-    ("chronoscene.io", "chronoscene.geodesy"),
+    ("chronoscene.io", "chronoscene.geodesy", "leaderboard.published"),
     ("chronoscene.kernels",),
     ("chronoscene.checks",),
     ("chronoscene.errors", "chronoscene.arrays"),

@@ -19,7 +19,7 @@ from chronoscene.bench.predictions import (
     safe_name,
 )
 from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord, read_run, run_folders
-from chronoscene.bench.tables import kind_of
+from chronoscene.bench.summary import kind_of
 from chronoscene.io.staging import replacing
 from chronoscene.metrics.psnr_ssim import psnr
 

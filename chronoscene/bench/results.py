@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from chronoscene.errors import CheckpointError
 from chronoscene.io.staging import write_text_atomic
@@ -37,6 +37,19 @@ PHOTOS = "photos"
 FIGURES = "figures"
 
 Values = dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One value of one view."""
+
+    view: str
+    camera_period: int
+    rendered_period: int
+    region: str
+    """One of `chronoscene.bench.regions.REGIONS`."""
+    metric: str
+    value: float
 
 
 class RunRecord(BaseModel):
@@ -119,6 +132,8 @@ class RunRecord(BaseModel):
     started: str
     """UTC, ISO 8601."""
     notices: list[str]
+    rows: Sequence[Row] = Field(default=(), exclude=True)
+    """What ``rows.csv`` says of single views, where that was read; no part of ``run.json``."""
 
     @property
     def label(self) -> str:
@@ -139,19 +154,6 @@ class Failure(BaseModel):
     scene: str
     seed: int
     reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One value of one view."""
-
-    view: str
-    camera_period: int
-    rendered_period: int
-    region: str
-    """One of `chronoscene.bench.regions.REGIONS`."""
-    metric: str
-    value: float
 
 
 RUN_COLUMNS = (

@@ -1,76 +1,42 @@
-"""Tables of runs: mean and spread over seeds, per method, period and aggregate."""
+"""Tables of runs: an overview as papers print it, each metric by period, and what runs cost."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from statistics import mean, stdev
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from chronoscene.bench.results import Failure, RunRecord, read_failures, read_run, run_folders
-from chronoscene.errors import CheckpointError
+from chronoscene.bench.results import Failure, RunRecord
+from chronoscene.bench.summary import (
+    AGGREGATES,
+    COSTS,
+    ENTRY_COLUMNS,
+    MEASURED,
+    PAPER_METRICS,
+    SIZE,
+    in_unit,
+    kind_of,
+    metric_names,
+    over_scenes,
+    published_entries,
+    summarise,
+)
 from chronoscene.io import tables
-from chronoscene.io.tables import Table
-from chronoscene.metrics.registry import MetricInfo, all_metrics, metric_info
+from chronoscene.io.tables import Head, Table
+from chronoscene.metrics.registry import all_metrics, metric_info
 
 if TYPE_CHECKING:
-    from pandas import DataFrame, Series
+    from pandas import DataFrame
 
-AGGREGATES = ("macro", "micro", "worst")
+    from leaderboard.published import PublishedTable
 
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """A column of the cost table."""
-
-    name: str
-    """Field of `RunRecord`."""
-    title: str
-    factor: float
-    decimals: int
-
-
-COSTS = (
-    Cost("seconds", "training [s]", 1.0, 1),
-    Cost("iterations", "iterations", 1.0, 0),
-    Cost("primitives", "primitives", 1.0, 0),
-    Cost("drawn", "drawn per view", 1.0, 0),
-    Cost("render_seconds", "rendering [ms]", 1e3, 1),
-    Cost("checkpoint_bytes", "checkpoint [MB]", 1e-6, 3),
-    Cost("peak_memory_bytes", "peak memory [MB]", 1e-6, 0),
-    Cost("peak_device_memory_bytes", "peak GPU memory [MB]", 1e-6, 0),
-)
-
-ENTRY_COLUMNS = (
-    *("scene", "method", "strategy", "preset", "variant", "config_hash"),
-    *("quantity", "column", "mean", "sd", "n", "seeds", "device", "commit"),
-)
-"""Columns of CSV and JSON. ``quantity`` is a metric, or a cost in the unit of `RunRecord`;
-``column`` is ``macro``, ``micro``, ``worst``, ``period <id>``, or empty for costs; ``sd`` is the
-sample standard deviation over ``n`` seeds, empty for one seed."""
-
-
-def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
-    """All finished and failed runs below some folders.
-
-    Raises:
-        CheckpointError: If a folder holds neither.
-    """
-    records: list[RunRecord] = []
-    failures: list[Failure] = []
-    for folder in folders:
-        found = [read_run(path) for path in run_folders(folder)]
-        failed = read_failures(folder)
-        if not found and not failed:
-            raise CheckpointError(
-                folder, expected="a folder of runs", found="no run in it", todo="run bench first"
-            )
-        records += found
-        failures += failed
-    return records, failures
+MAX_PERIODS = 8
+"""Periods that have columns beside the aggregates, and that stand in one table."""
+MAX_SCENES = 7
+"""Scenes in one table of the overview; the paper has six and their mean."""
+ALL_SCENES = "mean of scenes"
+COST_TITLES = {cost.name: cost.title for cost in COSTS}
 
 
 def format_runs(
@@ -78,168 +44,94 @@ def format_runs(
     failures: Sequence[Failure],
     style: str,
     metrics: Sequence[str] = (),
+    *,
+    published: PublishedTable | None = None,
+    periods: bool = False,
+    width: int | None = None,
 ) -> str:
-    """All tables of some runs in one of `chronoscene.io.tables.FORMATS`."""
+    """All tables of some runs in one of `chronoscene.io.tables.FORMATS`.
+
+    Args:
+        records: Finished runs of any scenes, as from `chronoscene.bench.summary.read_runs`.
+        failures: Runs that failed, for the notes.
+        style: The format.
+        metrics: Names of those wanted, without costs; none for all, and costs.
+        published: What a paper printed, to stand beside the runs in the overview.
+        periods: Whether to show every period of scenes with more than `MAX_PERIODS`, too.
+        width: Of the terminal that ``table`` goes to; None for as wide as it is.
+    """
+    import pandas as pd
+
     entries = summarise(records, metrics)
+    if published is not None:
+        scenes = dict.fromkeys(run.scene for run in records)
+        entries = pd.concat([entries, published_entries(published, scenes)])
+    listed = entries[entries.quantity.isin(metrics)] if metrics else entries
     if style == "csv":
         # NaN is a spread that is not defined, an empty cell that there is none.
-        entries["sd"] = [
-            "" if n == 1 else repr(sd) for n, sd in zip(entries.n, entries.sd, strict=True)
-        ]
-        return str(entries.to_csv(columns=ENTRY_COLUMNS, index=False, lineterminator="\n"))
+        sds = zip(listed.n, listed.sd, strict=True)
+        listed = listed.assign(sd=["" if n == 1 else repr(sd) for n, sd in sds])
+        return str(listed.to_csv(columns=ENTRY_COLUMNS, index=False, lineterminator="\n"))
     notes = footnotes(entries, records, failures, metrics)
+    if published is not None:
+        notes += published_notes(published, records)
     if style == "json":
-        found = [_json_entry(entry) for entry in entries[[*ENTRY_COLUMNS]].to_dict("records")]
+        found = [_json_entry(entry) for entry in listed[[*ENTRY_COLUMNS]].to_dict("records")]
         return json.dumps({"entries": found, "notes": notes}, indent=1, allow_nan=False) + "\n"
-    made = readable_tables(entries, records, metrics)
+    made = readable_tables(entries, records, metrics, periods=periods)
+    if any(table.ranks for table in made):
+        notes.insert(0, tables.LEGENDS[style])
     if style == "markdown":
         texts, bullet = [tables.markdown(t, special=r"\`*<>|_") for t in made], "- "
     elif style == "latex":
-        texts, bullet = [tables.latex(table) for table in made], "% "
+        texts, bullet = [tables.latex(table, cmidrules=True) for table in made], "% "
     else:
-        texts, bullet = [tables.plain_text(table) for table in made], ""
+        texts, bullet = [tables.boxed_text(table, width=width) for table in made], ""
     return "\n".join([*texts, "".join(f"{bullet}{note}\n" for note in notes)])
 
 
 def _json_entry(entry: dict[str, Any]) -> dict[str, Any]:
-    """Numbers that JSON lacks become the strings ``Infinity`` and ``NaN``."""
+    """Numbers that JSON lacks become ``Infinity`` and ``NaN``, what is not known becomes null."""
     entry["sd"] = None if entry["n"] == 1 else entry["sd"]
-    for key in ("mean", "sd"):
-        if entry[key] is not None and not math.isfinite(entry[key]):
+    for key, value in entry.items():
+        if isinstance(value, float) and not math.isfinite(value):
             names = {math.inf: "Infinity", -math.inf: "-Infinity"}
-            entry[key] = names.get(entry[key], "NaN")
+            entry[key] = names.get(value, "NaN" if key in ("mean", "sd") else None)
     return entry
 
 
-def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> DataFrame:
-    """Mean and spread over seeds of everything that was measured.
-
-    Runs that differ in the seed only are a group. Equal names with other scenes, configs or devices
-    stay apart: their ``label`` says in what they differ.
-
-    Args:
-        records: Runs of any scenes.
-        metrics: Names of those wanted; none for all.
-
-    Returns:
-        `ENTRY_COLUMNS` and ``label``, one row per group, quantity and column. What a run of a group
-        lacks is left out.
-    """
-    import pandas as pd
-
-    if not records:
-        return pd.DataFrame(columns=[*ENTRY_COLUMNS, "label"])
-    runs = _labelled(records).sort_values("seed", kind="stable")
-    in_group = runs.groupby(["scene", "label"], sort=False)
-    groups = in_group[["method", "strategy", "preset", "variant", "config_hash", "device"]].first()
-    groups["runs"] = in_group.size()
-    groups["seeds"] = in_group.seed.agg(lambda seeds: " ".join(map(str, seeds)))
-    groups["commit"] = in_group.commit.agg(lambda commits: " ".join(commits.unique()))
-
-    numbers = [
-        (run.scene, label, *number)
-        for run, label in zip(records, runs.label.sort_index(), strict=True)
-        for number in _numbers(run, metric_names([run], metrics))
-    ]
-    columns = ["scene", "label", "quantity", "column", "value"]
-    values = pd.DataFrame(numbers, columns=columns).groupby(columns[:-1], sort=False).value
-    entries = values.agg(mean=mean, sd=_spread, n="size").reset_index()
-    entries = entries.join(groups, on=["scene", "label"])
-    order = {scene: i for i, scene in enumerate(dict.fromkeys(run.scene for run in records))}
-    entries = entries[entries.n == entries.runs]
-    return _with_text(entries).sort_values(
-        "scene", key=lambda scenes: scenes.map(order), kind="stable", ignore_index=True
-    )
-
-
-def _with_text(entries: DataFrame) -> DataFrame:
-    """Entries with ``text``, ``mean`` or ``mean ± sd``, and ``shown``, the mean as it reads."""
-    # Quantity to its factor from the stored to the shown unit, and to its decimals
-    display = {name: (1.0, info.decimals) for name, info in all_metrics().items()}
-    display |= {cost.name: (cost.factor, cost.decimals) for cost in COSTS}
-    texts, shown = [], []
-    for quantity, value, sd, n in entries[["quantity", "mean", "sd", "n"]].itertuples(index=False):
-        factor, decimals = display[quantity]
-        spread = "" if n == 1 else f" ± {sd * factor:.{decimals}f}"
-        texts.append(f"{value * factor:.{decimals}f}{spread}")
-        shown.append(round(value * factor, decimals))
-    return entries.assign(text=texts, shown=shown)
-
-
-def _labelled(records: Sequence[RunRecord]) -> DataFrame:
-    """What tells runs apart, one row per record."""
-    import pandas as pd
-
-    fields = ("scene", "method", "strategy", "preset", "variant", "config_hash", "seed", "device")
-    runs = pd.DataFrame(
-        [{name: getattr(run, name) for name in (*fields, "commit")} for run in records]
-    )
-    runs["label"] = [f"{run.title} ({kind_of(run)})" for run in records]
-    differences = pd.DataFrame(
-        {
-            "method": runs.method,
-            "scene": [f"scene {run.scene_hash[:6]}" for run in records],
-            "config": [f"config {run.config_hash[:6]}" for run in records],
-            "device": runs.device,
-        }
-    )
-    differ = differences.groupby([runs.scene, runs.label]).transform("nunique") > 1
-    for i, columns in enumerate(differ.to_numpy()):
-        if columns.any():
-            told = ", ".join(differences.loc[i, columns])
-            runs.loc[i, "label"] += f" [{told}]"
-    return runs
-
-
-def kind_of(run: RunRecord | Failure) -> str:
-    """Strategy and preset, and what differs from it."""
-    return ", ".join(filter(None, (run.strategy, run.preset, run.variant.replace(",", ", "))))
-
-
-def _numbers(run: RunRecord, metrics: Sequence[str]) -> Iterable[tuple[str, str, float]]:
-    """Quantity, column and value of everything that a run gave, in the order of the tables."""
-    sources = {f"period {i}": run.periods[i] for i in sorted(run.periods, key=int)}
-    sources |= {name: run.aggregates[name] for name in AGGREGATES}
-    for metric in metrics:
-        for column, values in sources.items():
-            if metric in values:
-                yield metric, column, values[metric]
-    for cost in COSTS:
-        if (value := getattr(run, cost.name)) is not None:
-            yield cost.name, "", float(value)
-
-
-def _spread(values: Series) -> float:
-    """Sample standard deviation (n - 1); NaN for one value, or where one is infinite."""
-    return stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else math.nan
-
-
-def metric_names(records: Iterable[RunRecord], wanted: Sequence[str] = ()) -> list[str]:
-    """The metrics to show, in the order of the table of names: those wanted, or all there are."""
-    known = [metric_info(name).name for name in wanted]
-    there = {name for run in records for name in run.aggregates.get("macro", {})}
-    return [name for name in all_metrics() if name in there and (not known or name in known)]
-
-
 def readable_tables(
-    entries: DataFrame, records: Sequence[RunRecord], metrics: Sequence[str] = ()
+    entries: DataFrame,
+    records: Sequence[RunRecord],
+    metrics: Sequence[str] = (),
+    *,
+    periods: bool = False,
 ) -> list[Table]:
-    """Per scene a table of each metric and one of costs; a summary if there are several scenes.
+    """An overview, then per scene a table of each metric and one of costs.
 
     Args:
-        entries: What `summarise` returns for the records.
+        entries: What `summarise` returns for the records, and what was published.
         records: The runs.
         metrics: Names of those wanted; none for all.
+        periods: Whether every period is shown, however many there are.
     """
     names = metric_names(records, metrics)
-    made = []
-    for scene, part in entries.groupby("scene", sort=False):
+    made: list[Table] = []
+    shown = [
+        name
+        for name in all_metrics()
+        if (entries.quantity == name).any() and name in (metrics or PAPER_METRICS)
+    ]
+    if shown and (entries.scene.nunique() > 1 or len(shown) > 1):
+        made += _overviews(entries, shown, size=not metrics)
+    for scene, part in entries[entries.source == MEASURED].groupby("scene", sort=False):
         runs = [run for run in records if run.scene == scene]
-        made += [_quality_table(part, name, runs) for name in names]
-        if (part.column == "").any():  # nobody knows what images of other programs cost
+        for name in names:
+            made += _quality_tables(part, name, runs, every=periods)
+        if (
+            part.column == ""
+        ).any() and not metrics:  # nobody knows what images of other programs cost
             made.append(_cost_table(part, str(scene)))
-    if entries.scene.nunique() > 1:
-        made += [_summary_table(entries, name) for name in names]
     return made
 
 
@@ -251,17 +143,108 @@ def cost_tables(records: Sequence[RunRecord]) -> list[Table]:
     ]
 
 
-def _quality_table(part: DataFrame, metric: str, runs: Sequence[RunRecord]) -> Table:
-    """One metric on one scene: methods by periods and aggregates."""
-    info = metric_info(metric)
-    ids = sorted({i for run in runs for i in run.periods}, key=int)
-    columns = [*(f"period {i}" for i in ids), *AGGREGATES]
-    rows, best = _cells(part[part.quantity == metric], "column", columns, part, info)
-    rows = [[*row, str(n)] for row, n in zip(rows, _of_groups(part, "runs"), strict=True)]
-    titles = [_period_title(i, runs[0].period_labels) for i in ids]
+class _Column(NamedTuple):
+    """A column of a table; labels that it lacks have a dash."""
+
+    head: Head
+    entries: DataFrame
+    """At most one for each label."""
+    field: str = "text"
+    """What its cells show; means are marked."""
+
+
+def _table(title: str, labels: Sequence[str], columns: Sequence[_Column], **options: Any) -> Table:
+    """Columns side by side, with a row for each label."""
+    places = {label: i for i, label in enumerate(labels)}
+    rows = [[label, *["-"] * len(columns)] for label in labels]
+    ranks, ties = {}, set()
+    for j, (_, entries, field) in enumerate(columns, 1):
+        shown = entries[["label", field, "rank", "tied"]]
+        for label, text, rank, tied in shown.itertuples(index=False):
+            rows[places[label]][j] = str(text)
+            if field in ("text", "number") and rank:
+                ranks[places[label], j] = rank
+            if field in ("text", "number") and tied:
+                ties.add((places[label], j))
+    heads = [("method", ""), *(column.head for column in columns)]
+    return Table(heads, rows, title=title, ranks=ranks, ties=ties, **options)
+
+
+def _overviews(entries: DataFrame, names: Sequence[str], *, size: bool) -> Iterable[Table]:
+    """Macro means side by side: methods by scenes, as papers print them, and their mean."""
+    labels = entries.label.unique()
+    measured = entries[entries.source == MEASURED].label.nunique()
+    breaks = {measured - 1} if measured < len(labels) else ()
+    parts = [(str(scene), part) for scene, part in entries.groupby("scene", sort=False)]
+    title = f"{parts[0][0]}: macro means"
+    if several := len(parts) > 1:
+        parts.append((ALL_SCENES, over_scenes(entries, ALL_SCENES)))
+        title = "all scenes: macro means"
+        if len(names) == 1:
+            title = f"all scenes: {metric_info(names[0]).title} ({names[0]}), macro"
+    columns = []
+    for scene, part in parts:
+        macro = part[part.column == "macro"]
+        for i, name in enumerate(names):
+            head = metric_info(name).title if len(names) > 1 else ""
+            first = "" if i else scene
+            found = macro[macro.quantity == name]
+            columns.append(_Column((first, head) if several else (head, ""), found, "number"))
+    if size:
+        sizes = parts[-1][1].query("quantity == @SIZE")
+        columns.append(_Column((COST_TITLES[SIZE], ""), sizes, "number"))
+    step = MAX_SCENES * len(names)
+    starts = range(0, len(parts) * len(names), step)
+    for start in starts:
+        end = None if start == starts[-1] else start + step
+        yield _table(title, labels, columns[start:end], breaks=breaks)
+
+
+def _quality_tables(
+    part: DataFrame, metric: str, runs: Sequence[RunRecord], *, every: bool
+) -> list[Table]:
+    """One metric on one scene: methods by periods and aggregates; many periods in tables of their
+    own, if at all."""
+    info, labels = metric_info(metric), part.label.unique()
     arrow = "higher" if info.higher_is_better else "lower"
     title = f"{runs[0].scene}: {info.title} ({metric}), {arrow} is better"
-    return Table(_heads("method", *titles, *AGGREGATES, "n"), rows, title=title, best=best)
+    found = part[part.quantity == metric]
+    by_column = dict(list(found.groupby("column")))
+    none = found[:0]
+    ids = sorted({i for run in runs for i in run.periods}, key=int)
+    single = [
+        _Column((_period_title(i, runs[0].period_labels), ""), by_column.get(f"period {i}", none))
+        for i in ids
+    ]
+    few = len(ids) <= MAX_PERIODS
+    over = [
+        _Column((name, ""), by_column.get(name, none))
+        for name in (*AGGREGATES, *(() if few else ("median", "best")))
+    ]
+    over[1:1] = _uncertainty(by_column.get("macro", none))
+    count = _Column(("n", ""), part.drop_duplicates("label"), "runs")
+    made = [_table(title, labels, [*(single if few else ()), *over, count])]
+    for start in range(0, len(ids), MAX_PERIODS) if every and not few else ():
+        chosen = slice(start, start + MAX_PERIODS)
+        name = f"{title}; periods {ids[chosen][0]} to {ids[chosen][-1]}"
+        made.append(_table(name, labels, single[chosen]))
+    return made
+
+
+def _uncertainty(macro: DataFrame) -> Iterable[_Column]:
+    """Intervals over views of the macro means and of their differences to the best, if known."""
+    for head, prefix in (
+        (("interval", "over views"), ""),
+        (("difference", "to the best"), "difference_"),
+    ):
+        known = macro[macro[f"{prefix}low"].notna()]
+        texts = []
+        for entry in known.to_dict("records"):
+            low, high = (in_unit(entry["quantity"], entry[prefix + end]) for end in ("low", "high"))
+            difference = f"{in_unit(entry['quantity'], entry['difference'])} " if prefix else ""
+            texts.append(f"{difference}[{low}, {high}]".replace("-", "\N{MINUS SIGN}"))
+        if texts:
+            yield _Column(head, known.assign(uncertainty=texts), "uncertainty")
 
 
 def _period_title(period: str, labels: dict[str, str]) -> str:
@@ -271,66 +254,11 @@ def _period_title(period: str, labels: dict[str, str]) -> str:
 
 def _cost_table(part: DataFrame, scene: str) -> Table:
     """What the runs on one scene cost."""
-    shown = [cost for cost in COSTS if (part.quantity == cost.name).any()]
-    rows, _ = _cells(part[part.column == ""], "quantity", [cost.name for cost in shown], part)
-    rows = [[*row, seeds] for row, seeds in zip(rows, _of_groups(part, "seeds"), strict=True)]
-    heads = _heads("method", *(cost.title for cost in shown), "seeds")
-    return Table(heads, rows, title=f"{scene}: cost")
-
-
-def _summary_table(entries: DataFrame, metric: str) -> Table:
-    """Macro means of one metric: methods by scenes, and their mean where no scene is missing."""
-    import pandas as pd
-
-    info = metric_info(metric)
-    macro = entries[(entries.quantity == metric) & (entries.column == "macro")]
-    scenes = list(entries.scene.unique())
-    whole = macro.groupby("label").filter(lambda group: len(group) == len(scenes))
-    overall = whole.groupby("label", sort=False)["mean"].agg(mean).reset_index()
-    overall = overall.assign(scene="mean of scenes", quantity=metric, sd=math.nan, n=1)
-    columns = [*scenes, "mean of scenes"]
-    both = pd.concat([macro, _with_text(overall)])
-    rows, best = _cells(both, "scene", columns, entries, info)
-    title = f"all scenes: {info.title} ({metric}), macro"
-    return Table(_heads("method", *columns), rows, title=title, best=best)
-
-
-def _heads(*names: str) -> list[tables.Head]:
-    return [(name, "") for name in names]
-
-
-def _of_groups(part: DataFrame, column: str) -> Series:
-    """What all entries of a group have in common, one value per label."""
-    return part.groupby("label", sort=False)[column].first()
-
-
-def _cells(
-    entries: DataFrame,
-    by: str,
-    columns: Sequence[str],
-    whole: DataFrame,
-    metric: MetricInfo | None = None,
-) -> tuple[list[list[str]], set[tuple[int, int]]]:
-    """Label and texts of each row, and the places of the best of each column.
-
-    Args:
-        entries: At most one for each label and column.
-        by: Column of ``entries`` that says where in a row it belongs.
-        columns: Values of ``by`` in the order of the table.
-        whole: Entries with all labels, in the order of the table.
-        metric: Says what is better; None if nothing is.
-    """
-    labels = whole.label.unique()
-    texts = entries.pivot(index="label", columns=by, values="text")
-    texts = texts.reindex(index=labels, columns=columns).astype(object).fillna("-")
-    rows = [[label, *row] for label, row in zip(labels, texts.to_numpy(), strict=True)]
-    if metric is None or len(labels) < 2:
-        return rows, set()
-    # What reads the same in the table is marked alike.
-    shown = entries.pivot(index="label", columns=by, values="shown")
-    shown = shown.reindex(index=labels, columns=columns)
-    best = shown.max() if metric.higher_is_better else shown.min()
-    return rows, {(i, 1 + j) for i, j in zip(*shown.eq(best).to_numpy().nonzero(), strict=True)}
+    costs = part[part.column == ""]
+    shown = [cost for cost in COSTS if (costs.quantity == cost.name).any()]
+    columns = [_Column((cost.title, ""), costs[costs.quantity == cost.name]) for cost in shown]
+    columns.append(_Column(("seeds", ""), part.drop_duplicates("label"), "seeds"))
+    return _table(f"{scene}: cost", part.label.unique(), columns)
 
 
 def footnotes(
@@ -341,24 +269,37 @@ def footnotes(
 ) -> list[str]:
     """What a reader must know: aggregates, spread, device, code, what is absent and why."""
     notes = ["macro: mean over periods; micro: mean over test views; worst: the worst period"]
+    if any(len(run.periods) > MAX_PERIODS for run in records):
+        notes.append("median, best: of the means of the periods; --periods shows every period")
     if (entries.n > 1).any():
         notes.append("±: sample standard deviation over n seeds")
+    if entries.low.notna().any():
+        notes.append(
+            "[ ]: 95 % interval of macro over test views, by a bootstrap of blocks of neighbours "
+            "in each period; seeds are averaged before, so their spread is not in it"
+        )
+    if entries.tied.any():
+        notes.append("†: at 95 %, views or seeds do not tell it from the best of its column")
     for name, title in (("device", "device"), ("commit", "code")):
         values = dict.fromkeys(str(getattr(run, name)) for run in records)
         if values:
             notes.append(f"{title}: {'; '.join(values)}")
+    mixed = entries[entries.devices > 1].label.unique()
+    if len(mixed):
+        notes.append(f"seeds of several devices are averaged, costs too: {'; '.join(mixed)}")
     counted: dict[str, dict[str, None]] = {}
     for run in records:
-        if run.primitives is not None:
+        if run.primitives is not None and not wanted:
             counted.setdefault(run.primitive, {})[run.title] = None
     if counted:
         units = "; ".join(f"{unit} of {', '.join(titles)}" for unit, titles in counted.items())
         notes.append(f"primitives: {units}")
     absent: dict[str, list[str]] = {}
-    costs = {cost.name: cost.title for cost in COSTS}
     for run in records:
         skipped = {m: why for m, why in run.skipped.items() if not wanted or m in wanted}
-        costly = {costs[c]: why for c, why in run.absent.items() if c in costs}
+        costly = (
+            {} if wanted else {COST_TITLES[c]: w for c, w in run.absent.items() if c in COST_TITLES}
+        )
         for name, reason in {**skipped, **costly}.items():
             names = absent.setdefault(reason, [])
             if name not in names:
@@ -371,3 +312,14 @@ def footnotes(
         seeds.setdefault((name, f.reason), []).append(str(f.seed))
     failed = [f"failed: {n}, seed {', '.join(s)}: {reason}" for (n, reason), s in seeds.items()]
     return [*notes, *notices, *failed]
+
+
+def published_notes(table: PublishedTable, records: Sequence[RunRecord]) -> list[str]:
+    """What must be known of published rows, and which scenes have none."""
+    known = {row.scene.casefold() for row in table.rows}
+    strange = dict.fromkeys(run.scene for run in records if run.scene.casefold() not in known)
+    notes = [f"published: {table.title}; {table.hardware}. {' '.join(table.notes)}"]
+    if strange:
+        scenes = ", ".join(dict.fromkeys(row.scene for row in table.rows))
+        notes.append(f"nothing is published of {', '.join(strange)}; the scenes are {scenes}")
+    return notes

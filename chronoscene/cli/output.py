@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from errno import EISDIR
 from os import strerror
 from pathlib import Path
+from shutil import get_terminal_size
 from tempfile import TemporaryFile
 
 import click
@@ -40,6 +41,11 @@ def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
     with writing_to(option, out, expected=FILE):
         write_text_atomic(out, whole)
     tell_written(out)
+
+
+def terminal_width(out: Path | None) -> int | None:
+    """Columns of the terminal, if a text goes to one and not to a file."""
+    return get_terminal_size().columns if out is None and sys.stdout.isatty() else None
 
 
 def tell_written(*places: Path) -> None:

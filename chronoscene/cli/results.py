@@ -11,12 +11,14 @@ from chronoscene.bench.comparison_figure import draw_figures
 from chronoscene.bench.regions import freeze_change_masks
 from chronoscene.bench.results import RESULTS_FILE, ROWS_FILE
 from chronoscene.bench.scoring import rescore
-from chronoscene.bench.tables import format_runs, read_runs
-from chronoscene.cli.output import emit
+from chronoscene.bench.summary import read_runs
+from chronoscene.bench.tables import MAX_PERIODS, format_runs
+from chronoscene.cli.output import emit, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.io.tables import FORMATS
 from chronoscene.metrics.registry import METRICS, make_scorers, metric_info
+from leaderboard.published import load_published
 
 SOME_FAILED = 1  # Exit status when a run could not be scored
 
@@ -83,7 +85,8 @@ def score(
 
 def print_runs(out: Path) -> None:
     """Print the tables of all runs in a folder, and the files that belong to all of them."""
-    emit(format_runs(*read_runs([out]), "table") + "\n", None)
+    text = format_runs(*read_runs([out]), "table", width=terminal_width(None))
+    emit(text + "\n", None)
     paths = [out / RESULTS_FILE, out / ROWS_FILE, *draw_figures(out)]
     click.echo("\n".join(str(path) for path in paths))
 
@@ -108,7 +111,16 @@ def print_runs(out: Path) -> None:
     "--metric",
     "metrics",
     multiple=True,
-    help="Metrics to show, as NAME[,NAME...]. May be repeated.  [default: all]",
+    help="Metrics to show and nothing else, as NAME[,NAME...]. May be repeated.  [default: all]",
+)
+@click.option(
+    "--published",
+    "with_published",
+    is_flag=True,
+    help="Show what the paper of ChronoGS printed for the scenes beside the runs.",
+)
+@click.option(
+    "--periods", is_flag=True, help=f"Show every period where there are more than {MAX_PERIODS}."
 )
 @click.option(
     "--out",
@@ -116,16 +128,27 @@ def print_runs(out: Path) -> None:
     help="Write to this file instead of the terminal.",
 )
 def table(
-    folders: tuple[Path, ...], style: str, metrics: tuple[str, ...], out: Path | None
+    folders: tuple[Path, ...],
+    style: str,
+    metrics: tuple[str, ...],
+    with_published: bool,
+    periods: bool,
+    out: Path | None,
 ) -> None:
     """Print the results in one or several folders of runs.
 
-    There is a table per metric, with each period, macro (the mean over periods), micro (the mean
-    over views) and the worst period. Several seeds give the mean, the sample standard deviation and
-    the number of runs.
+    First come the means of all scenes, as papers print them. Then there is a table per scene and
+    metric, with each period, macro (the mean over periods), micro (the mean over views) and the
+    worst period, and one of costs. Several seeds give the mean, the sample standard deviation and
+    the number of runs. Intervals and differences are at 95 % over test views.
     """
     records, failures = read_runs(folders)
-    text = format_runs(records, failures, style, parse_metrics(metrics))
+    published = load_published() if with_published else None
+    width = terminal_width(out)
+    wanted = parse_metrics(metrics)
+    text = format_runs(
+        records, failures, style, wanted, published=published, periods=periods, width=width
+    )
     emit(text, out)
 
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from shutil import get_terminal_size
 from typing import Any, Literal
 
 import click
 
 from chronoscene.cli.convert import reading_options
-from chronoscene.cli.output import check_file, check_place, emit, tell_written, writing_to
+from chronoscene.cli.output import (
+    check_file,
+    check_place,
+    emit,
+    tell_written,
+    terminal_width,
+    writing_to,
+)
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import find_scenes, model_notes, read_scene
@@ -155,7 +160,7 @@ def command(
     full = [r for r in results if isinstance(r, SceneStatistics)]
     counts = [s.counts for s in full] or [r for r in results if isinstance(r, SceneCount)]
     if counts:
-        extra: Any = {"width": _width(out), "unreadable": unreadable}
+        extra: Any = {"width": terminal_width(out), "unreadable": unreadable}
         if full:
             text = format_details(full, output_format, **extra)
         else:
@@ -226,11 +231,6 @@ def _lost(item: tuple[Path, str]) -> Unreadable:
     return Unreadable(
         path, f"{path}: the process died; if memory ran out, run stats on this scene alone"
     )
-
-
-def _width(out: Path | None) -> int | None:
-    """Of the terminal, if the table goes to one."""
-    return get_terminal_size().columns if out is None and sys.stdout.isatty() else None
 
 
 def _file_names(paths: Sequence[Path]) -> list[str]:

@@ -10,8 +10,8 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from chronoscene.io.wording import printable
@@ -21,6 +21,20 @@ FORMATS = ("table", "csv", "markdown", "latex", "json")
 
 Head = tuple[str, str]
 """Two lines; a column whose first line is empty shares that of the column before."""
+LEGENDS = {
+    "table": "¹, ², ³: the first three of a column",
+    "markdown": "**bold**, <ins>underlined</ins>, *italic*: the first three of a column",
+    "latex": "bold, underlined, italic: the first three of a column",
+}
+"""What the marks of `Table.ranks` look like; those of `Table.ties` are daggers."""
+_RANKS = {
+    "table": ("{}", "¹ {}", "² {}", "³ {}"),
+    "markdown": ("{}", "**{}**", "<ins>{}</ins>", "*{}*"),
+    "latex": ("{}", r"\textbf{{{}}}", r"\underline{{{}}}", r"\textit{{{}}}"),
+}
+# Numbers stay aligned on the right.
+_TIES = {"table": "†{}", "markdown": "{} †", "latex": r"{}\rlap{{$^\dagger$}}"}
+
 GAP = 2  # Blanks between columns
 MIN_NAME_WIDTH = 12  # Characters of a name that are shown even on narrow terminals
 
@@ -35,8 +49,10 @@ class Table:
     labels: int = 1
     """Number of leading columns that say what a row is about; they are aligned on the left."""
     title: str = ""
-    best: Collection[tuple[int, int]] = ()
-    """Row and column of the cells that are emphasised."""
+    ranks: Mapping[tuple[int, int], int] = field(default_factory=dict)
+    """Row and column of the cells that are the first, second or third of their column."""
+    ties: Collection[tuple[int, int]] = ()
+    """Row and column of the cells that the first of their column may not really be better than."""
     breaks: Collection[int] = ()
     """Rows that are followed by a rule or a gap."""
 
@@ -50,6 +66,11 @@ class Table:
         return flat
 
 
+def _marked(table: Table, i: int, j: int, cell: str, style: str) -> str:
+    ranked = _RANKS[style][table.ranks.get((i, j), 0)].format(cell)
+    return _TIES[style].format(ranked) if (i, j) in table.ties else ranked
+
+
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A CSV document with a header; None becomes an empty cell."""
     buffer = io.StringIO()
@@ -60,12 +81,8 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def plain_text(table: Table) -> str:
-    """Title and aligned columns; ``*`` marks the best cells."""
-    starred = [
-        [f"{cell} *" if (i, j) in table.best else cell for j, cell in enumerate(row)]
-        for i, row in enumerate(table.rows)
-    ]
-    lines = [table.flat_heads, *starred]
+    """Title and aligned columns, without marks."""
+    lines = [table.flat_heads, *table.rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     lines.insert(1, ["-" * width for width in widths])
     aligned = (
@@ -79,23 +96,33 @@ def plain_text(table: Table) -> str:
 
 
 def boxed_text(table: Table, *, width: int | None = None) -> str:
-    """A table with rules for a terminal, without colours.
+    """A title and a table with rules for a terminal, without colours.
 
     Args:
         table: What to write.
         width: Of the terminal in characters. A wider table is cut into blocks of columns, each with
-            the labels of the rows. None for one block.
+            the labels of the rows, which go over several lines where that saves a block. None for
+            one block.
     """
     from rich.cells import cell_len
 
-    rows = [[printable(cell) for cell in row] for row in table.rows]
+    title = f"{printable(table.title)}\n" if table.title else ""
+    rows = [
+        [_marked(table, i, j, printable(cell), "table") for j, cell in enumerate(row)]
+        for i, row in enumerate(table.rows)
+    ]
     columns = zip(*(zip(*table.heads, strict=True)), *rows, strict=True)
     sizes = [GAP + max(map(cell_len, column)) for column in columns]
     if width is None or 1 + sum(sizes) <= width:
-        return _block(table, rows, range(len(sizes)))
-    longest = max(MIN_NAME_WIDTH, width // 5)
-    sizes = [min(size, GAP + longest) if i < table.labels else size for i, size in enumerate(sizes)]
-    return "".join(_block(table, rows, b, longest) for b in _fitting(table, sizes, width))
+        return title + _block(table, rows, range(len(sizes)))
+    labels, others = sizes[: table.labels], sizes[table.labels :]
+    least = max(MIN_NAME_WIDTH, width // 5)
+    cuts = {
+        longest: _fitting(table, [*(min(size, GAP + longest) for size in labels), *others], width)
+        for longest in range(max(least, *labels), least - 1, -1)
+    }
+    longest, blocks = min(cuts.items(), key=lambda cut: len(cut[1]))
+    return title + "".join(_block(table, rows, block, longest) for block in blocks)
 
 
 def _fitting(table: Table, sizes: Sequence[int], width: int) -> list[list[int]]:
@@ -118,16 +145,18 @@ def _fitting(table: Table, sizes: Sequence[int], width: int) -> list[list[int]]:
 def _block(
     table: Table, rows: Sequence[Sequence[str]], columns: Sequence[int], longest: int | None = None
 ) -> str:
-    """Some columns of a table; labels longer than ``longest`` are cut. Markup is only text."""
+    """Some columns of a table; labels longer than ``longest`` go over several lines, words that are
+    longer are cut. Markup is only text."""
     from rich import box
     from rich.console import Console
     from rich.table import Table as RichTable
 
+    two_lines = any(table.heads[i][1] for i in columns)
     drawn = RichTable(box=box.SIMPLE_HEAD, padding=(0, GAP - 1, 0, 0), collapse_padding=True)
     for i in columns:
-        head = "\n".join(table.heads[i])
+        head = "\n".join(table.heads[i] if two_lines else table.heads[i][:1])
         if i < table.labels:
-            drawn.add_column(head, no_wrap=True, max_width=longest, overflow="ellipsis")
+            drawn.add_column(head, max_width=longest, overflow="ellipsis")
         else:
             drawn.add_column(head, no_wrap=True, justify="right")
     for number, row in enumerate(rows):
@@ -139,7 +168,7 @@ def _block(
 
 
 def markdown(table: Table, *, special: str = r"\`*<>|[]") -> str:
-    """A pipe table, under its title if it has one; the best cells are bold.
+    """A pipe table, under its title if it has one.
 
     Args:
         table: What to write.
@@ -153,8 +182,7 @@ def markdown(table: Table, *, special: str = r"\`*<>|[]") -> str:
     lines.append(_piped(rule))
     for i, row in enumerate(table.rows):
         cells = [escape_markdown(printable(cell), special) for cell in row]
-        bold = [f"**{c}**" if (i, j) in table.best else c for j, c in enumerate(cells)]
-        lines.append(_piped(bold))
+        lines.append(_piped([_marked(table, i, j, c, "markdown") for j, c in enumerate(cells)]))
     return "\n".join(lines) + "\n"
 
 
@@ -168,7 +196,7 @@ def escape_markdown(text: str, special: str = r"\`*<>|_") -> str:
 
 
 def latex(table: Table, *, cmidrules: bool = False) -> str:
-    """A ``tabular`` for the booktabs package, its title in a comment; the best cells are bold.
+    """A ``tabular`` for the booktabs package, its title in a comment.
 
     Args:
         table: What to write.
@@ -183,8 +211,7 @@ def latex(table: Table, *, cmidrules: bool = False) -> str:
     ]
     for i, row in enumerate(table.rows):
         cells = [escape_latex(cell) for cell in row]
-        bold = [rf"\textbf{{{c}}}" if (i, j) in table.best else c for j, c in enumerate(cells)]
-        lines.append(_latex_row(bold))
+        lines.append(_latex_row(_marked(table, i, j, c, "latex") for j, c in enumerate(cells)))
         if i in table.breaks:
             lines.append(r"\midrule")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
@@ -201,7 +228,7 @@ def _latex_heads(heads: Sequence[Head], cmidrules: bool) -> list[str]:
         first.append(text if end - start == 1 else rf"\multicolumn{{{end - start}}}{{c}}{{{text}}}")
         rules += rf"\cmidrule(lr){{{start + 1}-{end}}}" if end - start > 1 else ""
     second = _latex_row([escape_latex(text) for _, text in heads])
-    return [_latex_row(first), *([rules] if cmidrules else []), second]
+    return [_latex_row(first), *([rules] if cmidrules and rules else []), second]
 
 
 def _latex_row(cells: Iterable[str]) -> str:
@@ -220,6 +247,7 @@ _LATEX = str.maketrans(
         ">": r"\textgreater{}",
         "|": r"\textbar{}",
         "±": r"$\pm$",
+        "\N{MINUS SIGN}": "$-$",
     }
 )
 

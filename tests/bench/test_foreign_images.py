@@ -11,7 +11,8 @@ from PIL import Image
 from chronoscene.bench.foreign_images import find_images, score_images
 from chronoscene.bench.results import read_rows, read_run
 from chronoscene.bench.scoring import rescore
-from chronoscene.bench.tables import format_runs, read_runs
+from chronoscene.bench.summary import read_runs
+from chronoscene.bench.tables import format_runs
 from chronoscene.errors import CheckpointError, ConfigError, ImageError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.decoding import load_rgb

@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from chronoscene.bench.results import read_run
-from chronoscene.bench.tables import format_runs, read_runs
+from chronoscene.bench.summary import read_runs
+from chronoscene.bench.tables import format_runs
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.methods import load_spec, method_names
 from chronoscene.training import losses

@@ -103,7 +103,7 @@ def test_nothing_is_written_into_a_dataset(
 
 def test_a_table(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(results, "read_runs", lambda folders: ([], []))
-    monkeypatch.setattr(results, "format_runs", lambda *_: "no runs\n")
+    monkeypatch.setattr(results, "format_runs", lambda *_, **__: "no runs\n")
     with pytest.raises(ConfigError, match=r"^--out .*file/t\.csv: expected a file that can be"):
         arguments = ["table", str(places), "--out", str(places / "file/t.csv")]
         CliRunner().invoke(cli, arguments, catch_exceptions=False)

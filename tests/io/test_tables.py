@@ -18,7 +18,7 @@ from chronoscene.io.tables import (
 
 HEADS = [("name", ""), ("size", "[m]"), ("", "[px]")]
 TABLE = Table(
-    HEADS, [["a_b", "1.0", "2"], ["[c", "30.5", "4"]], title="Sizes", best={(1, 1)}, breaks={0}
+    HEADS, [["a_b", "1.0", "2"], ["[c", "30.5", "4"]], title="Sizes", ranks={(1, 1): 1}, breaks={0}
 )
 
 
@@ -32,7 +32,7 @@ def test_plain():
         "name  size [m]  size [px]",
         "----  --------  ---------",
         "a_b        1.0          2",
-        "[c      30.5 *          4",
+        "[c        30.5          4",
     ]
 
 
