@@ -31,7 +31,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TypeVar
 
 from chronoscene.errors import ChronoSceneError
@@ -73,31 +72,34 @@ GRACE = 5.0  # Seconds that a program has to end after SIGTERM: a container is s
 def process_tree(roots: Iterable[int]) -> set[int]:
     """Processes that run: the given ones, their descendants, and all in the session of one of them.
 
-    Who leads a session has started what is in it, also where the parent in between has ended. Needs
-    ``/proc``; elsewhere nothing is found.
+    Who leads a session has started what is in it, also where the parent in between has ended.
     """
+    import psutil
+
     running = {}
-    for entry in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError, ValueError):  # ended in the meantime
-            # After the name, which is in brackets and may have any character.
-            state, parent, _, session = (entry / "stat").read_text().rpartition(")")[2].split()[:4]
-            if state != "Z":
-                running[int(entry.name)] = (int(parent), int(session))
+    for process in psutil.process_iter(["ppid", "status"]):
+        with suppress(OSError):  # ended in the meantime
+            if process.info["status"] != psutil.STATUS_ZOMBIE:
+                session = os.getsid(process.pid) if hasattr(os, "getsid") else None
+                running[process.pid] = {process.info["ppid"], session}
     members = set(roots)
-    while new := {pid for pid, above in running.items() if members & {*above}} - members:
+    while new := {pid for pid, above in running.items() if members & above} - members:
         members |= new
     return members & running.keys()
 
 
 def end_processes(roots: Iterable[int], *, grace: float = GRACE) -> None:
     """End processes and what they started: SIGTERM, and SIGKILL if they still run after a while."""
+    import psutil
+
     told: set[int] = set()
     end = time.monotonic() + grace
     while members := process_tree(roots):
         late = time.monotonic() > end
         for pid in members if late else members - told:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL if late else signal.SIGTERM)
+            with suppress(psutil.NoSuchProcess):
+                process = psutil.Process(pid)
+                process.kill() if late else process.terminate()
         told |= members
         time.sleep(0.05)
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from subprocess import DEVNULL, STDOUT, Popen, TimeoutExpired
 
+import psutil
+
 from chronoscene.errors import ProgramError
 from chronoscene.io.processes import Outcome, end_processes, process_tree, stoppable
 from chronoscene.io.wording import printable
@@ -90,11 +92,13 @@ def log_lines(log: Path) -> list[str]:
 
 
 def memory_of(processes: set[int]) -> int:
-    """Bytes of memory that processes take, a share of what they have in common with others."""
+    """Bytes of memory that processes take, a share of what they have in common with others.
+
+    Where the system does not tell the share (macOS, Windows), it is what each has alone.
+    """
     total = 0
     for pid in processes:
-        with suppress(OSError):  # ended in the meantime
-            for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines():
-                if line.startswith("Pss:"):
-                    total += 1024 * int(line.split()[1])
+        with suppress(psutil.Error):  # ended in the meantime, or another user's
+            taken = psutil.Process(pid).memory_full_info()
+            total += getattr(taken, "pss", taken.uss)
     return total
