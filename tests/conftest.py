@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Generator, Mapping
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from PIL import Image
 
 import chronoscene  # noqa: F401  (loads zlib before pycolmap)
 from chronoscene.io.pycolmap import pycolmap
+from chronoscene.kernels import runtime
 
 # How long an example takes is not a property of the code on a machine that others use too. What is
 # drawn is the same in every run, unless --hypothesis-profile=afresh asks for other draws.
@@ -107,3 +109,20 @@ def pytest_runtest_makereport(
         report.outcome = "skipped"
         report.longrepr = (str(item.path), 0, "Skipped: open3d is missing, or does not load")
     return report
+
+
+@pytest.fixture
+def set_gsplat(monkeypatch: pytest.MonkeyPatch) -> Generator[Callable[[str | None], None]]:
+    """Pretends that a version of gsplat is installed, or none."""
+
+    def pretend(installed: str | None) -> None:
+        def version(name: str) -> str:
+            if installed is None:
+                raise PackageNotFoundError
+            return installed
+
+        monkeypatch.setattr(runtime, "version", version)
+        runtime.gsplat_release.cache_clear()
+
+    yield pretend
+    runtime.gsplat_release.cache_clear()

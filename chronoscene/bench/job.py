@@ -20,6 +20,7 @@ from chronoscene.bench.strategies import STRATEGIES
 from chronoscene.checks import check_choice
 from chronoscene.errors import BackendError, ConfigError
 from chronoscene.formats import writable_formats
+from chronoscene.kernels.runtime import gsplat_release
 from chronoscene.methods import (
     MethodSpec,
     ProgramConfig,
@@ -245,7 +246,7 @@ def check_device(device: str) -> None:
     """Check on the machine that will train that it has the device.
 
     Raises:
-        BackendError: If a GPU is asked for that is not there.
+        BackendError: If a GPU is asked for that is not there, or its kernels are not.
     """
     if device != "cuda":
         return
@@ -258,6 +259,7 @@ def check_device(device: str) -> None:
             found=f"torch {torch.__version__} without one",
             todo="use --device cpu",
         )
+    gsplat_release()
 
 
 VALUES = ("data", "output", "work", "iterations", "seconds", "seed")

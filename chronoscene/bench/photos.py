@@ -17,7 +17,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.images.disk_cache import DiskCache, files_of
 from chronoscene.images.store import ImageStore
 from chronoscene.io.wording import counted
-from chronoscene.kernels.runtime import available_threads
+from chronoscene.kernels.runtime import available_threads, machine_memory
 from chronoscene.scene import Frame, Scene
 
 _DECODING = 20
@@ -34,7 +34,7 @@ few Gaussians, measured)."""
 
 @dataclass(frozen=True, slots=True)
 class PhotoNeeds:
-    """What the training photos of a scene take, all in bytes."""
+    """What the photos of a scene take, all in bytes; without more words, those of the training."""
 
     count: int
     total: int
@@ -51,6 +51,8 @@ class PhotoNeeds:
     """0 if all fit into memory."""
     training: int
     """In memory besides the photos, without the model."""
+    tests: int
+    """Of the images of all test views."""
 
     @property
     def in_memory(self) -> int:
@@ -59,7 +61,7 @@ class PhotoNeeds:
 
 
 def photo_needs(scene: Scene, job: Job) -> PhotoNeeds:
-    """What the training photos of a job take."""
+    """What the photos of a job take."""
     sizes = ImageStore(scene, max_width=job.max_width)
     frames = scene.select(split="train")
     photos = [sizes.bytes_of(frame) for frame in frames]
@@ -79,6 +81,7 @@ def photo_needs(scene: Scene, job: Job) -> PhotoNeeds:
         allowed=job.photo_memory,
         on_disk=0 if fits else min(total, job.photo_disk),
         training=_LIBRARIES + _STEP * max(math.prod(sizes.camera(f).size) for f in frames),
+        tests=sum(sizes.bytes_of(frame) for frame in scene.select(split="test")),
     )
 
 
@@ -111,9 +114,7 @@ def check_room(scene: Scene, job: Job, runs: int) -> str:
     """
     needs = photo_needs(scene, job)
     _check_memory(scene, needs)
-    sizes = ImageStore(scene, max_width=job.max_width)
-    tested = sum(sizes.bytes_of(frame) for frame in scene.select(split="test"))
-    _check_disk(job, needs, (1 + runs) * tested)
+    _check_disk(job, needs, (1 + runs) * needs.tests)
     photos = f"{counted(needs.count, 'training photo')}, {_gb(needs.total)} when decoded"
     kept = f", {_gb(needs.on_disk)} on disk" if needs.on_disk else ""
     return (
@@ -132,9 +133,9 @@ def _check_memory(scene: Scene, needs: PhotoNeeds) -> None:
             found=_gb(needs.allowed),
             todo=f"use --photo-memory {math.ceil(least / 1e7) / 100}",
         )
-    free = _free_memory()
+    _, free = machine_memory()
     wanted = needs.in_memory + needs.training
-    if free is not None and free < wanted:
+    if free < wanted:
         smaller = math.floor((free - needs.training) / 1e7) / 100
         raise ConfigError(
             scene.name,
@@ -171,12 +172,3 @@ def _pixels(frame: Frame) -> int:
 
 def _gb(size: int) -> str:
     return f"{size / 1e9:.2f} GB"
-
-
-def _free_memory() -> int | None:
-    """Bytes that programs can still have; None where the system does not tell."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    return next((1024 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable:")), None)

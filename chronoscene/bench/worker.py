@@ -11,9 +11,9 @@ import sys
 import time
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from datetime import UTC, datetime
-from importlib.util import find_spec
 from json import dumps
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,7 @@ from chronoscene.bench.training_loop import (
     train,
     warm_up,
 )
-from chronoscene.errors import ChronoSceneError, DiskFullError
+from chronoscene.errors import BackendError, ChronoSceneError, DiskFullError
 from chronoscene.formats import read_scene
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import needing_space, write_text_atomic
@@ -152,10 +152,12 @@ def pick_device(wanted: str, spec: MethodSpec) -> str:
     check_device(wanted)
     if wanted != "auto":
         return wanted
-    import torch
-
-    ready = torch.cuda.is_available() and find_spec("gsplat") is not None
-    return "cuda" if "cuda" in spec.devices and (ready or "cpu" not in spec.devices) else "cpu"
+    if "cuda" not in spec.devices or "cpu" not in spec.devices:
+        return spec.devices[0]
+    with suppress(BackendError):
+        check_device("cuda")
+        return "cuda"
+    return "cpu"
 
 
 def _new_method(job: Job, spec: MethodSpec) -> Method:

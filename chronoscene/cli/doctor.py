@@ -6,7 +6,6 @@ import os
 import platform
 import shutil
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
@@ -17,15 +16,14 @@ import click
 
 from chronoscene import __version__
 from chronoscene.cli.output import emit
-from chronoscene.errors import ChronoSceneError
+from chronoscene.errors import BackendError, ChronoSceneError
 from chronoscene.io.tables import Table, plain_text
 from chronoscene.io.wording import in_words
-from chronoscene.kernels.runtime import available_threads
+from chronoscene.kernels.runtime import available_threads, gsplat_release, machine_memory
 from chronoscene.metrics.lpips_weights import candidate_files, check_available
 
 CANNOT_RUN = 1  # Exit status if no method can be trained
 CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
-CONTAINER_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,15 +120,12 @@ def _cuda() -> Finding:
 
 
 def _gsplat() -> Finding:
-    todo = "pip install 'chronoscene[cuda]'; --device cuda needs it"
-    return _package("gsplat", "gsplat", todo)
-
-
-def _package(what: str, package: str, todo: str) -> Finding:
-    """Whether an optional package is installed, which is not imported."""
-    if find_spec(package) is None:
-        return Finding(what, "missing", "not installed", todo)
-    return Finding(what, "ok", f"{package} {version(package)}")
+    try:
+        gsplat_release()
+    except BackendError as error:
+        found = f"{error.found}, not {error.expected}"
+        return Finding("gsplat", "missing", found, f"{error.todo}; --device cuda needs it")
+    return Finding("gsplat", "ok", f"gsplat {version('gsplat')}")
 
 
 def _open3d() -> Finding:
@@ -154,7 +149,9 @@ def _lpips() -> Finding:
 
 
 def _video() -> Finding:
-    return _package("video", "av", "pip install av; MP4 files need it")
+    if find_spec("av") is None:
+        return Finding("video", "missing", "not installed", "pip install av; MP4 files need it")
+    return Finding("video", "ok", f"av {version('av')}")
 
 
 def _processors() -> Finding:
@@ -163,13 +160,7 @@ def _processors() -> Finding:
 
 
 def _memory() -> Finding:
-    try:
-        size = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError):  # Windows
-        return Finding("memory", "ok", "unknown")
-    with suppress(OSError, ValueError):  # no container, or one without a limit
-        size = min(size, int(CONTAINER_LIMIT.read_text()))
-    return Finding("memory", "ok", in_words(size))
+    return Finding("memory", "ok", in_words(machine_memory()[0]))
 
 
 def _disk() -> Finding:

@@ -1,10 +1,23 @@
-"""Settings of a process that runs kernels: how many threads, and what becomes of freed memory."""
+"""What kernels find on this machine: threads, memory, gsplat; and settings of their process."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import re
 import sys
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from chronoscene.errors import BackendError
+
+CONTAINER = Path("/sys/fs/cgroup")
+"""Where Linux says what the container of a process may have (cgroup v2)."""
+
+GSPLAT_ALPHA_MAX = {"1.5": 0.999, "1.6": 0.99}
+"""Cap of alpha in the kernels of gsplat, by version. Others were not looked at and are refused."""
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 _KEPT_BYTES = 256 << 20
@@ -14,6 +27,46 @@ _MAX_MMAP_THRESHOLD = 32 << 20  # The largest that glibc accepts
 def available_threads() -> int:
     """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def machine_memory() -> tuple[int, int]:
+    """Bytes of memory that this machine has, and that programs can still have.
+
+    Both are within the limit of a container. What it keeps of files can be had like free memory.
+    """
+    import psutil
+
+    machine = psutil.virtual_memory()
+    total, free = machine.total, machine.available
+    with suppress(OSError, ValueError):  # no container, or one without a limit, which is "max"
+        limit = int((CONTAINER / "memory.max").read_text())
+        used = int((CONTAINER / "memory.current").read_text())
+        files = re.search(r"^inactive_file (\d+)", (CONTAINER / "memory.stat").read_text(), re.M)
+        free = min(free, limit - used + (int(files[1]) if files else 0))
+        total = min(total, limit)
+    return total, free
+
+
+@cache
+def gsplat_release() -> str:
+    """Major and minor version of the installed gsplat, which is not imported.
+
+    Raises:
+        BackendError: If there is none, or one that is not in `GSPLAT_ALPHA_MAX`.
+    """
+    try:
+        found = version("gsplat")
+    except PackageNotFoundError:
+        found = "none"
+    if (short := ".".join(found.split(".")[:2])) in GSPLAT_ALPHA_MAX:
+        return short
+    raise BackendError(
+        "gsplat",
+        expected=f"version {' or '.join(GSPLAT_ALPHA_MAX)}",
+        found=found,
+        todo="pip install 'chronoscene[cuda]', or use the CPU; it compiles its kernels when it is "
+        "first used, with nvcc of the CUDA toolkit",
+    )
 
 
 def set_threads(count: int | None = None) -> int:

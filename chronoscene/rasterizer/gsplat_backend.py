@@ -12,19 +12,16 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from chronoscene.errors import BackendError
+from chronoscene.kernels.runtime import gsplat_release
 from chronoscene.rasterizer import RasterInfo, Rasterization, reference
 from chronoscene.rasterizer.constants import ALPHA_MIN, QUATERNION_MIN
 from chronoscene.rasterizer.inputs import Inputs, recentred
-
-ALPHA_MAX = {"1.5": 0.999, "1.6": 0.99}
-"""Cap of alpha in the kernels, by version of gsplat. Others were not looked at and are refused."""
 
 _TOOLKIT = (
     "gsplat compiles its kernels when it is first used, and needs for that a C++ compiler and the "
@@ -84,7 +81,7 @@ def spherical_harmonics(degree: int, offsets: Tensor, coeffs: Tensor) -> Tensor:
         sums: Colours less 0.5, not clamped. [N, 3]
     """
     gsplat = _load(offsets.device)
-    if release() == "1.5":
+    if gsplat_release() == "1.5":
         sums: Tensor = gsplat.spherical_harmonics(degree, offsets, coeffs)
         return sums
     # From 1.6 on it takes centres and cameras; this camera is at the origin.
@@ -94,31 +91,9 @@ def spherical_harmonics(degree: int, offsets: Tensor, coeffs: Tensor) -> Tensor:
 
 
 @cache
-def release() -> str:
-    """Major and minor version of gsplat.
-
-    Raises:
-        BackendError: If there is none, or one that is not in `ALPHA_MAX`.
-    """
-    expected = f"gsplat {' or '.join(ALPHA_MAX)}"
-    try:
-        found = version("gsplat")
-    except PackageNotFoundError:
-        found = "none"
-    if (short := ".".join(found.split(".")[:2])) in ALPHA_MAX:
-        return short
-    raise BackendError(
-        "backend 'cuda'",
-        expected=expected,
-        found=found,
-        todo=f"pip install 'chronoscene[cuda]' ({_TOOLKIT}), or choose backend='cpu'",
-    )
-
-
-@cache
 def _load(device: torch.device) -> Any:
     """The package gsplat with its kernels, if it can be used here."""
-    release()
+    gsplat_release()
     if not torch.cuda.is_available():
         raise BackendError(
             "backend 'cuda'",

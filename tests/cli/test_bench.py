@@ -110,7 +110,7 @@ def settings(monkeypatch):
 
 
 def test_a_device_that_is_not_there_is_refused_before_anything_is_read(
-    make_scene_folder, tmp_path, monkeypatch
+    make_scene_folder, tmp_path, monkeypatch, set_gsplat
 ):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     monkeypatch.setattr("chronoscene.bench.plan.read_scene", lambda path: pytest.fail("read"))
@@ -118,6 +118,11 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_read(
     result = CliRunner().invoke(cli, [*command, "--device", "cuda"])
     assert isinstance(result.exception, BackendError)
     assert str(result.exception).startswith("--device cuda: expected a CUDA device")
+    assert not (tmp_path / "r").exists()
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    set_gsplat("1.7.0")
+    result = CliRunner().invoke(cli, [*command, "--device", "cuda"])
+    assert str(result.exception).startswith("gsplat: expected version 1.5 or 1.6, found 1.7.0")
     assert not (tmp_path / "r").exists()
     result = CliRunner().invoke(cli, [*command, "--device", "cuda:3"])
     assert result.exit_code == 2 and "'cuda:3' is not one of 'auto', 'cpu', 'cuda'" in result.stderr

@@ -1,11 +1,14 @@
-"""Freed memory is kept: a process that allocates again touches no new pages."""
+"""What a process finds on its machine, and freed memory, which is kept."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 
+import psutil
 import pytest
+
+from chronoscene.kernels import runtime
 
 PROGRAM = """
 import resource, sys
@@ -38,3 +41,16 @@ def test_memory_is_kept() -> None:
         pytest.skip("the C library has no mallopt")
     default = new_pages("default")
     assert kept < 0.1 * default
+
+
+def test_memory_is_that_of_the_machine_within_the_limit_of_a_container(monkeypatch, tmp_path):
+    monkeypatch.setattr(runtime, "CONTAINER", tmp_path)
+    machine = psutil.virtual_memory().total
+    total, free = runtime.machine_memory()
+    assert total == machine and 0 < free < total
+    (tmp_path / "memory.max").write_text("max\n")
+    assert runtime.machine_memory()[0] == machine
+    (tmp_path / "memory.max").write_text("90000000\n")
+    (tmp_path / "memory.current").write_text("70000000\n")
+    (tmp_path / "memory.stat").write_text("anon 20000000\nfile 30000000\ninactive_file 10000000\n")
+    assert runtime.machine_memory() == (90_000_000, 30_000_000)

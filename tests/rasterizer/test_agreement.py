@@ -13,7 +13,7 @@ from hypothesis import assume, given, settings
 from rasterizer_cases.scenes import ANTIALIASED, SmallScene, scenes, well_posed
 
 from chronoscene.errors import ShapeError
-from chronoscene.rasterizer import gsplat_backend
+from chronoscene.kernels.runtime import GSPLAT_ALPHA_MAX, gsplat_release
 
 Check = Callable[..., Any]
 
@@ -231,7 +231,7 @@ def test_many_gaussians_on_one_pixel(tools: SimpleNamespace) -> None:
 def test_cuda_agrees(tools: SimpleNamespace, check_agreement: Check) -> None:
     """The reference has the cap of alpha of the gsplat that is installed."""
     pytest.importorskip("gsplat", reason="needs the extra cuda")
-    cap = gsplat_backend.ALPHA_MAX[gsplat_backend.release()]
+    cap = GSPLAT_ALPHA_MAX[gsplat_release()]
     with tools.thresholds(ALPHA_MAX=float(np.float32(cap))):
         for seed in range(3):
             scene = tools.random_scene(200, 48, 40, seed=seed, render_depth=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterator
-from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +13,7 @@ import torch
 
 import chronoscene
 from chronoscene.errors import BackendError, ShapeError
+from chronoscene.kernels.runtime import GSPLAT_ALPHA_MAX
 from chronoscene.rasterizer import gsplat_backend, rasterize
 
 
@@ -110,33 +110,30 @@ def test_unknown_backend(arguments: dict[str, Any]) -> None:
 
 
 @pytest.fixture
-def other_gsplat(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+def other_gsplat(
+    monkeypatch: pytest.MonkeyPatch, set_gsplat: Callable[..., None]
+) -> Iterator[Callable[..., None]]:
     """Pretends that another gsplat is installed: its version, its module, its kernels."""
 
-    def pretend(version: str, module: Any = None, kernels: Any = None) -> None:
+    def pretend(version: str | None, module: Any = None, kernels: Any = None) -> None:
         modules = {"gsplat": module, "gsplat.cuda._backend": SimpleNamespace(_C=kernels)}
-        monkeypatch.setattr(gsplat_backend, "version", lambda name: version)
         monkeypatch.setattr(gsplat_backend, "import_module", modules.__getitem__)
-        gsplat_backend.release.cache_clear()
+        set_gsplat(version)
         gsplat_backend._load.cache_clear()
 
     yield pretend
-    gsplat_backend.release.cache_clear()
     gsplat_backend._load.cache_clear()
 
 
 def test_cuda_without_gsplat_or_gpu_says_what_to_install(
     arguments: dict[str, Any], monkeypatch: pytest.MonkeyPatch, other_gsplat: Callable[..., None]
 ) -> None:
-    def missing(name: str) -> str:
-        raise PackageNotFoundError
-
-    monkeypatch.setattr(gsplat_backend, "version", missing)
+    other_gsplat(None)
     with pytest.raises(BackendError, match=r"found none; pip install 'chronoscene\[cuda\]'"):
         rasterize(**arguments, backend="cuda")
     for version in ("1.4.0", "1.7.0"):
         other_gsplat(version)
-        with pytest.raises(BackendError, match=rf"expected gsplat 1.5 or 1.6, found {version}"):
+        with pytest.raises(BackendError, match=rf"expected version 1.5 or 1.6, found {version}"):
             rasterize(**arguments, backend="cuda")
     other_gsplat("1.5.3")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -150,7 +147,7 @@ def test_cuda_without_gsplat_or_gpu_says_what_to_install(
 def test_versions_in_the_packaging_are_those_that_were_looked_at() -> None:
     path = Path(chronoscene.__file__).parents[1] / "pyproject.toml"
     (extra,) = tomllib.loads(path.read_text())["project"]["optional-dependencies"]["cuda"]
-    minors = [int(version.removeprefix("1.")) for version in gsplat_backend.ALPHA_MAX]
+    minors = [int(version.removeprefix("1.")) for version in GSPLAT_ALPHA_MAX]
     assert extra == f"gsplat>=1.{min(minors)},<1.{max(minors) + 1}"
 
 

@@ -110,7 +110,7 @@ def test_gsplat_is_asked_in_the_words_of_its_version(monkeypatch, release):
 
     functions = {"1.5": of_directions, "1.6": of_cameras}
     gsplat = SimpleNamespace(spherical_harmonics=functions[release])
-    monkeypatch.setattr(gsplat_backend, "release", lambda: release)
+    monkeypatch.setattr(gsplat_backend, "gsplat_release", lambda: release)
     monkeypatch.setattr(gsplat_backend, "_load", lambda device: gsplat)
     dc, rest, means, centre = random_inputs(40)
     means[7] = centre
