@@ -34,11 +34,14 @@ TORCH_SIDE = {f"chronoscene.{name}" for name in ("anchors", "gaussians", "traini
 """Rooms that need torch and are used by methods only."""
 
 
+SKELETON = set((ROOT / "chronoscene/cli/skeleton").rglob("*.py"))
+
+
 def modules() -> dict[str, Path]:
-    """All modules by name."""
+    """All modules by name; those of the example for methods are a package of its own."""
     found = {}
     for package in ("chronoscene", "chronogs", "baselines", "leaderboard"):
-        for path in (ROOT / package).rglob("*.py"):
+        for path in set((ROOT / package).rglob("*.py")) - SKELETON:
             parts = path.relative_to(ROOT).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found

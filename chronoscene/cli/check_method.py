@@ -14,9 +14,8 @@ from chronoscene.io.staging import staged_folder
 SOME_FAILED = 1  # Exit status when the method breaks a rule
 
 EXAMPLE = "tinted-gaussians"
-"""The package in ``examples/`` that new methods are copies of."""
 SKELETON = Path(__file__).parent / "skeleton"
-"""A link to it, which becomes a folder in an installed package."""
+"""The package of this name, which new methods are copies of."""
 KINDS = ("*.py", "*.toml", "*.md")  # Its own files; others are left there by Python and pip
 
 
@@ -56,7 +55,7 @@ def check(name: str) -> None:
 def new(name: str, out: Path | None) -> None:
     """Write the package of a new method called NAME.
 
-    It is a copy of examples/tinted-gaussians: a method that works, to be changed.
+    It is a method that works, to be changed: Gaussians with a tint per period.
     """
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name):
         raise ConfigError(
