@@ -15,6 +15,7 @@ from chronoscene.bench.predictions import (
     ImageEntry,
     ground_truth_folder,
     load_image,
+    load_mask,
     read_manifest,
     safe_name,
 )
@@ -131,7 +132,8 @@ def _draw_row(
     errors: bool,
 ) -> Any:
     """One view: the photo, then each method with its PSNR. Returns the last error map."""
-    photo = load_image(truth, entry)
+    photo, mask = load_image(truth, entry), load_mask(truth, entry)
+    ignored = mask is not None and not mask.any()
     axes[0].imshow(photo)
     axes[0].set_ylabel(shorten(period_title(entry.camera_period, labels), 26), fontsize=10)
     axes[0].set_xlabel(entry.view, fontsize=8)
@@ -139,11 +141,12 @@ def _draw_row(
     for axis, column in zip(axes[1:], columns, strict=True):
         image = load_image(column.folder, column.entries[entry.view])
         if errors:
-            error = mean_error(image, photo)
+            error = mean_error(image, photo, mask)
             shown = axis.imshow(error, vmin=0, vmax=ERROR_RANGE, cmap="magma")
         else:
             axis.imshow(image)
-        axis.set_xlabel(f"{psnr(image, photo):.2f} dB", fontsize=9)
+        value = "not scored" if ignored else f"{psnr(image, photo, mask):.2f} dB"
+        axis.set_xlabel(value, fontsize=9)
     for axis in axes:
         axis.set_xticks([])
         axis.set_yticks([])
@@ -156,7 +159,10 @@ def period_title(period: int, labels: dict[str, str]) -> str:
     return f"period {label}" if label == str(period) else label
 
 
-def mean_error(image: NDArray[np.uint8], photo: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Mean absolute error over the channels, 0..1. [H, W]"""
+def mean_error(
+    image: NDArray[np.uint8], photo: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None
+) -> NDArray[np.float64]:
+    """Mean absolute error over the channels, 0..1; nan where the mask ignores. [H, W]"""
     difference = image.astype(np.float64) - photo.astype(np.float64)
-    return np.asarray(np.abs(difference).mean(axis=2) / 255.0)
+    error = np.abs(difference).mean(axis=2) / 255.0
+    return error if mask is None else np.where(mask, error, np.nan)

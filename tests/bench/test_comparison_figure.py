@@ -2,15 +2,23 @@
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 
 from chronoscene.bench.comparison_figure import (
+    Column,
+    _draw_row,
     chosen_views,
     draw_figures,
     first_seeds,
     mean_error,
     period_title,
 )
-from chronoscene.bench.predictions import ground_truth_folder, load_image, read_manifest
+from chronoscene.bench.predictions import (
+    ImageWriter,
+    ground_truth_folder,
+    load_image,
+    read_manifest,
+)
 from chronoscene.bench.results import read_run
 
 JOINT = "ring/mean-joint-balanced/seed0"
@@ -51,9 +59,31 @@ def test_error_is_the_mean_over_channels():
     image[0, 0] = (255, 0, 51)
     np.testing.assert_allclose(mean_error(image, black), [[0.4, 0], [0, 0]])
     np.testing.assert_allclose(mean_error(black, image), [[0.4, 0], [0, 0]])
+    mask = np.array([[False, True], [True, True]])
+    np.testing.assert_equal(mean_error(image, black, mask), [[np.nan, 0], [0, 0]])
 
 
 def test_period_titles():
     assert period_title(1, {"1": "autumn"}) == "autumn"
     assert period_title(1, {"1": "1"}) == "period 1"
     assert period_title(2, {}) == "period 2"
+
+
+def test_what_a_mask_ignores_is_neither_error_nor_psnr(tmp_path):
+    photo, mask = np.zeros((8, 8, 3), np.uint8), np.eye(8, dtype=bool)
+    image = np.where(mask[..., None], photo + 51, 200).astype(np.uint8)
+    for name, pixels, masks in (("t", photo, (mask, mask & False)), ("p", image, (None, None))):
+        writer = ImageWriter(tmp_path / name)
+        for view, one in zip(("a", "b"), masks, strict=True):
+            writer.add(view, pixels, camera_period=0, rendered_period=0, mask=one)
+        writer.close(kind="predictions", scene="s", scene_hash="h", details={})
+    entries = {entry.view: entry for entry in read_manifest(tmp_path / "p").images}
+    for entry, label in zip(read_manifest(tmp_path / "t").images, ("13.98", "not"), strict=True):
+        axes = Figure().subplots(1, 2)
+        column = Column("", tmp_path / "p", entries)
+        shown = _draw_row(axes, tmp_path / "t", entry, [column], {}, errors=True)
+        assert axes[1].get_xlabel().startswith(label)
+        drawn = np.ma.filled(shown.get_array().astype(float), np.nan)
+        if label != "not":
+            np.testing.assert_allclose(drawn[mask], 0.2)
+        assert np.isnan(drawn[~mask]).all()
