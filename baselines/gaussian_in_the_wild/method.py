@@ -89,11 +89,15 @@ class GaussianInTheWild(GaussianMethod):
         They are held near the constant colour where views are few, as `bake` does.
         """
         model, p = self.model, self.model.parameters
-        normal = torch.zeros(len(model), NUM_BASES, NUM_BASES, device=p["means"].device)
-        moments = torch.zeros(len(model), NUM_BASES, 3, device=p["means"].device)
+        device, features = p["means"].device, self._read_periods()[:, int(period)]
+        rows = torch.arange(len(model), device=device)
+        normal = torch.zeros(len(model), NUM_BASES, NUM_BASES, device=device)
+        moments = torch.zeros(len(model), NUM_BASES, 3, device=device)
         for view in views:
-            colors = self.splats(view, period, period).colors
-            offsets = p["means"] - camera_centre_tensor(view, p["means"].device)
+            centre = camera_centre_tensor(view, device)
+            with one_thread():
+                colors = model.colors(centre, rows, features)
+            offsets = p["means"] - centre
             values = basis(torch.nn.functional.normalize(offsets), MAX_DEGREE)
             normal += values[:, :, None] * values[:, None]
             moments += values[:, :, None] * (colors - 0.5)[:, None]

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
+from math import log
 
 import torch
 from torch import Tensor
 
 from baselines.gaussian_in_the_wild.networks import Networks, colors_of
+from chronoscene.anchors.visibility import visible_anchors
 from chronoscene.gaussians.model import GaussianModel, opacities_of, scales_of
 from chronoscene.methods import View
 from chronoscene.training.splatting import Splats, camera_centre_tensor
 
 COORDINATES = "coordinates"
 """Group of parameters: where Gaussians read in feature maps. [N, 3, 2]"""
+_SLACK = log(2)
+"""Added to the logarithms of scales: to leave out too few costs little, too many is wrong."""
+_NEAR = 1e-6
+"""Nearest depth of what a view may show: below all near planes."""
 
 
 @dataclass(eq=False)
@@ -32,21 +38,39 @@ class WildModel(GaussianModel):
     def splats(self, view: View, period: float) -> Splats:
         """The Gaussians to draw in a view as of a whole period."""
         assert self.period_features is not None
-        return self.painted(view, self.period_features[:, int(period)])
+        rows = self.rows_in(view)
+        return self.painted(view, rows, self.period_features[rows, int(period)])
 
-    def painted(self, view: View, dynamic: Tensor) -> Splats:
-        """The Gaussians to draw in a view with what they read from a photo. [N, D]"""
+    def rows_in(self, view: View) -> Tensor:
+        """Gaussians that a view may show, and some more: the others need no colour. int64 [M]"""
         p = self.parameters
+        widest = (p["log_scales"].amax(1, keepdim=True) + _SLACK).repeat(1, 3)
+        return visible_anchors(p["means"], widest, view, near_plane=_NEAR)
+
+    def painted(self, view: View, rows: Tensor, dynamic: Tensor) -> Splats:
+        """The Gaussians to draw in a view; those that it cannot show are black.
+
+        Args:
+            view: The camera.
+            rows: Those that it may show. [M]
+            dynamic: What these read from a photo. [M, D]
+        """
+        p = self.parameters
+        centre = camera_centre_tensor(view, p["means"].device)
+        colors = torch.zeros_like(p["means"]).index_copy(
+            0, rows, self.colors(centre, rows, dynamic)
+        )
         return Splats(
             means=p["means"],
             quats=p["quats"],
             scales=scales_of(p["log_scales"]),
             opacities=opacities_of(p["logit_opacities"]),
-            colors=self.colors(camera_centre_tensor(view, p["means"].device), dynamic),
+            colors=colors,
         )
 
-    def colors(self, camera_centre: Tensor, dynamic: Tensor) -> Tensor:
-        """Colours as seen from a camera centre [3], with what is read from a photo. [N, 3]"""
-        p = self.parameters
-        intrinsic = torch.cat([p["sh_dc"], p["sh_rest"].flatten(1)], 1)
-        return colors_of(p["means"], intrinsic, dynamic, camera_centre, self.shared, self.networks)
+    def colors(self, camera_centre: Tensor, rows: Tensor, dynamic: Tensor) -> Tensor:
+        """Colours of some Gaussians as seen from a camera centre [3]. [M, 3]"""
+        names = ("means", "sh_dc", "sh_rest")
+        means, dc, rest = (self.parameters[name].index_select(0, rows) for name in names)
+        intrinsic = torch.cat([dc, rest.flatten(1)], 1)
+        return colors_of(means, intrinsic, dynamic, camera_centre, self.shared, self.networks)

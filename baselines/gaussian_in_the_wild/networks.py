@@ -7,18 +7,16 @@ Source: Zhang et al. 2024, and facts about the released code; README.md says wha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from math import prod, sqrt
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, conv_transpose2d, interpolate, linear, max_pool2d, relu
 
-from chronoscene.training import devices
 from chronoscene.training.spherical_harmonics import C0, NUM_BASES
 
 ENCODERS: dict[str, tuple[int, ...]] = {"resnet18": (64, 64, 128, 256, 512), "small": (16, 32, 64)}
@@ -29,8 +27,6 @@ INTRINSIC = 3 * NUM_BASES
 """Numbers of a Gaussian's own feature, kept as spherical harmonics would be."""
 
 _STREAM = 6  # Keeps the networks apart from other draws of the same seed
-_CHUNK = 4096
-"""Gaussians that go through the colour network together. Fixed, so that sums over them are."""
 
 Tensors = Mapping[str, Tensor]
 
@@ -184,43 +180,7 @@ def colors_of(
     tensors: Tensors,
     networks: Networks,
 ) -> Tensor:
-    """Colours of Gaussians: `colors_reference`, some thousand rows at a time on a CPU.
-
-    So what is between the layers stays in the cache, and the backward pass goes through the rows
-    with a gradient alone: a view does not show all Gaussians.
-
-    Args:
-        means: Centres in the training frame. [N, 3]
-        intrinsic: Features of their own. [N, 48]
-        dynamic: What they read from a photo. [N, D]
-        camera_centre: In the training frame. [3]
-        tensors: Those of the colour network.
-        networks: Sizes.
-
-    Returns:
-        Colours, not bounded. [N, 3]
-    """
-    names = [f"{layer}.{kind}" for layer in networks.layers() for kind in ("weight", "bias")]
-
-    def function(means: Tensor, intrinsic: Tensor, dynamic: Tensor, *weights: Tensor) -> Tensor:
-        own = dict(zip(names, weights, strict=True))
-        return colors_reference(means, intrinsic, dynamic, camera_centre, own, networks)
-
-    arguments = (means, intrinsic, dynamic, *(tensors[name] for name in names))
-    if not devices.has_kernels(*arguments):
-        return function(*arguments)
-    return _ByRows.apply(function, 3, *arguments)
-
-
-def colors_reference(
-    means: Tensor,
-    intrinsic: Tensor,
-    dynamic: Tensor,
-    camera_centre: Tensor,
-    tensors: Tensors,
-    networks: Networks,
-) -> Tensor:
-    """The definition of `colors_of`, in plain torch, for any floating type and device.
+    """Colours of Gaussians, not bounded. [N, 3]
 
     With e the encoding of the mean, f the intrinsic and d the dynamic feature, v the unit vector
     from the camera to the mean, and chains of linear layers with ReLU between them,
@@ -228,6 +188,14 @@ def colors_reference(
         h = encoder(e, d, f),  color = head(decoder(h, f), v),
 
     to which the constant colour of f is added where differences are learned.
+
+    Args:
+        means: Centres in the training frame. [N, 3]
+        intrinsic: Features of their own, f. [N, 48]
+        dynamic: What they read from a photo, d. [N, D]
+        camera_centre: In the training frame. [3]
+        tensors: Those of the colour network.
+        networks: Sizes.
     """
     means_of_unit = means / networks.position_unit
     octaves = [means_of_unit * 2.0**k for k in range(networks.frequencies)]
@@ -248,33 +216,3 @@ def _chain(tensors: Tensors, name: str, x: Tensor) -> Tensor:
         x = linear(x, tensors[f"color.{name}.{i}.weight"], tensors[f"color.{name}.{i}.bias"])
         i += 1
     return x
-
-
-class _ByRows(torch.autograd.Function):
-    """A function of rows, of which the first arguments have one each and the others are shared."""
-
-    @staticmethod
-    def forward(ctx: Any, function: Callable[..., Tensor], count: int, *args: Tensor) -> Tensor:
-        ctx.function, ctx.count = function, count
-        ctx.save_for_backward(*args)
-        rows, shared = args[:count], args[count:]
-        chunks = zip(*(value.split(_CHUNK) for value in rows), strict=True)
-        return torch.cat([function(*chunk, *shared) for chunk in chunks])
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
-        count, args = ctx.count, ctx.saved_tensors
-        used = grads[0].any(1).nonzero()[:, 0]
-        shared = [value.detach().requires_grad_() for value in args[count:]]
-        found = [torch.zeros_like(value) for value in args]
-        for part in used.split(_CHUNK):
-            rows = [value[part].detach().requires_grad_() for value in args[:count]]
-            with torch.enable_grad():
-                out = ctx.function(*rows, *shared)
-                parts = torch.autograd.grad(out, [*rows, *shared], grads[0][part])
-            for i, gradient in enumerate(parts):
-                if i < count:
-                    found[i][part] = gradient
-                else:
-                    found[i] += gradient
-        return None, None, *found

@@ -54,14 +54,15 @@ class WildTrainer(GaussianTrainer):
 
     def splats(self, number: int) -> Splats:
         config = self.config
-        dynamic, _, stages = self._read(self._reference(number))
         view, self._visible = self.train.views[number], None
+        rows = self.model.rows_in(view)
+        dynamic, _, stages = self._read(self._reference(number), rows)
         counts = config.visibility and self.timeline.last_moment > config.visibility_from
         if stages and counts and config.reference == "image":
             self._visible = see(stages, self.model.shared, view.height, view.width)
         generator = np.random.default_rng((self.seed, _STREAM, self.sampler.drawn))
         kept = uniform(generator, tuple(dynamic.shape), dynamic) >= config.dropout
-        return self.model.painted(view, dynamic * kept / (1 - config.dropout))
+        return self.model.painted(view, rows, dynamic * kept / (1 - config.dropout))
 
     def loss(self, raster: Rasterization, number: int, mask: Tensor | None) -> Tensor:
         free = self.model.parameters[COORDINATES][:, :-1]
@@ -95,6 +96,7 @@ class WildTrainer(GaussianTrainer):
         model, views = self.model, self.train.views
         size, channels = model.networks.dynamic, model.networks.map_channels
         device = self.background.device
+        rows = torch.arange(len(model), device=device)
         found = torch.zeros(len(model), self.train.num_periods, size, device=device)
         with one_thread():
             for period in range(self.train.num_periods):
@@ -104,7 +106,7 @@ class WildTrainer(GaussianTrainer):
                 count = torch.zeros(len(model), 1, device=device)
                 for i, number in enumerate(numbers):
                     self.train.expect(numbers[i:])
-                    dynamic, inside, _ = self._read(number)
+                    dynamic, inside, _ = self._read(number, rows)
                     total += dynamic
                     count += inside[:, None]
                 total[:, :-channels] /= max(len(numbers), 1)
@@ -112,13 +114,13 @@ class WildTrainer(GaussianTrainer):
                 found[:, period] = total
         return found
 
-    def _read(self, number: int) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """What Gaussians read from a training photo, whether they are inside, and the stages."""
+    def _read(self, number: int, rows: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """What some Gaussians read from a training photo, as `read_features`, and the stages."""
         model, train = self.model, self.train
         p, device = model.parameters, self.background.device
         if self.config.reference == "none":
-            nothing = torch.zeros(len(model), model.networks.dynamic, device=device)
-            return nothing, torch.zeros(len(model), dtype=torch.bool, device=device), []
+            nothing = torch.zeros(len(rows), model.networks.dynamic, device=device)
+            return nothing, torch.zeros_like(rows, dtype=torch.bool), []
         photo = small_photo(
             train.load_image(number), train.load_mask(number), self.config.reference_size
         )
@@ -126,8 +128,8 @@ class WildTrainer(GaussianTrainer):
         maps, stages = read_photo(pixels, model.shared, model.networks)
         dynamic, inside = read_features(
             maps,
-            p["means"],
-            p[COORDINATES],
+            p["means"].index_select(0, rows),
+            p[COORDINATES].index_select(0, rows),
             train.views[number],
             box_in_pixels=self.config.box_pixels > 0,
         )

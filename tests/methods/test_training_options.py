@@ -22,7 +22,9 @@ OPTIONS = [
     ("scaffold-gs", {"random_background": True, "exposure": "image"}),
     ("chronogs", {"exposure": "period"}),
     ("4dgs", {"exposure": "period"}),
+    ("gs-w", {"reference": "period", "exposure": "image"}),
     ("3dgs", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
+    ("gs-w", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
 ]
 OPTIONS_IDS = [f"{method}-{'-'.join(options)}" for method, options in OPTIONS]
 
