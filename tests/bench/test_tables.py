@@ -6,13 +6,14 @@ import json
 import re
 
 import pytest
-from made_runs import record
+from made_runs import record, scored
 
 from chronoscene.bench.results import Failure
 from chronoscene.bench.summary import ENTRY_COLUMNS, summarise
 from chronoscene.bench.tables import footnotes, format_runs, readable_tables
 from chronoscene.errors import ConfigError
 from chronoscene.io.tables import FORMATS
+from leaderboard.published import load_published
 
 RUNS = [
     record(seed=0, psnr=(20.0, 30.0), ssim=(0.5, 0.75)),
@@ -145,6 +146,120 @@ def test_a_metric_that_a_seed_lacks_has_no_mean():
     assert [row[1] for row in grids(runs, ["ssim"])[0].rows] == ["-"]
 
 
+# Of two periods; b is 0.1 worse on average, by views that differ more; c is 5 worse on each.
+TRUE = [[20.0, 22.0, 21.0, 24.0], [30.0, 31.0, 29.0, 33.0]]
+SCORED = [
+    scored("a", psnr=TRUE),
+    scored("b", psnr=[[v + d for v, d in zip(p, (2, -2, 1.5, -1.9), strict=True)] for p in TRUE]),
+    scored("c", psnr=[[value - 5 for value in values] for values in TRUE]),
+]
+
+
+def test_intervals_differences_and_ties():
+    (table,) = grids(SCORED, ["psnr"])
+    assert table.heads[3:6] == [
+        ("macro", ""),
+        ("interval", "over views"),
+        ("difference", "to the best"),
+    ]
+    a, b, c = ([cell.replace("\N{MINUS SIGN}", "-") for cell in row[3:6]] for row in table.rows)
+    assert a[0] == "26.25" and re.fullmatch(r"\[2\d\.\d\d, 2\d\.\d\d\]", a[1]) and a[2] == "-"
+    assert re.fullmatch(r"-0\.10 \[-\d\.\d\d, \d\.\d\d\]", b[2])
+    assert c[2] == "-5.00 [-5.00, -5.00]"
+    assert (1, 3) in table.ties and not {place for place in table.ties if place[0] != 1}
+    found = notes(SCORED, [])
+    assert any(note.startswith("†") for note in found) and any("[ ]: 95 %" in n for n in found)
+    assert not any(note.startswith(("†", "[ ]")) for note in notes(RUNS, []))
+
+
+def test_the_overview_has_metrics_and_size_side_by_side():
+    (overview, *_) = grids(RUNS)
+    assert overview.title == "plaza: macro means"
+    assert overview.flat_heads == ["method", "PSNR [dB]", "SSIM", "checkpoint [MB]"]
+    assert overview.rows[0] == ["CHRONOGS (joint, fast)", "25.75", "0.6250", "1.234"]
+    both = [*RUNS, *(run.model_copy(update={"scene": "quay"}) for run in RUNS)]
+    (overview, *_) = grids(both)
+    assert overview.title == "all scenes: macro means"
+    assert overview.heads[:5] == [
+        *(("method", ""), ("plaza", "PSNR [dB]"), ("", "SSIM")),
+        *(("quay", "PSNR [dB]"), ("", "SSIM")),
+    ]
+    assert overview.heads[5:] == [
+        *(("mean of scenes", "PSNR [dB]"), ("", "SSIM")),
+        ("checkpoint [MB]", ""),
+    ]
+
+
+@pytest.mark.parametrize(("scenes", "widths"), [(6, [16]), (12, [15, 14])])
+def test_many_scenes_are_folded(scenes, widths):
+    runs = [
+        record(method, scene=f"s{i}", ssim=(0.5, 0.5)) for i in range(scenes) for method in "ab"
+    ]
+    overviews = [table for table in grids(runs) if table.title == "all scenes: macro means"]
+    assert [len(table.heads) for table in overviews] == widths
+    assert overviews[-1].heads[-1] == ("checkpoint [MB]", "")
+
+
+def test_many_periods_are_folded():
+    runs = [record(method, psnr=tuple(range(10, 40))) for method in "ab"]
+    (table,) = grids(runs, ["psnr"])
+    assert table.flat_heads == ["method", "macro", "micro", "worst", "median", "best", "n"]
+    assert table.rows[0][1:] == ["24.50", "24.50", "10.00", "24.50", "39.00", "1"]
+    assert any("--periods" in note for note in notes(runs, []))
+    made = readable_tables(summarise(runs), runs, ["psnr"], periods=True)
+    assert [len(table.heads) - 1 for table in made] == [6, 8, 8, 8, 6]
+    assert made[-1].title.endswith("; periods 24 to 29") and made[-1].rows[1][-1] == "39.00"
+    eight = [record(psnr=tuple(range(8)))]
+    assert len(grids(eight, ["psnr"])[0].heads) == 1 + 8 + 3 + 1
+
+
+def test_published_rows_stand_below_the_measured_ones_and_are_never_marked():
+    runs = [run.model_copy(update={"scene": "Lawncourt"}) for run in RUNS]
+    runs.append(record("3dgs", psnr=(9.0, 9.0), scene="plaza", strategy="pooled"))
+    text = format_runs(runs, [], "markdown", ["psnr"], published=load_published())
+    lines = [line for line in text.split("**Lawncourt")[0].splitlines() if line.startswith("| ")]
+    assert lines[2] == "| CHRONOGS (joint, fast) | **25.75** | - | - |"
+    assert lines[4] == "| 3DGS (published) | 18.29 | - | - |"
+    assert lines[-1] == "| ChronoGS (published) | 22.16 | - | - |" and len(lines) == 12
+    assert "- published: ChronoGS: Disentangling" in text
+    assert "- nothing is published of plaza; the scenes are Lawncourt, " in text
+    assert text.count("(published)") == 8  # not in the tables by period
+    boxed = format_runs(runs, [], "table", published=load_published(), width=80)
+    assert max(map(len, boxed.split("\n¹, ²")[0].splitlines())) <= 80
+    rows = list(
+        csv.DictReader(io.StringIO(format_runs(runs, [], "csv", published=load_published())))
+    )
+    assert {row["source"] for row in rows if row["method"] == "CLNeRF"} == {load_published().title}
+    assert {row["source"] for row in rows if row["strategy"]} == {"measured"}
+
+
+def test_latex_has_as_many_columns_in_each_row_as_it_declares():
+    runs = [run.model_copy(update={"scene": s}) for s in ("Lawncourt", "b_%&") for run in SCORED]
+    runs += [record("d", ssim=(0.5, 0.5)), record("e", psnr=tuple(range(9)))]
+    runs.append(record("f", scene="Lawncourt", psnr=(1.0, 1.0)))
+    text = format_runs(runs, FAILURES, "latex", published=load_published(), periods=True)
+    blocks = re.findall(r"\\begin\{tabular\}\{([lr]+)\}(.*?)\\end\{tabular\}", text, re.S)
+    assert len(blocks) == text.count(r"\begin") == text.count(r"\end") > 9
+    for columns, body in blocks:
+        rules = re.findall(r"^\\(\w+rule)$", body, re.M)
+        assert rules[0] == "toprule" and rules[-1] == "bottomrule" and "midrule" in rules
+        for first, last in re.findall(r"\\cmidrule\(lr\)\{(\d+)-(\d+)\}", body):
+            assert 1 < int(first) < int(last) <= len(columns)
+        rows = [line for line in body.splitlines() if line.endswith(r" \\")]
+        for row in rows:
+            spans = [int(n) - 1 for n in re.findall(r"\\multicolumn\{(\d+)\}", row)]
+            assert len(re.findall(r"(?<!\\)&", row)) + 1 + sum(spans) == len(columns)
+            assert row.count("{") == row.count("}")
+        assert all(line.startswith("\\") or line in ("", *rows) for line in body.splitlines())
+    commands = set(re.findall(r"\\([a-z]+)", "".join(body for _, body in blocks)))
+    assert commands == {
+        *("toprule", "midrule", "bottomrule", "cmidrule", "multicolumn"),
+        *("textbf", "underline", "textit", "rlap", "dagger"),
+    }
+    outside = re.sub(r"\\begin\{tabular\}.*?\\end\{tabular\}", "", text, flags=re.S)
+    assert all(line.startswith("% ") for line in outside.splitlines() if line)
+
+
 def test_footnotes():
     found = notes(RUNS, FAILURES)
     assert "device: cpu (Test, 2 threads)" in found and "code: abc" in found
@@ -153,6 +268,10 @@ def test_footnotes():
     assert any("sample standard deviation" in note for note in found)
     assert not any("absent" in note for note in notes(RUNS, [], ["psnr"]))
     assert not any("standard deviation" in note for note in notes(RUNS[:1], []))
+    mixed = [record(seed=i, device=f"device {i}") for i in range(2)]
+    assert "device: device 0; device 1" in notes(mixed, [])
+    averaged = "seeds of several devices are averaged, costs too: CHRONOGS (joint, fast)"
+    assert averaged in notes(mixed, []) and averaged not in found
 
 
 def test_without_a_finished_run_there_are_notes_only():
@@ -161,5 +280,5 @@ def test_without_a_finished_run_there_are_notes_only():
 
 
 def test_unknown_metrics_are_refused():
-    with pytest.raises(ConfigError, match="expected one of lpips_vgg"):
+    with pytest.raises(ConfigError, match=r"expected one of .*lpips_vgg"):
         format_runs(RUNS, [], "csv", ["fid"])

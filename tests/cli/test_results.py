@@ -83,6 +83,12 @@ def test_metrics_may_be_listed_or_repeated(runs):
     assert "psnr" not in table(runs, "--metric", "ssim")
 
 
+def test_published_rows_and_single_periods_are_options(runs):
+    assert "nothing is published of plaza" in table(runs, "--published")
+    assert "published" not in table(runs)
+    assert table(runs, "--periods") == table(runs)  # it has one
+
+
 def test_files_are_written_whole(runs, tmp_path):
     (tmp_path / "new").mkdir()
     out = tmp_path / "new" / "table.csv"

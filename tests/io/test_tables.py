@@ -68,6 +68,36 @@ def test_latex(cmidrules):
     ]
 
 
+def test_ranks_and_ties_are_marked():
+    rows = [[name, value] for name, value in zip("abcd", ("9", "8", "7", "6"), strict=True)]
+    ranks = {(0, 1): 1, (1, 1): 2, (2, 1): 3}
+    table = Table([("n", ""), ("v", "")], rows, ranks=ranks, ties={(1, 1), (3, 1)})
+    assert [line.split(maxsplit=1)[1] for line in boxed_text(table).split("\n")[3:7]] == [
+        *("¹ 9", "†² 8", "³ 7", "†6")
+    ]
+    assert [line.split(" | ")[1] for line in markdown(table).splitlines()[2:]] == [
+        *("**9** |", "<ins>8</ins> † |", "*7* |", "6 † |")
+    ]
+    assert [line.split(" & ")[1] for line in latex(table).splitlines()[4:8]] == [
+        r"\textbf{9} \\",
+        r"\underline{8}\rlap{$^\dagger$} \\",
+        r"\textit{7} \\",
+        r"6\rlap{$^\dagger$} \\",
+    ]
+
+
+def test_labels_go_over_lines_where_that_saves_a_block():
+    name = "Scaffold-GS, period appearance (joint, fast)"
+    table = Table([("method", ""), *[("x" * 15, "")] * 3], [[name, "1", "2", "3"]], title="Title")
+    lines = boxed_text(table, width=80).splitlines()
+    assert lines[0] == "Title" and max(map(len, lines)) <= 80
+    texts = [line.split("  ")[0].strip() for line in lines]
+    assert sum(text == "method" for text in texts) == 1  # one block
+    first = texts.index("Scaffold-GS, period")
+    assert texts[first : first + 2] == ["Scaffold-GS, period", "appearance (joint, fast)"]
+    assert name in boxed_text(table)
+
+
 def test_csv():
     assert csv_text(["a", "b"], [[1, None], ["x,y", 0.5]]) == 'a,b\n1,\n"x,y",0.5\n'
 
