@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, stdev
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,7 @@ from chronoscene.bench.results import (
     read_run,
     run_folders,
 )
-from chronoscene.errors import CheckpointError
+from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.metrics.registry import all_metrics, metric_info
 
 if TYPE_CHECKING:
@@ -95,6 +95,37 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
         records += found
         failures += failed
     return records, failures
+
+
+def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
+    """Runs with the scores of a region in place of those of whole images.
+
+    Their scenes are called ``<scene> (<region>)`` and have the fingerprint of the change masks, so
+    they stand beside no other values. Runs of scenes without change masks are left out.
+
+    Raises:
+        ConfigError: If none is left.
+    """
+    found = [
+        run.model_copy(
+            update={
+                **run.regions[region],
+                "scene": f"{run.scene} ({region})",
+                "scene_hash": run.change_masks,
+                "rows": [replace(row, region=ALL) for row in run.rows if row.region == region],
+            }
+        )
+        for run in records
+        if region in run.regions
+    ]
+    if not found:
+        raise ConfigError(
+            f"--region {region}",
+            expected="runs that were scored with change masks",
+            found="none",
+            todo="run chronoscene score RUNS --truth FOLDER first",
+        )
+    return found
 
 
 def _with_rows(folder: Path) -> RunRecord:

@@ -10,7 +10,7 @@ import click
 from chronoscene.bench.leakage import COLUMNS, leakage_table, measure_leakage
 from chronoscene.bench.opening import open_run
 from chronoscene.bench.results import ROW_COLUMNS
-from chronoscene.cli.output import check_file, emit
+from chronoscene.cli.output import check_file, emit, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.cli.render import DEVICE, RUN, SCENE
 from chronoscene.errors import ConfigError
@@ -66,7 +66,11 @@ def command(
     if style == "csv":
         emit(tables.csv_text(ROW_COLUMNS, map(astuple, rows)), out)
         return
-    write = {"table": tables.plain_text, "markdown": tables.markdown, "latex": tables.latex}[style]
-    emit(write(leakage_table(rows, run.record.period_labels, run.record.label)), out)
+    made = leakage_table(rows, run.record.period_labels, run.record.label)
+    if style == "table":
+        text = tables.boxed_text(made, width=terminal_width(out))
+    else:
+        text = tables.markdown(made) if style == "markdown" else tables.latex(made)
+    emit(text, out)
     if absent := [title for key, (title, _) in COLUMNS.items() if key not in there]:
         click.echo(f"no truth, or nothing rendered, for: {', '.join(absent)}", err=True)

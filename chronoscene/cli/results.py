@@ -8,10 +8,10 @@ from pathlib import Path
 import click
 
 from chronoscene.bench.comparison_figure import draw_figures
-from chronoscene.bench.regions import freeze_change_masks
+from chronoscene.bench.regions import ALL, REGIONS, freeze_change_masks
 from chronoscene.bench.results import RESULTS_FILE, ROWS_FILE
 from chronoscene.bench.scoring import rescore
-from chronoscene.bench.summary import read_runs
+from chronoscene.bench.summary import in_region, read_runs
 from chronoscene.bench.tables import MAX_PERIODS, format_runs
 from chronoscene.cli.output import emit, terminal_width
 from chronoscene.cli.progress import progress_bar
@@ -114,6 +114,13 @@ def print_runs(out: Path) -> None:
     help="Metrics to show and nothing else, as NAME[,NAME...]. May be repeated.  [default: all]",
 )
 @click.option(
+    "--region",
+    type=click.Choice(REGIONS),
+    default=ALL,
+    show_default=True,
+    help="Part of the images that is scored; see chronoscene score --truth.",
+)
+@click.option(
     "--published",
     "with_published",
     is_flag=True,
@@ -131,6 +138,7 @@ def table(
     folders: tuple[Path, ...],
     style: str,
     metrics: tuple[str, ...],
+    region: str,
     with_published: bool,
     periods: bool,
     out: Path | None,
@@ -143,6 +151,8 @@ def table(
     the number of runs. Intervals and differences are at 95 % over test views.
     """
     records, failures = read_runs(folders)
+    if region != ALL:
+        records = in_region(records, region)
     published = load_published() if with_published else None
     width = terminal_width(out)
     wanted = parse_metrics(metrics)

@@ -1,6 +1,7 @@
 """Regions of test views: frozen with their photos, scored apart, old runs included."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from chronoscene.bench.regions import change_masks_hash, freeze_change_masks, re
 from chronoscene.bench.results import read_rows, read_run
 from chronoscene.bench.runner import BenchSettings, run_bench
 from chronoscene.bench.scoring import rescore
+from chronoscene.bench.summary import in_region, read_runs, summarise
 from chronoscene.errors import ConfigError
 from chronoscene.images.truth import truth_place
 from chronoscene.metrics.registry import Scorers, make_scorers
@@ -170,3 +172,25 @@ def test_what_the_mask_of_a_photo_ignores_is_in_no_region(tmp_path):
     np.testing.assert_array_equal(regions["all"], mask)
     np.testing.assert_array_equal(regions["changed"], mask & changed)
     np.testing.assert_array_equal(regions["invariant"], mask & ~changed)
+
+
+def test_tables_of_a_region(runs, truth, scorers):
+    freeze_change_masks(runs, truth)
+    rescore(runs, scorers)
+    records, _ = read_runs([runs])
+    changed = in_region(records, "changed")
+    assert {run.scene for run in changed} == {"ring (changed)"} and len(changed) == len(records)
+    entries = summarise(changed, ["psnr"]).query("column == 'macro' and strategy == 'joint'")
+    psnr = {run.method: run.regions["changed"]["aggregates"]["macro"]["psnr"]
+            for run in records if run.strategy == "joint"}  # fmt: skip
+    assert dict(zip(entries.method, entries["mean"], strict=True)) == psnr
+    for run, whole in zip(changed, records, strict=True):
+        expected = [row for row in whole.rows if row.region == "changed"]
+        assert [replace(row, region="changed") for row in run.rows] == expected != []
+
+
+def test_a_region_that_was_not_scored(runs):
+    with pytest.raises(
+        ConfigError, match=r"--region changed: .* found none; run chronoscene score"
+    ):
+        in_region(read_runs([runs])[0], "changed")

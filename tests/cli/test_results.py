@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 import chronoscene.cli.results as results_module
-from chronoscene.bench.results import RunRecord, write_run
+from chronoscene.bench.results import RunRecord, read_run, run_folders, write_run
 from chronoscene.bench.scoring import Rescored
 from chronoscene.cli import cli
 from chronoscene.cli.results import split_list
@@ -102,6 +102,18 @@ def test_files_are_written_whole(runs, tmp_path):
 def test_folders_add_up(runs):
     document = json.loads(table(runs, runs, "--format", "json"))
     assert {e["n"] for e in document["entries"]} == {4}
+
+
+def test_a_region_has_tables_of_its_own(runs):
+    for folder in run_folders(runs):
+        run = read_run(folder)
+        part = {"aggregates": run.aggregates, "periods": run.periods}
+        write_run(
+            folder, run.model_copy(update={"regions": {"changed": part}, "change_masks": "m"}), []
+        )
+    assert table(runs, "--region", "changed").count("plaza (changed)") >= 2
+    with pytest.raises(ConfigError, match="--region invariant: expected runs"):
+        table(runs, "--region", "invariant")
 
 
 def test_wrong_input_is_told(runs, tmp_path):
