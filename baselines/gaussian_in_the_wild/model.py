@@ -17,7 +17,7 @@ from chronoscene.training.splatting import Splats, camera_centre_tensor
 COORDINATES = "coordinates"
 """Group of parameters: where Gaussians read in feature maps. [N, 3, 2]"""
 _SLACK = log(2)
-"""Added to the logarithms of scales: to leave out too few costs little, too many is wrong."""
+"""Added to logarithms of scales: the test of anchors is a little tighter than the rasterizer."""
 _NEAR = 1e-6
 """Nearest depth of what a view may show: below all near planes."""
 

@@ -464,7 +464,7 @@ def test_what_covers_the_scene_in_single_photos_is_taken_for_not_visible() -> No
         images.append(photo)
         hidden.append((slice(row, row + 8), slice(column, column + 8)))
     covered = replace(scene, load_image=images.__getitem__)
-    method = train(covered, config(iterations=300), method_class=GaussianInTheWild)
+    method = train(covered, config(), method_class=GaussianInTheWild)
     trainer, inside, whole = trainer_of(method), [], []
     for i, place in enumerate(hidden):
         with torch.no_grad():
@@ -524,7 +524,7 @@ def test_the_released_rates_fall_and_the_colour_network_keeps_its_own() -> None:
 
 def test_an_exported_model_looks_alike_in_the_training_views() -> None:
     scene = two_periods()
-    method = train(scene, config(), method_class=GaussianInTheWild)
+    method = begun(scene, 50)
     own = [view for view in scene.views if view.period == 1]
     gaussians = method.to_gaussians(1.0, own)
     for view in own[::3]:
