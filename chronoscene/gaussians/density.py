@@ -8,6 +8,7 @@ Source: Kerbl et al. 2023 (3D Gaussian Splatting), with the values of the releas
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,10 @@ from chronoscene.training.devices import exp, normal
 from chronoscene.training.splatting import centres_count
 
 PARTS = 2  # Gaussians that a split one becomes
+
+Scatter = Callable[[dict[str, Tensor], GaussianConfig, np.random.Generator], None]
+"""Turns copies of Gaussians that are split into their parts, in place: each is smaller, and where
+the generator draws it."""
 
 
 class GradientStatistics:
@@ -99,6 +104,7 @@ def densify(
     prune_large: bool,
     config: GaussianConfig,
     generator: np.random.Generator,
+    scatter: Scatter,
 ) -> Round:
     """One round: clone, split, then prune old and new rows alike.
 
@@ -108,10 +114,15 @@ def densify(
         extent: `TrainingSet.camera_extent`.
         prune_large: Whether Gaussians may be too large.
         generator: Draws the centres of the parts.
+        scatter: Makes them.
     """
     largest = scales_of(parameters["log_scales"]).amax(-1)
     clone, split = choose_growth(gradient, largest, extent, config)
-    parts = _split({name: rows[split] for name, rows in parameters.items()}, config, generator)
+    parts = {
+        name: rows[split].repeat(PARTS, *(1,) * (rows.dim() - 1))
+        for name, rows in parameters.items()
+    }
+    scatter(parts, config, generator)
     new = {name: torch.cat([rows[clone], parts[name]]) for name, rows in parameters.items()}
     if int((~split).sum()) + len(new["means"]) <= config.prune_above:
         return Round(~split, new)
@@ -120,11 +131,10 @@ def densify(
     return Round(keep, {name: rows[keep_new] for name, rows in new.items()})
 
 
-def _split(
-    parents: dict[str, Tensor], config: GaussianConfig, generator: np.random.Generator
-) -> dict[str, Tensor]:
-    """Two smaller Gaussians for each, centred on samples of N(mean, R S S^T R^T)."""
-    parts = {name: rows.repeat(PARTS, *(1,) * (rows.dim() - 1)) for name, rows in parents.items()}
+def scatter_in_space(
+    parts: dict[str, Tensor], config: GaussianConfig, generator: np.random.Generator
+) -> None:
+    """Centres are samples of N(mean, R S S^T R^T)."""
     scales = exp(parts["log_scales"].double())
     samples = scales * normal(generator, tuple(scales.shape), scales)
     axes = axes_of(parts["quats"].double())
@@ -132,7 +142,6 @@ def _split(
     # A quaternion of length zero has no axes.
     parts["means"] += torch.where(moves.isfinite(), moves, samples).float()
     parts["log_scales"] -= float(np.log(config.split_factor))
-    return parts
 
 
 def _useless(

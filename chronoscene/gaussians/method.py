@@ -30,6 +30,8 @@ class GaussianMethod(SplattingMethod):
     primitive = "means"
     config_class: ClassVar[type[GaussianConfig]]
     trainer_class: ClassVar[type[GaussianTrainer]] = GaussianTrainer
+    shapes: ClassVar[Mapping[str, tuple[int, ...]]] = SHAPES
+    """Groups of parameters, with those of `SHAPES`: name to the shape of one row."""
     config: GaussianConfig
     model: GaussianModel
     trainer: GaussianTrainer | None
@@ -127,19 +129,21 @@ class GaussianMethod(SplattingMethod):
                 found=str(error),
                 todo="use the version of the software that wrote it, or train again",
             ) from error
-        _check_groups(folder, tensors)
+        _check_groups(folder, tensors, self.shapes)
         self.model = self.restore_model(tensors)
 
 
-def _check_groups(folder: Path, tensors: Mapping[str, Tensor]) -> None:
+def _check_groups(
+    folder: Path, tensors: Mapping[str, Tensor], shapes: Mapping[str, tuple[int, ...]]
+) -> None:
     """Raise unless a checkpoint holds all groups, each with a row for each Gaussian."""
-    shapes = {name: tuple(tensors[name].shape) for name in SHAPES if name in tensors}
-    count = next(iter(shapes.get("means", ())), None)
-    if shapes != {name: (count, *shape) for name, shape in SHAPES.items()}:
-        found = ", ".join(f"{name} {list(tensor.shape)}" for name, tensor in tensors.items())
+    found = {name: tuple(tensors[name].shape) for name in shapes if name in tensors}
+    count = next(iter(found.get("means", ())), None)
+    if found != {name: (count, *shape) for name, shape in shapes.items()}:
+        stored = ", ".join(f"{name} {list(tensor.shape)}" for name, tensor in tensors.items())
         raise CheckpointError(
             folder / META_FILE,
-            expected=f"the parameter groups {', '.join(SHAPES)}, one row per Gaussian",
-            found=found or "none",
+            expected=f"the parameter groups {', '.join(shapes)}, one row per Gaussian",
+            found=stored or "none",
             todo="train again with this version",
         )

@@ -14,7 +14,12 @@ import torch
 from torch import Tensor
 
 from chronoscene.gaussians.config import GaussianConfig
-from chronoscene.gaussians.density import GradientStatistics, densify, reset_opacities
+from chronoscene.gaussians.density import (
+    GradientStatistics,
+    densify,
+    reset_opacities,
+    scatter_in_space,
+)
 from chronoscene.gaussians.mcmc import make_generator, noise, relocate
 from chronoscene.gaussians.model import GaussianModel
 from chronoscene.methods import StepReport, TrainingSet
@@ -107,6 +112,8 @@ class GaussianTrainer:
     """Gives the learning rate of each tensor of the model at a step."""
 
     timeline_class: ClassVar[type[Timeline]] = Timeline
+    scatter = staticmethod(scatter_in_space)
+    """How Gaussians are split, a `density.Scatter`."""
 
     def __post_init__(self) -> None:
         self.timeline = self.timeline_class(self.config)
@@ -240,6 +247,7 @@ class GaussianTrainer:
                 prune_large=prune_large,
                 config=self.config,
                 generator=np.random.default_rng((self.seed, _SPLIT_STREAM, index)),
+                scatter=self.scatter,
             )
         for name, rows in result.new.items():
             self.optimizer.keep(name, result.keep)

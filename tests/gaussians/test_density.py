@@ -12,6 +12,7 @@ from chronoscene.gaussians.density import (
     choose_growth,
     densify,
     reset_opacities,
+    scatter_in_space,
 )
 from chronoscene.gaussians.model import SHAPES, logit, opacities_of, scales_of
 from chronoscene.rasterizer import RasterInfo
@@ -36,6 +37,7 @@ def run_round(parameters, gradient, *, prune_large=False, config=None, seed=0):
         prune_large=prune_large,
         config=config or GaussianConfig(),
         generator=np.random.default_rng(seed),
+        scatter=scatter_in_space,
     )
 
 
