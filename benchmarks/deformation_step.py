@@ -1,8 +1,8 @@
-"""Milliseconds of a training step of 4DGS and GS-W beside one of 3DGS on the same Gaussians.
+"""Milliseconds of a training step of 4DGS, realtime4DGS and GS-W beside one of 3DGS.
 
     python benchmarks/deformation_step.py [--gaussians 60000] [--size 320 240] [--steps 100]
 
-All methods train on the same generated surfaces and photos, in turns, in the second stage of 4DGS
+All methods train on equal Gaussians of the same generated surfaces and photos, in turns, in the second stage of 4DGS
 and with all colours; no round of density control falls into what is timed. Prints median and
 minimum of the wall time, the median of the processor time of all threads, and the ratio of each to
 that of 3DGS. On a machine with other work look at the minimum and the processor time.
@@ -32,6 +32,7 @@ CASES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "4dgs fast": ("4dgs", "fast", {}),
     "4dgs balanced": ("4dgs", "balanced", {}),
     "4dgs balanced, shape only": ("4dgs", "balanced", PLAIN),
+    "realtime4dgs balanced": ("realtime4dgs", "balanced", {}),
     "gs-w fast": ("gs-w", "fast", {}),
     "gs-w balanced": ("gs-w", "balanced", {}),
 }

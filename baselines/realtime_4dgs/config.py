@@ -1,0 +1,51 @@
+"""Options of realtime4DGS."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import sqrt
+from typing import ClassVar, Self
+
+from chronoscene.checks import check_choice
+from chronoscene.gaussians.config import GaussianConfig
+
+
+@dataclass(frozen=True)
+class Realtime4DGSConfig(GaussianConfig):
+    """Defaults are those of the released configuration for scenes with several cameras.
+
+    Times are in units of the time from the first period to the last.
+    """
+
+    start_times: str = "uniform"
+    """Time centres at the start. ``uniform``: anywhere from 0.1 before the first period to 0.1
+    after the last. ``seen``: the mean of the periods whose photos see the sparse point."""
+    initial_time_scale: float = sqrt(0.2)
+    """Standard deviations in time at the start."""
+    wave_cycle: float = 1.0
+    """Length of the longest wave of the colours in time. 1: each Gaussian has the same colour in
+    the first period and in the last, as in the released code."""
+    wave_interval: int = 1_000
+    """Moments from one order of the waves to the next; they begin after the spherical harmonics."""
+
+    # Learning rates
+    time_lr: float = 1.6e-4
+    """Of the time centres, times the extent of the cameras in `length_unit`, as released."""
+    wave_dc_lr: float = 0.000125
+    """Of the waves of the constant coefficients."""
+
+    minima: ClassVar[Mapping[str, int]] = {**GaussianConfig.minima, "wave_interval": 1}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice("start_times", self.start_times, ("uniform", "seen"))
+        # What moves and shrinks there are Gaussians in space.
+        check_choice("densification", self.densification, ("adaptive",))
+
+    def in_training_frame(self, training_from_world: float) -> Self:
+        config = super().in_training_frame(training_from_world)
+        if self.length_unit == "training":
+            return config
+        # The extent is that of the training frame from now on.
+        return replace(config, time_lr=self.time_lr / training_from_world)
