@@ -2,10 +2,11 @@
 
     python benchmarks/deformation_step.py [--gaussians 60000] [--size 320 240] [--steps 100]
 
-All methods train on equal Gaussians of the same generated surfaces and photos, in turns, in the second stage of 4DGS
-and with all colours; no round of density control falls into what is timed. Prints median and
-minimum of the wall time, the median of the processor time of all threads, and the ratio of each to
-that of 3DGS. On a machine with other work look at the minimum and the processor time.
+All methods train on the same generated surfaces and photos, with equal Gaussians, in turns, in the
+second stage of 4DGS and with all colours; no round of density control falls into what is timed.
+Prints median and minimum of the wall time, the median of the processor time of all threads, and the
+ratio of each to that of 3DGS. On a machine with other work look at the minimum and the processor
+time.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from baselines.realtime_4dgs.slicing.function import OUTPUTS, Slice
-from baselines.realtime_4dgs.slicing.kernels import SWEEPS, TWIN_AXES, VARIANCES_AWAY
+from baselines.realtime_4dgs.slicing.kernels import ORTHOGONAL, SWEEPS, TWIN_AXES, VARIANCES_AWAY
 from chronoscene.gaussians import model
 from chronoscene.gaussians.model import axes_of, dot
 from chronoscene.training import devices
@@ -118,8 +118,8 @@ def turned(left: Tensor, right: Tensor, vectors: Tensor) -> Tensor:
 def _principal_axes(Y: Tensor) -> tuple[Tensor, Tensor]:
     """Variances along the principal axes of Y Y^T [N, 3], and their rotation [N, 4].
 
-    The axes are constants to autograd. That the covariance turns them is added to first order,
-    which is zero.
+    To autograd, what Jacobi found is a constant; what that left to do, to first order, is not, and
+    turns with the covariance.
     """
     turn = _jacobi(Y.detach())
     rows = [dot([x[:, None] for x in axis], Y.unbind(1)) for axis in axes_of(turn)]
@@ -142,10 +142,11 @@ def _jacobi(Y: Tensor) -> Tensor:
     turn = torch.zeros_like(Y[:, 0])
     turn[:, 0] = 1.0
     for k, i, j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)) * SWEEPS:
+        alpha, beta = rows[i].square().sum(-1), rows[j].square().sum(-1)
         gamma = (rows[i] * rows[j]).sum(-1)
-        zeta = (rows[j].square().sum(-1) - rows[i].square().sum(-1)) / (2 * gamma)
+        zeta = (beta - alpha) / (2 * gamma)
         tangent = -torch.copysign(1 / (zeta.abs() + (1 + zeta * zeta).sqrt()), zeta)
-        tangent = torch.where(gamma == 0, 0.0, tangent)
+        tangent = torch.where(gamma.square() > ORTHOGONAL * alpha * beta, tangent, 0.0)
         c = (1 + tangent * tangent).rsqrt()
         s = c * tangent
         rows[i], rows[j] = (

@@ -20,13 +20,13 @@ from chronoscene.kernels.compilation import inner, kernel
 VARIANCES_AWAY = 2 * math.log(20)
 """Square of the distance in time, over the variance, at which a Gaussian has a weight of 0.05."""
 
-TWIN_AXES = 1e-3
+TWIN_AXES = 2e-5
 """Relative difference of two variances below which their axes count as equally long."""
 
 SWEEPS = 6
 """Rounds of three Jacobi rotations. From random axes, all that float64 can hold takes 5."""
 
-_ORTHOGONAL = 1e-20  # Square of the cosine of two rows that count as such
+ORTHOGONAL = 1e-8
 BLOCK = 256  # Rows that one task handles. Fixed, so that the result does not depend on the threads.
 
 
@@ -111,7 +111,7 @@ def _jacobi(y):  # type: ignore[no-untyped-def]
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
             alpha, beta, gamma = _dot(y, i, i), _dot(y, j, j), _dot(y, i, j)
-            if not gamma * gamma > _ORTHOGONAL * alpha * beta:
+            if not gamma * gamma > ORTHOGONAL * alpha * beta:
                 continue
             done = False
             zeta = (beta - alpha) / (2 * gamma)
@@ -134,6 +134,25 @@ def _jacobi(y):  # type: ignore[no-untyped-def]
         if done:
             break
     return turn
+
+
+@inner(forceinline=True)
+def _reciprocal(a, b):  # type: ignore[no-untyped-def]
+    """1 / (a - b), but 0 where they are equal."""
+    twin = TWIN_AXES * (a + b)
+    return (a - b) / ((a - b) * (a - b) + twin * twin)
+
+
+@inner(forceinline=True)
+def _rest_of_turn(y):  # type: ignore[no-untyped-def]
+    """What the Jacobi rotations left to do, to first order."""
+    a, b, c = _dot(y, 0, 0), _dot(y, 1, 1), _dot(y, 2, 2)
+    return (
+        1.0,
+        0.5 * _dot(y, 1, 2) * _reciprocal(b, c),
+        0.5 * _dot(y, 2, 0) * _reciprocal(c, a),
+        0.5 * _dot(y, 0, 1) * _reciprocal(a, b),
+    )
 
 
 @kernel(parallel=True)
@@ -180,7 +199,8 @@ def slice_forward(  # type: ignore[no-untyped-def]
                 out_logits[n] = -np.inf
                 continue
             move = _turned(right, v[0], v[1], v[2])
-            turn = _product(right, _jacobi(y))
+            turn = _jacobi(y)
+            turn = _product(right, _product(turn, _rest_of_turn(y)))
             for c in range(3):
                 out_means[n, c] = means[n, c] + move[c] * dt
                 out_scales[n, c] = 0.5 * math.log(_dot(y, c, c))
@@ -200,13 +220,6 @@ def slice_forward(  # type: ignore[no-untyped-def]
                 for c in range(3):
                     wave = one * waves_rest[n, 0, k, c] + two * waves_rest[n, 1, k, c]
                     out_rest[n, k, c] = sh_rest[n, k, c] + wave
-
-
-@inner(forceinline=True)
-def _reciprocal(a, b):  # type: ignore[no-untyped-def]
-    """1 / (a - b), but 0 where they are equal."""
-    twin = TWIN_AXES * (a + b)
-    return (a - b) / ((a - b) * (a - b) + twin * twin)
 
 
 @inner
@@ -332,7 +345,8 @@ def slice_backward(  # type: ignore[no-untyped-def]
             )
             _store_gradient(_product(right, g_pair), left, left_length, d_quats, n)
             one = _product(left, _conjugate(g_pair))
-            two = _product(_row(g_quats, n), back)
+            two = _product(turn, _rest_of_turn(y))
+            two = _product(_row(g_quats, n), _conjugate(two))
             swing = (0.0, v[1] * wz - v[2] * wy, v[2] * wx - v[0] * wz, v[0] * wy - v[1] * wx)
             three = _product(right, swing)
             g_right = (
