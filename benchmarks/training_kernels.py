@@ -72,6 +72,7 @@ class Step:
         self.weights = torch.tensor([0.0, 1.0, 0.0])
         self.centre = torch.randn(3, generator=g)
         self.visible = torch.arange(anchors)
+        self.used_offsets = torch.full((anchors,), -1)
 
     def run(self, function: Callable[..., object]) -> object:
         """Decode everything."""
@@ -81,7 +82,7 @@ class Step:
         """What is decoded."""
         return DecodeInputs(
             self.positions, *self.leaves, self.weights, *self.heads, self.centre, self.visible,
-            base_dim=BASE, period_dim=PERIOD,
+            self.used_offsets, base_dim=BASE, period_dim=PERIOD,
         )  # fmt: skip
 
     def parameters(self) -> list[Tensor]:

@@ -33,10 +33,9 @@ class ChronoGS(AnchorMethod):
         return lambda model, rates: share_periods(model, rates["features"] * weight)
 
     def stored_tensors(self) -> dict[str, Tensor]:
-        model = self.model
-        return pack_features(model.tensors(), model.layout)
+        return pack_features(super().stored_tensors(), self._model.layout)
 
     def restored_tensors(
         self, stored: dict[str, Tensor], layout: AnchorLayout
     ) -> dict[str, Tensor]:
-        return unpack_features(stored, layout)
+        return super().restored_tensors(unpack_features(stored, layout), layout)

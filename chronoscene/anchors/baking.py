@@ -19,12 +19,13 @@ import torch
 from numba import prange
 from torch import Tensor
 
+from chronoscene.anchors.contribution import blending_weights
 from chronoscene.anchors.model import AnchorModel
 from chronoscene.kernels.compilation import kernel
 from chronoscene.methods import View
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, NUM_BASES, basis
-from chronoscene.training.splatting import Splats, camera_centre_tensor, draw
+from chronoscene.training.splatting import Splats, camera_centre_tensor
 
 RIDGE = 0.01
 """Penalty on the squares of all coefficients but the constant one, as a share of all weights."""
@@ -32,20 +33,17 @@ MIN_WEIGHT = 1e-3
 """Pixels that a Gaussian must fill, over all views together, to be kept."""
 
 
-def bake(
-    model: AnchorModel, period_weights: Tensor, views: Sequence[View], background: Tensor
-) -> GaussianCloud:
+def bake(model: AnchorModel, period_weights: Tensor, views: Sequence[View]) -> GaussianCloud:
     """The Gaussians that some views show, whatever their number of views.
 
     Args:
         model: What is decoded.
         period_weights: Of the period, see `chronoscene.training.periods`. [T]
         views: Where the result is to be right.
-        background: Colour behind everything. [3]
     """
     totals = torch.zeros(len(model) * model.layout.offsets)
     for view in views:
-        rows, _, weights = _seen(model, period_weights, view, background)
+        rows, _, weights = _seen(model, period_weights, view)
         totals[rows] += weights
     kept = totals > MIN_WEIGHT
     place, count = kept.cumsum(0) - 1, int(kept.sum())
@@ -53,7 +51,7 @@ def bake(
     dyads, moments = torch.zeros(count, 4, 4), torch.zeros(count, NUM_BASES, 3)
     normal = torch.zeros(count, NUM_BASES, NUM_BASES)
     for view in views:  # again, as all that all views decode may not fit into memory
-        rows, splats, weights = _seen(model, period_weights, view, background)
+        rows, splats, weights = _seen(model, period_weights, view)
         used = kept[rows]
         at, w = place[rows[used]], weights[used]
         splats = Splats(*(value[used] for value in splats))
@@ -77,23 +75,11 @@ def bake(
     return GaussianCloud(*(tensor.contiguous().numpy() for tensor in tensors))
 
 
-def _seen(
-    model: AnchorModel, period_weights: Tensor, view: View, background: Tensor
-) -> tuple[Tensor, Splats, Tensor]:
+def _seen(model: AnchorModel, period_weights: Tensor, view: View) -> tuple[Tensor, Splats, Tensor]:
     """What a view shows: numbers of Gaussians, the Gaussians, and their weights, on the CPU. [L]"""
     layout, (centre, visible) = model.layout, model.seen_from(view)
     splats, index = model.decode_active(period_weights, centre, visible)
-    with torch.enable_grad():
-        colors = splats.colors.detach().requires_grad_()
-        raster = draw(
-            splats._replace(colors=colors),
-            view,
-            background,
-            near_plane=layout.near_plane,
-            antialiased=layout.antialiased,
-        )
-        (gradient,) = torch.autograd.grad(raster.image.sum(), colors)
-    weights = gradient[:, 0]  # the image is the sum of weights times colours
+    weights = blending_weights(splats, view, layout)
     seen = weights > 0
     rows = visible[index // layout.offsets] * layout.offsets + index % layout.offsets
     kept = Splats(*(value[seen].cpu() for value in splats))

@@ -121,6 +121,10 @@ class AnchorConfig(SplattingConfig):
     """``opacity`` (code); ``gradient`` (main text of the paper); ``both``."""
     prune_gradient: float = 1e-6
     """Summed gradient per visit below which ``gradient`` prunes; the paper gives no value."""
+    unused_share: float = 0.0
+    """Once growth is over, the anchors are dropped that add least to the training views, as many as
+    add no more than this share of the light of any period, and single offsets likewise. 0: none.
+    Not in the papers."""
     growth_levels: int = 3
     """Cell sizes that are tried, coarse to fine."""
     coarsest_cell: int = 16
@@ -148,6 +152,13 @@ class AnchorConfig(SplattingConfig):
                 raise ConfigError(
                     name, expected=f"at least {low}", found=str(value), todo="correct the value"
                 )
+        if self.unused_share and self.offsets_per_anchor > _MAX_OFFSETS:
+            raise ConfigError(
+                "offsets_per_anchor",
+                expected=f"at most {_MAX_OFFSETS} with unused_share",
+                found=str(self.offsets_per_anchor),
+                todo="take fewer offsets, or unused_share=0",
+            )
 
     def in_training_frame(self, training_from_world: float) -> Self:
         """As for every method; also bound and volume of scales, and the learning rate of offsets.
@@ -181,6 +192,8 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "prune_by": ("opacity", "gradient", "both"),
 }
 
+_MAX_OFFSETS = 31  # Their use is stored in the bits of an int32
+
 _LOWER_BOUNDS: dict[str, float] = {
     "iterations": 1,
     "offsets_per_anchor": 1,
@@ -196,4 +209,5 @@ _LOWER_BOUNDS: dict[str, float] = {
     "growth_levels": 0,
     "coarsest_cell": 1,
     "cell_refinement": 1,
+    "unused_share": 0.0,
 }

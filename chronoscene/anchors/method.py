@@ -14,6 +14,7 @@ from torch import Tensor
 
 from chronoscene.anchors.baking import bake
 from chronoscene.anchors.config import HEADS, AnchorConfig
+from chronoscene.anchors.contribution import pack_offsets, unpack_offsets
 from chronoscene.anchors.density import initial_anchors, resolve_voxel_size
 from chronoscene.anchors.model import LAYERS, AnchorLayout, AnchorModel
 from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer
@@ -77,7 +78,7 @@ class AnchorMethod(SplattingMethod):
         self, stored: dict[str, Tensor], layout: AnchorLayout
     ) -> dict[str, Tensor]:
         """Inverse of `stored_tensors`."""
-        return stored
+        return unpack_offsets(stored, layout.offsets)
 
     @property
     def model(self) -> AnchorModel:
@@ -150,7 +151,7 @@ class AnchorMethod(SplattingMethod):
         return torch.from_numpy(self.weights(period)).to(self._model.device)
 
     def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
-        return bake(self.model, self._weights(period), views, self.background)
+        return bake(self.model, self._weights(period), views)
 
     def draw_splats(self, splats: Splats, view: View) -> Rasterization:
         layout = self._model.layout
@@ -164,7 +165,7 @@ class AnchorMethod(SplattingMethod):
         )
 
     def stored_tensors(self) -> dict[str, Tensor]:
-        return self.model.tensors()
+        return pack_offsets(self.model.tensors())
 
     def restore(self, folder: Path, tensors: dict[str, Tensor], device: str) -> None:
         if not isinstance(self.meta.get("layout"), dict):

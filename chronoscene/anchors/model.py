@@ -30,6 +30,7 @@ from chronoscene.training.splatting import Splats, camera_centre_tensor
 
 PER_ANCHOR = ("offsets", "features", "log_scales")  # Trained tensors with one row per anchor
 
+FIXED = ("anchors", "used_offsets")  # Tensors with one row per anchor that are not trained
 LAYERS = HeadWeights._fields
 BANK = "bank"  # Name of the MLP that mixes features, where there is one
 _ADDED_LATER = ("near_plane", "antialiased", "distance_heads", "distance_scale", "feature_bank")
@@ -121,6 +122,8 @@ class AnchorModel:
     """[T, G]"""
     heads: Mapping[str, HeadWeights]
     """Two-layer MLPs by name; ``w1`` holds only the inputs that the MLP sees."""
+    used_offsets: Tensor | None = None
+    """Bit j says whether an anchor uses its offset j; None if all do. int64 [A]"""
 
     def __len__(self) -> int:
         return len(self.anchors)
@@ -166,6 +169,8 @@ class AnchorModel:
         named = {name: getattr(self, name) for name in ("anchors", *PER_ANCHOR, "global_features")}
         for name, head in self.heads.items():
             named |= {f"{name}.{layer}": getattr(head, layer) for layer in LAYERS}
+        if self.used_offsets is not None:
+            named["used_offsets"] = self.used_offsets
         return named
 
     @classmethod
@@ -173,7 +178,7 @@ class AnchorModel:
         """Inverse of `tensors`."""
         heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in LAYERS)) for h in layout.mlps}
         named = {name: tensors[name] for name in ("anchors", *PER_ANCHOR, "global_features")}
-        return cls(layout, **named, heads=heads)
+        return cls(layout, **named, heads=heads, used_offsets=tensors.get("used_offsets"))
 
     def to(self, device: str | torch.device) -> Self:
         """The same model on another device."""
@@ -183,7 +188,7 @@ class AnchorModel:
     def requires_grad(self) -> Self:
         """Mark everything but the positions of the anchors as trained."""
         for name, tensor in self.tensors().items():
-            if name != "anchors":
+            if name not in FIXED:
                 tensor.requires_grad_()
         return self
 
@@ -211,6 +216,9 @@ class AnchorModel:
     ) -> DecodeInputs:
         features, base_dim = self.seen_features(centre)
         opacity, covariance, color = (self._kernel_head(name) for name in HEADS)
+        used = self.used_offsets
+        if used is None:
+            used = torch.full((len(self),), -1, device=self.device)
         return DecodeInputs(
             anchors=self.anchors,
             offsets=self.offsets,
@@ -223,6 +231,7 @@ class AnchorModel:
             color_head=color,
             camera_centre=centre,
             visible=visible,
+            used_offsets=used,
             base_dim=base_dim,
             period_dim=self.layout.period_dim,
         )

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
+from chronoscene.anchors.contribution import pack_bits, unpack_bits, used_offsets
 from chronoscene.anchors.density import COUNTERS, AnchorRows, DensityStatistics, grow, prune_mask
-from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
+from chronoscene.anchors.model import FIXED, PER_ANCHOR, AnchorModel
 from chronoscene.anchors.visibility import projected_centres
 from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
@@ -94,6 +95,7 @@ class AnchorTrainer:
         self.growth_generator = np.random.default_rng((seed, 1))
         self.noise_generator = np.random.default_rng((seed, 2))
         self.statistics: DensityStatistics | None = None
+        self._dropped = False
 
     def step(self, index: int, progress: float) -> StepReport:
         """Render one training view, learn from it, and grow and prune where a round is due."""
@@ -106,7 +108,7 @@ class AnchorTrainer:
             view, photo = downscale_view(view, factor), downscale_image(photo, factor)
             mask = None if mask is None else downscale_mask(mask, factor)
         loss, skipped = self._learn(view, photo, mask, position, done)
-        resized = self._densify_if_due(index, done)
+        resized = self._densify_if_due(index, done) or self._drop_if_due(done)
         if skipped is None:
             self._update(done, resized=resized)
         self.optimizer.zero_grad()
@@ -169,6 +171,7 @@ class AnchorTrainer:
             log_scales=tables["log_scales"].fetch(visible),
             global_features=model.global_features[row : row + 1],
             heads=model.heads,
+            used_offsets=None if model.used_offsets is None else model.used_offsets[visible],
         )
 
     def state(self) -> TrainingState:
@@ -183,6 +186,7 @@ class AnchorTrainer:
             tensors |= {f"{prefix}.{name}": tensor for name, tensor in source.items()}
         values = {
             "views_drawn": self.sampler.drawn,
+            "dropped": self._dropped,
             "growth_generator": self.growth_generator.bit_generator.state,
             "noise_generator": self.noise_generator.bit_generator.state,
         }
@@ -193,8 +197,10 @@ class AnchorTrainer:
         """Go on from what `state` gave, in a trainer that was made alike."""
         model, stored = self.model, parts(state.tensors, "model")
         model.anchors = stored["anchors"].to(model.anchors)
+        if "used_offsets" in stored:
+            model.used_offsets = stored["used_offsets"].to(model.device)
         for name, tensor in model.tensors().items():
-            if name != "anchors" and name not in self.tables:
+            if name not in FIXED and name not in self.tables:
                 tensor.copy_(stored[name])
         for name, table in self.tables.items():
             setattr(model, name, table.load_state(parts(state.tensors, f"table.{name}")))
@@ -206,6 +212,7 @@ class AnchorTrainer:
             for name in COUNTERS:
                 getattr(self.statistics, name).copy_(counters[name])
         self.sampler.drawn = state.values["views_drawn"]
+        self._dropped = state.values["dropped"]
         self.growth_generator.bit_generator.state = state.values["growth_generator"]
         self.noise_generator.bit_generator.state = state.values["noise_generator"]
 
@@ -269,18 +276,46 @@ class AnchorTrainer:
         for name, table in self.tables.items():
             setattr(model, name, table.extend(getattr(new, name)))
         model.anchors = torch.cat([model.anchors, new.anchors])
+        if model.used_offsets is not None:
+            every = model.used_offsets.new_full((len(new.anchors),), -1)
+            model.used_offsets = torch.cat([model.used_offsets, every])
         statistics.extend(len(new.anchors))
 
     def _prune(self, statistics: DensityStatistics) -> None:
         """Drop anchors and bound the scales. A model is never left without any anchor."""
         keep = prune_mask(statistics, self.config)
         if not keep.all() and keep.any():
-            for name, table in self.tables.items():
-                setattr(self.model, name, table.keep(keep))
-            self.model.anchors = self.model.anchors[keep]
+            self._keep(keep)
             statistics.keep(keep)
         with torch.no_grad():
             self.model.log_scales[:, 3:].clamp_(max=self.config.max_log_scale)
+
+    def _keep(self, mask: Tensor) -> None:
+        """Forget the anchors outside a mask. bool [A]"""
+        model = self.model
+        for name, table in self.tables.items():
+            setattr(model, name, table.keep(mask))
+        model.anchors = model.anchors[mask]
+        if model.used_offsets is not None:
+            model.used_offsets = model.used_offsets[mask]
+
+    def _drop_if_due(self, done: float) -> bool:
+        """Once growth is over, drop what carries nothing; whether the rows of the anchors
+        changed."""
+        config = self.config
+        if self._dropped or not config.unused_share or done < config.density_until - _MARGIN:
+            return False
+        self._dropped, model = True, self.model
+        for table in self.tables.values():
+            table.flush()
+        used = used_offsets(
+            model, self.train.views, self.feature_rows.tolist(), config.unused_share
+        )
+        if model.used_offsets is not None:
+            used &= unpack_bits(model.used_offsets, model.layout.offsets)
+        model.used_offsets = pack_bits(used)
+        self._keep(used.any(1))
+        return True
 
     def _update(self, done: float, *, resized: bool) -> None:
         """Adam. After a round only the MLPs and global features move, as in the official code,

@@ -58,7 +58,7 @@ def picture(splats, view):
 
 def test_what_does_not_depend_on_the_direction_stays_as_it_is():
     model = make_model(())
-    cloud = bake(model, WEIGHTS, ring(12), BACKGROUND)
+    cloud = bake(model, WEIGHTS, ring(12))
     assert len(cloud) > 100
     for view in ring(5, phase=0.1):
         np.testing.assert_allclose(baked(cloud, view), decoded(model, view), atol=2e-3)
@@ -68,7 +68,7 @@ def test_what_does_not_depend_on_the_direction_stays_as_it_is():
 def test_new_views_are_near_the_model(heads, one_colour, least):
     """In dB between the two; colours with one term each, and with all."""
     model = make_model(heads)
-    cloud = bake(model, WEIGHTS, ring(30), BACKGROUND)
+    cloud = bake(model, WEIGHTS, ring(30))
     views = ring(7, phase=0.05)
     found = [np.mean([psnr(baked(cloud, v, n), decoded(model, v)) for v in views]) for n in (1, 16)]
     assert found[0] < one_colour and found[1] > least, found
@@ -78,13 +78,13 @@ def test_what_no_view_shows_is_left_out():
     model = make_model(())
     views = ring(12)
     model.anchors[:50] += torch.tensor([0.0, 0.0, 40.0])
-    cloud = bake(model, WEIGHTS, views, BACKGROUND)
+    cloud = bake(model, WEIGHTS, views)
     assert len(cloud) and cloud.means[:, 2].max() < 10
 
 
 def test_the_result_does_not_depend_on_the_order_of_the_views():
     model = make_model(HEADS)
-    first, second = (bake(model, WEIGHTS, ring(8)[::step], BACKGROUND) for step in (1, -1))
+    first, second = (bake(model, WEIGHTS, ring(8)[::step]) for step in (1, -1))
     assert len(first) == len(second)
     np.testing.assert_allclose(first.opacities, second.opacities, rtol=1e-4)
     np.testing.assert_allclose(first.sh_coeffs, second.sh_coeffs, atol=1e-3)

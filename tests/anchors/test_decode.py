@@ -113,6 +113,7 @@ def make_problem(
             "period_weights": torch.tensor(weights[:periods]),
             "camera_centre": normal(3),
             "visible": chosen,
+            "used_offsets": torch.full((anchors,), -1),
         },
         leaves={
             "offsets": leaf(anchors, offsets, 3),
@@ -332,6 +333,20 @@ def test_active_equals_the_active_part(
     assert torch.equal(index, truth)
     assert all(torch.equal(a, b) for a, b in zip(ours, whole, strict=True))
     assert all(torch.equal(our_grads[name], grad) for name, grad in grads.items())
+
+
+def test_offsets_that_are_not_used_are_off() -> None:
+    problem = make_problem(anchors=200, visible=150, offsets=4)
+    whole = problem.call(decode, problem.leaves, problem.heads)
+    bits = torch.randint(0, 16, (200,), generator=torch.Generator().manual_seed(7))
+    problem.fixed["used_offsets"] = bits
+    assert_equals_reference(problem)
+    chosen = bits[problem.fixed["visible"]]
+    used = torch.tensor([b >> j & 1 for b in chosen.tolist() for j in range(4)], dtype=torch.bool)
+    some = problem.call(decode, problem.leaves, problem.heads)
+    torch.testing.assert_close(some.opacities, torch.where(used, whole.opacities, -1.0))
+    _, index = problem.call(decode_active, problem.leaves, problem.heads)
+    assert torch.equal(index, (used & (whole.opacities > 0)).nonzero()[:, 0])
 
 
 def test_active_over_several_chunks_and_threads() -> None:

@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.anchors import trainer as anchor_training
+from chronoscene.anchors.contribution import unpack_bits
 from chronoscene.anchors.density import DensityStatistics
-from chronoscene.errors import CheckpointError
+from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet
 from chronoscene.rasterizer import NEAR_PLANE
@@ -340,3 +342,27 @@ def test_the_early_part_can_be_coarse(method: Make, monkeypatch: pytest.MonkeyPa
     view = made.trainer.train.views[0]
     whole, half = (view.height, view.width), (view.height // 2, view.width // 2)
     assert seen == [half, half, whole, whole]
+
+
+def test_what_carries_nothing_is_dropped_once_growth_is_over(
+    method: Make, noise_set: Callable[[int], TrainingSet], tmp_path: Path
+) -> None:
+    made = method(2, unused_share=0.2, density_until=0.5)
+    before = len(made.model)
+    for index in range(40):
+        made.step(index, index / 40)
+        assert (made.model.used_offsets is None) == (index < 19)
+    assert len(made.model) < before
+    made.save(tmp_path)
+    stored = load_file(tmp_path / "model.safetensors")
+    count = int(unpack_bits(made.model.used_offsets, made.model.layout.offsets).sum())
+    assert len(stored["offsets"]) == count < 10 * len(made.model)
+    loaded = ChronoGS(made.config)
+    loaded.load(tmp_path, device="cpu")
+    view = noise_set(2).views[0]
+    assert np.array_equal(loaded.render(view, 1.0).rgb, made.render(view, 1.0).rgb)
+
+
+def test_more_offsets_than_bits() -> None:
+    with pytest.raises(ConfigError, match="offsets_per_anchor: expected at most 31 with"):
+        ChronoGSConfig(unused_share=0.1, offsets_per_anchor=32)

@@ -66,6 +66,8 @@ class DecodeInputs(NamedTuple):
     """In the training frame; gets no gradient. [3]"""
     visible: Tensor
     """Ascending indices of the anchors to decode. int64 [M]"""
+    used_offsets: Tensor
+    """Bit j says whether an anchor uses its offset j; what it does not has opacity -1. int64 [A]"""
     base_dim: int
     """Fb"""
     period_dim: int
@@ -113,11 +115,14 @@ def decode_reference(x: DecodeInputs) -> Splats:
     factors = torch.exp(x.log_scales.index_select(0, x.visible))[:, None, :]
     offsets = x.offsets.index_select(0, x.visible)
     covariances = mlp(inputs, x.covariance_head).reshape(-1, num_offsets, 7)
+    bits = torch.arange(num_offsets, device=x.visible.device)
+    used = x.used_offsets.index_select(0, x.visible)[:, None].bitwise_right_shift(bits) & 1
+    opacities = torch.where(used == 1, torch.tanh(mlp(inputs, x.opacity_head)), -1)
     return Splats(
         means=(centres[:, None] + offsets * factors[..., :3]).reshape(-1, 3),
         quats=_unit_quats(covariances[..., 3:].reshape(-1, 4)),
         scales=(factors[..., 3:] * torch.sigmoid(covariances[..., :3])).reshape(-1, 3),
-        opacities=torch.tanh(mlp(inputs, x.opacity_head)).reshape(-1),
+        opacities=opacities.reshape(-1),
         colors=torch.sigmoid(mlp(inputs, x.color_head)).reshape(-1, 3),
     )
 
@@ -149,7 +154,7 @@ def decode_active(x: DecodeInputs) -> tuple[Splats, Tensor]:
 
 def _decode(x: DecodeInputs, above: np.float32) -> tuple[Splats, Tensor]:
     _check(x)
-    fixed = (x.anchors, x.period_weights, x.camera_centre, x.visible)
+    fixed = (x.anchors, x.period_weights, x.camera_centre, x.visible, x.used_offsets)
     tensors = (x.offsets, x.features, x.log_scales, x.global_features)
     weights = [weight for head in x.heads for weight in head]
     floats = (*fixed[:3], *tensors, *weights)
@@ -174,6 +179,7 @@ def _check(x: DecodeInputs) -> None:
     check_shape("global_features", x.global_features, (periods, None))
     check_shape("camera_centre", x.camera_centre, (3,))
     check_shape("visible", x.visible, (None,))
+    check_shape("used_offsets", x.used_offsets, (rows,))
     inputs = x.base_dim + x.period_dim + 3 + x.global_features.shape[1]
     names = ("opacity", "covariance", "color")
     for name, head, width in zip(names, x.heads, (1, 7, 3), strict=True):

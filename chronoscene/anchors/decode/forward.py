@@ -119,13 +119,18 @@ def _output_layer(layout, weights, work, head, first, columns):  # type: ignore[
 
 
 @inner
-def _count_row(raw, at, count, m, above, out):  # type: ignore[no-untyped-def]
-    """Opacities tanh(o) of an anchor, and how many of its Gaussians are active."""
+def _count_row(raw, at, count, m, used, above, out):  # type: ignore[no-untyped-def]
+    """Opacities tanh(o) of an anchor, and how many of its Gaussians are active.
+
+    ``used`` are the bits of its offsets.
+    """
     first = m * count
     for c in range(0, count, LANES):
         store_first(out.alphas, first + c, tanh(load(raw, at + c)), count - c)
     active = 0
     for j in range(first, first + count):
+        if not (used >> (j - first)) & 1:
+            write(out.alphas, j, -ONE)
         # What is not a number is active, so that it does not go unnoticed.
         active += not (read(out.alphas, j) <= above)
     write_index(out.starts, m + 1, active)
@@ -153,7 +158,9 @@ def decode_opacities(layout, weights, source, above, out, work, work_size, tasks
             _output_layer(layout, weights, own, 0, 0, layout.scales_at)
             for i in range(count):
                 at = i * layout.outputs_pad
-                _count_row(own.raw, at, layout.offsets, begin + i, above, out)
+                anchor = read_index(source.visible, begin + i)
+                used = read_index(source.used_offsets, anchor)
+                _count_row(own.raw, at, layout.offsets, begin + i, used, above, out)
     write_index(out.starts, 0, 0)
     for m in range(source.num_visible):
         total = read_index(out.starts, m) + read_index(out.starts, m + 1)

@@ -63,7 +63,7 @@ class Decode(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         # Read here although the job knows them too: torch checks that nobody changed them.
         saved = ctx.saved_tensors
-        fixed, tensors, outputs = saved[:4], saved[4:20], saved[20:]
+        fixed, tensors, outputs = saved[:5], saved[5:21], saved[21:]
         job = ctx.job
         grads = tuple(grad.contiguous() for grad in grads[:5])
         out = [torch.empty(tensor.shape) for tensor in tensors]
@@ -93,7 +93,7 @@ class _Job:
     def __init__(
         self, dims: tuple[int, int], fixed: Sequence[Tensor], tensors: Sequence[Tensor]
     ) -> None:
-        anchors, weights, centre, visible = (_plain(tensor) for tensor in fixed)
+        anchors, weights, centre, visible, used = (_plain(tensor) for tensor in fixed)
         offsets, features, log_scales, global_features, *heads = (_plain(t) for t in tensors)
         self.layout = make_layout(
             base=dims[0],
@@ -116,6 +116,7 @@ class _Job:
             centre=centre.data_ptr(),
             visible=visible.data_ptr(),
             num_visible=len(visible),
+            used_offsets=used.data_ptr(),
             periods=periods.data_ptr(),
             weights=weights.data_ptr(),
             num_periods=len(periods),
@@ -128,7 +129,7 @@ class _Job:
         memory = torch.zeros(tasks * sum(sizes))
         self.work = (Work(*place(sizes, memory.data_ptr())), sum(sizes), tasks)
         # The kernels know addresses only, so this object keeps alive what is there.
-        plain = (anchors, weights, centre, visible, offsets, features, log_scales, periods)
+        plain = (anchors, weights, centre, visible, used, offsets, features, log_scales, periods)
         self._alive = (*plain, *heads, packed, memory)
 
 

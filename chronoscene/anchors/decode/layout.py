@@ -171,6 +171,8 @@ class Anchors(NamedTuple):
     num_anchors: int
     visible: int
     num_visible: int
+    used_offsets: int
+    """Bits. int64"""
     periods: int
     """Those of weight other than 0. int64"""
     weights: int

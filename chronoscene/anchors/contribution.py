@@ -1,0 +1,114 @@
+"""What anchors and their offsets add to images, and which of them carry nothing.
+
+What a Gaussian adds to a view, summed over the pixels, is its weight there: transmittance times
+falloff times opacity. Not in the papers of Scaffold-GS and ChronoGS, which prune anchors by their
+opacity: behind others, or too small to be seen, an anchor may be as opaque as it likes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from chronoscene.anchors.model import AnchorLayout, AnchorModel
+from chronoscene.methods import TrainingView, View
+from chronoscene.training.schedule import downscale_view
+from chronoscene.training.splatting import Splats, draw
+
+
+def blending_weights(splats: Splats, view: View, layout: AnchorLayout) -> Tensor:
+    """What Gaussians add to a view, in pixels. [L]"""
+    with torch.enable_grad():
+        colors = splats.colors.detach().requires_grad_()
+        raster = draw(
+            splats._replace(colors=colors),
+            view,
+            torch.zeros(3, device=colors.device),
+            near_plane=layout.near_plane,
+            antialiased=layout.antialiased,
+        )
+        (gradient,) = torch.autograd.grad(raster.image.sum(), colors)
+    return gradient[:, 0]  # the image is the sum of weights times colours
+
+
+def least(amounts: Tensor, share: float) -> Tensor:
+    """The smallest amounts, as many as make up no more than a share of their sum. bool, as given"""
+    values, order = amounts.flatten().double().sort(stable=True)
+    found = torch.zeros_like(order, dtype=torch.bool)
+    found[order] = values.cumsum(0) <= share * values.sum()
+    return found.view(amounts.shape)
+
+
+@torch.no_grad()
+def used_offsets(
+    model: AnchorModel, views: Sequence[TrainingView], feature_rows: Sequence[int], share: float
+) -> Tensor:
+    """Offsets that some period needs.
+
+    In each period, the anchors that add least are not needed, as many as add no more than the share
+    of what all add to the views of the period; nor are the offsets that add least. Views count at
+    half their size.
+
+    Args:
+        model: What is decoded.
+        views: All training views.
+        feature_rows: Which of the features that vary each view has. [V]
+        share: 0 to less than 1.
+
+    Returns:
+        bool [A, k], no offset of the anchors that no period needs.
+    """
+    k, rows = model.layout.offsets, torch.eye(model.layout.num_periods, device=model.device)
+    anchors = torch.zeros(len(model), 1, dtype=torch.bool, device=model.device)
+    offsets = torch.zeros(len(model), k, dtype=torch.bool, device=model.device)
+    for period in sorted({view.period for view in views}):
+        total = torch.zeros(len(model) * k, device=model.device)
+        for view, row in zip(views, feature_rows, strict=True):
+            if view.period == period:
+                half = downscale_view(view, 2)
+                centre, visible = model.seen_from(half)
+                splats, places = model.decode_active(rows[row], centre, visible)
+                total[visible[places // k] * k + places % k] += blending_weights(
+                    splats, half, model.layout
+                )
+        amounts = total.view(-1, k)
+        anchors |= ~least(amounts.sum(1, keepdim=True), share)
+        offsets |= ~least(amounts, share)
+    return offsets & anchors
+
+
+def pack_bits(used: Tensor) -> Tensor:
+    """Bit j for column j. bool [A, k] -> int64 [A]"""
+    return (used.long() << torch.arange(used.shape[1], device=used.device)).sum(1)
+
+
+def unpack_bits(bits: Tensor, count: int) -> Tensor:
+    """Inverse of `pack_bits`. [A] -> bool [A, k]"""
+    places = torch.arange(count, device=bits.device)
+    return (bits[:, None].long() >> places & 1).bool()
+
+
+def pack_offsets(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Leave out the offsets that are not used, where ``used_offsets`` says so.
+
+    Returns:
+        tensors: ``offsets`` [N, 3] anchor by anchor, ``used_offsets`` int32 [A]. Without
+            ``used_offsets``, what was given.
+    """
+    if "used_offsets" not in tensors:
+        return tensors
+    bits, offsets = tensors["used_offsets"], tensors["offsets"].detach()
+    kept = offsets[unpack_bits(bits, offsets.shape[1])]
+    return tensors | {"offsets": kept, "used_offsets": bits.to(torch.int32)}
+
+
+def unpack_offsets(tensors: dict[str, Tensor], count: int) -> dict[str, Tensor]:
+    """Inverse of `pack_offsets`, with zeros for offsets that are not used."""
+    if "used_offsets" not in tensors:
+        return tensors
+    bits, kept = tensors["used_offsets"].long(), tensors["offsets"]
+    offsets = kept.new_zeros(len(bits), count, 3)
+    offsets[unpack_bits(bits, count)] = kept
+    return tensors | {"offsets": offsets, "used_offsets": bits}
