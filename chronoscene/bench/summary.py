@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from leaderboard.published import PublishedTable
 
 AGGREGATES = ("macro", "micro", "worst")
+TRANSFERS = ("forgetting", "backward_transfer", "forward_transfer")
 MEASURED = "measured"
 SIZE = "checkpoint_bytes"  # What papers print as memory
 MARKED = 3  # Ranks that are marked in tables
@@ -69,7 +70,8 @@ ENTRY_COLUMNS = (
 )
 """Columns of CSV and JSON. ``source`` is ``measured`` or a publication; ``quantity`` is a metric,
 or a cost in the unit of `RunRecord`; ``column`` is ``period <id>``, ``macro``, ``micro``,
-``worst``, ``median`` or ``best`` (of the periods), or empty for costs. ``sd`` is the sample
+``worst``, ``median`` or ``best`` (of the periods), or empty for costs; runs in stages have
+``<stage>: period <id>`` and `TRANSFERS`, too. ``sd`` is the sample
 standard deviation over ``n`` seeds, empty for one seed; ``low`` and ``high`` are the ends of the
 95 % interval over views. ``difference`` is that to the best mean of the same scene, quantity and
 column, with its interval over the same views; ``tied`` says that views or seeds do not tell the two
@@ -205,6 +207,7 @@ def compared(entries: DataFrame) -> DataFrame:
     entries = entries.assign(low=low, high=high, tied=False, rank=0)
     entries[["difference", "difference_low", "difference_high"]] = math.nan
     measured = entries[entries.quantity.isin(all_metrics()) & (entries.source == MEASURED)]
+    measured = measured[~measured.column.isin(TRANSFERS)]
     for (_, quantity, _), part in measured.groupby(["scene", "quantity", "column"], sort=False):
         ascending = not metric_info(str(quantity)).higher_is_better
         ranks = part.number.astype(float).rank(method="min", ascending=ascending)
@@ -339,6 +342,10 @@ def _numbers(
         values = {f"period {i}": value for i, value in known}
         values |= {name: run.aggregates[name][metric] for name in AGGREGATES}
         values |= {name: float(over[name]([v for _, v in known])) for name in ("median", "best")}
+        for stage, periods in run.stages.items():
+            of_stage = {f"{stage}: period {i}": v for i, v in periods.items()}
+            values |= {column: v[metric] for column, v in of_stage.items() if metric in v}
+        values |= {name: v[metric] for name, v in run.transfer.items() if metric in v}
         resampled = {}
         if metric in views:
             by_period = views[metric]

@@ -7,7 +7,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from chronoscene.bench.results import Failure, RunRecord
+from chronoscene.bench.results import UNTRAINED, Failure, RunRecord
+from chronoscene.bench.strategies import period_part
 from chronoscene.bench.summary import (
     AGGREGATES,
     COSTS,
@@ -15,6 +16,7 @@ from chronoscene.bench.summary import (
     MEASURED,
     PAPER_METRICS,
     SIZE,
+    TRANSFERS,
     in_unit,
     kind_of,
     metric_names,
@@ -107,7 +109,8 @@ def readable_tables(
     *,
     periods: bool = False,
 ) -> list[Table]:
-    """An overview, then per scene a table of each metric and one of costs.
+    """An overview, then per scene a table of each metric, two more where there are runs in stages,
+    and one of costs.
 
     Args:
         entries: What `summarise` returns for the records, and what was published.
@@ -128,10 +131,13 @@ def readable_tables(
         runs = [run for run in records if run.scene == scene]
         for name in names:
             made += _quality_tables(part, name, runs, every=periods)
+        staged = [run for run in runs if run.stages]
+        for name in names if staged else ():
+            made += _stage_tables(part, name, staged)
         if (
             part.column == ""
         ).any() and not metrics:  # nobody knows what images of other programs cost
-            made.append(_cost_table(part, str(scene)))
+            made.append(_cost_table(part, str(scene), shown))
     return made
 
 
@@ -252,13 +258,39 @@ def _period_title(period: str, labels: dict[str, str]) -> str:
     return f"period {period}" if label == period else f"{period}: {label}"
 
 
-def _cost_table(part: DataFrame, scene: str) -> Table:
-    """What the runs on one scene cost."""
-    costs = part[part.column == ""]
+def _stage_tables(part: DataFrame, metric: str, runs: Sequence[RunRecord]) -> list[Table]:
+    """One metric of the runs in stages: each period after each stage, and what is left at last."""
+    found = part[part.quantity == metric]
+    texts = found.set_index(["label", "column"]).text
+    labels = found.label[found.column.str.startswith(f"{period_part(0)}: ")].unique()
+    ids = list(runs[0].period_labels)
+    titles = [_period_title(i, runs[0].period_labels) for i in ids]
+    stages = [UNTRAINED, *(period_part(int(i)) for i in ids)]
+    rows = [
+        ["" if number else label, after]
+        + [texts.get((label, f"{stage}: period {i}"), "-") for i in ids]
+        for label in labels
+        for number, (stage, after) in enumerate(zip(stages, ["no training", *titles], strict=True))
+    ]
+    heads = [(name, "") for name in ("method", "after", *titles)]
+    title = f"{runs[0].scene}: {metric_info(metric).title} ({metric}) after"
+    breaks = range(len(stages) - 1, len(rows) - 1, len(stages))
+    matrix = Table(heads, rows, labels=2, title=f"{title} each stage", breaks=breaks)
+    columns = ("macro", *TRANSFERS)
+    rows = [[label, *(texts.get((label, column), "-") for column in columns)] for label in labels]
+    heads = [("method", ""), *((column.replace("_", " "), "") for column in columns)]
+    return [matrix, Table(heads, rows, title=f"{title} the last stage")]
+
+
+def _cost_table(part: DataFrame, scene: str, metrics: Sequence[str] = ()) -> Table:
+    """What the runs on one scene reach and cost."""
+    costs, macro = part[part.column == ""], part[part.column == "macro"]
     shown = [cost for cost in COSTS if (costs.quantity == cost.name).any()]
-    columns = [_Column((cost.title, ""), costs[costs.quantity == cost.name]) for cost in shown]
+    columns = [_Column((metric_info(m).title, ""), macro[macro.quantity == m]) for m in metrics]
+    columns += [_Column((cost.title, ""), costs[costs.quantity == cost.name]) for cost in shown]
     columns.append(_Column(("seeds", ""), part.drop_duplicates("label"), "seeds"))
-    return _table(f"{scene}: cost", part.label.unique(), columns)
+    title = f"{scene}: macro means and cost" if metrics else f"{scene}: cost"
+    return _table(title, part.label.unique(), columns)
 
 
 def footnotes(

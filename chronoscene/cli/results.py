@@ -11,6 +11,7 @@ from chronoscene.bench.comparison_figure import draw_figures
 from chronoscene.bench.regions import ALL, REGIONS, freeze_change_masks
 from chronoscene.bench.results import RESULTS_FILE, ROWS_FILE
 from chronoscene.bench.scoring import rescore
+from chronoscene.bench.stage_figure import draw_stages
 from chronoscene.bench.summary import in_region, read_runs
 from chronoscene.bench.tables import MAX_PERIODS, format_runs
 from chronoscene.cli.output import emit, terminal_width
@@ -87,7 +88,7 @@ def print_runs(out: Path) -> None:
     """Print the tables of all runs in a folder, and the files that belong to all of them."""
     text = format_runs(*read_runs([out]), "table", width=terminal_width(None))
     emit(text + "\n", None)
-    paths = [out / RESULTS_FILE, out / ROWS_FILE, *draw_figures(out)]
+    paths = [out / RESULTS_FILE, out / ROWS_FILE, *draw_figures(out), *draw_stages(out)]
     click.echo("\n".join(str(path) for path in paths))
 
 

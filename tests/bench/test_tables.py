@@ -9,6 +9,7 @@ import pytest
 from made_runs import record, scored
 
 from chronoscene.bench.results import Failure
+from chronoscene.bench.stages import transfer
 from chronoscene.bench.summary import ENTRY_COLUMNS, summarise
 from chronoscene.bench.tables import footnotes, format_runs, readable_tables
 from chronoscene.errors import ConfigError
@@ -258,6 +259,53 @@ def test_latex_has_as_many_columns_in_each_row_as_it_declares():
     }
     outside = re.sub(r"\\begin\{tabular\}.*?\\end\{tabular\}", "", text, flags=re.S)
     assert all(line.startswith("% ") for line in outside.splitlines() if line)
+
+
+def in_stages(seed, *values):
+    """A run whose stages gave these values: period 0 after both, period 1 untrained and so on."""
+    old, forgotten, start, ahead, new = values
+    stages = {
+        "untrained": {"1": {"psnr": start}},
+        "period-0": {"0": {"psnr": old}, "1": {"psnr": ahead}},
+        "period-1": {"0": {"psnr": forgotten}, "1": {"psnr": new}},
+    }
+    return record(
+        seed=seed,
+        strategy="sequential",
+        psnr=(forgotten, new),
+        stages=stages,
+        transfer=transfer(stages),
+    )
+
+
+def test_stages_have_a_matrix_and_what_is_left_at_the_end():
+    runs = [in_stages(0, 30.0, 20.0, 8.0, 12.0, 31.0), in_stages(1, 32.0, 26.0, 8.0, 12.0, 31.0)]
+    _, matrix, left = grids([*runs, RUNS[2]], ["psnr"])
+    assert matrix.title == "plaza: PSNR [dB] (psnr) after each stage"
+    assert matrix.flat_heads == ["method", "after", "0: May_2016 & before", "period 1"]
+    assert matrix.rows == [
+        ["CHRONOGS (sequential, fast)", "no training", "-", "8.00 ± 0.00"],
+        ["", "0: May_2016 & before", "31.00 ± 1.41", "12.00 ± 0.00"],
+        ["", "period 1", "23.00 ± 4.24", "31.00 ± 0.00"],
+    ]
+    heads = ["method", "macro", "forgetting", "backward transfer", "forward transfer"]
+    assert left.flat_heads == heads
+    values = ["27.00 ± 2.12", "8.00 ± 2.83", "-8.00 ± 2.83", "4.00 ± 0.00"]
+    assert left.rows == [["CHRONOGS (sequential, fast)", *values]]
+    entries = summarise(runs).query("column == 'period-0: period 1'")
+    assert entries["mean"].tolist() == [12.0]
+
+
+def test_joint_and_separate_training_stand_side_by_side_with_what_they_cost():
+    separate = record(strategy="separate", psnr=(24.0, 30.0), checkpoint_bytes=3_000_000)
+    table = grids([record(psnr=(20.0, 30.0)), separate])[-1]
+    assert table.title == "plaza: macro means and cost"
+    found = [dict(zip(table.flat_heads, row, strict=True)) for row in table.rows]
+    names = ("PSNR [dB]", "training [s]", "iterations", "checkpoint [MB]", "peak memory [MB]")
+    assert [[row[name] for name in names] for row in found] == [
+        ["25.00", "10.0", "100", "1.234", "400"],
+        ["27.00", "10.0", "100", "3.000", "400"],
+    ]
 
 
 def test_footnotes():
