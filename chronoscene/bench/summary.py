@@ -115,6 +115,7 @@ def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
                 "scene": f"{run.scene} ({region})",
                 "scene_hash": run.change_masks,
                 "rows": [replace(row, region=ALL) for row in run.rows if row.region == region],
+                **dict.fromkeys(("stages", "transfer"), {}),  # of whole images
             }
         )
         for run in records

@@ -10,7 +10,7 @@ from made_runs import record, scored
 
 from chronoscene.bench.results import Failure
 from chronoscene.bench.stages import transfer
-from chronoscene.bench.summary import ENTRY_COLUMNS, summarise
+from chronoscene.bench.summary import ENTRY_COLUMNS, in_region, summarise
 from chronoscene.bench.tables import footnotes, format_runs, readable_tables
 from chronoscene.errors import ConfigError
 from chronoscene.io.tables import FORMATS
@@ -330,3 +330,10 @@ def test_without_a_finished_run_there_are_notes_only():
 def test_unknown_metrics_are_refused():
     with pytest.raises(ConfigError, match=r"expected one of .*lpips_vgg"):
         format_runs(RUNS, [], "csv", ["fid"])
+
+
+def test_stages_of_whole_images_are_not_in_the_tables_of_a_region():
+    run = in_stages(0, 30.0, 20.0, 8.0, 12.0, 31.0)
+    run.regions, run.change_masks = {"changed": {"aggregates": {}, "periods": {}}}, "hash"
+    (changed,) = in_region([run], "changed")
+    assert (changed.stages, changed.transfer) == ({}, {})
