@@ -115,7 +115,8 @@ def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
                 "scene": f"{run.scene} ({region})",
                 "scene_hash": run.change_masks,
                 "rows": [replace(row, region=ALL) for row in run.rows if row.region == region],
-                **dict.fromkeys(("stages", "transfer"), {}),  # of whole images
+                "stages": {},  # these are of whole images
+                "transfer": {},
             }
         )
         for run in records
