@@ -88,7 +88,10 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
     records: list[RunRecord] = []
     failures: list[Failure] = []
     for folder in folders:
-        found = [_with_rows(path) for path in run_folders(folder)]
+        found = [
+            read_run(path).model_copy(update={"rows": read_rows(path)})
+            for path in run_folders(folder)
+        ]
         failed = read_failures(folder)
         if not found and not failed:
             raise CheckpointError(
@@ -130,10 +133,6 @@ def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
             todo="run chronoscene score RUNS --truth FOLDER first",
         )
     return found
-
-
-def _with_rows(folder: Path) -> RunRecord:
-    return read_run(folder).model_copy(update={"rows": read_rows(folder)})
 
 
 def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> DataFrame:
@@ -225,7 +224,7 @@ def _compare(entries: DataFrame, best: Any, others: Sequence[Any]) -> None:
     first, rest = entries.loc[best], entries.loc[others]
     difference = rest["mean"] - first["mean"]
     gaps = np.stack(rest.resampled) - first.resampled
-    gaps[rest.views != first.views] = math.nan  # not paired
+    gaps[[views != first.views for views in rest.views]] = math.nan  # not paired
     low, high = interval(gaps)
     by_seeds = np.abs(difference) <= seed_margin(rest.sd, rest.n, first.sd, first.n)
     tied = ((low <= 0) & (high >= 0)) | by_seeds
@@ -240,6 +239,8 @@ def over_scenes(entries: DataFrame, name: str) -> DataFrame:
 
     Labels that lack a scene are left out.
     """
+    import pandas as pd
+
     chosen = entries[(entries.column == "macro") | (entries.quantity == SIZE)]
     rows = [
         {
@@ -254,7 +255,7 @@ def over_scenes(entries: DataFrame, name: str) -> DataFrame:
         for _, part in chosen.groupby(["label", "quantity"], sort=False)
         if len(part) == entries.scene.nunique()
     ]
-    return compared(with_texts(type(entries)(rows, columns=entries.columns)))
+    return compared(with_texts(pd.DataFrame(rows, columns=entries.columns)))
 
 
 def published_entries(table: PublishedTable, scenes: Iterable[str]) -> DataFrame:

@@ -67,7 +67,9 @@ def format_runs(
     entries = summarise(records, metrics)
     if published is not None:
         scenes = dict.fromkeys(run.scene for run in records)
-        entries = pd.concat([entries, published_entries(published, scenes)])
+        printed = published_entries(published, scenes)
+        wanted = printed.quantity.isin(metrics) if metrics else slice(None)
+        entries = pd.concat([entries, printed[wanted]])
     listed = entries[entries.quantity.isin(metrics)] if metrics else entries
     if style == "csv":
         # NaN is a spread that is not defined, an empty cell that there is none.
@@ -134,9 +136,8 @@ def readable_tables(
         staged = [run for run in runs if run.stages]
         for name in names if staged else ():
             made += _stage_tables(part, name, staged)
-        if (
-            part.column == ""
-        ).any() and not metrics:  # nobody knows what images of other programs cost
+        # Nobody knows what images of other programs cost.
+        if not metrics and (part.column == "").any():
             made.append(_cost_table(part, str(scene), shown))
     return made
 
@@ -329,9 +330,8 @@ def footnotes(
     absent: dict[str, list[str]] = {}
     for run in records:
         skipped = {m: why for m, why in run.skipped.items() if not wanted or m in wanted}
-        costly = (
-            {} if wanted else {COST_TITLES[c]: w for c, w in run.absent.items() if c in COST_TITLES}
-        )
+        shown = {} if wanted else COST_TITLES
+        costly = {shown[cost]: why for cost, why in run.absent.items() if cost in shown}
         for name, reason in {**skipped, **costly}.items():
             names = absent.setdefault(reason, [])
             if name not in names:

@@ -225,6 +225,12 @@ def test_published_rows_stand_below_the_measured_ones_and_are_never_marked():
     assert "- published: ChronoGS: Disentangling" in text
     assert "- nothing is published of plaza; the scenes are Lawncourt, " in text
     assert text.count("(published)") == 8  # not in the tables by period
+    others = [record(m, scene=scene) for m in "ab" for scene in ("Lawncourt", "plaza")]
+    for run in others:
+        for values in (*run.aggregates.values(), *run.periods.values()):
+            values["flip"] = 0.5
+    text = format_runs(others, [], "table", ["flip"], published=load_published())
+    assert "all scenes: FLIP" in text and "(published)" not in text
     boxed = format_runs(runs, [], "table", published=load_published(), width=80)
     assert max(map(len, boxed.split("\n¹, ²")[0].splitlines())) <= 80
     rows = list(
