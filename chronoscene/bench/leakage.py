@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,8 @@ from chronoscene.bench.opening import OpenRun
 from chronoscene.bench.predictions import to_bytes
 from chronoscene.bench.regions import ALL, CHANGED, INVARIANT
 from chronoscene.bench.results import Row
-from chronoscene.images.decoding import load_rgb
 from chronoscene.images.store import ImageStore
-from chronoscene.images.truth import UNCHANGED, Kind, load_changes, truth_place
+from chronoscene.images.truth import UNCHANGED, load_changes, load_depth, load_other, truth_place
 from chronoscene.io.tables import Table
 from chronoscene.metrics.change import change_scores, share_of_other
 from chronoscene.metrics.depth import depth_errors
@@ -50,16 +48,6 @@ COLUMNS: dict[Key, tuple[str, int]] = {
 """Heading and decimals of what is measured, in the order of the table."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Shown:
-    """A test camera at one period, as it was rendered or as it is in truth."""
-
-    image: Image | None
-    """[H, W, 3]"""
-    depth: NDArray[np.floating] | None
-    """In units of the world. [H, W]"""
-
-
 def measure_leakage(run: OpenRun, scene: Scene, truth: Path) -> Iterator[list[Row]]:
     """What one test view after the other shows at each period.
 
@@ -82,50 +70,36 @@ def measure_leakage(run: OpenRun, scene: Scene, truth: Path) -> Iterator[list[Ro
 def _of_view(
     run: OpenRun, store: ImageStore, frame: Frame, truth: Path, counted: Mask
 ) -> list[Row]:
-    camera, own = store.camera(frame), frame.period
-    rendered, true = {}, {}
-    for period in range(run.num_periods):
-        prediction = run.render(camera, frame.cam_from_world, period)
-        rendered[period] = Shown(to_bytes(prediction.rgb), prediction.depth)
-        other = None if period == own else period
-        image = store.load(frame) if other is None else None
-        if (path := truth / truth_place("cross_rgb", frame.name, other)).is_file():
-            image = load_rgb(path, size=camera.size)
-        kind: Kind = "depth" if other is None else "cross_depth"
-        true[period] = Shown(image, _load_depth(truth / truth_place(kind, frame.name, other)))
+    camera, own, photo = store.camera(frame), frame.period, store.load(frame)
+    rendered = [run.render(camera, frame.cam_from_world, p) for p in range(run.num_periods)]
+    images = [to_bytes(prediction.rgb) for prediction in rendered]
     rows = []
-    for period in rendered:
-        values = quality(rendered[period], true[period], counted)
+    for period, prediction in enumerate(rendered):
+        other = None if period == own else period
+        true = photo if other is None else load_other(truth, frame.name, other, camera.size)
+        values = {} if true is None else {(ALL, "psnr"): psnr(images[period], true, counted)}
+        depth = load_depth(truth, frame.name, other)
+        if depth is not None and prediction.depth is not None:
+            values |= depth_values(prediction.depth, depth, counted)
         path = truth / truth_place("change", frame.name, period)
-        if period != own and path.is_file():
+        if other is not None and path.is_file():
             changes = load_changes(path, camera.size, run.record.max_width)
-            pair = rendered[own], rendered[period], true[own], true[period]
-            values |= pair_values(*pair, changes, counted)
+            values |= pair_values(images[own], images[period], photo, true, changes, counted)
         rows += [Row(frame.name, own, period, *key, value) for key, value in values.items()]
     return rows
 
 
-def _load_depth(path: Path) -> NDArray[np.floating] | None:
-    if not path.is_file():
-        return None
-    with np.load(path) as arrays:  # refuses pickles
-        return np.asarray(arrays["depth"])
-
-
-def quality(shown: Shown, truth: Shown, counted: Mask) -> dict[Key, float]:
-    """How good one picture is, as far as the truth is known. Depth is not resized."""
-    values = {}
-    if shown.image is not None and truth.image is not None:
-        values[ALL, "psnr"] = psnr(shown.image, truth.image, counted)
-    d, t = shown.depth, truth.depth
-    if d is not None and t is not None and d.shape == t.shape and (t[counted] > 0).any():
-        errors = depth_errors(d, t, counted)
-        values |= {(ALL, name): value for name, value in errors.items()}
-    return values
+def depth_values(
+    depth: NDArray[np.floating], truth: NDArray[np.floating], counted: Mask
+) -> dict[Key, float]:
+    """Errors of depth, if any is known at the size of the image: it is not resized."""
+    if depth.shape != truth.shape or not (truth[counted] > 0).any():
+        return {}
+    return {(ALL, name): value for name, value in depth_errors(depth, truth, counted).items()}
 
 
 def pair_values(
-    own: Shown, other: Shown, own_truth: Shown, other_truth: Shown, changes: Image, counted: Mask
+    own: Image, other: Image, photo: Image, truth: Image | None, changes: Image, counted: Mask
 ) -> dict[Key, float]:
     """What two periods of one camera say about each other.
 
@@ -137,32 +111,30 @@ def pair_values(
     - ``change_ap``: average precision of the difference between the renders as a change map.
 
     Args:
-        own: The render at the period of the photo.
-        other: The render at the other period.
-        own_truth: The photo.
-        other_truth: What the camera would see at the other period.
+        own: The render at the period of the photo. [H, W, 3]
+        other: The render at the other period. [H, W, 3]
+        photo: What the camera saw. [H, W, 3]
+        truth: What it would see at the other period; None if that is not known. [H, W, 3]
         changes: Change mask of the two periods. [H, W]
         counted: Pixels that count. [H, W]
     """
-    assert own.image is not None and other.image is not None
     changed, same = counted & (changes != UNCHANGED), counted & (changes == UNCHANGED)
-    difference = np.abs(own.image.astype(int) - other.image).sum(axis=2)
+    difference = np.abs(own.astype(int) - other).sum(axis=2)
     found = change_scores(difference, changes, counted)
     values = {(ALL, name): value for name, value in found.items()}
     if same.any():
-        values[INVARIANT, "consistency"] = psnr(other.image, own.image, same)
-    a, b = own_truth.image, other_truth.image
-    if a is None or b is None:
+        values[INVARIANT, "consistency"] = psnr(other, own, same)
+    if truth is None:
         return values
     if same.any():
-        values[INVARIANT, "psnr"] = psnr(other.image, b, same)
-        values[INVARIANT, "consistency_truth"] = psnr(b, a, same)
+        values[INVARIANT, "psnr"] = psnr(other, truth, same)
+        values[INVARIANT, "consistency_truth"] = psnr(truth, photo, same)
     if changed.any():
-        values[CHANGED, "psnr"] = psnr(other.image, b, changed)
-        if (a[changed] != b[changed]).any():
-            ghosting = share_of_other(own.image, a, b, changed)
-            values[CHANGED, "ghosting"] = ghosting
-            values[CHANGED, "sensitivity"] = share_of_other(other.image, a, b, changed) - ghosting
+        values[CHANGED, "psnr"] = psnr(other, truth, changed)
+        if (photo[changed] != truth[changed]).any():
+            shares = [share_of_other(image, photo, truth, changed) for image in (own, other)]
+            values[CHANGED, "ghosting"] = shares[0]
+            values[CHANGED, "sensitivity"] = shares[1] - shares[0]
     return values
 
 

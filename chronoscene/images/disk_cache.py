@@ -25,7 +25,7 @@ from chronoscene.io.staging import replacing, sha256_of
 
 _FORMAT = 1  # Of the files; to be raised when they, or the rules of decoding, change
 _HEADERS = 2048  # Bytes that a file has besides its arrays, at most
-_UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile)
+UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile)
 """What damaged files raise."""
 _NO_MASK = np.zeros((0, 0), bool)  # In files of photos that count everywhere
 
@@ -109,7 +109,7 @@ def _read(file: Path, size: tuple[int, int]) -> Photo | None:
         os.utime(file)  # It is in use
         with np.load(file) as arrays:
             image, mask = arrays["image"], arrays["mask"]
-    except _UNREADABLE:
+    except UNREADABLE:
         return None
     shape = size[1], size[0]
     if (image.shape, image.dtype) != ((*shape, 3), np.uint8) or mask.dtype != bool:

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.errors import ImageError
-from chronoscene.images.decoding import image_size, load_grey
+from chronoscene.images.decoding import image_size, load_grey, load_rgb
+from chronoscene.images.disk_cache import UNREADABLE
 from chronoscene.images.masks import resize_mask
 from chronoscene.images.store import evaluation_size
 
@@ -91,3 +92,35 @@ def changed_at_all(
         return None
     masks = [load_changes(path, size, max_width) != UNCHANGED for path in paths]
     return np.asarray(np.logical_or.reduce(masks))
+
+
+def load_other(
+    folder: Path, view: str, period: int, size: tuple[int, int]
+) -> NDArray[np.uint8] | None:
+    """What the camera of a view would see at another period; None if that is not known.
+
+    Arguments as for `changed_at_all`, errors as for `load_rgb`. [H, W, 3]
+    """
+    path = folder / truth_place("cross_rgb", view, period)
+    return load_rgb(path, size=size) if path.is_file() else None
+
+
+def load_depth(folder: Path, view: str, other: int | None) -> NDArray[np.floating] | None:
+    """Depth of a view at another period, or at its own; None if that is not known. [H, W]
+
+    Raises:
+        ImageError: If the file is damaged.
+    """
+    path = folder / truth_place("depth" if other is None else "cross_depth", view, other)
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path) as arrays:  # refuses pickles
+            return np.asarray(arrays["depth"], np.float64)
+    except (*UNREADABLE, TypeError) as error:
+        raise ImageError(
+            path,
+            expected="an array of the name depth in NumPy's npz format",
+            found=str(error) or type(error).__name__,
+            todo="write the file again with numpy.savez",
+        ) from error

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from chronoscene.arrays import Array
 from chronoscene.checks import check_shape
-from chronoscene.metrics.psnr_ssim import masked_mean
+from chronoscene.metrics.psnr_ssim import checked_mask, masked_mean
 
 DELTA = 1.25
 """Ratio of depths below which a pixel counts as right."""
@@ -35,7 +35,7 @@ def depth_errors(
     t = np.asarray(truth, np.float64)
     d: Array = np.asarray(depth, np.float64)
     check_shape("depth", d, t.shape)
-    known = (t > 0) if mask is None else (t > 0) & np.asarray(mask, bool)
+    known = (t > 0) if mask is None else (t > 0) & checked_mask(mask, t)
     t = np.where(known, t, 1.0)
     near = np.maximum(d, t) < DELTA * np.minimum(d, t)
     return {

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from chronoscene.bench.leakage import Shown, leakage_table, pair_values, quality
+from chronoscene.bench.leakage import depth_values, leakage_table, pair_values
 from chronoscene.bench.opening import open_run
 from chronoscene.bench.predictions import to_bytes
 from chronoscene.bench.results import Row, read_rows
@@ -36,8 +36,7 @@ def truths():
 
 
 def values_of(own, other, truths, counted=ALL):
-    shown = [Shown(image, None) for image in (own, other, *truths)]
-    return pair_values(*shown, CHANGES, counted)
+    return pair_values(own, other, *truths, CHANGES, counted)
 
 
 def test_a_perfect_model(truths):
@@ -81,12 +80,12 @@ def test_a_flicker_where_nothing_changed(truths):
 
 def test_without_truth_of_the_other_period(truths):
     own, other = truths
-    shown = Shown(own, None), Shown(other, None), Shown(own, None), Shown(None, None)
-    assert {key[1] for key in pair_values(*shown, CHANGES, ALL)} == {
+    images = own, other, own, None
+    assert {key[1] for key in pair_values(*images, CHANGES, ALL)} == {
         *("change_ap", "change_ap_geometry", "change_ap_appearance", "consistency")
     }
     everywhere = np.full(CHANGES.shape, GEOMETRY)
-    values = pair_values(*shown, everywhere, ALL)
+    values = pair_values(*images, everywhere, ALL)
     assert {key[1] for key in values} == {"change_ap", "change_ap_geometry"}
 
 
@@ -102,11 +101,10 @@ def test_pixels_that_do_not_count(truths):
 
 def test_depth_of_the_size_of_the_truth_only():
     depth = np.full((6, 8), 2.2)
-    values = quality(Shown(None, depth), Shown(None, np.full((6, 8), 2.0)), ALL)
+    values = depth_values(depth, np.full((6, 8), 2.0), ALL)
     assert values["all", "depth_abs_rel"] == pytest.approx(0.1)
-    assert quality(Shown(None, depth), Shown(None, np.ones((3, 4))), ALL) == {}
-    assert quality(Shown(None, depth), Shown(None, np.zeros((6, 8))), ALL) == {}
-    assert quality(Shown(None, None), Shown(None, depth), ALL) == {}
+    assert depth_values(depth, np.ones((3, 4)), ALL) == {}
+    assert depth_values(depth, np.zeros((6, 8)), ALL) == {}
 
 
 def test_the_table_has_means_over_views_and_pairs():

@@ -11,6 +11,8 @@ from chronoscene.images.truth import (
     UNCHANGED,
     changed_at_all,
     load_changes,
+    load_depth,
+    load_other,
     truth_place,
 )
 
@@ -61,3 +63,17 @@ def test_a_mask_of_another_size(tmp_path):
     Image.fromarray(np.zeros((3, 8, 3), np.uint8)).save(path)
     with pytest.raises(ImageError, match="one channel of 8 bits"):
         load_changes(path, (8, 3), 8)
+
+
+def test_what_is_not_known_and_what_is_damaged(tmp_path):
+    assert load_other(tmp_path, "x.jpg", 1, (4, 1)) is None
+    assert load_depth(tmp_path, "x.jpg", None) is load_depth(tmp_path, "x.jpg", 1) is None
+    path = tmp_path / "cross_depth/x__p1.npz"
+    path.parent.mkdir()
+    np.savez(path, depth=np.full((2, 3), 7, np.float32))
+    np.testing.assert_array_equal(load_depth(tmp_path, "x.jpg", 1), np.full((2, 3), 7.0))
+    np.savez(path, other=np.ones(3))
+    for _ in range(2):
+        with pytest.raises(ImageError, match=r"x__p1\.npz: expected an array of the name depth"):
+            load_depth(tmp_path, "x.jpg", 1)
+        path.write_bytes(path.read_bytes()[:50])
