@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -158,7 +159,8 @@ def _filtered_copy(
     """
     held = np.zeros(int(tracks.track.max()) + 1 if len(tracks.track) else 0, bool)
     held[chosen] = True
-    with replacing(target) as partial:
+    with replacing(target) as partial, ExitStack() as leaving:
+        leaving.callback(_remove_journals, partial)
         _copy_database(source, partial)
         with pycolmap.Database.open(str(partial)) as opened:
             pair_ids, geometries = opened.read_two_view_geometries()
@@ -187,8 +189,13 @@ def _copy_database(source: Path, target: Path) -> None:
         a.backup(b)
     a.close()
     b.close()
+    _remove_journals(target)
+
+
+def _remove_journals(database: Path) -> None:
+    """Remove what is left of them when all connections are closed, or when the disk is full."""
     for suffix in ("-wal", "-shm"):
-        Path(f"{target}{suffix}").unlink(missing_ok=True)
+        Path(f"{database}{suffix}").unlink(missing_ok=True)
 
 
 def _write_held_out(
