@@ -119,6 +119,8 @@ class Job:
     """Folder of all runs."""
     lpips_weights: str | None
     commit: str
+    period_by: str | None = None
+    """As for `read_scene`."""
     notices: list[str] = field(default_factory=list)
     staging: str = ""
     """Where the worker writes; renamed to `folder` when it has ended."""

@@ -49,6 +49,8 @@ class RunSource(BaseModel):
     """Folder from which ``module:SPEC`` was imported."""
     scene_root: str
     scene_format: str
+    period_by: str | None = None
+    """As for `read_scene`."""
     training_from_world: list[list[float]]
     """Similarity transform as a matrix. [4, 4]"""
 
@@ -60,6 +62,7 @@ def write_source(job: Job, training_from_world: Sim3) -> None:
         plugin_path=job.plugin_path,
         scene_root=job.scene_root,
         scene_format=job.scene_format,
+        period_by=job.period_by,
         training_from_world=training_from_world.to_matrix().tolist(),
     )
     write_text_atomic(Path(job.staging) / SOURCE_FILE, source.model_dump_json(indent=1) + "\n")
@@ -236,7 +239,8 @@ class OpenRun:
         """
         place, found = root or Path(self.source.scene_root), "nothing"
         if place.exists():
-            scene = read_scene(place, format=self.source.scene_format)
+            source = self.source
+            scene = read_scene(place, format=source.scene_format, period_by=source.period_by)
             if scene_hash(scene) == self.record.scene_hash:
                 return scene
             found = "another scene, or a changed one"

@@ -16,6 +16,7 @@ from chronoscene.bench.provenance import code_version, scene_hash
 from chronoscene.bench.strategies import STRATEGIES, check_scene, effective_strategy
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
+from chronoscene.formats.shared.grouping import absolute_rule
 from chronoscene.images.store import MAX_WIDTH, ImageStore
 from chronoscene.methods import MethodSpec, load_spec
 from chronoscene.metrics.lpips_weights import check_available
@@ -59,6 +60,8 @@ class BenchSettings:
     lpips_weights: Path | None = None
     dataset_format: str | None = None
     """Of the scenes; None to find out."""
+    period_by: str | None = None
+    """How their images are grouped into periods, where the format leaves a choice."""
     overwrite: bool = False
     """Whether finished runs with other settings may be replaced."""
 
@@ -73,7 +76,9 @@ def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]
     scenes = []
     for path in settings.scenes:
         say(f"read {path}")
-        scenes.append(read_scene(path, format=settings.dataset_format))
+        scenes.append(
+            read_scene(path, format=settings.dataset_format, period_by=settings.period_by)
+        )
     _check_names(scenes)
     commit = code_version()
     plan: dict[Path, tuple[Job, MethodSpec]] = {}
@@ -177,6 +182,7 @@ def _scene_jobs(
         job = Job(
             scene_root=str(scene.root.resolve()),
             scene_format=scene.format,
+            period_by=absolute_rule(settings.period_by),
             scene=scene.name,
             scene_hash=digest,
             split_hash=split,

@@ -92,7 +92,7 @@ def run_job(job: Job) -> None:
     keep_freed_memory()
     machine = Machine(pick_device(job.device, spec), set_threads(job.threads))
     write_text_atomic(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
-    scene = read_scene(job.scene_root, format=job.scene_format)
+    scene = read_scene(job.scene_root, format=job.scene_format, period_by=job.period_by)
     takes_period = spec.period_input != "none"
     parts = make_parts(scene, open_store(scene, job), job.strategy, takes_period=takes_period)
     write_source(job, parts[0].train.training_from_world)

@@ -12,7 +12,7 @@ from chronoscene.bench.results import read_failures
 from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.strategies import STRATEGIES
 from chronoscene.checks import check_choice
-from chronoscene.cli.convert import format_option
+from chronoscene.cli.convert import reading_options
 from chronoscene.cli.methods import look_here_for
 from chronoscene.cli.output import check_place
 from chronoscene.cli.results import LPIPS_WEIGHTS, RUNS_OUT, print_runs, split_list
@@ -37,7 +37,7 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
     show_default=True,
     help=f"One or several of {', '.join(STRATEGIES)}, separated by commas.",
 )
-@format_option("the scenes")
+@reading_options("the scenes")
 @click.option("--preset", default="balanced", show_default=True, help="Preset of the methods.")
 @click.option(
     "--budget",

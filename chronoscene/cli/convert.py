@@ -26,16 +26,12 @@ def _period_help() -> str:
     return f"How images are grouped into periods, where the format leaves a choice. {rules}."
 
 
-def format_option(scene: str) -> Callable[[Any], Any]:
-    """The option ``--dataset-format`` of a command that reads scenes."""
-    help = f"Format of {scene}.  [default: detected]"
-    return click.option("--dataset-format", type=click.Choice(format_names()), help=help)
-
-
 def reading_options(scene: str) -> Callable[[Any], Any]:
     """The options ``--dataset-format`` and ``--period-by`` of a command that reads scenes."""
+    help = f"Format of {scene}.  [default: detected]"
+    format_option = click.option("--dataset-format", type=click.Choice(format_names()), help=help)
     period_option = click.option("--period-by", metavar="RULE", help=_period_help())
-    return lambda command: format_option(scene)(period_option(command))
+    return lambda command: format_option(period_option(command))
 
 
 @click.command("convert")

@@ -8,7 +8,7 @@ import click
 
 from chronoscene.bench.foreign_images import score_images
 from chronoscene.bench.results import write_summary
-from chronoscene.cli.convert import format_option
+from chronoscene.cli.convert import reading_options
 from chronoscene.cli.output import check_place
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.results import LPIPS_WEIGHTS, RUNS_OUT, print_runs
@@ -35,7 +35,7 @@ from chronoscene.metrics.registry import make_scorers
     show_default=True,
     help="Which of several trainings of the program it was; tables show their mean and spread.",
 )
-@format_option("the scene")
+@reading_options("the scene")
 @click.option(
     "--max-width",
     type=click.IntRange(min=1),
@@ -52,6 +52,7 @@ def command(
     table: Path | None,
     seed: int,
     dataset_format: str | None,
+    period_by: str | None,
     max_width: int,
     lpips_weights: Path | None,
     out: Path,
@@ -65,7 +66,7 @@ def command(
     check_outside(out, [scene], option="--out")
     check_place("--out", out)
     with progress_bar(f"read {scene}") as bar:
-        whole = read_scene(scene, format=dataset_format)
+        whole = read_scene(scene, format=dataset_format, period_by=period_by)
         bar("load the metrics", 0, 1)
         scorers = make_scorers(lpips_weights=lpips_weights)
         bar("score the images", 0, 1)

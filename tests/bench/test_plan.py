@@ -1,5 +1,8 @@
 """Plans: whose overrides they are, and what a run differs in."""
 
+import shutil
+
+from chronoscene.bench.opening import open_run
 from chronoscene.bench.plan import BenchSettings, first_difference, split_overrides
 from chronoscene.methods import load_spec
 
@@ -14,3 +17,19 @@ def test_overrides_with_a_prefix_are_for_one_method(tmp_path):
     settings = BenchSettings((), (), tmp_path, overrides={"blind.rate": "1", "rate": "2"})
     specs = [load_spec("toy_methods:MEAN"), load_spec("toy_methods:BLIND")]
     assert split_overrides(settings, specs) == {"mean": {"rate": "2"}, "blind": {"rate": "1"}}
+
+
+def test_periods_that_the_user_names_hold_for_the_whole_run(
+    bench_here, scene_folder, tmp_path, monkeypatch
+):
+    """For the planning, the training, and whoever opens the run from another folder."""
+    folder = tmp_path / "project"
+    shutil.copytree(scene_folder, folder)
+    (folder / "sparse/split.txt").unlink()
+    rows = [f"{name}/{i}.png,{i // 2}" for name in "ab" for i in range(4)]
+    (tmp_path / "periods.csv").write_text("\n".join(["file,period", *rows]))
+    monkeypatch.chdir(tmp_path)
+    outcome, _ = bench_here("toy_methods:MEAN", scenes=(folder,), period_by="table:periods.csv")
+    monkeypatch.chdir("/")
+    (run,) = map(open_run, outcome.finished)
+    assert [frame.period for frame in run.scene().frames] == [0, 0, 1, 1] * 2

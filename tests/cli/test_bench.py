@@ -151,7 +151,7 @@ def test_every_option_arrives(settings, tmp_path):
         "--seed", "5", "--set", "x=1", "--set", "chronogs.y=a=b", "--max-width", "320",
         "--threads", "3", "--device", "cpu", "--separate-iterations", "each",
         "--lpips-weights", str(tmp_path), "--out", "elsewhere", "--overwrite",
-        "--dataset-format", "wat",
+        "--dataset-format", "wat", "--period-by", "year",
     )  # fmt: skip
     assert asked.scenes == (Path("a"), Path("b")) and asked.methods == ("3dgs", "chronogs")
     assert asked.strategies == ("joint", "separate") and asked.preset == "fast"
@@ -159,7 +159,7 @@ def test_every_option_arrives(settings, tmp_path):
     assert asked.overrides == {"x": "1", "chronogs.y": "a=b"}
     assert (asked.max_width, asked.threads, asked.device) == (320, 3, "cpu")
     assert asked.separate_iterations == "each" and asked.overwrite
-    assert asked.dataset_format == "wat"
+    assert asked.dataset_format == "wat" and asked.period_by == "year"
     assert asked.lpips_weights == tmp_path and asked.runs == Path("elsewhere")
 
 

@@ -38,6 +38,13 @@ _CALENDAR = {"year": 4, "month": 7, "day": 10}
 """Characters of an ISO date that images of one period share."""
 
 
+def absolute_rule(rule: str | None) -> str | None:
+    """The same answer to ``--period-by``, from whatever folder it is read."""
+    if rule is None or not rule.startswith(TABLE):
+        return rule
+    return f"{TABLE}{Path(rule.removeprefix(TABLE)).resolve()}"
+
+
 def natural_key(text: str) -> tuple[tuple[tuple[int, int | str], ...], str]:
     """Sorts ``t2`` before ``t10``; texts that differ in leading zeros alone by the text."""
     parts = re.findall(r"[0-9]{1,18}|[^0-9]+", text)
