@@ -15,12 +15,17 @@ def find_up(poses: Array) -> Array:
     """The direction that is up if the cameras are held level, whatever they look at. [C, 4, 4]
 
     It is the one to which the x axes of the cameras are most nearly at right angles. Where these
-    are all parallel, the direction that is up and back in the images decides.
+    are all parallel, it is also at right angles to the plane in which the cameras are: they fly
+    over the ground. Where they are in a line, what is up and back in the images decides.
     """
     right, down, forward = np.moveaxis(poses[:, :3, :3], 1, 0)
     guess = -(down + forward).mean(axis=0)
     guess /= max(np.linalg.norm(guess), 1e-9)
-    up = np.linalg.eigh(right.T @ right / len(poses) - 0.01 * np.outer(guess, guess))[1][:, 0]
+    centres = camera_centre(poses)
+    centres = centres - centres.mean(axis=0)
+    spread = centres.T @ centres / max((centres**2).sum(), 1e-18)
+    doubt = 0.01 * spread - 1e-4 * np.outer(guess, guess)
+    up = np.linalg.eigh(right.T @ right / len(poses) + doubt)[1][:, 0]
     return np.asarray(up if up @ guess >= 0 else -up)
 
 

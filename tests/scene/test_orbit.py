@@ -52,6 +52,17 @@ def test_up_is_found_whatever_the_cameras_look_at(height):
     assert find_up(ring([0.2, 0.9], height)) @ UP > 0.999
 
 
+@pytest.mark.parametrize("headings", [(0,), (0, np.pi), (0, np.pi / 2)])
+def test_up_is_up_where_cameras_look_straight_down(headings):
+    """Flights over the ground, each with one heading."""
+    poses = []
+    for i, j in np.ndindex(5, 4):
+        eye = MIDDLE + (i - 2) * EAST + 2 * (j - 1.5) * NORTH + 10 * UP
+        turn = headings[i % len(headings)] + 0.02 * (j - i)
+        poses.append(look_at(eye, eye - UP, roll=turn, up=NORTH))
+    assert find_up(np.stack(poses)) @ UP > 0.999
+
+
 def test_one_camera_right_above():
     down = look_at(MIDDLE + 10 * UP, MIDDLE, up=NORTH)[None]
     assert np.isfinite(orbit(down, MIDDLE[None], 4)).all()

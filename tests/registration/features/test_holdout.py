@@ -18,7 +18,7 @@ def test_a_full_disk_leaves_no_journals(tmp_path, monkeypatch):
 
     monkeypatch.setattr(holdout, "_copy_database", full)
     nothing = np.zeros(0, np.int64)
-    tracks = holdout.Tracks(image=nothing, keypoint=nothing, track=nothing)
+    tracks = holdout.Tracks(nothing, nothing, nothing, {}, nothing)
     with pytest.raises(DiskFullError):
         holdout._filtered_copy(tmp_path / "a.db", tmp_path / "b.db", tracks, nothing)
     assert not list(tmp_path.iterdir())
