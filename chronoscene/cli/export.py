@@ -57,5 +57,7 @@ def command(
         lost = round(loss.model - loss.exported, 2) + 0.0  # never -0.00
         pair = f"{loss.model:.2f} dB, exported {loss.exported:.2f} dB"
         lines.append(f"PSNR on {counted(loss.views, 'test view')}: {pair}: {lost:.2f} dB lost")
+    if getattr(run.config, "exposure", "none") != "none":
+        lines.append("The exposure is in the colours; where the background shows, a viewer lacks it")
     emit("\n".join(lines) + "\n", None)
     tell_written(out)

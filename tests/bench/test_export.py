@@ -76,6 +76,13 @@ def test_the_file_gives_the_psnr_that_is_stated(trained, tmp_path, method, perio
     assert abs(lost) <= {"chronogs": 0.3, "3dgs-period": 0.5, "4dgs": 0.0}[method]
 
 
+def test_an_exposure_does_not_reach_the_background(trained, tmp_path):
+    for method, said in (("3dgs-period", True), ("4dgs", False)):
+        arguments = ["export", str(trained[method]), "--period", "0", "--out"]
+        result = CliRunner().invoke(cli, [*arguments, str(tmp_path / "a.ply")])
+        assert ("where the background shows, a viewer lacks it\n" in result.stdout) == said
+
+
 def test_a_period_in_between_is_exported_and_not_measured(trained, tmp_path):
     assert export(trained["chronogs"], tmp_path / "a.ply", 0.5) == []
     assert len(read(tmp_path / "a.ply")[0]) > 0
