@@ -178,6 +178,13 @@ def score_images(
             found=f"none ({scene.split_rule})",
             todo=f"choose some (chronoscene split {scene.root} --scene-out NEW), and use NEW",
         )
+    if not re.search(r"\w", name):
+        raise ConfigError(
+            "--name",
+            expected="letters or digits",
+            found=repr(name),
+            todo="choose the name that tables are to show",
+        )
     method = re.sub(r"[^\w.+-]+", "-", name)
     out = runs / safe_name(scene.name) / f"{method}-{STRATEGY}-{PRESET}" / f"seed{seed}"
     if out.exists():

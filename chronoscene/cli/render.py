@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mimetypes import guess_type
 from pathlib import Path
 
 import click
@@ -11,6 +12,7 @@ from chronoscene.bench.rendering import check_shots, is_animation, render_shots,
 from chronoscene.bench.shots import VIEWS, find_shots, with_periods
 from chronoscene.cli.output import check_file, check_place, tell_written
 from chronoscene.cli.progress import tracked
+from chronoscene.errors import ConfigError
 from chronoscene.io.staging import check_outside
 
 RUN = click.argument("folder", metavar="RUN", type=click.Path(path_type=Path))
@@ -94,6 +96,13 @@ def command(
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
     if is_animation(out):
         check_file("--out", out)
+    elif (guess_type(out)[0] or "").startswith(("image/", "video/")):
+        raise ConfigError(
+            "--out",
+            expected="a folder, or a file that ends in .mp4 or .webp",
+            found=str(out),
+            todo="choose one of them",
+        )
     else:
         check_place("--out", out)
     periods = () if period is None else run.parse_periods(period)

@@ -152,6 +152,12 @@ def test_a_table_says_which_file_shows_which_view(scene, images, tmp_path):
         find_images(images, scene, table)
 
 
+@pytest.mark.parametrize("name", ["", "///"])
+def test_a_name_that_says_nothing_is_refused(score, name):
+    with pytest.raises(ConfigError, match="--name: expected letters or digits"):
+        score(name=name)
+
+
 def test_a_second_run_of_the_name_is_refused(score):
     before = (score() / "run.json").read_bytes()
     with pytest.raises(ConfigError, match="choose another --name or --seed, or delete it"):

@@ -100,6 +100,8 @@ def test_places_that_are_refused(trained, scene_folder, tmp_path):
         render(folder, tmp_path / "out")
     with pytest.raises(ConfigError, match=r"--out .*film.mp4: expected a file"):
         render(folder, tmp_path / "nowhere" / "film.mp4")
+    with pytest.raises(ConfigError, match=r"that ends in .mp4 or .webp, found .*film.gif"):
+        render(folder, tmp_path / "film.gif")
 
 
 def test_a_run_without_a_model(runs, tmp_path):
