@@ -42,6 +42,7 @@ SPLATFACTO = MethodSpec(
     presets={"balanced": {}, "fast": {"iterations": 7_000}},
     runner=Runner(
         exports="nerfstudio",
+        prepare="baselines.external.prepare:splatfacto",
         train=(
             *("ns-train", "splatfacto", "--output-dir", "{output}", "--experiment-name", "run"),
             *("--timestamp", "run", "--max-num-iterations", "{iterations}"),

@@ -29,6 +29,21 @@ PUBLISHED_ITERATIONS = "40_000"
 """Iterations, and the ends of schedules, as the config file of ChronoGS writes them."""
 
 
+def splatfacto(data: Path, output: Path, config: ProgramConfig) -> list[str]:
+    """Nothing to write; refuses what ``ns-render`` would fail on after the training.
+
+    It names images by what follows the folder that all test views have in common.
+    """
+    if len(read_scene(data, format="nerfstudio").select(split="test")) == 1:
+        raise ProgramError(
+            "ns-render",
+            expected="at least two test views",
+            found="one, which it cannot name",
+            todo="hold out more (chronoscene split SCENE --scene-out NEW), and use NEW",
+        )
+    return []
+
+
 def chronogs(data: Path, output: Path, config: ProgramConfig) -> list[str]:
     """``config.yaml`` with another number of iterations; growth ends at half of it."""
     file = Path(config.source, "config/chronogs.yaml")

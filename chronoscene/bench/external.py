@@ -61,7 +61,9 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
     staging, document = Path(job.staging), job.document(spec)
     write_text_atomic(staging / results.CONFIG_FILE, json.dumps(document, indent=1) + "\n")
     scene = read_scene(job.scene_root, format=job.scene_format, period_by=job.period_by)
-    parts = make_parts(scene, ImageStore(scene, max_width=job.max_width), job.strategy)
+    parts = make_parts(
+        scene, ImageStore(scene, max_width=job.max_width, memory_limit=0), job.strategy
+    )
     write_source(job, parts[0].train.training_from_world)
     writer = ImageWriter(staging / results.PREDICTIONS)
     stops = job.stop_rules(spec, len(parts))

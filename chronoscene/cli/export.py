@@ -58,6 +58,8 @@ def command(
         pair = f"{loss.model:.2f} dB, exported {loss.exported:.2f} dB"
         lines.append(f"PSNR on {counted(loss.views, 'test view')}: {pair}: {lost:.2f} dB lost")
     if getattr(run.config, "exposure", "none") != "none":
-        lines.append("The exposure is in the colours; where the background shows, a viewer lacks it")
+        lines.append(
+            "The exposure is in the colours; where the background shows, a viewer lacks it"
+        )
     emit("\n".join(lines) + "\n", None)
     tell_written(out)

@@ -7,6 +7,7 @@ import tomllib
 import venv
 from dataclasses import replace
 from pathlib import Path
+from tempfile import mkdtemp
 
 import numpy as np
 import pytest
@@ -138,15 +139,15 @@ def test_the_recipe_of_the_page_runs(bench_here, tmp_path, monkeypatch):
 def prepared(make_scene, tmp_path):
     """Call a preparation on the scene with other cameras."""
 
-    def run(name, function, format, source, **camera):
+    def run(name, function, format, source, frames=None, **camera):
         spec = SPECS[name]
         config = build_config(spec, preset="balanced", overrides={"source": str(source)})
         scene = make_scene()
         frames = [
             replace(f, camera=replace(f.camera, camera_id=i + 1, **camera) if i else f.camera)
-            for i, f in enumerate(scene.frames)
+            for i, f in enumerate(frames or scene.frames)
         ]
-        data, output = tmp_path / "data", tmp_path / "output"
+        data, output = (Path(mkdtemp(dir=tmp_path), name) for name in ("data", "output"))
         output.mkdir()
         load_format(format).write(scene.with_frames(frames), data)
         return function(data, output, config)
@@ -166,6 +167,14 @@ def test_images_of_several_sizes_are_refused_where_the_program_has_one(prepared,
     source = installed("four_d")["source"]
     with pytest.raises(ProgramError, match=r"images of one size, .* found 12 x 16, 24 x 16"):
         prepared("FOUR_D_GAUSSIANS", prepare.four_d_gaussians, "nerfstudio", source, width=12)
+
+
+def test_a_single_test_view_is_refused_before_the_training(make_scene, prepared):
+    scene = make_scene()
+    assert prepared("SPLATFACTO", prepare.splatfacto, "nerfstudio", "") == []
+    frames = [replace(f, split="test" if f.name == "a/2.png" else "train") for f in scene.frames]
+    with pytest.raises(ProgramError, match="ns-render: expected at least two test views"):
+        prepared("SPLATFACTO", prepare.splatfacto, "nerfstudio", "", frames=frames)
 
 
 def test_source_code_that_is_not_there_is_named(prepared, installed, tmp_path):
