@@ -138,7 +138,7 @@ def readable_tables(
             made += _stage_tables(part, name, staged)
         # Nobody knows what images of other programs cost.
         if not metrics and (part.column == "").any():
-            made.append(_cost_table(part, str(scene), shown))
+            made.append(_cost_table(part, str(scene), [name for name in shown if name in names]))
     return made
 
 

@@ -117,11 +117,13 @@ def boxed_text(table: Table, *, width: int | None = None) -> str:
         return title + _block(table, rows, range(len(sizes)))
     labels, others = sizes[: table.labels], sizes[table.labels :]
     least = max(MIN_NAME_WIDTH, width // 5)
-    cuts = {
-        longest: _fitting(table, [*(min(size, GAP + longest) for size in labels), *others], width)
-        for longest in range(max(least, *labels), least - 1, -1)
-    }
-    longest, blocks = min(cuts.items(), key=lambda cut: len(cut[1]))
+    cuts = []
+    for longest in range(max(least, *labels), least - 1, -1):
+        sizes = [*(min(size, GAP + longest) for size in labels), *others]
+        blocks = _fitting(table, sizes, width)
+        excess = max(0, *(1 + sum(sizes[i] for i in block) - width for block in blocks))
+        cuts.append((excess, len(blocks), longest, blocks))
+    *_, longest, blocks = min(cuts, key=lambda cut: cut[:2])
     return title + "".join(_block(table, rows, block, longest) for block in blocks)
 
 

@@ -96,6 +96,9 @@ def test_labels_go_over_lines_where_that_saves_a_block():
     first = texts.index("Scaffold-GS, period")
     assert texts[first : first + 2] == ["Scaffold-GS, period", "appearance (joint, fast)"]
     assert name in boxed_text(table)
+    heads = [("method", ""), *[("plaza", "x" * 12), ("", "x" * 12), ("", "x" * 12)] * 2]
+    text = boxed_text(Table(heads, [[name, *"123456"]]), width=80)
+    assert text.count("plaza") == 2 and max(map(len, text.splitlines())) <= 80
 
 
 def test_csv():
