@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from baselines.gaussian_in_the_wild.config import GaussianInTheWildConfig
 from baselines.gaussian_in_the_wild.features import start_coordinates
-from baselines.gaussian_in_the_wild.model import COORDINATES, WildModel
+from baselines.gaussian_in_the_wild.model import COORDINATES, EARLIER, WildModel
 from baselines.gaussian_in_the_wild.networks import Networks, start_networks
 from baselines.gaussian_in_the_wild.trainer import WildTrainer, one_thread
 from chronoscene.anchors.baking import RIDGE
@@ -59,6 +59,11 @@ class GaussianInTheWild(GaussianMethod):
             {name: tensor.to(means.device) for name, tensor in tensors.items()},
             networks=networks,
         )
+
+    def extended_model(self, train: TrainingSet) -> WildModel:
+        """Gaussians keep what they read from photos of earlier periods, which are gone."""
+        model, read = self.model, self._read_periods().detach()
+        return replace(model, parameters=model.parameters | {EARLIER: read}, period_features=None)
 
     def restore_model(self, tensors: dict[str, Tensor]) -> WildModel:
         features = tensors.pop("period_features")

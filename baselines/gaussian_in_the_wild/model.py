@@ -16,6 +16,9 @@ from chronoscene.training.splatting import Splats, camera_centre_tensor
 
 COORDINATES = "coordinates"
 """Group of parameters: where Gaussians read in feature maps. [N, 3, 2]"""
+EARLIER = "earlier_features"
+"""Group of what Gaussians read from photos of periods before this training, if any; not trained.
+[N, S, D]"""
 _SLACK = log(2)
 """Added to logarithms of scales: the test of anchors is a little tighter than the rasterizer."""
 _NEAR = 1e-6

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from baselines.gaussian_in_the_wild.config import GaussianInTheWildConfig
 from baselines.gaussian_in_the_wild.features import read_features, small_photo
-from baselines.gaussian_in_the_wild.model import COORDINATES, WildModel
+from baselines.gaussian_in_the_wild.model import COORDINATES, EARLIER, WildModel
 from baselines.gaussian_in_the_wild.networks import read_photo, see
 from chronoscene.gaussians.trainer import GaussianTrainer
 from chronoscene.methods import StepReport, TrainingSet
@@ -98,9 +98,13 @@ class WildTrainer(GaussianTrainer):
         device = self.background.device
         rows = torch.arange(len(model), device=device)
         found = torch.zeros(len(model), self.train.num_periods, size, device=device)
+        earlier = model.parameters.get(EARLIER, found[:, :0])
+        found[:, : earlier.shape[1]] = earlier
         with one_thread():
             for period in range(self.train.num_periods):
                 own = [i for i, view in enumerate(views) if view.period == period]
+                if not own:
+                    continue
                 numbers = list(dict.fromkeys(self._reference(i) for i in own))
                 total = torch.zeros(len(model), size, device=device)
                 count = torch.zeros(len(model), 1, device=device)

@@ -39,11 +39,16 @@ class Realtime4DGS(GaussianMethod):
         parameters = start_in_time(parameters, seen, self.config, seed)
         return SpacetimeModel(parameters, periods=train.num_periods, cycle=self.config.wave_cycle)
 
+    def extended_model(self, train: TrainingSet) -> SpacetimeModel:
+        """The same model: a new period comes as long after the last one as that after the first."""
+        self.meta["first_periods"] = self.model.periods
+        return self.model
+
     def restore_model(self, tensors: dict[str, Tensor]) -> SpacetimeModel:
         return SpacetimeModel(
             tensors,
             sh_degree=self.meta["sh_degree"],
-            periods=self.meta["num_periods"],
+            periods=self.meta.get("first_periods", self.meta["num_periods"]),
             cycle=self.config.wave_cycle,
         )
 

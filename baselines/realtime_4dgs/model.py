@@ -25,6 +25,7 @@ class SpacetimeModel(GaussianModel):
 
     _: KW_ONLY
     periods: int
+    """Of the first training, which lie from time 0 to 1."""
     cycle: float
     """Length of the longest wave of the colours."""
     order: int = ORDERS

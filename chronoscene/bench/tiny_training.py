@@ -97,8 +97,8 @@ def make_training_set(num_periods: int) -> TrainingSet:
 
 
 def make_stage(period: int, *, hide_period: bool) -> TrainingSet:
-    """One of two periods, as the strategy ``sequential`` gives them."""
-    data = make_training_set(2)
+    """One of three periods, as the strategy ``sequential`` gives them."""
+    data = make_training_set(3)
     own = [i for i, view in enumerate(data.views) if view.period == period]
     known = 1 if hide_period else period + 1
     return replace(
