@@ -1,5 +1,6 @@
 """``chronoscene export``: files that show what the run shows, as plyfile reads them."""
 
+import dataclasses
 import errno
 import os
 import re
@@ -10,6 +11,7 @@ import torch
 from click.testing import CliRunner
 from plyfile import PlyData
 
+from chronoscene.bench.export import export_gaussians
 from chronoscene.bench.opening import open_run
 from chronoscene.bench.predictions import to_bytes
 from chronoscene.cli import cli
@@ -122,3 +124,30 @@ def test_no_space_leaves_nothing_behind(trained, tmp_path, monkeypatch):
     with pytest.raises(DiskFullError, match=r"a\.ply: expected space"):
         export(trained["chronogs"], tmp_path / "a.ply", 0)
     assert not list(tmp_path.iterdir())
+
+
+def test_an_earlier_stage_is_exported_from_the_views_that_it_saw(bench_here, tmp_path):
+    outcome, _ = bench_here("chronogs", strategies=("sequential",), preset="fast", iterations=12)
+    folder, out = outcome.finished[0], tmp_path / "stage.ply"
+    arguments = ["export", str(folder), "--period", "0", "--out", str(out), "--stage", "0"]
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert result.exit_code == 0 and len(read(out)[0]) > 0
+    run = open_run(folder, stage=0)
+    scene = run.scene()
+    own = [frame for frame in scene.frames if frame.period == 0]
+    alone = export_gaussians(
+        run,
+        scene.with_frames(
+            [
+                frame if frame in own else dataclasses.replace(frame, split="test")
+                for frame in scene.frames
+            ]
+        ),
+        0,
+    )
+    whole = export_gaussians(run, scene, 0)
+    np.testing.assert_array_equal(whole.sh_coeffs, alone.sh_coeffs)
+    pictures = tmp_path / "pictures"
+    arguments = ["render", str(folder), "--period", "0", "--out", str(pictures), "--stage", "0"]
+    assert CliRunner().invoke(cli, arguments, catch_exceptions=False).exit_code == 0
+    assert len(list(pictures.rglob("*.png"))) == 3

@@ -163,12 +163,14 @@ def test_variants_lie_side_by_side_and_are_named_by_what_differs(bench_here):
     (plain,) = outcome.finished
     assert plain.parent.name == "mean-joint-balanced"
     changes = {"overrides": {"sleep": "0.001", "rate": "0.25"}, "separate_iterations": "each"}
+    changes["strategies"] = ("joint", "separate")
     outcome, said = bench_here(toy, budget_seconds=0.05, iterations=3, **changes)
-    (folder,) = outcome.finished
-    variant = "iterations=3,rate=0.25,sleep=0.001,budget=0.05s,separate_iterations=each"
+    folder, separate = outcome.finished
+    variant = "iterations=3,rate=0.25,sleep=0.001,budget=0.05s"
     assert folder.parent.name == f"mean-joint-balanced-{variant}" and plain.is_dir()
     assert read_run(folder).variant == variant
-    assert f"[1/1] ring: mean joint balanced {variant} seed 0" in said
+    assert read_run(separate).variant == f"{variant},separate_iterations=each"
+    assert f"[1/2] ring: mean joint balanced {variant} seed 0" in said
     table = format_runs([read_run(plain), read_run(folder)], [], "table")
     assert "Mean (joint, balanced) " in table
     assert "Mean (joint, balanced, iterations=3, rate=0.25, " in table
@@ -246,9 +248,11 @@ def test_a_full_disk_ends_the_bench_and_leaves_nothing_half(bench, tmp_path):
     assert len(json.loads((runs / "results.json").read_text())) == 1
 
 
-def test_separate_models_share_or_repeat(bench):
-    each, _ = bench("MEAN", strategies=("separate",), iterations=9, separate_iterations="each")
+@pytest.mark.parametrize("strategy", ["separate", "sequential"])
+def test_separate_models_and_stages_share_or_repeat(bench, strategy):
+    each, said = bench("MEAN", strategies=(strategy,), iterations=9, separate_iterations="each")
     assert read_run(each.finished[0]).iterations == 18
+    assert any(line.endswith("has all iterations and time") for line in said)
 
 
 @pytest.mark.parametrize(
@@ -260,6 +264,9 @@ def test_separate_models_share_or_repeat(bench):
         ({"device": "cuda"}, "mean --device: expected one of cpu"),
         ({"overrides": {"iterations": "0"}}, "expected a positive number"),
         ({"strategies": ("mixed",)}, "expected one of joint, pooled, separate"),
+        ({"strategies": ("sequential",), "methods": ("toy_methods:FIXED",)}, "without extend"),
+        ({"strategies": ("sequential",), "methods": ("toy_programs:PROGRAM",)}, "without extend"),
+        ({"strategies": ("sequential",), "keep_training": True}, "--keep-training, --continue-to"),
     ],
 )
 def test_wrong_settings_end_before_anything_is_trained(bench, tmp_path, changes, message):

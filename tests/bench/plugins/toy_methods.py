@@ -79,6 +79,10 @@ class MeanColour:
         self.load(folder, device="cpu")
 
 
+class FixedPeriods:
+    """Cannot be extended."""
+
+
 class Drawing(MeanColour):
     """Learns with random rates, from the global generators."""
 
@@ -148,6 +152,7 @@ def spec(name, cls, period_input="label"):
 
 
 MEAN = spec("mean", MeanColour)
+FIXED = spec("fixed", FixedPeriods)
 DRAWING = spec("drawing", Drawing)
 BLIND = spec("blind", MeanColour, period_input="none")
 RAISES = spec("raises", Raises)
