@@ -17,6 +17,7 @@ _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousand
     "width": 64,
     "frequencies": 4,
     "start_from_points": True,
+    "visibility": False,
     "coordinate_lr_initial": 0.01,
     "coordinate_lr_final": 1e-3,
     "network_lr": 2e-3,

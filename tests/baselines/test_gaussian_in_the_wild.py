@@ -417,9 +417,9 @@ def test_torch_has_its_threads_again_after_a_step() -> None:
 def test_visibility_counts_after_its_moment_alone() -> None:
     """Before it the model is the same, bit by bit, as without visibility."""
     scene = toy_scene()
-    models = [begun(scene, 6, visibility=on).model.tensors() for on in (True, False)]
+    models = [begun(scene, 6, visibility=on, visibility_from=30_000).model.tensors() for on in (True, False)]
     assert all(torch.equal(tensor, models[1][name]) for name, tensor in models[0].items())
-    method = begun(scene, 6, visibility_from=0)
+    method = begun(scene, 6, visibility=True, visibility_from=0)
     filters = [name for name in method.model.shared if name.startswith("photo.see.")]
     assert filters
     for name in filters:
@@ -464,7 +464,7 @@ def test_what_covers_the_scene_in_single_photos_is_taken_for_not_visible() -> No
         images.append(photo)
         hidden.append((slice(row, row + 8), slice(column, column + 8)))
     covered = replace(scene, load_image=images.__getitem__)
-    method = train(covered, config(), method_class=GaussianInTheWild)
+    method = train(covered, config(visibility=True), method_class=GaussianInTheWild)
     trainer, inside, whole = trainer_of(method), [], []
     for i, place in enumerate(hidden):
         with torch.no_grad():
