@@ -13,7 +13,7 @@ from baselines.gaussian_in_the_wild.config import GaussianInTheWildConfig
 from baselines.gaussian_in_the_wild.features import read_features, small_photo
 from baselines.gaussian_in_the_wild.model import COORDINATES, EARLIER, WildModel
 from baselines.gaussian_in_the_wild.networks import read_photo, see
-from chronoscene.gaussians.trainer import GaussianTrainer
+from chronoscene.gaussians.trainer import Due, GaussianTrainer
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.geometry import camera_centre
@@ -22,6 +22,10 @@ from chronoscene.training.devices import to_device, uniform
 from chronoscene.training.splatting import Splats
 
 _STREAM = 8  # Keeps the dropout apart from other draws of the same seed
+PAUSE = 300
+"""Steps after an opacity reset in which visibility does not count. The image is nearly empty then,
+and where nothing is visible the loss is smaller than where all is wrong: from there no training
+comes back."""
 
 
 @contextmanager
@@ -42,6 +46,8 @@ class WildTrainer(GaussianTrainer):
     model: WildModel
     _visible: Tensor | None = None
     """Where the photo of this step shows the scene; None for everywhere. [H, W]"""
+    _last_reset: int = -PAUSE
+    """Views drawn before the latest opacity reset."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,8 +63,7 @@ class WildTrainer(GaussianTrainer):
         view, self._visible = self.train.views[number], None
         rows = self.model.rows_in(view)
         dynamic, _, stages = self._read(self._reference(number), rows)
-        counts = config.visibility and self.timeline.last_moment > config.visibility_from
-        if stages and counts and config.reference == "image":
+        if stages and self._visibility_counts():
             self._visible = see(stages, self.model.shared, view.height, view.width)
         generator = np.random.default_rng((self.seed, _STREAM, self.sampler.drawn))
         kept = uniform(generator, tuple(dynamic.shape), dynamic) >= config.dropout
@@ -82,8 +87,25 @@ class WildTrainer(GaussianTrainer):
         hidden = (1 - visible).square().mean()
         return loss + (other - other.detach()) + self.config.visibility_weight * hidden
 
+    def _visibility_counts(self) -> bool:
+        config = self.config
+        begun = self.timeline.last_moment > config.visibility_from
+        paused = self.sampler.drawn - self._last_reset <= PAUSE
+        return config.visibility and config.reference == "image" and begun and not paused
+
+    def _update(self, due: Due) -> None:
+        super()._update(due)
+        if due.reset:
+            self._last_reset = self.sampler.drawn
+
+    def state(self) -> TrainingState:
+        state = super().state()
+        state.values["last_reset"] = self._last_reset
+        return state
+
     def load_state(self, state: TrainingState) -> None:
         super().load_state(state)
+        self._last_reset = state.values["last_reset"]
         self.model.period_features = None
 
     @torch.no_grad()

@@ -417,13 +417,33 @@ def test_torch_has_its_threads_again_after_a_step() -> None:
 def test_visibility_counts_after_its_moment_alone() -> None:
     """Before it the model is the same, bit by bit, as without visibility."""
     scene = toy_scene()
-    models = [begun(scene, 6, visibility=on, visibility_from=30_000).model.tensors() for on in (True, False)]
+    models = [
+        begun(scene, 6, visibility=on, visibility_from=30_000).model.tensors()
+        for on in (True, False)
+    ]
     assert all(torch.equal(tensor, models[1][name]) for name, tensor in models[0].items())
     method = begun(scene, 6, visibility=True, visibility_from=0)
     filters = [name for name in method.model.shared if name.startswith("photo.see.")]
     assert filters
     for name in filters:
         assert not torch.equal(method.model.shared[name], models[1][name])
+
+
+def test_visibility_pauses_after_an_opacity_reset(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in a training that goes on from between the two."""
+    monkeypatch.setattr("baselines.gaussian_in_the_wild.trainer.PAUSE", 3)
+    options = {"visibility": True, "visibility_from": 0, "reset_interval": 600}
+    method, resumed = (begun(two_periods(), **options) for _ in range(2))
+    counts = []
+    for index in range(10):  # 150 moments each; resets are in steps 4 and 8
+        if index == 5:
+            trainer_of(resumed).load_state(trainer_of(method).state())
+        for each in (method, resumed) if index >= 5 else (method,):
+            each.step(index, index / 200)
+        counts.append(trainer_of(method)._visible is not None)
+        if index >= 5:
+            assert (trainer_of(resumed)._visible is not None) == counts[-1]
+    assert counts == [True] * 5 + [False] * 3 + [True, False]
 
 
 def test_the_loss_has_the_gradients_of_the_reference_in_image_and_visibility() -> None:
