@@ -10,7 +10,6 @@ _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousand
     "length_unit": "training",
     "stretch": True,
     "start_times": "seen",
-    "initial_time_scale": 1.0,
     "wave_cycle": 2.0,
     "time_lr": 5e-3,
     "wave_dc_lr": 0.0025,

@@ -67,6 +67,12 @@ def _unit(quats, n):  # type: ignore[no-untyped-def]
     return (w / length, x / length, y / length, z / length), length
 
 
+@inner(forceinline=True)
+def _exp(x):  # type: ignore[no-untyped-def]
+    """In float64, as all arithmetic here."""
+    return math.exp(np.float64(x))
+
+
 @inner
 def _open(n, dt, left, right, log_scales, log_time_scales, m, y):  # type: ignore[no-untyped-def]
     """Fill m with R S in axes that the right quaternion turns, and y with Y. [4, 4], [3, 4]
@@ -75,8 +81,8 @@ def _open(n, dt, left, right, log_scales, log_time_scales, m, y):  # type: ignor
         Whether the Gaussian is there at the time; the variance in time; v.
     """
     (w, a, b, c) = _product(_conjugate(right), left)
-    sx, sy = math.exp(log_scales[n, 0]), math.exp(log_scales[n, 1])
-    sz, st = math.exp(log_scales[n, 2]), math.exp(log_time_scales[n])
+    sx, sy = _exp(log_scales[n, 0]), _exp(log_scales[n, 1])
+    sz, st = _exp(log_scales[n, 2]), _exp(log_time_scales[n])
     m[0, 0], m[0, 1], m[0, 2], m[0, 3] = w * sx, -c * sy, b * sz, a * st
     m[1, 0], m[1, 1], m[1, 2], m[1, 3] = c * sx, w * sy, -a * sz, b * st
     m[2, 0], m[2, 1], m[2, 2], m[2, 3] = -b * sx, a * sy, w * sz, c * st
@@ -314,7 +320,7 @@ def slice_backward(  # type: ignore[no-untyped-def]
             px, py, pz = _turned(back, wx, wy, wz)
             along = v[0] * wx + v[1] * wy + v[2] * wz
             # Of the logarithm of w, and of o.
-            log_w, e = -0.5 * dt * dt / variance, math.exp(logits[n])
+            log_w, e = -0.5 * dt * dt / variance, _exp(logits[n])
             g_o = g_logits[n] / (1 - e * math.expm1(log_w))
             g_log_w = g_o * (1 + e)
             d_logits[n] = g_o
@@ -335,8 +341,8 @@ def slice_backward(  # type: ignore[no-untyped-def]
                 d_scales[n, i] = _column(d, m, i)
             d_log_time_scales[n] = _column(d, m, 3)
 
-            s0, s1 = math.exp(log_scales[n, 0]), math.exp(log_scales[n, 1])
-            s2, s3 = math.exp(log_scales[n, 2]), math.exp(log_time_scales[n])
+            s0, s1 = _exp(log_scales[n, 0]), _exp(log_scales[n, 1])
+            s2, s3 = _exp(log_scales[n, 2]), _exp(log_time_scales[n])
             g_pair = (
                 d[0, 0] * s0 + d[1, 1] * s1 + d[2, 2] * s2 + d[3, 3] * s3,
                 d[2, 1] * s1 - d[1, 2] * s2 + d[0, 3] * s3 - d[3, 0] * s0,
