@@ -5,8 +5,10 @@
 Prints milliseconds as the caller sees them, medians and minima, and the processor time of the
 calling thread. The step is that of ChronoGS at the sizes of the paper, with all anchors visible:
 10 offsets, features of 16 + 3 x 16 and 32, hidden layers of 32. "active" are offsets with a
-positive opacity, the only ones that a rasterizer sends gradients to. The last lines compare Adam
-on all rows of ten times as many anchors with Adam on those in view; "forward" is the fetch.
+positive opacity, the only ones that a rasterizer sends gradients to. "slice" is that of
+realtime4DGS, with two orders of waves and gradients for half of the Gaussians. The last lines
+compare Adam on all rows of ten times as many anchors with Adam on those in view; "forward" is the
+fetch.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import chronoscene  # noqa: F401
 import torch
 from torch import Tensor
 
+from baselines.realtime_4dgs.slicing import SHAPES, slice_at, slice_reference
 from chronoscene.anchors.decode import (
     DecodeInputs,
     HeadWeights,
@@ -177,6 +180,27 @@ def time_loss(repeats: int, reference: bool) -> None:
         report(name, repeats, parts.forward, parts.backward)
 
 
+def time_slice(count: int, repeats: int, reference: bool) -> None:
+    """Gaussians in space and time, most of which are there."""
+    g = torch.Generator().manual_seed(3)
+    leaves = {n: torch.randn(count, *shape, generator=g) for n, shape in SHAPES.items()}
+    for leaf in leaves.values():
+        leaf.requires_grad_()
+    for name, function in (
+        (f"slice, {count} Gaussians", slice_at),
+        ("slice in torch", slice_reference),
+    )[: 1 + reference]:
+
+        def forward(function: Callable[..., dict[str, Tensor]] = function) -> Sequence[Tensor]:
+            return list(function(leaves, 0.5, cycle=1.0, order=2).values())
+
+        grads = [torch.randn(value.shape, generator=g) for value in forward()]
+        for grad in grads:
+            grad[::2] = 0
+        parts = TwoParts(forward, grads, list(leaves.values()))
+        report(name, repeats, parts.forward, parts.backward)
+
+
 def time_adam(step: Step, repeats: int, reference: bool) -> None:
     """One update of all parameters."""
     named = {str(index): value for index, value in enumerate(step.parameters())}
@@ -224,6 +248,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--anchors", type=int, default=31_000)
+    parser.add_argument("--gaussians", type=int, default=60_000, help="that are sliced")
     parser.add_argument("--active", type=float, default=0.21, help="share of offsets switched on")
     parser.add_argument("--no-reference", dest="reference", action="store_false")
     args = parser.parse_args()
@@ -235,6 +260,7 @@ def main() -> None:
         print(f"threads: {set_threads(threads)}")
         time_decode(step, args.repeats, args.reference)
         time_loss(args.repeats, args.reference)
+        time_slice(args.gaussians, args.repeats, args.reference)
         time_adam(step, args.repeats, args.reference)
         time_tables(10 * args.anchors, args.repeats)
 

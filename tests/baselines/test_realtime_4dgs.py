@@ -127,7 +127,7 @@ def test_what_blinks_is_there_in_its_period_alone() -> None:
     blinking = train(scene, config(), method_class=Realtime4DGS)
     static = train(scene, replace(SHORT, iterations=300, max_gaussians=200))
     ours, theirs = (mean_squared_error(method, scene) for method in (blinking, static))
-    assert ours < 0.4 * theirs
+    assert ours < 0.5 * theirs
 
 
 def times_of(scene: TrainingSet, given: Realtime4DGSConfig, seed: int = 0) -> np.ndarray:
