@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from textwrap import shorten
+from textwrap import fill, shorten
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ METRICS = ("psnr", "ssim", "lpips_vgg")
 """Those that are drawn, as far as there are values."""
 WRITTEN = 10
 """Periods up to which cells have numbers."""
+TITLE_WIDTH = 30  # Characters
 
 
 def draw_stages(runs: Path) -> list[Path]:
@@ -30,7 +31,8 @@ def draw_stages(runs: Path) -> list[Path]:
     for record in map(read_run, run_folders(runs)):
         if record.stages:
             rows = scenes.setdefault(record.scene, {})
-            rows.setdefault(f"{record.title}\n{kind_of(record)}", []).append(record)
+            title = f"{record.title}\n{fill(kind_of(record), TITLE_WIDTH, break_long_words=False)}"
+            rows.setdefault(title, []).append(record)
     written = []
     for scene, rows in scenes.items():
         path = runs / FIGURES / f"{safe_name(scene)}_stages.png"
@@ -94,7 +96,7 @@ def _draw_matrix(
             axis.text(column, row, text, ha="center", va="center", color=ink, fontsize=7)
     steps = np.arange(periods + 1)
     axis.step(steps - 0.5, np.minimum(steps + 0.5, periods + 0.5), where="post", color="red", lw=1)
-    axis.set_xticks(range(periods), names, rotation=45, ha="right", fontsize=7)
+    axis.set_xticks(range(periods), names, rotation=90, fontsize=7)
     axis.set_yticks(range(periods + 1), ["no training", *names], fontsize=7)
     axis.set_ylabel("trained up to", fontsize=8)
     return image
