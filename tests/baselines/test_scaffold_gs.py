@@ -274,3 +274,15 @@ def test_appearance_of_a_period_is_chronogs_without_features_that_vary(
     images = [ours.render(two.views[0], period).rgb for period in (0, 0.5, 1)]
     assert not np.array_equal(images[0], images[2])
     np.testing.assert_array_equal(images[1], theirs.render(two.views[0], 0.5).rgb)
+
+
+def test_vectors_of_other_images_start_at_the_mean_by_which_views_are_rendered(train_set):
+    method = ScaffoldGS(ScaffoldGSConfig(**GROWING, appearance_dim=8))
+    method.setup(train_set, seed=0, device="cpu")
+    for i in range(6):
+        method.step(i, i / 20)
+    before = method.render(train_set.views[0], 0.0).rgb
+    method.extend(replace(train_set, views=train_set.views[:2]))
+    assert method.model.global_features.shape == (2, 8)
+    np.testing.assert_allclose(method.render(train_set.views[0], 0.0).rgb, before, atol=1e-6)
+    method.step(0, 0.0)

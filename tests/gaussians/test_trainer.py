@@ -106,6 +106,19 @@ def test_moments_of_survivors_stay_and_new_rows_have_none():
             assert not after[f"{name}.{part}"][survivors:].any()
 
 
+def test_an_extended_training_begins_anew_with_the_degree_that_was_reached():
+    method = GaussianSplatting(replace(SHORT, sh_interval=1_000))
+    method.setup(toy_scene(), seed=0, device="cpu")
+    method.step(0, 0.9)
+    degree, before = method.model.sh_degree, method.model.parameters["means"]
+    assert degree == 3
+    method.extend(toy_scene(views=4))
+    assert method.model.parameters["means"] is before
+    assert not any(values.any() for values in method.trainer.optimizer.state().values())
+    method.step(0, 0.0)
+    assert method.model.sh_degree == degree and method.trainer.sampler.count == 4
+
+
 def test_a_reset_leaves_the_opacities_alone_otherwise():
     config = replace(SHORT, reset_interval=3_000, densify_from=30_000)
     method = GaussianSplatting(config)

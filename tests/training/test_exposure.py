@@ -121,6 +121,18 @@ def test_images_of_a_period_learn_together():
     assert torch.equal(transformed(image, exposure.by_period()[2]), exposure.apply(image, 1))
 
 
+@pytest.mark.parametrize("kind", ["image", "period"])
+def test_other_transforms_to_begin_with(kind):
+    """Those of periods without images stay, the others learn."""
+    image, starts = torch.rand(8, 8, 3), torch.eye(3, 4) * torch.tensor([2.0, 3.0])[:, None, None]
+    exposure = Exposure(kind, views_of([1, 1], 2), "cpu")
+    exposure.begin(starts)
+    assert torch.equal(exposure.by_period(), starts)
+    learn(exposure, image, 0, 1.0, steps=2)
+    found = exposure.by_period()
+    assert torch.equal(found[0], starts[0]) and not torch.equal(found[1], starts[1])
+
+
 def test_between_periods_transforms_are_mixed():
     transforms = torch.stack([torch.eye(3, 4), 3 * torch.eye(3, 4)])
     torch.testing.assert_close(of_period(transforms, 0.25), 1.5 * torch.eye(3, 4))
