@@ -135,7 +135,7 @@ def readable_tables(
             made += _quality_tables(part, name, runs, every=periods)
         staged = [run for run in runs if run.stages]
         for name in names if staged else ():
-            made += _stage_tables(part, name, staged)
+            made += _stage_tables(part, name, staged, every=periods)
         # Nobody knows what images of other programs cost.
         if not metrics and (part.column == "").any():
             made.append(_cost_table(part, str(scene), [name for name in shown if name in names]))
@@ -259,8 +259,11 @@ def _period_title(period: str, labels: dict[str, str]) -> str:
     return f"period {period}" if label == period else f"{period}: {label}"
 
 
-def _stage_tables(part: DataFrame, metric: str, runs: Sequence[RunRecord]) -> list[Table]:
-    """One metric of the runs in stages: each period after each stage, and what is left at last."""
+def _stage_tables(
+    part: DataFrame, metric: str, runs: Sequence[RunRecord], *, every: bool
+) -> list[Table]:
+    """One metric of the runs in stages: each period after each stage, unless there are many, and
+    what is left at last."""
     found = part[part.quantity == metric]
     texts = found.set_index(["label", "column"]).text
     labels = found.label[found.column.str.startswith(f"{period_part(0)}: ")].unique()
@@ -280,7 +283,8 @@ def _stage_tables(part: DataFrame, metric: str, runs: Sequence[RunRecord]) -> li
     columns = ("macro", *TRANSFERS)
     rows = [[label, *(texts.get((label, column), "-") for column in columns)] for label in labels]
     heads = [("method", ""), *((column.replace("_", " "), "") for column in columns)]
-    return [matrix, Table(heads, rows, title=f"{title} the last stage")]
+    left = Table(heads, rows, title=f"{title} the last stage")
+    return [matrix, left] if every or len(ids) <= MAX_PERIODS else [left]
 
 
 def _cost_table(part: DataFrame, scene: str, metrics: Sequence[str] = ()) -> Table:

@@ -298,6 +298,11 @@ def test_stages_have_a_matrix_and_what_is_left_at_the_end():
     assert left.flat_heads == heads
     values = ["27.00 ± 2.12", "8.00 ± 2.83", "-8.00 ± 2.83", "4.00 ± 0.00"]
     assert left.rows == [["CHRONOGS (sequential, fast)", *values]]
+    many = {str(i): str(i) for i in range(9)}
+    for run in runs:
+        run.period_labels = many
+    titles = [table.title for table in grids(runs, ["psnr"])]
+    assert titles[1:] == ["plaza: PSNR [dB] (psnr) after the last stage"]
     entries = summarise(runs).query("column == 'period-0: period 1'")
     assert entries["mean"].tolist() == [12.0]
 
