@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -28,3 +33,16 @@ def render_page(name: str, **values: Any) -> str:
         (TEMPLATES / file).read_text(encoding="utf-8").removesuffix("\n")
     )
     return environment.get_template(f"{name}.html.j2").render(**values)
+
+
+def data_uri(picture: Image.Image, *, form: str = "jpeg", quality: int = 82) -> str:
+    """A picture in a data URI.
+
+    Args:
+        picture: Of any mode; it becomes RGB.
+        form: ``jpeg`` or ``webp``.
+        quality: As Pillow counts it, up to 100.
+    """
+    file = io.BytesIO()
+    picture.convert("RGB").save(file, form, quality=quality)
+    return f"data:image/{form};base64," + base64.b64encode(file.getvalue()).decode()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -15,6 +13,7 @@ from PIL import Image
 from chronoscene.arrays import Array
 from chronoscene.errors import ChronoSceneError
 from chronoscene.images.decoding import load_rgb
+from chronoscene.io.pages import data_uri
 from chronoscene.registration.report.spots import Spot
 from chronoscene.registration.result import Registered
 from chronoscene.scene.cameras import project_points
@@ -24,8 +23,6 @@ PATCH = 260  # Pixels: side of a patch on the page
 MAGNIFIED = 1.5  # Pixels of a patch for one of the photo
 
 PHOTO_WIDTH = 460
-
-QUALITY = 82
 
 MAP_WIDTH = 720.0  # Units of the drawing
 MAX_DOTS = 1500  # Points of the scene that are drawn
@@ -101,13 +98,6 @@ def patch_grid(model: Registered, spot: Spot) -> Array:
     return np.asarray(
         spot.xyz + offsets[None, :, None] * right + offsets[:, None, None] * down, np.float64
     )
-
-
-def data_uri(picture: Image.Image) -> str:
-    """A picture as JPEG in a data URI."""
-    file = io.BytesIO()
-    picture.convert("RGB").save(file, "JPEG", quality=QUALITY)
-    return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
 
 
 @dataclass(frozen=True, slots=True)

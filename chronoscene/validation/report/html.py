@@ -6,8 +6,6 @@ shown, and only files that really are below ``images/``.
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Iterator, Sequence
 from itertools import groupby, islice
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import Any
 from PIL import Image
 
 from chronoscene import __version__
-from chronoscene.io.pages import render_page
+from chronoscene.io.pages import data_uri, render_page
 from chronoscene.validation import rule
 from chronoscene.validation.checks.names import is_safe
 from chronoscene.validation.rule import SEVERITIES, Finding, SceneReport, Severity, is_valid
@@ -99,10 +97,9 @@ class Pictures:
             with Image.open(path) as image:
                 image.draft("RGB", (2 * PICTURE_SIDE, 2 * PICTURE_SIDE))
                 image.thumbnail((PICTURE_SIDE, PICTURE_SIDE))
-                image.convert("RGB").save(file := io.BytesIO(), "JPEG", quality=70)
+                return data_uri(image, quality=70)
         except Exception:  # damaged files make Pillow raise almost anything
             return None
-        return "data:image/jpeg;base64," + base64.b64encode(file.getvalue()).decode()
 
 
 def _names(place: str) -> Iterator[str]:
