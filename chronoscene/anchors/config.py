@@ -97,6 +97,9 @@ class AnchorConfig(SplattingConfig):
     """Of the MLP that gives scales and rotations."""
     color_lr: tuple[float, float] = (0.008, 0.00005)
     """Of the MLP that gives colours."""
+    cooldown: float = 0.0
+    """Share of the training, its last, in which all learning rates fall further, to a tenth of what
+    they would be: the model settles. Not in the papers."""
 
     # Growth and pruning
     statistics_from: float = 500 / 40_000
@@ -205,6 +208,7 @@ _LOWER_BOUNDS: dict[str, float] = {
     "hidden_dim": 0,
     "density_interval": 1,
     "coarse_until": 0.0,
+    "cooldown": 0.0,
     "coarse_factor": 1,
     "growth_levels": 0,
     "coarsest_cell": 1,

@@ -46,6 +46,7 @@ from chronoscene.training.splatting import (
 
 AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]
 
+_COOLED = 0.1  # Factor of the learning rates at the end of a cooldown
 _MARGIN = 1e-9
 """Shares of the training this close are equal: progress is a quotient of rounded numbers."""
 
@@ -321,6 +322,9 @@ class AnchorTrainer:
         """Adam. After a round only the MLPs and global features move, as in the official code,
         where the anchors then have new tensors without gradients."""
         rates = {name: log_linear(done, *rate) for name, rate in self.rates.items()}
+        if cooldown := self.config.cooldown:
+            factor = log_linear(1.0 - (1.0 - done) / cooldown, 1.0, _COOLED)
+            rates = {name: rate * factor for name, rate in rates.items()}
         self.optimizer.step(rates)
         self.exposure.step(done)
         if not resized:

@@ -27,6 +27,7 @@ def test_the_paper_preset_is_what_the_official_code_does() -> None:
     assert (config.base_dim, config.period_dim, config.global_dim) == (16, 16, 32)
     assert (config.voxel_size, config.voxel_unit) == (0.001, "world")
     assert (config.direction_noise, config.feature_decay, config.head_decay) == (0, 0, 0)
+    assert (config.antialiased, config.cooldown) == (False, 0)
     assert config.density_from * config.iterations == 1_500
     assert config.statistics_from * config.iterations == 500
 

@@ -59,10 +59,11 @@ def test_learning_rates_at_start_middle_and_end(method: Make) -> None:
     assert set(rates) == trained
 
 
+@pytest.mark.parametrize("cooldown", [0.0, 0.25])
 def test_learning_rates_follow_the_share_that_is_done(
-    method: Make, monkeypatch: pytest.MonkeyPatch
+    method: Make, monkeypatch: pytest.MonkeyPatch, cooldown: float
 ) -> None:
-    made = method()
+    made = method(cooldown=cooldown)
     trainer = made.trainer
     assert trainer is not None
     optimizer, table = trainer.optimizer, trainer.tables["offsets"]
@@ -72,9 +73,11 @@ def test_learning_rates_follow_the_share_that_is_done(
     monkeypatch.setattr(table, "step", lambda rate: (taken.update(offsets=rate), table_step(rate)))
     for index in range(40):
         made.step(index, index / 40)
+        done = (index + 1) / 40
+        factor = 0.1 ** max((done - 0.75) / 0.25, 0.0) if cooldown else 1.0
         for name in ("opacity.w1", "offsets", "global_features"):
             start, end = made.rates(1.1)[name]
-            assert taken[name] == pytest.approx(start * (end / start) ** ((index + 1) / 40)), index
+            assert taken[name] == pytest.approx(start * (end / start) ** done * factor), index
 
 
 def rounds(config: ChronoGSConfig, train_set: TrainingSet, total: int) -> list[int]:
