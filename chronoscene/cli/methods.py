@@ -56,26 +56,25 @@ def list_methods() -> None:
     """Print a table of all installed methods, and one of other programs."""
     console = Console()
     table = Table(title="Methods")
-    for column in ("name", "title", "period input", "presets", "paper"):
+    for column in ("name", "title", "period input", "presets"):
         table.add_column(column, no_wrap=column == "name")
     for name in method_names():
         spec = load_spec(name)
-        table.add_row(
-            name, spec.title, spec.period_input, ", ".join(sorted(spec.presets)), spec.paper
-        )
+        table.add_row(name, spec.title, spec.period_input, ", ".join(sorted(spec.presets)))
     console.print(table)
     if programs := method_names(PROGRAM_GROUP):
         console.print(_program_table(programs))
+    console.print("chronoscene methods NAME describes one: paper, licence, options, costs.")
 
 
 def _program_table(names: tuple[str, ...]) -> Table:
     """Methods that are other programs, which are installed on their own."""
     table = Table(title="External programs, installed apart from ChronoScene")
-    for column in ("name", "title", "period input", "tested", "paper"):
+    for column in ("name", "title", "period input", "tested"):
         table.add_column(column, no_wrap=column == "name")
     for spec in map(load_spec, names):
         tested = spec.runner.tested if spec.runner else ""
-        table.add_row(spec.name, spec.title, spec.period_input, tested, spec.paper)
+        table.add_row(spec.name, spec.title, spec.period_input, tested)
     return table
 
 
