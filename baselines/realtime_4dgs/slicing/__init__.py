@@ -56,8 +56,8 @@ def slice_at(
         mean = mu + v dt, covariance = Y Y^T with Y = X - v tau, opacity = sigmoid(o) w
         coefficients = sh + sum_k cos(2 pi k dt / cycle) waves[k]
 
-    A Gaussian with a w of 0.05 or less is transparent, and has no gradient but in its mean and in
-    its constant colours. Differentiable in all groups. On the CPU equal bits for any number of
+    A Gaussian with a w of 0.05 or less is transparent, and only its mean and its constant colours
+    have a gradient. Differentiable in all groups. On the CPU equal bits for any number of
     threads.
 
     Args:
