@@ -37,7 +37,9 @@ class Realtime4DGS(GaussianMethod):
     ) -> SpacetimeModel:
         seen = train.point_periods[finite_rows(train.points)]
         parameters = start_in_time(parameters, seen, self.config, seed)
-        return SpacetimeModel(parameters, periods=train.num_periods, cycle=self.config.wave_cycle)
+        return SpacetimeModel(
+            parameters, periods=train.num_periods, cycle=self.config.wave_cycle, order=0
+        )
 
     def extended_model(self, train: TrainingSet) -> SpacetimeModel:
         """The same model: a new period comes as long after the last one as that after the first."""

@@ -7,6 +7,7 @@ from baselines.realtime_4dgs.model import SpacetimeModel, scatter_in_spacetime
 from baselines.realtime_4dgs.slicing import ORDERS
 from chronoscene.gaussians.trainer import GaussianTrainer
 from chronoscene.methods import StepReport
+from chronoscene.training.checkpoint import TrainingState
 
 
 class SpacetimeTrainer(GaussianTrainer):
@@ -19,5 +20,16 @@ class SpacetimeTrainer(GaussianTrainer):
     def step(self, index: int, progress: float) -> StepReport:
         config, moment = self.config, self.timeline.moment(progress)
         begin = config.sh_degree * config.sh_interval
-        self.model.order = min(max(moment - begin, 0) // config.wave_interval, ORDERS)
+        due = min(max(moment - begin, 0) // config.wave_interval, ORDERS)
+        # Higher than what is due at the start of a training that goes on with a model.
+        self.model.order = max(due, self.model.order)
         return super().step(index, progress)
+
+    def state(self) -> TrainingState:
+        state = super().state()
+        state.values["order"] = self.model.order
+        return state
+
+    def load_state(self, state: TrainingState) -> None:
+        super().load_state(state)
+        self.model.order = state.values["order"]

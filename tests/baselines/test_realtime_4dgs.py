@@ -196,6 +196,19 @@ def test_waves_of_colours_come_in_after_the_spherical_harmonics() -> None:
     assert int(method.trainer.optimizer.state()["waves_rest.steps"]) == 4
 
 
+def test_waves_stay_in_use_where_a_training_is_resumed_or_extended(tmp_path: Path) -> None:
+    scene = moving_scene(arc)
+    methods = [started(scene, config()) for _ in range(2)]
+    assert [method.model.order for method in methods] == [0, 0]
+    methods[0].step(0, 0.5)
+    methods[0].save_training(tmp_path)
+    methods[1].load_training(tmp_path)
+    assert [method.model.order for method in methods] == [2, 2]
+    methods[1].extend(scene)
+    methods[1].step(0, 0.0)
+    assert methods[1].model.order == 2
+
+
 def test_a_colour_of_the_first_period_is_that_of_the_last_where_a_wave_is_as_long() -> None:
     """As in the released code; with waves of twice the length they differ."""
     for cycle, alike in ((1.0, True), (2.0, False)):
