@@ -41,7 +41,7 @@ def modules() -> dict[str, Path]:
     """All modules by name; those of the example for methods are a package of its own."""
     found = {}
     for package in ("chronoscene", "chronogs", "baselines", "leaderboard"):
-        for path in set((ROOT / package).rglob("*.py")) - SKELETON:
+        for path in sorted({*(ROOT / package).rglob("*.py")} - SKELETON):
             parts = path.relative_to(ROOT).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return found
