@@ -153,7 +153,7 @@ def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> Data
 
     if not records:
         return pd.DataFrame(columns=[*ENTRY_COLUMNS, "label", "rank", "devices"])
-    runs = _labelled(records).sort_values("seed", kind="stable")
+    runs = labelled(records).sort_values("seed", kind="stable")
     in_group = runs.groupby(["scene", "label"], sort=False)
     groups = in_group[["method", "strategy", "preset", "variant", "config_hash", "views"]].first()
     groups["runs"] = in_group.size()
@@ -285,8 +285,8 @@ def published_entries(table: PublishedTable, scenes: Iterable[str]) -> DataFrame
     return compared(with_texts(entries))
 
 
-def _labelled(records: Sequence[RunRecord]) -> DataFrame:
-    """What tells runs apart, one row per record."""
+def labelled(records: Sequence[RunRecord]) -> DataFrame:
+    """What tells runs apart, one row per record; ``label`` is how tables call each."""
     import pandas as pd
 
     fields = ("scene", "method", "strategy", "preset", "variant", "config_hash", "seed", "device")

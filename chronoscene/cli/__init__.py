@@ -15,6 +15,7 @@ from chronoscene.io.staging import disk_full
 COMMANDS = {
     "bench": "chronoscene.cli.bench:command",
     "check-method": "chronoscene.cli.check_method:check",
+    "compare": "chronoscene.cli.compare:command",
     "convert": "chronoscene.cli.convert:command",
     "doctor": "chronoscene.cli.doctor:command",
     "download": "chronoscene.cli.download:command",

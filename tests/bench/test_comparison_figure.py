@@ -12,6 +12,7 @@ from chronoscene.bench.comparison_figure import (
     first_seeds,
     mean_error,
     period_title,
+    where_methods_differ,
 )
 from chronoscene.bench.predictions import (
     ImageWriter,
@@ -79,11 +80,49 @@ def test_what_a_mask_ignores_is_neither_error_nor_psnr(tmp_path):
         writer.close(kind="predictions", scene="s", scene_hash="h", details={})
     entries = {entry.view: entry for entry in read_manifest(tmp_path / "p").images}
     for entry, label in zip(read_manifest(tmp_path / "t").images, ("13.98", "not"), strict=True):
-        axes = Figure().subplots(1, 2)
+        axes = Figure().subplots(1, 2, squeeze=False)
         column = Column("", tmp_path / "p", entries)
         shown = _draw_row(axes, tmp_path / "t", entry, [column], {}, errors=True)
-        assert axes[1].get_xlabel().startswith(label)
+        assert axes[0, 1].get_xlabel().startswith(label)
         drawn = np.ma.filled(shown.get_array().astype(float), np.nan)
         if label != "not":
             np.testing.assert_allclose(drawn[mask], 0.2)
         assert np.isnan(drawn[~mask]).all()
+
+
+def test_what_is_enlarged_is_where_methods_differ():
+    both, one = np.zeros((2, 40, 60))
+    both[0:10, 0:15] = 0.9  # what all methods get wrong tells them apart nowhere
+    one[22:28, 31:37] = 0.2
+    rows, columns = where_methods_differ([both, both + one, both])
+    assert (rows.stop - rows.start, columns.stop - columns.start) == (10, 15)
+    assert rows.start <= 22 and rows.stop >= 28 and columns.start <= 31 and columns.stop >= 37
+    masked = np.where(one > 0, np.nan, both)
+    assert where_methods_differ([masked + one / 2]) == (slice(0, 10), slice(0, 15))
+    assert where_methods_differ([np.zeros((1, 3))]) == (slice(0, 1), slice(0, 1))
+    far = np.zeros((40, 60))
+    far[-1, -1] = 1
+    assert where_methods_differ([far, both * 0]) == (slice(30, 40), slice(45, 60))
+
+
+def test_the_window_is_enlarged_below_each_image(tmp_path):
+    rng = np.random.default_rng(0)
+    photo = rng.integers(0, 256, (24, 32, 3), dtype=np.uint8)
+    wrong = photo.copy()
+    wrong[6:12, 8:16] //= 2
+    columns = []
+    for name, pixels in (("t", photo), ("good", photo), ("bad", wrong)):
+        writer = ImageWriter(tmp_path / name)
+        writer.add("v", pixels, camera_period=0, rendered_period=0)
+        writer.close(kind="predictions", scene="s", scene_hash="h", details={})
+        entries = {entry.view: entry for entry in read_manifest(tmp_path / name).images}
+        columns.append(Column(name, tmp_path / name, entries))
+    (entry,) = columns[0].entries.values()
+    axes = Figure().subplots(2, 3)
+    _draw_row(axes, tmp_path / "t", entry, columns[1:], {}, errors=False)
+    for column, pixels in zip(axes.T, (photo, photo, wrong), strict=True):
+        full, enlarged = (axis.get_images()[0].get_array() for axis in column)
+        np.testing.assert_array_equal(full, pixels)
+        np.testing.assert_array_equal(enlarged, pixels[6:12, 8:16])
+        (frame,) = column[0].patches
+        assert (*frame.get_xy(), frame.get_width(), frame.get_height()) == (7.5, 5.5, 8, 6)
