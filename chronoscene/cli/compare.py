@@ -51,7 +51,7 @@ def command(
     """Show where the methods of the finished runs in RUNS differ.
 
     Writes RUNS/figures: photos and predictions side by side, the window in which methods differ
-    most enlarged, and error maps on one scale. Prints the test views that the methods do worst.
+    most enlarged, and error maps on one scale. Prints the test views that they reproduce worst.
     """
     check_file("--out", out)
     check_file("--html", html)
