@@ -16,6 +16,19 @@ _SHORT: dict[str, Any] = {
 """For thousands of steps instead of tens of thousands. The voxel follows the sparse cloud, so the
 unit of the scene does not matter."""
 
+_LEAN: dict[str, Any] = _SHORT | {
+    "offsets_per_anchor": 5,
+    "base_dim": 28,
+    "period_dim": 4,
+    "unused_share": 0.06,
+    "antialiased": True,
+    "feature_lr": (0.015, 0.0075),
+    "opacity_lr": (0.004, 0.0004),
+    "color_lr": (0.008, 0.0005),
+    "cooldown": 0.2,
+}
+"""Less than half of the numbers: docs/what-a-scene-requires.md has the trials."""
+
 _TEXT: dict[str, Any] = {
     "fusion": "sum",
     "base_dim": 32,
@@ -50,6 +63,7 @@ SPEC = MethodSpec(
         "paper-text": _TEXT,
         "fast": _SHORT | {"iterations": 1_000, "density_interval": 40, "offsets_per_anchor": 5},
         "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
+        "lean": _LEAN | {"iterations": 3_000, "density_interval": 50},
         "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
     },
     resumable=True,
