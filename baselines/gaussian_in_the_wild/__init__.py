@@ -9,7 +9,6 @@ from chronoscene.methods import MethodSpec
 _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousands
     "length_unit": "training",
     "stretch": True,
-    "gradient_threshold": 0.0002,
     "sh_dc_lr": 2.5e-3,
     "sh_rest_lr": 1.25e-3,
     "encoder": "small",
