@@ -1,6 +1,8 @@
 # make demo    a scene, its checks and a benchmark of four methods, from nothing
 # make test    lint, types and tests, from nothing
 # make lint    lint and types alone
+# make leaderboard  a site of the measured entries, in build/leaderboard; RUNS names folders of
+#              runs, whose pictures go with them
 # make clean   remove what demo and tools wrote; distclean also removes the environment
 
 PYTHON ?= python3
@@ -18,7 +20,7 @@ DEMO := demo
 DEMO_METHODS := chronogs,scaffold-gs,3dgs,4dgs
 DEMO_BUDGET := 90s
 
-.PHONY: demo test lint clean distclean open3d-libraries
+.PHONY: demo leaderboard test lint clean distclean open3d-libraries
 
 demo: $(DEMO)/.scene
 	$(BIN)/chronoscene validate $(DEMO)/scene
@@ -34,6 +36,13 @@ $(DEMO)/.scene: | $(READY)
 	mkdir -p $(DEMO)
 	$(BIN)/chronoscene synth $(DEMO)/scene --preset demo
 	touch $@
+
+SITE := build/leaderboard
+RUNS ?= $(wildcard $(DEMO)/runs)
+
+leaderboard: $(READY)
+	rm -rf $(SITE)
+	$(BIN)/chronoscene leaderboard leaderboard/entries/measured --out $(SITE) $(RUNS:%=--runs %)
 
 test: lint
 	$(BIN)/python -m pytest -q --numprocesses auto --dist worksteal

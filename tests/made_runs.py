@@ -1,8 +1,12 @@
 """Runs that nobody trained, for tests of what is made of runs."""
 
+from pathlib import Path
+from zlib import crc32
+
 import numpy as np
 
-from chronoscene.bench.results import Row, RunRecord
+from chronoscene.bench.predictions import ImageWriter, ground_truth_folder
+from chronoscene.bench.results import PREDICTIONS, Row, RunRecord, write_run
 from chronoscene.bench.scoring import aggregate
 
 
@@ -60,6 +64,30 @@ def scored(method="chronogs", seed=0, *, psnr, **changes):
     aggregates, periods = aggregate(rows)
     own = {"rows": rows, "aggregates": aggregates, "periods": periods}
     return record(method, seed, **own | changes)
+
+
+def write_scored(
+    runs: Path, method="3dgs", seed=0, *, psnr=((20.0, 21.0, 22.0), (24.0, 25.0, 26.0)), **changes
+) -> Path:
+    """A folder of such a run, with predictions and ground truth of noise."""
+    hashes = {"scene_hash": "a" * 64, "split_hash": "b" * 64}
+    hashes["config_hash"] = format(crc32(method.encode()), "064x")
+    run = scored(method, seed, psnr=psnr, **hashes | changes)
+    folder = runs / run.scene / f"{method}-joint-fast" / f"seed{seed}"
+    places = {"ground truth": ground_truth_folder(runs, run.scene)}
+    places["predictions"] = folder / PREDICTIONS
+    for kind, place in places.items():
+        if kind == "ground truth" and place.exists():
+            continue
+        rng = np.random.default_rng(crc32(f"{kind} {method} {seed}".encode()))
+        writer = ImageWriter(place)
+        for row in run.rows:
+            pixels = rng.integers(0, 256, (6, 8, 3), dtype=np.uint8)
+            period = row.camera_period
+            writer.add(row.view, pixels, camera_period=period, rendered_period=period)
+        writer.close(kind=kind, scene=run.scene, scene_hash=hashes["scene_hash"], details={})
+    write_run(folder, run, run.rows)
+    return folder
 
 
 def smooth(rng, shape, correlation=0.3):

@@ -11,8 +11,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 LAYERS = (
-    ("leaderboard", "chronogs", "baselines", "chronoscene.__main__"),
+    ("chronogs", "baselines", "chronoscene.__main__"),
     ("chronoscene.cli",),
+    ("leaderboard",),
     ("chronoscene.bench", "chronoscene.registration", "chronoscene.figures", "chronoscene.synth"),
     ("chronoscene.stats", "chronoscene.validation", "chronoscene.download"),
     ("chronoscene.anchors", "chronoscene.gaussians"),

@@ -24,3 +24,21 @@ def test_means_by_group():
 def test_unknown_method_is_an_error():
     with pytest.raises(KeyError, match="nerf"):
         load_published().mean("nerf", "psnr")
+
+
+def test_all_tables_of_the_paper_are_there():
+    table = load_published()
+    ids = ("counts", "per_period_training", "ablation_components", "ablation_d_g", "ablation_d_v")
+    ids += ("ablation_d_b", "ablation_init", "wat", "cl_splats_real", "five_pointz")
+    assert [further.id for further in table.tables] == [*ids, "hyperparameters"]
+    assert len(table.inconsistencies) == 18
+    counts = table.tables[0]
+    scenes = [row for row in counts.rows if row[2] == "all" and row[0] != "all"]
+    # The printed totals are in the last row.
+    assert [sum(row[i] for row in scenes) for i in (3, 4)] == [*counts.rows[-1][3:]]
+
+
+def test_methods_have_ids_of_their_own():
+    table = load_published()
+    assert {row.method for row in table.rows} <= table.methods.keys()
+    assert len({*table.methods.values()}) == len(table.methods) == 17

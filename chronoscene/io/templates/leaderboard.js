@@ -1,0 +1,55 @@
+for (const button of document.querySelectorAll(".sort")) {
+  button.addEventListener("click", () => {
+    const head = button.closest("th"), table = head.closest("table"), column = head.cellIndex;
+    const best = head.matches(".name") || button.dataset.lower ? "ascending" : "descending";
+    const before = head.getAttribute("aria-sort");
+    const order = before === best ? (best === "ascending" ? "descending" : "ascending") : best;
+    for (const other of table.querySelectorAll("thead th")) other.removeAttribute("aria-sort");
+    head.setAttribute("aria-sort", order);
+    const sign = order === "ascending" ? 1 : -1;
+    // Published rows have a body of their own, and stay below the measured ones.
+    for (const body of table.tBodies) {
+      const rows = [...body.rows].filter((row) => !row.matches(".kind"));
+      const key = (row) => row.cells[column].dataset.value;
+      rows.sort((a, b) => {
+        if (head.matches(".name")) {
+          return sign * a.cells[column].textContent.localeCompare(b.cells[column].textContent);
+        }
+        const [x, y] = [key(a), key(b)];
+        if (x === undefined || y === undefined) return (x === undefined) - (y === undefined);
+        return sign * (x - y);
+      });
+      body.append(...rows);
+    }
+  });
+}
+
+const compare = document.querySelector("#compare");
+if (compare) {
+  const get = (id) => document.getElementById(id);
+  const pictures = JSON.parse(get("pictures").textContent);
+  const stack = compare.querySelector(".stack");
+  const show = () => {
+    const period = Number(get("period").value);
+    const shown = pictures.views[Number(get("view").value)][period];
+    get("truth").src = shown.truth;
+    get("prediction").src = shown.predictions[Number(get("method").value)];
+    get("which").textContent = pictures.periods[period];
+    get("period").setAttribute("aria-valuetext", pictures.periods[period]);
+    get("name").textContent = shown.view;
+  };
+  const cut = () => stack.style.setProperty("--cut", `${get("cut").value}%`);
+  const drag = (event) => {
+    if (event.type === "pointermove" && !event.buttons) return;
+    const box = stack.getBoundingClientRect();
+    get("cut").value = 100 * (event.clientX - box.left) / box.width;
+    cut();
+  };
+  for (const id of ["period", "view", "method"]) get(id).addEventListener("input", show);
+  get("cut").addEventListener("input", cut);
+  stack.addEventListener("pointerdown", drag);
+  stack.addEventListener("pointermove", drag);
+  stack.addEventListener("dragstart", (event) => event.preventDefault());
+  show();  // a browser that goes back keeps what was chosen
+  cut();
+}

@@ -1,0 +1,110 @@
+"""Pictures of the test views for the site, from the runs that entries were made of."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.bench.predictions import ImageEntry, ground_truth_folder, load_image, read_manifest
+from chronoscene.bench.results import PREDICTIONS, RunRecord, read_run, run_folders
+from chronoscene.formats.shared.grouping import natural_key
+from leaderboard.entries import Entry, EntryRun
+
+VIEWS = 3
+"""Of each period, spread over its test views."""
+WIDTH = 640
+"""In pixels, at most."""
+QUALITY = 82
+
+
+def find_runs(folders: Iterable[Path], entries: Iterable[Entry]) -> dict[Path, EntryRun]:
+    """Folders of runs whose predictions are those of an entry, of the first seed of each entry."""
+    wanted = {hashes_of(entry.runs[0]): entry.runs[0] for entry in entries}
+    found = {}
+    for run in (run for folder in folders for run in run_folders(folder)):
+        images = read_manifest(run / PREDICTIONS).images
+        hashes = frozenset(
+            (i.view, i.sha256) for i in images if i.rendered_period == i.camera_period
+        )
+        if (entry := wanted.get(hashes)) is not None and _same(entry.record, read_run(run)):
+            found[run] = entry
+    return found
+
+
+def hashes_of(run: EntryRun) -> frozenset[tuple[str, str]]:
+    """The predictions that were scored."""
+    return frozenset((view.view, view.sha256) for view in run.views)
+
+
+def _same(first: RunRecord, second: RunRecord) -> bool:
+    return (first.scene_hash, first.config_hash) == (second.scene_hash, second.config_hash)
+
+
+def gallery(runs: Mapping[Path, str], folder: Path, place: str) -> dict[str, Any]:
+    """Copy pictures of a scene, and say what they show.
+
+    Args:
+        runs: Folder of each run, and the label of its method.
+        folder: Where the pictures go; made.
+        place: That folder as the page names it.
+
+    Returns:
+        ``labels`` of the methods; ``views``: for each place on the list of views, one mapping per
+        period with ``view``, ``truth`` and ``predictions``, which are names of files.
+
+    Raises:
+        CheckpointError: If an image is not the one that its manifest lists.
+    """
+    first = next(iter(runs))
+    record = read_run(first)
+    truth = ground_truth_folder(first.parents[2], record.scene)
+    photos = {image.view: image for image in read_manifest(truth).images}
+    images = {run: {i.view: i for i in _own(run / PREDICTIONS)} for run in runs}
+    periods = sorted(map(int, record.periods))
+    folder.mkdir(parents=True)
+
+    def picture(source: Path, image: ImageEntry, name: str) -> str:
+        _write(load_image(source, image), folder / f"{name}.webp")
+        return f"{place}/{name}.webp"
+
+    views = []
+    for k in range(VIEWS):
+        of_periods = []
+        for period in periods:
+            names = [i.view for i in images[first].values() if i.camera_period == period]
+            names = sorted(names, key=natural_key)
+            view = names[k * len(names) // VIEWS]
+            of_periods.append(
+                {
+                    "view": view,
+                    "truth": picture(truth, photos[view], f"{k}-{period}"),
+                    "predictions": [
+                        picture(run / PREDICTIONS, images[run][view], f"{k}-{period}-{j}")
+                        for j, run in enumerate(runs)
+                    ],
+                }
+            )
+        views.append(of_periods)
+    return {
+        "labels": [*runs.values()],
+        "periods": [record.period_labels[str(period)] for period in periods],
+        "views": views,
+    }
+
+
+def _own(predictions: Path) -> list[ImageEntry]:
+    """Images of the period in which their camera stood."""
+    images = read_manifest(predictions).images
+    return [i for i in images if i.rendered_period == i.camera_period]
+
+
+def _write(rgb: NDArray[np.uint8], path: Path) -> None:
+    from PIL import Image
+
+    image = Image.fromarray(rgb)
+    image.thumbnail((WIDTH, WIDTH))
+    image.save(path, "WEBP", quality=QUALITY)

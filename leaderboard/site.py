@@ -1,0 +1,329 @@
+"""A static site of measured and published results, which needs no server."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from markupsafe import Markup
+
+from chronoscene.bench.results import RunRecord
+from chronoscene.bench.summary import (
+    PAPER_METRICS,
+    SIZE,
+    in_unit,
+    metric_names,
+    published_entries,
+    summarise,
+)
+from chronoscene.io.pages import render_page
+from chronoscene.io.staging import staged_folder
+from chronoscene.methods import MethodSpec, installed_methods, load_spec
+from chronoscene.metrics.registry import metric_info
+from leaderboard.entries import Entry
+from leaderboard.groups import Setting, comparable, effort_of, setting_of
+from leaderboard.pareto import Point, plot
+from leaderboard.pictures import find_runs, gallery
+from leaderboard.published import PublishedTable
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+OTHER_SCENES = "Other scenes"
+PARTS = {"real": "Real scenes of the paper", "synthetic": "Synthetic scenes of the paper"}
+COSTS = {"seconds": "training [s]", SIZE: "size [MB]", "peak_memory_bytes": "memory [MB]"}
+
+
+def write_site(
+    entries: Sequence[Entry], published: PublishedTable, out: Path, runs: Iterable[Path] = ()
+) -> int:
+    """Write the site.
+
+    Args:
+        entries: What was measured.
+        published: What a paper printed, to stand beside it.
+        out: A new or empty folder.
+        runs: Folders of runs, for the pictures of the entries that were made of them.
+
+    Returns:
+        How many entries have pictures.
+
+    Raises:
+        SceneError: If ``out`` has content.
+        CheckpointError: If an image of a run is not the one that its manifest lists.
+    """
+    pictured = find_runs(runs, entries)
+    with staged_folder(out) as staged:
+        _Site(entries, published, staged).write({r: e.record for r, e in pictured.items()})
+    return len(pictured)
+
+
+class _Site:
+    """All pages; methods and scenes have a name for their files each."""
+
+    def __init__(self, entries: Sequence[Entry], published: PublishedTable, folder: Path) -> None:
+        self.published, self.folder = published, folder
+        self.records = [record for entry in entries for record in entry.records]
+        printed = published_entries(published, dict.fromkeys(row.scene for row in published.rows))
+        self.printed = printed.assign(method=printed.method.map(published.methods))
+        self.parts = {row.scene: row.group for row in published.rows}
+        names = {scene.casefold(): scene for scene in self.parts}
+        self.scene_of = {r.scene: names.get(r.scene.casefold(), r.scene) for r in self.records}
+        scenes = dict.fromkeys([*self.scene_of.values(), *self.parts])
+        self.scenes = _file_names(scenes)
+        methods = dict.fromkeys([*(r.method for r in self.records), *published.methods.values()])
+        self.methods = _file_names(methods)
+
+    def write(self, pictured: dict[Path, RunRecord]) -> None:
+        """Write everything."""
+        for kind in ("scene", "method"):
+            (self.folder / kind).mkdir()
+        self._page("index", "index.html", parts=[*self._parts()])
+        self._page("published", "published.html")
+        for scene, file in self.scenes.items():
+            found = {run: r for run, r in pictured.items() if self.scene_of[r.scene] == scene}
+            found = dict(sorted(found.items(), key=_worst_last))
+            views = [setting_of(r)[:-1] for r in found.values()]  # of one scene, split and width
+            runs = {run: _label(r) for run, r in found.items() if setting_of(r)[:-1] == views[0]}
+            pictures = None
+            if runs:
+                place = self.folder / "images" / file.removesuffix(".html")
+                pictures = gallery(runs, place, f"../images/{place.name}")
+            self._scene_page(scene, file, pictures)
+        for method, file in self.methods.items():
+            self._method_page(method, file)
+
+    def _page(self, template: str, file: str, **values: Any) -> None:
+        page = render_page(
+            f"leaderboard_{template}", site=self, root="../" if "/" in file else "", **values
+        )
+        (self.folder / file).write_text(page + "\n", encoding="utf-8", newline="\n")
+
+    def title_of(self, method: str) -> str:
+        """Name of a method in tables."""
+        printed = {name: title for title, name in self.published.methods.items()}
+        measured = {record.method: record.title for record in self.records}
+        return measured.get(method) or printed.get(method, method)
+
+    def _parts(self) -> Iterator[dict[str, Any]]:
+        """Tables of the first page: PSNR of methods by scenes, one per part of a dataset."""
+        groups = dict.fromkeys([*(self.parts.get(s, "") for s in self.scenes)])
+        for group in sorted(groups):  # other scenes, which were measured, come first
+            scenes = [scene for scene in self.scenes if self.parts.get(scene, "") == group]
+            measured: dict[tuple[str, str, str], dict[str, Any]] = {}
+            for setting, _, part in self._groups(scenes):
+                for row in part[(part.quantity == "psnr") & (part.column == "macro")].itertuples():
+                    cells = measured.setdefault((row.method, row.label, setting.effort), {})
+                    cells[self.scene_of[setting.scene]] = _cell(row)
+            printed: dict[str, dict[str, Any]] = {}
+            psnr = self.printed[self.printed.quantity == "psnr"]
+            for row in psnr[psnr.scene.isin(scenes)].itertuples():
+                printed.setdefault(row.method, {})[row.scene] = _cell(row)
+            yield {
+                "title": PARTS.get(group, group) or OTHER_SCENES,
+                "scenes": scenes,
+                "measured": [
+                    {"method": m, "label": label, "effort": effort, "cells": cells}
+                    for (m, label, effort), cells in sorted(measured.items(), key=_falling)
+                ],
+                "published": printed,
+            }
+
+    def _groups(
+        self, scenes: Iterable[str]
+    ) -> Iterator[tuple[Setting, list[RunRecord], DataFrame]]:
+        """What was measured on some scenes in each setting: runs, and their summary."""
+        chosen = [r for r in self.records if self.scene_of[r.scene] in {*scenes}]
+        for setting, runs in comparable(chosen).items():
+            yield setting, runs, summarise(runs)
+
+    def _scene_page(self, scene: str, file: str, pictures: dict[str, Any] | None) -> None:
+        printed = self.printed[self.printed.scene == scene]
+        groups = [_group(*group, printed) for group in self._groups([scene])]
+        if not groups:
+            columns = [(name, "macro", metric_info(name).title) for name in PAPER_METRICS]
+            columns.append((SIZE, "", COSTS[SIZE]))
+            groups = [_table(columns, printed[:0], printed)]
+        self._page(
+            "scene",
+            f"scene/{file}",
+            scene=scene,
+            groups=groups,
+            pictures=pictures,
+            data=pictures and Markup(json.dumps(pictures).replace("<", "\\u003c")),
+        )
+
+    def _method_page(self, method: str, file: str) -> None:
+        printed = self.printed[self.printed.method == method]
+        of_paper = dict(printed.query("quantity == 'psnr'")[["scene", "mean"]].to_numpy())
+        measured: list[dict[str, Any]] = []
+        for record in {setting_of(r): r for r in self.records if r.method == method}.values():
+            measured += self._measured(record, of_paper)
+        names = {name for name, value in self.published.methods.items() if value == method}
+        tables = [
+            {"title": table.title, "columns": table.columns, "rows": rows}
+            for table in self.published.tables
+            if (rows := [row for row in table.rows if row[0] in names])
+        ]
+        columns = [(name, "macro", metric_info(name).title) for name in PAPER_METRICS]
+        columns.append((SIZE, "", COSTS[SIZE]))
+        self._page(
+            "method",
+            f"method/{file}",
+            method=method,
+            spec=spec_of(method),
+            measured=measured,
+            columns=[title for _, _, title in columns],
+            printed=_rows(printed, columns, by="scene"),
+            repeated=len({self.scene_of[m["scene"]] for m in measured} & of_paper.keys()),
+            tables=tables,
+        )
+
+    def _measured(self, like: RunRecord, of_paper: dict[str, float]) -> Iterator[dict[str, Any]]:
+        """What a method reached in a setting, a row for each variant.
+
+        Args:
+            like: One of the runs.
+            of_paper: PSNR that was printed, by scene.
+        """
+        setting = setting_of(like)
+        runs = [r for r in self.records if setting_of(r) == setting and r.method == like.method]
+        part = summarise(runs)
+        for row in part.query("quantity == 'psnr' and column == 'macro'").itertuples():
+            printed = of_paper.get(self.scene_of[like.scene])
+            run = next(r for r in runs if r.config_hash == row.config_hash)
+            yield {
+                "scene": like.scene,
+                "label": row.label,
+                "effort": setting.effort,
+                "cell": {**_cell(row), "best": False, "tied": False},
+                "difference": "" if printed is None else f"{row.mean - printed:+.2f}",
+                "seeds": row.seeds,
+                "command": command_of(run),
+            }
+
+
+def spec_of(method: str) -> MethodSpec | None:
+    """The spec of an installed method; nothing that an entry names is imported."""
+    return load_spec(method) if method in installed_methods() else None
+
+
+def command_of(run: RunRecord) -> str:
+    """The command that makes such a run again."""
+    words = ["chronoscene", "bench", "SCENE", "--method", run.method, "--strategy", run.strategy]
+    words += ["--preset", run.preset, "--seed", str(run.seed)]
+    for part in filter(None, run.variant.split(",")):
+        name, _, value = part.partition("=")
+        words += [f"--{name}", value] if name in ("budget", "iterations") else ["--set", part]
+    return shlex.join(words)
+
+
+Column = tuple[str, str, str]
+"""Quantity and column of `summarise`, and the title."""
+
+
+def _group(
+    setting: Setting, runs: Sequence[RunRecord], part: DataFrame, printed: DataFrame
+) -> dict[str, Any]:
+    """Table and plots of runs that may stand side by side."""
+    labels = runs[0].period_labels
+    periods = sorted({i for run in runs for i in run.periods}, key=int)
+    names = metric_names(runs)
+    quality, *others = [name for name in PAPER_METRICS if name in names] or names
+    columns = [
+        (quality, "macro", metric_info(quality).title),
+        *((quality, f"period {i}", labels[i]) for i in periods),
+        *((name, "macro", metric_info(name).title) for name in others),
+        *((name, "", title) for name, title in COSTS.items()),
+    ]
+    means = part[(part.quantity == quality) & (part.column == "macro")].set_index("label")
+    plots = []
+    for name, cost in (("seconds", "training time [s]"), (SIZE, "size of the model [MB]")):
+        costs = part[part.quantity == name].set_index("label")["mean"]
+        points = [
+            Point(label.partition(" (")[0], float(in_unit(name, costs[label])), value)
+            for label, value in means["mean"].items()
+            if label in costs
+        ]
+        plots.append(plot(points, cost=cost, quality=metric_info(quality).title))
+    return {
+        **_table(columns, part, printed),
+        "setting": setting,
+        "plots": [p for p in plots if p is not None],
+        "devices": list(dict.fromkeys(run.device for run in runs)),
+        "commits": list(dict.fromkeys(run.commit[:10] for run in runs)),
+    }
+
+
+def _table(columns: Sequence[Column], measured: DataFrame, printed: DataFrame) -> dict[str, Any]:
+    """A table for the page of a scene."""
+    return {
+        "columns": [title for _, _, title in columns],
+        "lower": [q in COSTS or not metric_info(q).higher_is_better for q, _, _ in columns],
+        "rows": sorted(_rows(measured, columns), key=lambda row: _order(row["cells"][0])),
+        "printed": _rows(printed, columns),
+        "tied": bool(measured.tied.any()),
+    }
+
+
+def _rows(part: DataFrame, columns: Sequence[Column], *, by: str = "label") -> list[dict[str, Any]]:
+    """Rows of a table, one per label or per scene."""
+    rows = []
+    for name, own in part.groupby(by, sort=False):
+        found = {(row.quantity, row.column): row for row in own.itertuples()}
+        cells = [_cell(found[q, c]) if (q, c) in found else None for q, c, _ in columns]
+        first = own.iloc[0]
+        rows.append({by: name, "method": first.method, "seeds": first.seeds, "cells": cells})
+    return rows
+
+
+def _cell(row: Any) -> dict[str, Any]:
+    """A cell of a table, from a row of `summarise`."""
+    interval = ""
+    if math.isfinite(row.low) and row.column == "macro":
+        interval = f"{in_unit(row.quantity, row.low)} to {in_unit(row.quantity, row.high)}"
+    return {
+        "text": row.text,
+        "value": float(row.mean),
+        "interval": interval,
+        "tied": bool(row.tied),
+        "best": row.rank == 1,
+    }
+
+
+def _order(cell: dict[str, Any] | None) -> float:
+    """Key that sorts the largest first, and what is missing last."""
+    return -cell["value"] if cell else math.inf
+
+
+def _falling(item: tuple[Any, dict[str, Any]]) -> float:
+    """Key that sorts rows of cells by their first."""
+    return _order(next(iter(item[1].values())))
+
+
+def _worst_last(item: tuple[Path, RunRecord]) -> float:
+    """Key that sorts runs by PSNR, where it was computed."""
+    return -item[1].aggregates["macro"].get("psnr", -math.inf)
+
+
+def _label(record: RunRecord) -> str:
+    """A run in the list of pictures."""
+    return f"{record.title} ({record.strategy}, {effort_of(record)})"
+
+
+def _file_names(names: Iterable[str]) -> dict[str, str]:
+    """A file name for each name: plain, and no two alike."""
+    found: dict[str, str] = {}
+    for name in names:
+        plain = re.sub(r"[^a-z0-9]+", "-", name.casefold()).strip("-")[:60] or "x"
+        number, file = 1, f"{plain}.html"
+        while file in found.values():
+            number += 1
+            file = f"{plain}-{number}.html"
+        found[name] = file
+    return found

@@ -1,0 +1,90 @@
+"""Finished runs into measured entries."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from chronoscene.bench.predictions import load_image, read_manifest
+from chronoscene.bench.regions import ALL
+from chronoscene.bench.results import PREDICTIONS, RUN_FILE, read_rows, read_run, run_folders
+from chronoscene.io.staging import write_text_atomic
+from leaderboard.entries import Entry, EntryRun, ScoredView, read_entries, reason_of, refused
+
+
+def submit(folders: Iterable[Path], to: Path) -> list[Path]:
+    """Add runs to the entries of a folder; a run of a seed that is there replaces it.
+
+    Args:
+        folders: Of single runs, or of many.
+        to: Folder of entries; made if there is none.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        CheckpointError: If a run is damaged, or its images are not those that its manifest lists.
+        ConfigError: If a run is not plausible, or an entry that is there is not.
+    """
+    entries = {entry.key: entry for entry in read_entries(to)}
+    changed = {}
+    for folder in (run for given in folders for run in _runs_of(given)):
+        entry = Entry(runs=(entry_run(folder),))
+        if (known := entries.get(entry.key)) is not None:
+            by_seed = {run.record.seed: run for run in (*known.runs, *entry.runs)}
+            entry = Entry(runs=tuple(by_seed[seed] for seed in sorted(by_seed)))
+        entries[entry.key] = changed[entry.key] = entry
+    to.mkdir(parents=True, exist_ok=True)
+    written = []
+    for entry in changed.values():
+        written.append(to / file_name(entry))
+        write_text_atomic(written[-1], entry.model_dump_json(indent=1) + "\n")
+    return written
+
+
+def _runs_of(folder: Path) -> list[Path]:
+    if (folder / RUN_FILE).is_file():
+        return [folder]
+    if not (found := run_folders(folder)):
+        read_run(folder)  # says what is missing
+    return found
+
+
+def entry_run(folder: Path) -> EntryRun:
+    """What an entry holds of a run. Errors as for `submit`."""
+    record = read_run(folder)
+    predictions = folder / PREDICTIONS
+    manifest = read_manifest(predictions)
+    if manifest.scene_hash != record.scene_hash:
+        raise refused(folder, "predictions of another scene")
+    values: dict[str, dict[str, float]] = {}
+    for row in read_rows(folder):
+        if row.region == ALL and row.rendered_period == row.camera_period:
+            values.setdefault(row.view, {})[row.metric] = row.value
+    images = {i.view: i for i in manifest.images if i.rendered_period == i.camera_period}
+    if images.keys() != values.keys():
+        raise refused(folder, "other views in its rows than among its predictions")
+    for image in images.values():
+        load_image(predictions, image)  # checks the hash
+    try:
+        return EntryRun(
+            record=record.model_copy(update={"regions": {}, "stages": {}, "transfer": {}}),
+            views=tuple(
+                ScoredView(view=view, period=i.camera_period, sha256=i.sha256, values=values[view])
+                for view, i in images.items()
+            ),
+        )
+    except ValidationError as error:
+        raise refused(folder, reason_of(error)) from error
+
+
+def file_name(entry: Entry) -> str:
+    """Name of the file of an entry: readable, and of its own."""
+    run = entry.runs[0].record
+    words = "-".join((run.scene, run.method, run.strategy, run.preset))
+    plain = re.sub(r"[^\w.-]+", "_", words)[:100]
+    return f"{plain}-{hashlib.sha256(repr(entry.key).encode()).hexdigest()[:8]}.json"

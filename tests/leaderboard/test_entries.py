@@ -1,0 +1,116 @@
+"""Entries are read as they were written; what cannot be true is refused in one line."""
+
+import json
+
+import pytest
+
+from chronoscene.errors import ConfigError
+from leaderboard.entries import read_entries, read_entry
+from leaderboard.submit import submit
+
+
+@pytest.fixture
+def path(make_run, tmp_path):
+    (written,) = submit([make_run(), make_run(seed=1)], tmp_path / "entries")
+    return written
+
+
+def test_an_entry_gives_back_its_runs(path):
+    runs = read_entry(path).records
+    assert [run.seed for run in runs] == [0, 1]
+    assert runs[0].aggregates["macro"] == {"psnr": 23.0}
+    assert [row.value for row in runs[0].rows] == [20, 21, 22, 24, 25, 26]
+
+
+def first(document):
+    return document["runs"][0]["record"]
+
+
+def view(document):
+    return document["runs"][0]["views"][0]
+
+
+def set_all(document, **values):
+    for run in document["runs"]:
+        run["record"].update(values)
+
+
+HOSTILE = {
+    "script in a name": (lambda d: set_all(d, method="<script>alert(1)</script>"), "markup"),
+    "script in a title": (lambda d: set_all(d, title="<img src=x onerror=alert(1)>"), "markup"),
+    "script in a key": (lambda d: first(d)["period_labels"].update({"<b>": "x"}), "markup"),
+    "quotes in a name": (lambda d: set_all(d, scene='x" onload="y'), "scene is no plain name"),
+    "path in a scene": (lambda d: set_all(d, scene="../../etc"), "scene is no plain name"),
+    "path in a view": (lambda d: view(d).update(view="../../x.png"), "leads out of its folder"),
+    "absolute view": (lambda d: view(d).update(view="/etc/passwd"), "leads out of its folder"),
+    "control character": (lambda d: set_all(d, device="cpu\x1b[2J"), "control characters"),
+    "long text": (lambda d: set_all(d, device="x" * 1001), "too long"),
+    "huge integer": (lambda d: first(d).update(primitives=10**30), "a number that cannot be: 1000"),
+    "huge number": (lambda d: first(d).update(seconds=1e300), r"a number that cannot be: 1e\+300"),
+    "huge metric": (lambda d: view(d)["values"].update(psnr=1e4), "a number that cannot be: 10000"),
+    "negative cost": (lambda d: first(d).update(seconds=-1.0), "seconds is negative"),
+    "NaN": (lambda d: view(d)["values"].update(psnr=float("nan")), "a number that cannot be: nan"),
+    "infinity": (lambda d: first(d).update(seconds=float("inf")), "a number that cannot be: inf"),
+    "infinity as text": (
+        lambda d: view(d)["values"].update(psnr="Infinity"),
+        "a number that cannot be: inf",
+    ),
+    "hash of an image": (lambda d: view(d).update(sha256="0" * 63), "should match pattern"),
+    "hash of the scene": (lambda d: set_all(d, scene_hash="x"), "scene_hash is no SHA-256"),
+    "better mean": (lambda d: first(d)["aggregates"]["macro"].update(psnr=40.0), "not those of"),
+    "better period": (lambda d: first(d)["periods"]["1"].update(psnr=40.0), "not those of"),
+    "better view": (lambda d: view(d)["values"].update(psnr=40.0), "not those of"),
+    "more metrics": (lambda d: first(d)["aggregates"]["macro"].update(ssim=1.0), "not those of"),
+    "unknown metric": (lambda d: view(d)["values"].update(best=1.0), "unknown metrics: best"),
+    "unknown field": (lambda d: d.update(rank=1), r"Extra inputs are not permitted \(rank\)"),
+    "unknown field of a run": (lambda d: first(d).update(rank=1), r"not permitted \(.*rank\)"),
+    "view twice": (lambda d: d["runs"][0]["views"].append(dict(view(d))), "a view twice"),
+    "no views": (
+        lambda d: (
+            d["runs"][0].update(views=[]),
+            first(d).update(periods={}, aggregates={"macro": {}, "micro": {}, "worst": {}}),
+        ),
+        "no period",
+    ),
+    "period without label": (lambda d: first(d).update(period_labels={}), "without a label"),
+    "regions": (
+        lambda d: first(d).update(regions={"changed": {}}),
+        "regions and stages are no part",
+    ),
+    "seed twice": (lambda d: d["runs"].append(d["runs"][0]), "a seed twice"),
+    "two methods": (lambda d: first(d).update(method="other"), "runs that differ in method"),
+    "no runs": (lambda d: d.update(runs=[]), "at least 1 item"),
+    "other version": (lambda d: d.update(format_version=2), "format_version"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_entries_are_refused(path, case):
+    change, reason = HOSTILE[case]
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(ConfigError, match=reason) as refused:
+        read_entry(path)
+    message = str(refused.value)
+    assert message.startswith(f"{path}: expected a measured entry")
+    assert "\n" not in message and "\x1b" not in message
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"runs": 1e999}'])
+def test_what_is_no_entry_is_refused(tmp_path, text):
+    (tmp_path / "x.json").write_text(text)
+    with pytest.raises(ConfigError, match="expected a measured entry"):
+        read_entries(tmp_path)
+
+
+def test_large_files_are_not_read(path, monkeypatch):
+    monkeypatch.setattr("leaderboard.entries.MAX_BYTES", 100)
+    with pytest.raises(ConfigError, match="more than 100 bytes"):
+        read_entry(path)
+
+
+def test_two_files_of_one_entry_are_refused(path):
+    path.with_name("z.json").write_text(path.read_text())
+    with pytest.raises(ConfigError, match=r"z\.json: .* as in another file"):
+        read_entries(path.parent)

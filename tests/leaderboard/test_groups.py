@@ -1,0 +1,38 @@
+"""Runs stand side by side only if what they were given is equal."""
+
+import pytest
+from made_runs import record
+
+from leaderboard.groups import comparable, effort_of
+
+
+def test_methods_with_the_same_preset_are_compared():
+    runs = [record("3dgs"), record("chronogs"), record("chronogs", 1, strategy="pooled")]
+    assert [*comparable(runs).values()] == [runs]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"scene": "other"},
+        {"scene_hash": "other"},
+        {"split_hash": "other"},
+        {"max_width": 800},
+        {"preset": "paper"},
+        {"variant": "iterations=7"},
+        {"variant": "budget=90s"},
+    ],
+)
+def test_different_settings_are_not_compared(other):
+    assert len(comparable([record(), record("3dgs", **other)])) == 2
+
+
+def test_equal_budgets_are_compared_on_one_device_whatever_the_preset():
+    runs = [record(preset=p, variant="sh_degree=2,budget=90s") for p in ("fast", "paper")]
+    assert len(comparable(runs)) == 1
+    assert effort_of(runs[0]) == "90s of training on cpu (Test, 2 threads)"
+    assert len(comparable([runs[0], runs[0].model_copy(update={"device": "cuda"})])) == 2
+
+
+def test_an_option_of_a_method_is_no_effort():
+    assert len(comparable([record(), record("3dgs", variant="sh_degree=2")])) == 1

@@ -1,0 +1,45 @@
+"""The front has what no cheaper method reaches; the plot puts it where the axes say."""
+
+import math
+from itertools import pairwise
+
+import pytest
+
+from leaderboard.pareto import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Point, front, plot
+
+POINTS = [Point("a", 10, 20), Point("b", 100, 30), Point("c", 50, 19), Point("d", 100, 25)]
+
+
+def test_front():
+    assert [p.label for p in front(POINTS)] == ["a", "b"]
+    assert [p.label for p in front([Point("x", 1, 5), Point("y", 2, 5)])] == ["x"]
+
+
+def test_points_lie_inside_and_in_order():
+    made = plot(POINTS, cost="s", quality="dB")
+    assert made is not None
+    points = {p["label"]: p for p in made["points"]}
+    assert all(LEFT < p["x"] < WIDTH - RIGHT for p in points.values())
+    assert all(TOP < p["y"] < HEIGHT - BOTTOM for p in points.values())
+    assert points["b"]["x"] == points["d"]["x"] and points["b"]["y"] < points["d"]["y"]
+    # The axis is logarithmic: 10 to 50 is as far as log 5.
+    share = (points["c"]["x"] - points["a"]["x"]) / (points["b"]["x"] - points["a"]["x"])
+    assert share == pytest.approx(math.log10(5), abs=2e-3)
+    assert [p["label"] for p in made["points"] if p["best"]] == ["a", "b"]
+
+
+def test_ticks_are_round_and_inside():
+    made = plot(POINTS, cost="s", quality="dB")
+    assert [text for _, text in made["across"]] == ["10", "20", "50", "100"]
+    assert [text for _, text in made["up"]] == ["18", "20", "22", "24", "26", "28", "30"]
+
+
+def test_labels_do_not_cover_each_other():
+    close = [Point(str(i), 10 + 5 * i, 20 + i / 1000) for i in range(4)]
+    heights = sorted(p["height"] for p in plot(close, cost="s", quality="dB")["points"])
+    assert all(b - a >= 13 for a, b in pairwise(heights))
+
+
+@pytest.mark.parametrize("costs", [[], [10], [90.0, 90.1, 90.2], [0, 10]])
+def test_equal_costs_need_no_plot(costs):
+    assert plot([Point("x", cost, i) for i, cost in enumerate(costs)], cost="", quality="") is None

@@ -1,0 +1,236 @@
+"""The site: its links, its text, what stands beside what, and how it works in a browser."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from functools import partial
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from made_runs import write_scored
+
+from chronoscene.errors import CheckpointError, SceneError
+from leaderboard.entries import read_entries
+from leaderboard.published import load_published
+from leaderboard.site import command_of, write_site
+from leaderboard.submit import submit
+
+NASTY = "May & \"June\" 'x'"
+
+
+class Page(HTMLParser):
+    """Texts of the rows of all tables, and everything that a page leads to."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.rows: list[str] = []
+        self.inside = False
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        self.links += [value for name, value in attrs if name in ("href", "src")]
+        if tag == "tr":
+            self.inside = True
+            self.rows.append("")
+
+    def handle_endtag(self, tag):
+        self.inside = self.inside and tag != "tr"
+
+    def handle_data(self, data):
+        if self.inside and data.strip():
+            self.rows[-1] += f" {data.strip()}"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    make = partial(
+        write_scored, tmp_path_factory.mktemp("x") / "runs", period_labels={"0": NASTY, "1": "late"}
+    )
+    make(), make(seed=1)
+    better = ((28.0, 29.0, 30.0), (31.0, 32.0, 33.0))
+    make("chronogs", psnr=better, seconds=20.0, checkpoint_bytes=500_000)
+    make("lab-method", psnr=better, seconds=30.0)  # nobody installed this one
+    return make("4dgs", scene="Lawncourt").parents[2]
+
+
+@pytest.fixture(scope="module")
+def entries(runs):
+    submit([runs], runs.parent / "entries")
+    return read_entries(runs.parent / "entries")
+
+
+@pytest.fixture(scope="module")
+def site(entries, runs):
+    assert write_site(entries, load_published(), runs.parent / "site", [runs]) == 4
+    return runs.parent / "site"
+
+
+def test_every_link_leads_somewhere_inside(site):
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) == 2 + 13 + 18  # scenes of the paper and plaza; methods, one unheard of
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        assert not re.search(r"https?:|@import|url\(|fetch\(|import\(", text)
+        for link in Page(page).links:
+            assert (page.parent / link).is_file(), (page, link)
+            assert (page.parent / link).resolve().is_relative_to(site)
+
+
+def test_texts_of_entries_are_escaped(site):
+    text = (site / "scene/plaza.html").read_text(encoding="utf-8")
+    assert html.escape(NASTY).replace("&#x27;", "&#39;").replace("&quot;", "&#34;") in text
+    found = re.search(r'<script type="application/json" id="pictures">(.*?)</script>', text)
+    assert json.loads(found[1])["periods"] == [NASTY, "late"]
+
+
+def test_best_and_ties_are_marked_and_means_have_intervals(site):
+    rows = Page(site / "scene/plaza.html").rows
+    (ours,) = [row for row in rows if row.startswith(" CHRONOGS")]
+    (others,) = [row for row in rows if row.startswith(" LAB-METHOD")]
+    (worse,) = [row for row in rows if row.startswith(" 3DGS")]
+    assert "30.50" in ours and " to " in ours
+    assert "†" in ours + others and "†" not in worse
+    assert worse.endswith(" 0 1")
+
+
+def test_published_rows_are_apart_and_not_ranked(site):
+    text = (site / "scene/lawncourt.html").read_text(encoding="utf-8")
+    measured, published = text.split('<tbody class="published">')
+    assert "4DGS (joint" in measured and "22.16" not in measured
+    assert "22.16" in published and "<b>22.16" not in published
+    assert "†" not in published
+
+
+def test_methods_say_what_they_are_and_how_far_they_are_reproduced(site):
+    page = (site / "method/4dgs.html").read_text(encoding="utf-8")
+    assert "1 of its 12 published scenes has been measured here" in page
+    assert "+3.97" in page  # 23.00 less 19.03
+    assert "chronoscene bench SCENE --method 4dgs --strategy joint" in page
+    assert "Apache-2.0" in page
+    unknown = (site / "method/lab-method.html").read_text(encoding="utf-8")
+    assert "not one of the methods that come with ChronoScene" in unknown
+
+
+def test_the_names_of_an_entry_import_nothing(make_run, tmp_path, monkeypatch):
+    make_run(method="os:system")
+    submit([tmp_path / "runs"], tmp_path / "e")
+    monkeypatch.setattr("leaderboard.site.load_spec", lambda name: pytest.fail(name))
+    monkeypatch.setattr("leaderboard.site.installed_methods", dict)
+    write_site(read_entries(tmp_path / "e"), load_published(), tmp_path / "site")
+
+
+def test_all_numbers_of_the_paper_are_on_a_page(site):
+    rows = Page(site / "published.html").rows
+    published = load_published()
+    count = len(published.rows) + sum(len(table.rows) for table in published.tables)
+    heads, memory = len(published.tables) + 2, len(published.memory_gb["real"])
+    assert len(rows) == count + heads + memory
+
+
+def test_commands_make_the_run_again(entries):
+    run = entries[0].records[0].model_copy(update={"variant": "sh_degree=2,budget=90s"})
+    assert command_of(run).endswith("--seed 0 --set sh_degree=2 --budget 90s")
+
+
+def test_pictures_come_only_from_the_runs_of_an_entry(entries, make_run, tmp_path):
+    make_run("lab-other")
+    assert write_site(entries[:1], load_published(), tmp_path / "x", [tmp_path / "runs"]) == 0
+    assert not (tmp_path / "x/images").exists()
+
+
+def test_a_changed_picture_is_refused(entries, runs, tmp_path):
+    shutil.copytree(runs, tmp_path / "runs")
+    images = sorted((tmp_path / "runs/ground_truth/plaza/0").glob("*.png"))
+    images[0].write_bytes(images[1].read_bytes())
+    with pytest.raises(CheckpointError, match="another file"):
+        write_site(entries, load_published(), tmp_path / "x", [tmp_path / "runs"])
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_folder_in_use_is_kept(entries, site):
+    with pytest.raises(SceneError, match="new or empty folder"):
+        write_site(entries, load_published(), site)
+
+
+def test_a_site_without_measurements(tmp_path):
+    write_site([], load_published(), tmp_path / "x")
+    assert "Nothing has been measured here yet" in (tmp_path / "x/index.html").read_text("utf-8")
+
+
+HARNESS = """<!doctype html><body style="margin: 0">
+<iframe src="scene/plaza.html" style="border: 0; width: 360px; height: 800px"></iframe>
+<iframe src="scene/plaza.html" style="border: 0; width: 1280px; height: 800px"></iframe>
+<iframe src="index.html" style="border: 0; width: 360px; height: 800px"></iframe>
+<iframe src="method/4dgs.html" style="border: 0; width: 360px; height: 800px"></iframe>
+<iframe src="published.html" style="border: 0; width: 360px; height: 800px"></iframe>
+<script>
+addEventListener("load", () => {
+  const reports = [];
+  for (const frame of document.querySelectorAll("iframe")) {
+    const w = frame.contentWindow, d = w.document, get = (id) => d.getElementById(id);
+    const report = { errors: w.errors, wide: d.documentElement.scrollWidth, width: w.innerWidth };
+    reports.push(report);
+    if (!get("compare")) continue;
+    const table = d.querySelector("table"), names = () =>
+      [...table.tBodies[0].rows].slice(1).map((row) => row.cells[0].textContent.split(" ")[0]);
+    const buttons = [...table.querySelectorAll(".sort")];
+    const size = buttons.find((b) => b.textContent.includes("size"));
+    report.before = names();
+    size.focus(); report.focus = d.activeElement === size;
+    size.click(); report.up = names(); size.click(); report.down = names();
+    report.sorted = size.closest("th").getAttribute("aria-sort");
+    const move = (id, steps) => {
+      get(id).focus(); report.focus &&= d.activeElement === get(id);
+      get(id).stepUp(steps); get(id).dispatchEvent(new w.Event("input"));
+    };
+    move("cut", 20); report.cut = w.getComputedStyle(get("truth")).clipPath;
+    const images = [get("truth"), get("prediction")];
+    report.loaded = images.every((image) => image.naturalWidth === 8);
+    const period = get("truth").getAttribute("src");
+    move("period", 1); report.which = get("which").textContent;
+    report.moved = get("truth").getAttribute("src") !== period;
+    get("method").value = "1"; get("method").dispatchEvent(new w.Event("input"));
+    report.prediction = get("prediction").getAttribute("src");
+  }
+  document.body.dataset.report = JSON.stringify(reports);
+});
+</script>"""
+
+
+def test_in_a_browser(site, tmp_path):
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no chromium here")
+    site = shutil.copytree(site, tmp_path / "site")
+    catch = (
+        "<script>errors = []; addEventListener('error', (e) => errors.push(e.message));</script>"
+    )
+    for page in site.rglob("*.html"):
+        text = page.read_text(encoding="utf-8")
+        page.write_text(text.replace("<head>", f"<head>{catch}"), encoding="utf-8")
+    (site / "harness.html").write_text(HARNESS, encoding="utf-8")
+    options = "--headless --no-sandbox --disable-quic --no-first-run --disable-gpu --disable-sync "
+    options += "--disable-background-networking --dump-dom --allow-file-access-from-files "
+    options += f"--user-data-dir={tmp_path / 'profile'}"
+    command = [browser, *options.split(), (site / "harness.html").as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    found = re.search('data-report="(.*?)"', done.stdout)
+    assert found is not None, done.stdout[-2000:] + done.stderr[-500:]
+    reports = json.loads(html.unescape(found[1]))
+    assert [report["errors"] for report in reports] == [[]] * 5
+    assert [report["width"] for report in reports] == [360, 1280, 360, 360, 360]
+    assert all(report["wide"] <= report["width"] for report in reports)
+    for report in reports[:2]:
+        assert report["focus"]
+        assert report["before"][-1] == "3DGS"
+        assert report["up"][0] == "CHRONOGS" and report["down"][-1] == "CHRONOGS"
+        assert report["sorted"] == "descending"
+        assert "30%" in report["cut"]
+        assert (report["which"], report["moved"]) == ("late", True)
+        assert (site / "scene" / report["prediction"]).name == "0-1-1.webp"
+        assert (site / "scene" / report["prediction"]).is_file()
+        assert report["loaded"]
