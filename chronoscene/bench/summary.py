@@ -235,13 +235,13 @@ def _compare(entries: DataFrame, best: Any, others: Sequence[Any]) -> None:
 
 
 def over_scenes(entries: DataFrame, name: str) -> DataFrame:
-    """Means of macro and size over all scenes, as entries of a scene of that name.
+    """Means of macro and costs over all scenes, as entries of a scene of that name.
 
     Labels that lack a scene are left out.
     """
     import pandas as pd
 
-    chosen = entries[(entries.column == "macro") | (entries.quantity == SIZE)]
+    chosen = entries[entries.column.isin(("macro", ""))]
     rows = [
         {
             **part.iloc[0],

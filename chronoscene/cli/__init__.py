@@ -33,6 +33,7 @@ COMMANDS = {
     "submit": "chronoscene.cli.leaderboard:submit_command",
     "synth": "chronoscene.cli.synth:command",
     "table": "chronoscene.cli.results:table",
+    "tradeoff": "chronoscene.cli.tradeoff:command",
     "undistort": "chronoscene.cli.undistort:command",
     "validate": "chronoscene.cli.validate:command",
 }
