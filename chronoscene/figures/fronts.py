@@ -16,6 +16,7 @@ MAX_COLUMNS = 4
 """Panels side by side; what is more goes on below."""
 LEGEND_LINE, LEGEND_COLUMN = 0.155, 4.0  # Inches
 LETTERS = 46  # Of a title on one line
+MANY_TICKS = 15  # Factor between the ends of an axis from which on few of its ticks have numbers
 DISC = 9.0  # Diameter in points of the discs with numbers
 
 
@@ -95,8 +96,10 @@ def _draw_panel(axes: Any, panel: Panel, colors: Mapping[int, str]) -> None:
 
     canvas.quiet_axes(axes)
     axes.set_xscale("log")
-    axes.set_xlim(*_limits(panel.marks))
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+    low, high = _limits(panel.marks)
+    axes.set_xlim(low, high)
+    subs = (1, 3) if high > MANY_TICKS * low else (1, 1.5, 2, 3, 5, 7)
+    axes.xaxis.set_major_locator(LogLocator(subs=subs))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(which="major", color=canvas.GRID, linewidth=0.5)

@@ -160,12 +160,13 @@ def test_scenes_are_averaged_with_their_intervals_and_spreads():
     ]
     runs.append(scored("b", psnr=VIEWS))  # on one of the scenes
     entries = summarise(runs)
-    (mean, size) = over_scenes(entries, "mean").itertuples()
+    mean, *costs = over_scenes(entries, "mean").itertuples()
     assert mean.mean == pytest.approx(VIEWS.mean() + 3.5 / 2)
     assert mean.sd == pytest.approx(5 / 2**0.5 / 2)  # of the mean of two: hypot(3, 4) / sqrt(2) / 2
     lows = entries.query("column == 'macro' and method == 'chronogs'").eval("mean - low")
     assert (mean.mean - mean.low) == pytest.approx(lows.mean() / 2**0.5, rel=0.1)
-    assert (size.quantity, size.mean) == ("checkpoint_bytes", 1_234_000)
+    means = {cost.quantity: cost.mean for cost in costs}
+    assert (means["checkpoint_bytes"], means["seconds"]) == (1_234_000, 10.0)
 
 
 def test_published_rows():
