@@ -24,11 +24,9 @@ _LEAN: dict[str, Any] = _SHORT | {
     "base_dim": 28,
     "period_dim": 4,
     "unused_share": 0.06,
-    "antialiased": True,
     "feature_lr": (0.015, 0.0075),
     "opacity_lr": (0.004, 0.0004),
     "color_lr": (0.008, 0.0005),
-    "cooldown": 0.2,
 }
 """Less than half of the numbers: docs/what-a-scene-requires.md has the trials."""
 
