@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from chronoscene.bench.results import CURVE_FILE, RunRecord
+from chronoscene.bench.results import RunRecord
 from chronoscene.bench.summary import kind_of
+from chronoscene.bench.time_to_quality import read_curve
 
 WIDTH, HEIGHT = 640.0, 340.0
 """Of the drawing, in its units."""
@@ -61,7 +61,7 @@ def draw_curves(found: Sequence[tuple[Path, RunRecord]]) -> Curves | None:
     probes = [
         (i, record, model, points)
         for i, (folder, record) in enumerate(found)
-        for model, points in _read(folder / CURVE_FILE).items()
+        for model, points in _read(folder).items()
     ]
     if not probes:
         return None
@@ -89,13 +89,10 @@ def draw_curves(found: Sequence[tuple[Path, RunRecord]]) -> Curves | None:
     )
 
 
-def _read(path: Path) -> dict[str, list[tuple[float, float]]]:
+def _read(folder: Path) -> dict[str, list[tuple[float, float]]]:
     """Seconds and PSNR of each model; none where another program made the images."""
-    if not path.is_file():
-        return {}
     models: dict[str, list[tuple[float, float]]] = {}
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            if math.isfinite(value := float(row["psnr"])):
-                models.setdefault(row["model"], []).append((float(row["seconds"]), value))
+    for point in read_curve(folder):
+        if math.isfinite(point.psnr):
+            models.setdefault(point.model, []).append((point.seconds, point.psnr))
     return models

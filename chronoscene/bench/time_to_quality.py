@@ -129,7 +129,7 @@ def readings(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -> li
     found: list[Reading] = []
     for device in dict.fromkeys(run.device for run, _ in known):
         here = [(run, curve) for run, curve in known if run.device == device]
-        labels = labelled([run for run, _ in here]).label.sort_index()
+        labels = labelled([run for run, _ in here]).label
         groups: dict[tuple[str, str], list[Curve]] = {}
         for (run, curve), label in zip(here, labels, strict=True):
             groups.setdefault((run.scene, label), []).append(curve)

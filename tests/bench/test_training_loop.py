@@ -134,6 +134,27 @@ def test_budgets_stop_by_the_clock(part, clock):
     assert (trained.setup_seconds, trained.seconds, trained.iterations) == (2.0, 5.0, 12)
 
 
+def test_models_that_share_a_budget_keep_it_within_a_step_each(make_scene, clock):
+    scene = make_scene()
+    parts = make_parts(scene, ImageStore(scene), "separate")
+    seconds = []
+    for part, stop in zip(parts, StopRule(None, 20.0).split(len(parts)), strict=True):
+        method = toy()
+        method.setup = clock.takes(1.0, method.setup)
+        method.step = clock.takes(0.4, method.step)
+        method.render = clock.takes(50.0, method.render)  # probes
+        seconds.append(run(method, part, stop, now=clock).seconds)
+    assert seconds == pytest.approx([10.2, 10.2])
+    assert sum(seconds) <= 1.05 * 20.0 and clock.seconds > 700
+
+
+def test_a_set_up_that_takes_the_budget_leaves_no_step(part, clock):
+    method = toy()
+    method.setup = clock.takes(5.0, method.setup)
+    trained = run(method, part, StopRule(None, 4.0), now=clock)
+    assert (trained.seconds, trained.iterations) == (5.0, 0)
+
+
 def test_progress_follows_the_clock(part, clock):
     progress = []
     method = toy()
