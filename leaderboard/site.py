@@ -17,6 +17,7 @@ from chronoscene.bench.summary import (
     PAPER_METRICS,
     SIZE,
     in_unit,
+    kind_of,
     metric_names,
     published_entries,
     summarise,
@@ -26,7 +27,7 @@ from chronoscene.io.staging import staged_folder
 from chronoscene.methods import MethodSpec, installed_methods, load_spec
 from chronoscene.metrics.registry import metric_info
 from leaderboard.entries import Entry
-from leaderboard.groups import Setting, comparable, effort_of, setting_of
+from leaderboard.groups import Setting, comparable, setting_of
 from leaderboard.pareto import Point, plot
 from leaderboard.pictures import find_runs, gallery
 from leaderboard.published import PublishedTable
@@ -89,7 +90,8 @@ class _Site:
             found = {run: r for run, r in pictured.items() if self.scene_of[r.scene] == scene}
             found = dict(sorted(found.items(), key=_worst_last))
             views = [setting_of(r)[:-1] for r in found.values()]  # of one scene, split and width
-            runs = {run: _label(r) for run, r in found.items() if setting_of(r)[:-1] == views[0]}
+            found = {run: r for run, r in found.items() if setting_of(r)[:-1] == views[0]}
+            runs = {run: f"{r.title} ({kind_of(r)})" for run, r in found.items()}
             pictures = None
             if runs:
                 place = self.folder / "images" / file.removesuffix(".html")
@@ -309,11 +311,6 @@ def _falling(item: tuple[Any, dict[str, Any]]) -> float:
 def _worst_last(item: tuple[Path, RunRecord]) -> float:
     """Key that sorts runs by PSNR, where it was computed."""
     return -item[1].aggregates["macro"].get("psnr", -math.inf)
-
-
-def _label(record: RunRecord) -> str:
-    """A run in the list of pictures."""
-    return f"{record.title} ({record.strategy}, {effort_of(record)})"
 
 
 def _file_names(names: Iterable[str]) -> dict[str, str]:

@@ -187,7 +187,7 @@ addEventListener("load", () => {
       get(id).focus(); report.focus &&= d.activeElement === get(id);
       get(id).stepUp(steps); get(id).dispatchEvent(new w.Event("input"));
     };
-    move("cut", 20); report.cut = w.getComputedStyle(get("truth")).clipPath;
+    move("cut", 20); report.cut = w.getComputedStyle(get("prediction")).clipPath;
     const images = [get("truth"), get("prediction")];
     report.loaded = images.every((image) => image.naturalWidth === 8);
     const period = get("truth").getAttribute("src");
@@ -229,7 +229,7 @@ def test_in_a_browser(site, tmp_path):
         assert report["before"][-1] == "3DGS"
         assert report["up"][0] == "CHRONOGS" and report["down"][-1] == "CHRONOGS"
         assert report["sorted"] == "descending"
-        assert "30%" in report["cut"]
+        assert "70%" in report["cut"]
         assert (report["which"], report["moved"]) == ("late", True)
         assert (site / "scene" / report["prediction"]).name == "0-1-1.webp"
         assert (site / "scene" / report["prediction"]).is_file()

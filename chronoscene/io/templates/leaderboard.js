@@ -28,7 +28,6 @@ const compare = document.querySelector("#compare");
 if (compare) {
   const get = (id) => document.getElementById(id);
   const pictures = JSON.parse(get("pictures").textContent);
-  const stack = compare.querySelector(".stack");
   const show = () => {
     const period = Number(get("period").value);
     const shown = pictures.views[Number(get("view").value)][period];
@@ -38,18 +37,6 @@ if (compare) {
     get("period").setAttribute("aria-valuetext", pictures.periods[period]);
     get("name").textContent = shown.view;
   };
-  const cut = () => stack.style.setProperty("--cut", `${get("cut").value}%`);
-  const drag = (event) => {
-    if (event.type === "pointermove" && !event.buttons) return;
-    const box = stack.getBoundingClientRect();
-    get("cut").value = 100 * (event.clientX - box.left) / box.width;
-    cut();
-  };
   for (const id of ["period", "view", "method"]) get(id).addEventListener("input", show);
-  get("cut").addEventListener("input", cut);
-  stack.addEventListener("pointerdown", drag);
-  stack.addEventListener("pointermove", drag);
-  stack.addEventListener("dragstart", (event) => event.preventDefault());
   show();  // a browser that goes back keeps what was chosen
-  cut();
 }
