@@ -28,6 +28,9 @@ BUDGET_NOTICE = "--budget: schedules follow the clock, and equal seeds do not gi
 Say = Callable[[str], None]
 """Takes one line for the user."""
 
+Plan = list[tuple[Job, MethodSpec]]
+"""Runs, each with its method."""
+
 
 @dataclass(frozen=True, slots=True)
 class BenchSettings:
@@ -66,7 +69,7 @@ class BenchSettings:
     """Whether finished runs with other settings may be replaced."""
 
 
-def plan_jobs(settings: BenchSettings, say: Say) -> list[tuple[Job, MethodSpec]]:
+def plan_jobs(settings: BenchSettings, say: Say) -> Plan:
     """All runs asked for, checked; freezes the ground truth of the scenes."""
     specs = [(name, load_spec(name)) for name in settings.methods]
     _check_lengths(settings)

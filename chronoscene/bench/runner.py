@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from chronoscene.bench import results
 from chronoscene.bench.job import Job
-from chronoscene.bench.plan import BenchSettings, Say, is_finished, is_obsolete, plan_jobs
+from chronoscene.bench.plan import BenchSettings, Plan, Say, is_finished, is_obsolete, plan_jobs
 from chronoscene.errors import DiskFullError
 from chronoscene.io.processes import run_worker, stoppable
 from chronoscene.methods import MethodSpec
@@ -50,7 +50,20 @@ def run_bench(settings: BenchSettings, say: Say, *, execute: Execute | None = No
     Raises:
         ChronoSceneError: If anything asked for is wrong; nothing is trained then.
     """
-    plan = plan_jobs(settings, say)
+    return run_plan(plan_jobs(settings, say), settings, say, execute=execute)
+
+
+def run_plan(
+    plan: Plan, settings: BenchSettings, say: Say, *, execute: Execute | None = None
+) -> BenchOutcome:
+    """Run what is planned and not finished yet, as `run_bench` does.
+
+    Args:
+        plan: All runs, each once, in one folder of runs.
+        settings: Where that folder is, and whether runs may be replaced.
+        say: Called with lines for the user.
+        execute: As for `run_bench`.
+    """
     todo = [(job, spec) for job, spec in plan if not is_finished(job, spec, settings.overwrite)]
     if len(todo) < len(plan):
         say(f"{len(plan) - len(todo)} of {len(plan)} runs are finished and kept")

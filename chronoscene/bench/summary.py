@@ -88,10 +88,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
     records: list[RunRecord] = []
     failures: list[Failure] = []
     for folder in folders:
-        found = [
-            read_run(path).model_copy(update={"rows": read_rows(path)})
-            for path in run_folders(folder)
-        ]
+        found = [read_with_rows(path) for path in run_folders(folder)]
         failed = read_failures(folder)
         if not found and not failed:
             raise CheckpointError(
@@ -100,6 +97,11 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
         records += found
         failures += failed
     return records, failures
+
+
+def read_with_rows(folder: Path) -> RunRecord:
+    """A finished run with the values of its views."""
+    return read_run(folder).model_copy(update={"rows": read_rows(folder)})
 
 
 def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
@@ -215,13 +217,13 @@ def compared(entries: DataFrame) -> DataFrame:
         entries.loc[ranks.index[ranks <= min(MARKED, len(part) - 1)], "rank"] = ranks.astype(int)
         best, *others = part.sort_values("mean", ascending=ascending, kind="stable").index
         if others:
-            _compare(entries, best, others)
+            compare_with(entries, best, others)
     return entries
 
 
-def _compare(entries: DataFrame, best: Any, others: Sequence[Any]) -> None:
-    """Fill in what tells some entries from the best of them."""
-    first, rest = entries.loc[best], entries.loc[others]
+def compare_with(entries: DataFrame, reference: Any, others: Sequence[Any]) -> None:
+    """Fill in what tells some entries from another one, all named by their index."""
+    first, rest = entries.loc[reference], entries.loc[others]
     difference = rest["mean"] - first["mean"]
     gaps = np.stack(rest.resampled) - first.resampled
     gaps[[views != first.views for views in rest.views]] = math.nan  # not paired

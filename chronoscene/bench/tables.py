@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from chronoscene.bench.results import UNTRAINED, Failure, RunRecord
@@ -80,7 +80,7 @@ def format_runs(
     if published is not None:
         notes += published_notes(published, records)
     if style == "json":
-        found = [_json_entry(entry) for entry in listed[[*ENTRY_COLUMNS]].to_dict("records")]
+        found = [json_entry(entry) for entry in listed[[*ENTRY_COLUMNS]].to_dict("records")]
         return json.dumps({"entries": found, "notes": notes}, indent=1, allow_nan=False) + "\n"
     made = readable_tables(entries, records, metrics, periods=periods)
     if any(table.ranks for table in made):
@@ -94,7 +94,7 @@ def format_runs(
     return "\n".join([*texts, "".join(f"{bullet}{note}\n" for note in notes)])
 
 
-def _json_entry(entry: dict[str, Any]) -> dict[str, Any]:
+def json_entry(entry: dict[str, Any]) -> dict[str, Any]:
     """Numbers that JSON lacks become ``Infinity`` and ``NaN``, what is not known becomes null."""
     entry["sd"] = None if entry["n"] == 1 else entry["sd"]
     for key, value in entry.items():
@@ -245,13 +245,18 @@ def _uncertainty(macro: DataFrame) -> Iterable[_Column]:
         (("difference", "to the best"), "difference_"),
     ):
         known = macro[macro[f"{prefix}low"].notna()]
-        texts = []
-        for entry in known.to_dict("records"):
-            low, high = (in_unit(entry["quantity"], entry[prefix + end]) for end in ("low", "high"))
-            difference = f"{in_unit(entry['quantity'], entry['difference'])} " if prefix else ""
-            texts.append(f"{difference}[{low}, {high}]".replace("-", "\N{MINUS SIGN}"))
+        texts = [interval_text(entry, prefix) for entry in known.to_dict("records")]
         if texts:
             yield _Column(head, known.assign(uncertainty=texts), "uncertainty")
+
+
+def interval_text(entry: Mapping[Any, Any], prefix: str = "") -> str:
+    """The interval of a mean; or, with the prefix ``difference_``, a difference and its interval,
+    if that is known."""
+    low, high = (in_unit(entry["quantity"], entry[prefix + end]) for end in ("low", "high"))
+    text = "" if math.isnan(entry[f"{prefix}low"]) else f"[{low}, {high}]"
+    difference = in_unit(entry["quantity"], entry["difference"]) if prefix else ""
+    return f"{difference} {text}".strip().replace("-", "\N{MINUS SIGN}")
 
 
 def _period_title(period: str, labels: dict[str, str]) -> str:

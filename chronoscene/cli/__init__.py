@@ -30,6 +30,7 @@ COMMANDS = {
     "score-images": "chronoscene.cli.score_images:command",
     "split": "chronoscene.cli.split:command",
     "stats": "chronoscene.cli.stats:command",
+    "study": "chronoscene.cli.study:command",
     "submit": "chronoscene.cli.leaderboard:submit_command",
     "synth": "chronoscene.cli.synth:command",
     "table": "chronoscene.cli.results:table",

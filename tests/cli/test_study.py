@@ -1,0 +1,45 @@
+"""``chronoscene study`` from the outside: a study file, the table, the files."""
+
+import json
+
+from .test_bench import IMAGES, TESTS, chronoscene
+
+STUDY = """
+title = "Rates"
+question = "Which rate is better?"
+method = "toy_methods:MEAN"
+
+[[rows]]
+label = "slow"
+set = { rate = 0.01 }
+
+[[rows]]
+label = "fast"
+set = { rate = 0.5 }
+"""
+
+
+def test_a_study_of_ones_own(make_scene_folder, tmp_path):
+    scene = make_scene_folder(IMAGES, tests=TESTS, name="place")
+    file, runs = tmp_path / "rates.toml", tmp_path / "runs"
+    file.write_text(STUDY)
+    call = ("study", file, scene, "--iterations", 12, "--threads", 1, "--out", runs)
+    done = chronoscene(*call)
+    assert done.returncode == 0, done.stderr
+    assert "Which rate is better?" in done.stdout
+    assert "place, fast: nothing is published to compare with." in done.stdout
+    assert "2 of 2 runs are finished and kept" in (again := chronoscene(*call)).stderr
+    assert again.stdout == done.stdout
+    rows = {e["row"] for e in json.loads((runs / "study-rates.json").read_text())["entries"]}
+    assert rows == {"slow", "fast"}
+    assert "| place | fast |" in (runs / "study-rates.md").read_text()
+    assert (runs / "study-rates.csv").read_text().startswith("row,source,scene,")
+
+
+def test_mistakes_are_one_line(make_scene_folder, tmp_path):
+    scene, file = make_scene_folder(IMAGES, name="place"), tmp_path / "rates.toml"
+    file.write_text(STUDY.replace("label", "name"))
+    for name, text in ((file, "Field required (rows.0.label)"), ("parts", "base-length, comp")):
+        done = chronoscene("study", name, scene, "--out", tmp_path / "runs")
+        assert done.returncode == 2 and done.stderr.count("\n") == 1
+        assert text in done.stderr
