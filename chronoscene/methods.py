@@ -274,6 +274,13 @@ class Method(Protocol):
     def render_gaussians(self, gaussians: GaussianCloud, view: View) -> Prediction:
         """Render what `to_gaussians` gave."""
 
+    def permute(self, order: NDArray[np.int64]) -> None:
+        """Put the anchors or Gaussians of a loaded model into another order. [N]
+
+        Only where the model is a set of these, whose positions are the tensor ``anchors`` or
+        ``means``; a method without it has no such function.
+        """
+
     def save_training(self, folder: Path) -> None:
         """Write everything that the steps to come depend on into an existing empty folder.
 

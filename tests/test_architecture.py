@@ -24,7 +24,7 @@ LAYERS = (
     ("chronoscene.images",),
     ("chronoscene.colmap",),
     ("chronoscene.scene",),
-    ("chronoscene.io", "chronoscene.geodesy", "leaderboard.published"),
+    ("chronoscene.compression", "chronoscene.io", "chronoscene.geodesy", "leaderboard.published"),
     ("chronoscene.kernels",),
     ("chronoscene.checks",),
     ("chronoscene.errors", "chronoscene.arrays"),

@@ -16,7 +16,7 @@ from chronoscene.anchors.baking import bake
 from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.contribution import pack_offsets, unpack_offsets
 from chronoscene.anchors.density import initial_anchors, resolve_voxel_size
-from chronoscene.anchors.model import LAYERS, AnchorLayout, AnchorModel
+from chronoscene.anchors.model import LAYERS, PER_ANCHOR, AnchorLayout, AnchorModel
 from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import TrainingSet, View
@@ -166,6 +166,12 @@ class AnchorMethod(SplattingMethod):
 
     def stored_tensors(self) -> dict[str, Tensor]:
         return pack_offsets(self.model.tensors())
+
+    def permute(self, order: NDArray[np.int64]) -> None:
+        rows, tensors = torch.from_numpy(order), self._model.tensors()
+        for name in {"anchors", *PER_ANCHOR, "used_offsets"} & tensors.keys():
+            tensors[name] = tensors[name][rows]
+        self._model = self.model_class.from_tensors(self._model.layout, tensors)
 
     def restore(self, folder: Path, tensors: dict[str, Tensor], device: str) -> None:
         if not isinstance(self.meta.get("layout"), dict):

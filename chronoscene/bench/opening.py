@@ -157,10 +157,11 @@ class OpenRun:
         split = self.strategy.model_per_period or self.strategy.in_order
         part = period_part(last) if split else ""
         if part not in self._models:
-            self._models[part] = self._load(self.folder / CHECKPOINT / part)
+            self._models[part] = self.load(self.folder / CHECKPOINT / part)
         return self._models[part]
 
-    def _load(self, folder: Path) -> Method:
+    def load(self, folder: Path) -> Method:
+        """A model of the method, from where `Method.save` wrote it."""
         if not folder.is_dir():
             raise CheckpointError(
                 folder,

@@ -16,6 +16,7 @@ COMMANDS = {
     "bench": "chronoscene.cli.bench:command",
     "check-method": "chronoscene.cli.check_method:check",
     "compare": "chronoscene.cli.compare:command",
+    "compress": "chronoscene.cli.compress:command",
     "convert": "chronoscene.cli.convert:command",
     "doctor": "chronoscene.cli.doctor:command",
     "download": "chronoscene.cli.download:command",

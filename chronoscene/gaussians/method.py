@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.errors import CheckpointError
@@ -113,6 +115,10 @@ class GaussianMethod(SplattingMethod):
 
     def stored_tensors(self) -> dict[str, Tensor]:
         return self.model.tensors()
+
+    def permute(self, order: NDArray[np.int64]) -> None:
+        rows, parameters = torch.from_numpy(order), self.model.parameters
+        self.model.parameters = {name: tensor[rows] for name, tensor in parameters.items()}
 
     def save(self, folder: Path) -> None:
         self.meta["sh_degree"] = self.model.sh_degree

@@ -1,5 +1,7 @@
 """Models on disk: ``model.safetensors`` for numbers, ``model.json`` for everything else. No pickle.
 
+``model.compressed`` may stand in the place of ``model.safetensors``; see `chronoscene.compression`.
+
 The JSON file is written last and holds the digest of the tensor file, so a folder whose
 ``model.json`` is present and agrees is complete. Equal models give equal bytes.
 """
@@ -13,15 +15,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from chronoscene.compression.file import COMPRESSED_FILE, META_FILE, read_compressed
+from chronoscene.compression.file import TENSOR_FILE as TENSOR_FILE
 from chronoscene.errors import CheckpointError
 from chronoscene.io.staging import replacing, sha256_of, write_text_atomic
 
-TENSOR_FILE = "model.safetensors"
-META_FILE = "model.json"
 TRAINING = "training"
 """Stem of the files that hold a training."""
 FORMAT_VERSION = 1
@@ -89,11 +92,16 @@ def load_tensors(
     if method is not None and meta.get("method") != method:
         todo = "name another folder or another method"
         raise _refusal(described, f"a model of {method}", f"one of {meta.get('method')}", todo)
-    path = folder / f"{stem}.safetensors"
+    path, compressed = folder / f"{stem}.safetensors", folder / COMPRESSED_FILE
+    if not path.is_file() and f"{stem}.json" == META_FILE and compressed.is_file():
+        path = compressed
     if not path.is_file():
         raise _refusal(path, "the tensors of the model", "no such file", "train again")
     if sha256_of(path) != meta["tensors_sha256"]:
         raise _refusal(path, f"the digest given in {described.name}", "another one")
+    if path == compressed:
+        arrays = read_compressed(path)
+        return {name: torch.from_numpy(array).to(device) for name, array in arrays.items()}, meta
     try:
         return load_file(path, device=device), meta
     except SafetensorError as error:
