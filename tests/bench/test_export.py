@@ -49,7 +49,7 @@ def read(path):
     )
 
 
-def render_in_world(gaussians, camera, cam_from_world):
+def render_in_world(gaussians, camera, cam_from_world, antialiased=False):
     """The picture of a camera, drawn in the frame of the scene. [H, W, 3]"""
     means, quats, scales, opacities, sh_coeffs = gaussians
     directions = means - torch.from_numpy(camera_centre(cam_from_world)).float()
@@ -57,7 +57,9 @@ def render_in_world(gaussians, camera, cam_from_world):
     colors = ((values[..., None] * sh_coeffs).sum(1) + 0.5).clamp_min(0)
     pose, K = (torch.tensor(m, dtype=torch.float32)[None] for m in (cam_from_world, camera.K))
     size = camera.width, camera.height
-    raster = rasterize(means, quats, scales, opacities, colors, pose, K, *size)
+    raster = rasterize(
+        means, quats, scales, opacities, colors, pose, K, *size, antialiased=antialiased
+    )
     return to_bytes(raster.image[0].numpy())
 
 
@@ -69,7 +71,8 @@ def test_the_file_gives_the_psnr_that_is_stated(trained, tmp_path, method, perio
     scene, values = run.scene(), []
     store, gaussians = ImageStore(scene), read(tmp_path / "a.ply")
     for frame in scene.select(split="test", period=period):
-        image = render_in_world(gaussians, store.camera(frame), frame.cam_from_world)
+        camera, pose = store.camera(frame), frame.cam_from_world
+        image = render_in_world(gaussians, camera, pose, antialiased=run.config.antialiased)
         values.append(psnr(image, store.load(frame)))
     assert np.mean(values) == pytest.approx(exported, abs=0.01)
     assert model == pytest.approx(run.record.periods[str(period)]["psnr"], abs=0.006)
