@@ -85,6 +85,20 @@ def format_runs(
     made = readable_tables(entries, records, metrics, periods=periods)
     if any(table.ranks for table in made):
         notes.insert(0, tables.LEGENDS[style])
+    return tables_text(made, notes, style, width=width)
+
+
+def tables_text(
+    made: Sequence[Table], notes: Iterable[str], style: str, *, width: int | None = None
+) -> str:
+    """Tables and the notes below them, in a format that people read.
+
+    Args:
+        made: The tables.
+        notes: One line each.
+        style: ``table``, ``markdown`` or ``latex``.
+        width: Of the terminal that ``table`` goes to; None for as wide as it is.
+    """
     if style == "markdown":
         texts, bullet = [tables.markdown(t, special=r"\`*<>|_") for t in made], "- "
     elif style == "latex":

@@ -66,13 +66,16 @@ class FrontPoint:
     """Whether no other configuration of the panel is as good for less, or better for as much."""
 
 
-def with_widths(records: Sequence[RunRecord]) -> list[RunRecord]:
-    """Runs whose variant says the width of their images, where it is not the usual one."""
+def as_configurations(records: Sequence[RunRecord]) -> list[RunRecord]:
+    """Runs whose variant says the width of their images, where it is not the usual one.
+
+    They have no rows: intervals over views are not asked for.
+    """
     named = []
     for run in records:
         width = "" if run.max_width == MAX_WIDTH else f"max_width={run.max_width}"
         variant = ",".join(filter(None, (run.variant, width)))
-        named.append(run.model_copy(update={"variant": variant}))
+        named.append(run.model_copy(update={"variant": variant, "rows": ()}))
     return named
 
 

@@ -13,7 +13,7 @@ import click
 from chronoscene.bench.job import parse_duration
 from chronoscene.bench.results import FIGURES, Failure, RunRecord, run_folders
 from chronoscene.bench.summary import COSTS, read_runs, summarise
-from chronoscene.bench.tables import footnotes
+from chronoscene.bench.tables import COST_TITLES, footnotes, tables_text
 from chronoscene.bench.time_to_quality import (
     Reading,
     read_curve,
@@ -24,10 +24,10 @@ from chronoscene.bench.time_to_quality import (
 from chronoscene.bench.tradeoff import (
     FrontPoint,
     Limits,
+    as_configurations,
     choose,
     front_points,
     front_tables,
-    with_widths,
 )
 from chronoscene.cli.output import emit, tell_written, terminal_width, writing_to
 from chronoscene.errors import ConfigError
@@ -88,22 +88,17 @@ def command(
     sentence which configuration to use, and nothing else. docs/benchmark.md, "Trade-off".
     """
     records, failures = read_runs(folders)
-    records = with_widths(records)
-    given = {"--budget": budget, "--max-bytes": max_bytes}
-    if target_psnr is not None:
-        given["--target-psnr"] = f"{target_psnr:g}"
-    given = {name: value for name, value in given.items() if value is not None}
+    records = as_configurations(records)
+    target = None if target_psnr is None else f"{target_psnr:g}"
+    typed = {"--budget": budget, "--max-bytes": max_bytes, "--target-psnr": target}
+    given = [f"{name} {value}" for name, value in typed.items() if value is not None]
     if given:
         limits = Limits(
             seconds=None if budget is None else parse_duration(budget),
             size=None if max_bytes is None else parse_size(max_bytes),
             psnr=target_psnr,
         )
-        wanted = " ".join(
-            f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}"
-            for name, value in given.items()
-        )
-        emit("".join(f"{line}\n" for line in choose(records, limits, wanted)), out)
+        emit("".join(f"{line}\n" for line in choose(records, limits, " ".join(given))), out)
         return
     paths = (path for folder in folders for path in run_folders(folder))
     curves = [
@@ -139,8 +134,7 @@ def parse_size(text: str) -> float:
 
 def _notes(records: Sequence[RunRecord], failures: Sequence[Failure]) -> list[str]:
     """What a reader must know of the runs, and of widths that differ."""
-    entries = summarise([run.model_copy(update={"rows": ()}) for run in records])
-    notes = footnotes(entries.assign(tied=False), records, failures)
+    notes = footnotes(summarise(records).assign(tied=False), records, failures)
     if len(widths := sorted({run.max_width for run in records})) > 1:
         sizes = ", ".join(map(str, widths))
         notes.append(f"scored at several --max-width ({sizes}): smaller images are easier")
@@ -165,14 +159,7 @@ def _text(
         adapter = TypeAdapter(dict[str, Any], config=ConfigDict(ser_json_inf_nan="strings"))
         return adapter.dump_json(document, indent=1).decode() + "\n"
     made = [*front_tables(points), *time_tables(times)]
-    if style == "markdown":
-        texts, bullet = [tables.markdown(table) for table in made], "- "
-    elif style == "latex":
-        texts, bullet = [tables.latex(table) for table in made], "% "
-    else:
-        width = terminal_width(out)
-        texts, bullet = [tables.boxed_text(table, width=width) for table in made], ""
-    return "\n".join([*texts, "".join(f"{bullet}{note}\n" for note in notes)])
+    return tables_text(made, notes, style, width=terminal_width(out))
 
 
 def draw(points: Sequence[FrontPoint], path: Path, records: Sequence[RunRecord]) -> None:
@@ -207,9 +194,10 @@ def draw(points: Sequence[FrontPoint], path: Path, records: Sequence[RunRecord])
         for (scene, metric), row in panels.items()
     ]
     devices = "; ".join(dict.fromkeys(run.device for run in records))
-    commits = ", ".join(dict.fromkeys(run.commit[:12] for run in records))
+    commits = ", ".join(dict.fromkeys(run.commit for run in records))
     note = (
-        "Filled: on the Pareto front, which the line follows. Bars: standard deviation over seeds."
+        "Test views, means over periods. Filled: on the Pareto front, which the line follows. "
+        "Bars: standard deviation over seeds."
         f"\nDevice: {devices}. Code: {commits}."
     )
     draw_fronts(rows, path, names=names, groups={k: list(v) for k, v in groups.items()}, note=note)
@@ -218,7 +206,7 @@ def draw(points: Sequence[FrontPoint], path: Path, records: Sequence[RunRecord])
 def _axis(cost: str) -> str:
     if cost == "render_seconds":
         return "rendering [images/s]"
-    return next(known.title for known in COSTS if known.name == cost)
+    return COST_TITLES[cost]
 
 
 def _mark(point: FrontPoint, number: int) -> Any:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil, exp, log
 from pathlib import Path
-from textwrap import fill
+from textwrap import fill, wrap
 from typing import Any
 
 from chronoscene.figures import canvas
@@ -15,7 +15,7 @@ PANEL = (2.7, 2.3)  # Width and height in inches
 MAX_COLUMNS = 4
 """Panels side by side; what is more goes on below."""
 LEGEND_LINE, LEGEND_COLUMN = 0.155, 4.0  # Inches
-LETTERS = 46  # Of a title on one line
+LETTERS, NOTE_LETTER = 46, 0.06  # Of a title on one line; width of one of the note in inches
 MANY_TICKS = 15  # Factor between the ends of an axis from which on few of its ticks have numbers
 DISC = 9.0  # Diameter in points of the discs with numbers
 
@@ -68,7 +68,8 @@ def draw_fronts(
     columns = ceil(max(len(row) for row in rows) / lines)
     rows = [row[i : i + columns] for row in rows for i in range(0, len(row), columns)]
     per_line = max(1, int(columns * PANEL[0] / LEGEND_COLUMN))
-    note_lines = note.split("\n")
+    per_note = int(columns * PANEL[0] / NOTE_LETTER)
+    note_lines = [line for part in note.split("\n") for line in wrap(part, per_note)]
     below = LEGEND_LINE * (ceil(len(names) / per_line) + len(note_lines)) + 0.3
     height = PANEL[1] * len(rows) + below
     figure = canvas.new_figure(columns * PANEL[0], height)

@@ -9,12 +9,12 @@ from made_runs import record
 from chronoscene.bench.tables import ALL_SCENES
 from chronoscene.bench.tradeoff import (
     Limits,
+    as_configurations,
     choose,
     command_line,
     front_points,
     front_tables,
     on_front,
-    with_widths,
 )
 from chronoscene.errors import ConfigError
 
@@ -149,5 +149,5 @@ def test_the_command_names_what_differs_from_the_preset():
 
 
 def test_unusual_widths_are_named():
-    wide, narrow = with_widths([run("m", 1.0, 1.0), run("m", 1.0, 1.0, max_width=800)])
+    wide, narrow = as_configurations([run("m", 1.0, 1.0), run("m", 1.0, 1.0, max_width=800)])
     assert (wide.variant, narrow.variant) == ("", "max_width=800")
