@@ -23,21 +23,16 @@ QUALITY = 82
 
 def find_runs(folders: Iterable[Path], entries: Iterable[Entry]) -> dict[Path, EntryRun]:
     """Folders of runs whose predictions are those of an entry, of the first seed of each entry."""
-    wanted = {hashes_of(entry.runs[0]): entry.runs[0] for entry in entries}
+    wanted = {
+        frozenset((view.view, view.sha256) for view in entry.runs[0].views): entry.runs[0]
+        for entry in entries
+    }
     found = {}
     for run in (run for folder in folders for run in run_folders(folder)):
-        images = read_manifest(run / PREDICTIONS).images
-        hashes = frozenset(
-            (i.view, i.sha256) for i in images if i.rendered_period == i.camera_period
-        )
+        hashes = frozenset((image.view, image.sha256) for image in _own(run / PREDICTIONS))
         if (entry := wanted.get(hashes)) is not None and _same(entry.record, read_run(run)):
             found[run] = entry
     return found
-
-
-def hashes_of(run: EntryRun) -> frozenset[tuple[str, str]]:
-    """The predictions that were scored."""
-    return frozenset((view.view, view.sha256) for view in run.views)
 
 
 def _same(first: RunRecord, second: RunRecord) -> bool:

@@ -114,14 +114,17 @@ class _Site:
 
     def _parts(self) -> Iterator[dict[str, Any]]:
         """Tables of the first page: PSNR of methods by scenes, one per part of a dataset."""
-        groups = dict.fromkeys([*(self.parts.get(s, "") for s in self.scenes)])
+        groups = {self.parts.get(scene, "") for scene in self.scenes}
         for group in sorted(groups):  # other scenes, which were measured, come first
             scenes = [scene for scene in self.scenes if self.parts.get(scene, "") == group]
-            measured: dict[tuple[str, str, str], dict[str, Any]] = {}
+            measured: dict[tuple[Any, ...], dict[str, Any]] = {}
             for setting, _, part in self._groups(scenes):
                 for row in part[(part.quantity == "psnr") & (part.column == "macro")].itertuples():
-                    cells = measured.setdefault((row.method, row.label, setting.effort), {})
-                    cells[self.scene_of[setting.scene]] = _cell(row)
+                    scene = self.scene_of[setting.scene]
+                    key: tuple[Any, ...] = (row.method, row.label, setting.effort)
+                    while scene in measured.get(key, {}):  # other photos or test views
+                        key = (*key, "")
+                    measured.setdefault(key, {})[scene] = _cell(row)
             printed: dict[str, dict[str, Any]] = {}
             psnr = self.printed[self.printed.quantity == "psnr"]
             for row in psnr[psnr.scene.isin(scenes)].itertuples():
@@ -131,7 +134,7 @@ class _Site:
                 "scenes": scenes,
                 "measured": [
                     {"method": m, "label": label, "effort": effort, "cells": cells}
-                    for (m, label, effort), cells in sorted(measured.items(), key=_falling)
+                    for (m, label, effort, *_), cells in sorted(measured.items(), key=_falling)
                 ],
                 "published": printed,
             }

@@ -131,6 +131,15 @@ def test_all_numbers_of_the_paper_are_on_a_page(site):
     assert len(rows) == count + heads + memory
 
 
+def test_scenes_of_one_name_have_rows_of_their_own(make_run, tmp_path):
+    submit([make_run()], tmp_path / "e")
+    submit([make_run(split_hash="f" * 64, psnr=((11.0, 12.0), (13.0, 14.0)))], tmp_path / "e")
+    write_site(read_entries(tmp_path / "e"), load_published(), tmp_path / "site")
+    for page in ("index.html", "scene/plaza.html", "method/3dgs.html"):
+        text = (tmp_path / "site" / page).read_text(encoding="utf-8")
+        assert "23.00" in text and "12.50" in text
+
+
 def test_commands_make_the_run_again(entries):
     run = entries[0].records[0].model_copy(update={"variant": "sh_degree=2,budget=90s"})
     assert command_of(run).endswith("--seed 0 --set sh_degree=2 --budget 90s")
