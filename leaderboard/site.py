@@ -22,6 +22,7 @@ from chronoscene.bench.summary import (
     published_entries,
     summarise,
 )
+from chronoscene.bench.tables import period_title
 from chronoscene.io.pages import render_page
 from chronoscene.io.staging import staged_folder
 from chronoscene.methods import MethodSpec, installed_methods, load_spec
@@ -242,7 +243,7 @@ def _group(
     quality, *others = [name for name in PAPER_METRICS if name in names] or names
     columns = [
         (quality, "macro", metric_info(quality).title),
-        *((quality, f"period {i}", labels[i]) for i in periods),
+        *((quality, f"period {i}", period_title(i, labels)) for i in periods),
         *((name, "macro", metric_info(name).title) for name in others),
         *((name, "", title) for name, title in COSTS.items()),
     ]

@@ -234,7 +234,7 @@ def _quality_tables(
     none = found[:0]
     ids = sorted({i for run in runs for i in run.periods}, key=int)
     single = [
-        _Column((_period_title(i, runs[0].period_labels), ""), by_column.get(f"period {i}", none))
+        _Column((period_title(i, runs[0].period_labels), ""), by_column.get(f"period {i}", none))
         for i in ids
     ]
     few = len(ids) <= MAX_PERIODS
@@ -273,7 +273,8 @@ def interval_text(entry: Mapping[Any, Any], prefix: str = "") -> str:
     return f"{difference} {text}".strip().replace("-", "\N{MINUS SIGN}")
 
 
-def _period_title(period: str, labels: dict[str, str]) -> str:
+def period_title(period: str, labels: dict[str, str]) -> str:
+    """Heading of the column of a period: its number, and its label if it has one."""
     label = labels.get(period, period)
     return f"period {period}" if label == period else f"{period}: {label}"
 
@@ -287,7 +288,7 @@ def _stage_tables(
     texts = found.set_index(["label", "column"]).text
     labels = found.label[found.column.str.startswith(f"{period_part(0)}: ")].unique()
     ids = list(runs[0].period_labels)
-    titles = [_period_title(i, runs[0].period_labels) for i in ids]
+    titles = [period_title(i, runs[0].period_labels) for i in ids]
     stages = [UNTRAINED, *(period_part(int(i)) for i in ids)]
     rows = [
         ["" if number else label, after]

@@ -92,6 +92,7 @@ def test_best_and_ties_are_marked_and_means_have_intervals(site):
     (ours,) = [row for row in rows if row.startswith(" CHRONOGS")]
     (others,) = [row for row in rows if row.startswith(" LAB-METHOD")]
     (worse,) = [row for row in rows if row.startswith(" 3DGS")]
+    assert f"0: {NASTY}" in rows[0] and "1: late" in rows[0]
     assert "30.50" in ours and " to " in ours
     assert "†" in ours + others and "†" not in worse
     assert worse.endswith(" 0 1")
