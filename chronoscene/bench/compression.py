@@ -11,9 +11,10 @@ bisection, so that the PSNR of training views falls by no more than the user all
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -52,7 +53,7 @@ POSITIONS = ("anchors", "means")
 MIN_ROWS = 256
 """Tensors with fewer rows are not worth a table of symbols."""
 PROBE_VIEWS, LOSS_VIEWS = 9, 24
-"""Training views by which columns are measured, and by which the loss is, evenly spread."""
+"""Training views by which columns are measured, and by which the loss is; see `spread`."""
 ROUNDS, LEAST = 7, -24.0
 """Of bisection; where it gives up, as a power of two of the first guess."""
 
@@ -94,7 +95,7 @@ class _Part:
 
     def psnr(self, tensors: Arrays) -> float:
         """Mean over training views."""
-        frames = _spread(self.frames, LOSS_VIEWS)
+        frames = spread(self.frames, LOSS_VIEWS)
         values = []
         for frame, image in zip(frames, self.images(tensors, frames), strict=True):
             mask = self.store.load_mask(frame)
@@ -204,7 +205,7 @@ def _fit(part: _Part, max_loss: float, progress: Progress) -> dict[str, Columns]
         return before - part.psnr(part.rounded(at(start * 2**exponent))) <= max_loss
 
     progress("find the steps")
-    # Half of the change that noise of this loss would be, to begin with.
+    # To begin with, the noise that would lower the PSNR by this much, shared among all numbers.
     error = 10 ** (-before / 10)
     numbers = sum(counts[name] * len(rule.steps) for name, rule in rules.items())
     start = error * (10 ** (max_loss / 10) - 1) / numbers
@@ -228,7 +229,7 @@ def _sensitivity(
     part: _Part, rules: Mapping[str, Columns], progress: Progress
 ) -> dict[str, NDArray[np.float64]]:
     """k_c of every column, by rounding one after the other."""
-    frames = _spread(part.frames, PROBE_VIEWS)
+    frames = spread(part.frames, PROBE_VIEWS)
     plain = part.images(part.tensors, frames)
     found = {}
     for name, rule in rules.items():
@@ -275,10 +276,15 @@ def _score(run: OpenRun, scene: Scene, store: ImageStore, variant: str, runs: Pa
     score_run(run.folder, record.model_copy(update=changed), truth, make_scorers())
 
 
-def _spread(frames: tuple[Frame, ...], count: int) -> tuple[Frame, ...]:
-    """At most so many of the frames, evenly spread."""
-    places = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round())
-    return tuple(frames[int(place)] for place in places)
+def spread(frames: Sequence[Frame], count: int) -> tuple[Frame, ...]:
+    """About so many of the frames, evenly spread over those of each period; one at least."""
+    periods = sorted({frame.period for frame in frames})
+    chosen: list[Frame] = []
+    for period in periods:
+        own = [frame for frame in frames if frame.period == period]
+        number = min(len(own), math.ceil(count / len(periods)))
+        chosen += (own[i * len(own) // number] for i in range(number))
+    return tuple(chosen)
 
 
 def _rows(tensor: NDArray[Any]) -> NDArray[Any]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from chronoscene.bench.compression import compress_run
+from chronoscene.bench.compression import compress_run, spread
 from chronoscene.bench.opening import open_run
 from chronoscene.bench.predictions import load_image, read_manifest, to_bytes
 from chronoscene.bench.results import read_run, run_folders
@@ -87,6 +87,14 @@ def test_a_damaged_model_is_refused(copied):
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(CheckpointError, match=r"model\.compressed: .*digest"):
         open_run(out).model(0)
+
+
+def test_every_period_has_a_view_however_many_there_are(copied):
+    frames = open_run(copied("chronogs")).scene().frames
+    many = [replace(frames[0], period=i % 40, image_id=i) for i in range(100)]
+    assert [f.period for f in spread(many, 9)] == list(range(40))
+    assert [f.image_id for f in spread(many[:1] * 7, 3)] == [0] * 3
+    assert spread(many[::40], 99) == tuple(many[::40])
 
 
 def test_a_run_in_stages_is_refused(copied):
