@@ -12,12 +12,9 @@ _SHORT: dict[str, Any] = {
     "voxel_unit": "spacing",
     "max_initial_anchors": 100_000,
     "max_anchors": 200_000,
-    "antialiased": True,
-    "cooldown": 0.2,
 }
 """For thousands of steps instead of tens of thousands. The voxel follows the sparse cloud, so the
-unit of the scene does not matter. The last two are better on views that were not trained on:
-docs/generalisation.md."""
+unit of the scene does not matter."""
 
 _LEAN: dict[str, Any] = _SHORT | {
     "offsets_per_anchor": 5,
@@ -27,8 +24,11 @@ _LEAN: dict[str, Any] = _SHORT | {
     "feature_lr": (0.015, 0.0075),
     "opacity_lr": (0.004, 0.0004),
     "color_lr": (0.008, 0.0005),
+    "antialiased": True,
+    "cooldown": 0.2,
 }
-"""Less than half of the numbers: docs/what-a-scene-requires.md has the trials."""
+"""Two fifths of the numbers: docs/what-a-scene-requires.md and docs/generalisation.md have the
+trials."""
 
 _TEXT: dict[str, Any] = {
     "fusion": "sum",
