@@ -157,22 +157,20 @@ def _signed(entry: Mapping[Any, Any]) -> str:
 def directions(study: Study, entries: DataFrame) -> list[str]:
     """A sentence for each scene and row but the first: whether the difference to the first row has
     the sign of the published one."""
-    measured = entries[(entries.source == MEASURED) & (entries.column == "macro")]
+    is_measured = entries.source == MEASURED
+    metrics = [name for name in _quantities(study, entries) if name in all_metrics()]
     sentences = []
-    for scene in measured.scene.unique():
+    for scene in entries[is_measured].scene.unique():
+        here = is_measured & (entries.scene == scene)
         for row in study.rows[1:]:
             verdicts: dict[str, list[str]] = {}
-            for quantity in _quantities(study, measured):
-                printed = [
-                    figures[quantity] - study.rows[0].published[place][quantity]
-                    for place, figures in row.published.items()
-                    if quantity in figures and quantity in study.rows[0].published.get(place, {})
-                ]
-                here = (measured.scene == scene) & (measured.row == row.label)
-                found = measured[here & (measured.quantity == quantity)].to_dict("records")
+            for metric in metrics:
+                mine = (entries.row == row.label) & (entries.quantity == metric)
+                printed = entries[mine & ~is_measured].difference.dropna().tolist()
+                found = entries[mine & here].to_dict("records")
                 if printed:
                     verdict = direction(found[0], printed) if found else f"{UNTOLD} (no result)"
-                    verdicts.setdefault(verdict, []).append(metric_info(quantity).title)
+                    verdicts.setdefault(verdict, []).append(metric_info(metric).title)
             said = [f"in {', '.join(t)} the direction {v}" for v, t in verdicts.items()]
             text = "; ".join(said) or "nothing is published to compare with"
             sentences.append(f"{scene}, {row.label}: {text}.")

@@ -126,6 +126,15 @@ def test_shipped_rows_have_options_that_exist(name):
             build_config(spec, preset=preset, overrides=row.options)
 
 
+def test_features_that_are_added_have_one_length():
+    """Features may be left out then, but not have lengths of their own (docs/studies.md)."""
+    spec = load_spec("chronogs")
+    for row in SHIPPED["components"].rows:
+        build_config(spec, preset="paper-text", overrides=row.options)
+    with pytest.raises(ConfigError, match="of one length"):
+        build_config(spec, preset="paper-text", overrides=SHIPPED["base-length"].rows[1].options)
+
+
 def test_models_without_a_component_train(scene_folder, tmp_path, monkeypatch):
     monkeypatch.setattr("chronoscene.bench.worker.warm_up", lambda *args, **options: None)
     outcome, finished, _ = run(

@@ -8,7 +8,13 @@ import pytest
 
 from chronoscene.bench.results import write_run
 from chronoscene.bench.study import Study
-from chronoscene.bench.study_tables import direction, directions, study_entries, study_texts
+from chronoscene.bench.study_tables import (
+    direction,
+    directions,
+    study_entries,
+    study_table,
+    study_texts,
+)
 from tests.made_runs import scored
 
 STUDY = Study.model_validate(
@@ -59,7 +65,10 @@ def test_directions(runs):
 
 
 def test_a_row_without_a_result_has_no_direction(runs):
-    without = directions(STUDY, study_entries(STUDY, runs | {"without a": []}))
+    entries = study_entries(STUDY, runs | {"without a": []})
+    _, row, *_ = study_table(STUDY, entries).rows
+    assert row == ["plaza", "without a", "-", "-", "24.50 (\N{MINUS SIGN}0.50)", "-", "-", "-"]
+    without = directions(STUDY, entries)
     assert without[0] == "plaza, without a: in PSNR [dB] the direction cannot be told (no result)."
     first = directions(STUDY, study_entries(STUDY, runs | {"full": []}))
     assert "cannot be told (there is no interval)" in first[0]
