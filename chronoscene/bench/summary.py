@@ -187,7 +187,7 @@ def with_texts(entries: DataFrame) -> DataFrame:
     numbers, texts = [], []
     for quantity, value, sd, n in entries[["quantity", "mean", "sd", "n"]].itertuples(index=False):
         numbers.append(in_unit(quantity, value))
-        texts.append(numbers[-1] + ("" if n == 1 else f" ± {in_unit(quantity, sd)}"))
+        texts.append(with_spread(quantity, value, None if n == 1 else sd))
     return entries.assign(number=numbers, text=texts)
 
 
@@ -197,6 +197,11 @@ def in_unit(quantity: str, value: float) -> str:
         return f"{value:.{all_metrics()[quantity].decimals}f}"
     (cost,) = (cost for cost in COSTS if cost.name == quantity)
     return f"{value * cost.factor:.{cost.decimals}f}"
+
+
+def with_spread(quantity: str, value: float, sd: float | None) -> str:
+    """A mean as tables show it, with its spread if there is one."""
+    return in_unit(quantity, value) + ("" if sd is None else f" ± {in_unit(quantity, sd)}")
 
 
 def compared(entries: DataFrame) -> DataFrame:

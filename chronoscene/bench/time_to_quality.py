@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from chronoscene.bench.checkpoints import CurvePoint
 from chronoscene.bench.results import CURVE_FILE, RunRecord
 from chronoscene.bench.strategies import STRATEGIES
-from chronoscene.bench.summary import in_unit, labelled
+from chronoscene.bench.summary import labelled, with_spread
 from chronoscene.bench.tables import ALL_SCENES
 from chronoscene.errors import CheckpointError
 from chronoscene.io.tables import Table
@@ -223,8 +223,7 @@ def _table(title: str, part: Sequence[Reading], quantity: str, more: dict[str, s
 
 def _text(reading: Reading) -> str:
     unit = "seconds" if reading.quantity.startswith("seconds") else "psnr"
-    spread = "" if reading.sd is None else f" ± {in_unit(unit, reading.sd)}"
-    return in_unit(unit, reading.mean) + spread
+    return with_spread(unit, reading.mean, reading.sd)
 
 
 def in_time(seconds: float) -> str:

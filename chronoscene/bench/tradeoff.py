@@ -15,10 +15,10 @@ from chronoscene.bench.results import RunRecord
 from chronoscene.bench.summary import (
     PAPER_METRICS,
     SIZE,
-    in_unit,
     metric_names,
     over_scenes,
     summarise,
+    with_spread,
 )
 from chronoscene.bench.tables import ALL_SCENES, COST_TITLES
 from chronoscene.errors import ConfigError
@@ -150,7 +150,7 @@ def on_front(costs: NDArray[np.float64], quality: NDArray[np.float64]) -> NDArra
 
 
 def front_tables(points: Sequence[FrontPoint]) -> list[Table]:
-    """The fronts, a table for each scene, metric and device."""
+    """The fronts, a table for each scene and metric."""
     panels: dict[tuple[str, str], dict[tuple[str, str], list[FrontPoint]]] = {}
     for point in points:
         if point.on_front:
@@ -165,8 +165,8 @@ def front_tables(points: Sequence[FrontPoint]) -> list[Table]:
                 [
                     "" if number else what,
                     point.label,
-                    _with_sd(cost, point.value, point.value_sd),
-                    _with_sd(metric, point.quality, point.quality_sd),
+                    with_spread(cost, point.value, point.value_sd),
+                    with_spread(metric, point.quality, point.quality_sd),
                 ]
                 for number, point in enumerate(front)
             ]
@@ -183,10 +183,6 @@ def front_tables(points: Sequence[FrontPoint]) -> list[Table]:
             )
         )
     return made
-
-
-def _with_sd(quantity: str, mean: float, sd: float | None) -> str:
-    return in_unit(quantity, mean) + ("" if sd is None else f" ± {in_unit(quantity, sd)}")
 
 
 @dataclass(frozen=True, slots=True)
