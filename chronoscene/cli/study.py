@@ -50,7 +50,7 @@ ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 @LPIPS_WEIGHTS
 @RUNS_OUT
 def command(name: str, seeds: int, assignments: tuple[str, ...], out: Path, **options: Any) -> None:
-    """Run a study on scenes: variants of a method, and one table of what differs between them.
+    """Run variants of a method on scenes, for one table.
 
     NAME is a study that comes with a method, such as components of ChronoGS, or FILE.toml one of
     your own; docs/studies.md describes both. The runs are those of bench, of which finished ones
