@@ -38,7 +38,8 @@ def make_page(tmp_path):
             folders[method] = folder / PREDICTIONS
             run = scored(method, psnr=psnr, period_labels=dict(zip("01", labels, strict=True)))
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / CURVE_FILE).write_text("seconds,psnr,model\n1,20,all\n2,24,all\n")
+            header = "seconds,iteration,primitives,psnr,parameters,model"
+            (folder / CURVE_FILE).write_text(f"{header}\n1,5,9,20,90,all\n2,10,9,24,90,all\n")
             write_run(folder, run.model_copy(update={"title": f"{run.title} {NASTY}"}), run.rows)
         for name, folder in folders.items():
             writer = ImageWriter(folder)

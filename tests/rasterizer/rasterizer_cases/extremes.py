@@ -112,9 +112,9 @@ def rounded(scene: SmallScene) -> SmallScene:
 
 def in_training_frame(scene: SmallScene) -> SmallScene:
     """As the bench hands a scene to methods, but still float64."""
-    frames = [SimpleNamespace(cam_from_world=viewmat) for viewmat in scene.viewmats]
+    frames = [SimpleNamespace(cam_from_world=pose, period=0) for pose in scene.viewmats]
     described: Any = SimpleNamespace(
-        select=lambda split: frames, points=SimpleNamespace(xyz=scene.means)
+        num_periods=1, select=lambda split: frames, points=SimpleNamespace(xyz=scene.means)
     )
     training_from_world = training_frame(described)
     return scene.with_(
