@@ -19,7 +19,7 @@ import torch
 from numba import prange
 from torch import Tensor
 
-from chronoscene.anchors.contribution import blending_weights
+from chronoscene.anchors.contribution import weigh
 from chronoscene.anchors.model import AnchorModel
 from chronoscene.kernels.compilation import kernel
 from chronoscene.methods import View
@@ -77,11 +77,8 @@ def bake(model: AnchorModel, period_weights: Tensor, views: Sequence[View]) -> G
 
 def _seen(model: AnchorModel, period_weights: Tensor, view: View) -> tuple[Tensor, Splats, Tensor]:
     """What a view shows: numbers of Gaussians, the Gaussians, and their weights, on the CPU. [L]"""
-    layout, (centre, visible) = model.layout, model.seen_from(view)
-    splats, index = model.decode_active(period_weights, centre, visible)
-    weights = blending_weights(splats, view, layout)
+    rows, splats, weights = weigh(model, period_weights, view)
     seen = weights > 0
-    rows = visible[index // layout.offsets] * layout.offsets + index % layout.offsets
     kept = Splats(*(value[seen].cpu() for value in splats))
     return rows[seen].cpu(), kept, weights[seen].cpu()
 

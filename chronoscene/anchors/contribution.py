@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from chronoscene.anchors.decode import unpack_bits
 from chronoscene.anchors.model import AnchorLayout, AnchorModel
 from chronoscene.methods import TrainingView, View
 from chronoscene.training.schedule import downscale_view
@@ -31,6 +32,14 @@ def blending_weights(splats: Splats, view: View, layout: AnchorLayout) -> Tensor
         )
         (gradient,) = torch.autograd.grad(raster.image.sum(), colors)
     return gradient[:, 0]  # the image is the sum of weights times colours
+
+
+def weigh(model: AnchorModel, period_weights: Tensor, view: View) -> tuple[Tensor, Splats, Tensor]:
+    """The Gaussians that a view decodes: their numbers, anchor * k + offset, and weights. [L]"""
+    k, (centre, visible) = model.layout.offsets, model.seen_from(view)
+    splats, places = model.decode_active(period_weights, centre, visible)
+    numbers = visible[places // k] * k + places % k
+    return numbers, splats, blending_weights(splats, view, model.layout)
 
 
 def least(amounts: Tensor, share: float) -> Tensor:
@@ -67,27 +76,12 @@ def used_offsets(
         total = torch.zeros(len(model) * k, device=model.device)
         for view, row in zip(views, feature_rows, strict=True):
             if view.period == period:
-                half = downscale_view(view, 2)
-                centre, visible = model.seen_from(half)
-                splats, places = model.decode_active(rows[row], centre, visible)
-                total[visible[places // k] * k + places % k] += blending_weights(
-                    splats, half, model.layout
-                )
+                numbers, _, weights = weigh(model, rows[row], downscale_view(view, 2))
+                total[numbers] += weights
         amounts = total.view(-1, k)
         anchors |= ~least(amounts.sum(1, keepdim=True), share)
         offsets |= ~least(amounts, share)
     return offsets & anchors
-
-
-def pack_bits(used: Tensor) -> Tensor:
-    """Bit j for column j. bool [A, k] -> int64 [A]"""
-    return (used.long() << torch.arange(used.shape[1], device=used.device)).sum(1)
-
-
-def unpack_bits(bits: Tensor, count: int) -> Tensor:
-    """Inverse of `pack_bits`. [A] -> bool [A, k]"""
-    places = torch.arange(count, device=bits.device)
-    return (bits[:, None].long() >> places & 1).bool()
 
 
 def pack_offsets(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.config import AnchorConfig
-from chronoscene.anchors.contribution import pack_bits, unpack_bits, used_offsets
+from chronoscene.anchors.contribution import used_offsets
+from chronoscene.anchors.decode import pack_bits, unpack_bits
 from chronoscene.anchors.density import COUNTERS, AnchorRows, DensityStatistics, grow, prune_mask
 from chronoscene.anchors.model import FIXED, PER_ANCHOR, AnchorModel
 from chronoscene.anchors.visibility import projected_centres

@@ -3,19 +3,16 @@
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.contribution import (
     blending_weights,
     least,
-    pack_bits,
     pack_offsets,
-    unpack_bits,
     unpack_offsets,
     used_offsets,
 )
+from chronoscene.anchors.decode import pack_bits
 from chronoscene.anchors.model import AnchorLayout, AnchorModel
 from chronoscene.methods import TrainingView, View
 from chronoscene.scene.geometry import look_at
@@ -56,12 +53,6 @@ def test_least_amounts() -> None:
     assert least(amounts, 0.1).tolist() == [[False, True], [True, False]]
     assert least(amounts, 0.09).tolist() == [[False, False], [True, False]]
     assert least(amounts, 0.5).tolist() == [[False, True], [True, True]]
-
-
-@given(st.lists(st.lists(st.booleans(), min_size=5, max_size=5), min_size=1, max_size=9))
-def test_bits(rows: list[list[bool]]) -> None:
-    used = torch.tensor(rows)
-    assert torch.equal(unpack_bits(pack_bits(used), 5), used)
 
 
 def test_packing_keeps_what_is_used() -> None:

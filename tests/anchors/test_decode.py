@@ -18,6 +18,8 @@ from chronoscene.anchors.decode import (
     decode,
     decode_active,
     decode_reference,
+    pack_bits,
+    unpack_bits,
 )
 from chronoscene.anchors.decode.layout import BLOCK, CHUNK
 from chronoscene.errors import ShapeError
@@ -333,6 +335,12 @@ def test_active_equals_the_active_part(
     assert torch.equal(index, truth)
     assert all(torch.equal(a, b) for a, b in zip(ours, whole, strict=True))
     assert all(torch.equal(our_grads[name], grad) for name, grad in grads.items())
+
+
+@given(st.lists(st.lists(st.booleans(), min_size=5, max_size=5), min_size=1, max_size=9))
+def test_bits(rows: list[list[bool]]) -> None:
+    used = torch.tensor(rows)
+    assert torch.equal(unpack_bits(pack_bits(used), 5), used)
 
 
 def test_offsets_that_are_not_used_are_off() -> None:

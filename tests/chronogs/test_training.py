@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.anchors import trainer as anchor_training
-from chronoscene.anchors.contribution import unpack_bits
+from chronoscene.anchors.decode import unpack_bits
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.kernels.runtime import set_threads

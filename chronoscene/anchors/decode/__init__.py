@@ -78,6 +78,17 @@ class DecodeInputs(NamedTuple):
         return self.opacity_head, self.covariance_head, self.color_head
 
 
+def pack_bits(used: Tensor) -> Tensor:
+    """Bit j for column j. bool [A, k] -> int64 [A]"""
+    return (used.long() << torch.arange(used.shape[1], device=used.device)).sum(1)
+
+
+def unpack_bits(bits: Tensor, count: int) -> Tensor:
+    """Inverse of `pack_bits`. [A] -> bool [A, k]"""
+    places = torch.arange(count, device=bits.device)
+    return (bits[:, None].long() >> places & 1).bool()
+
+
 def decode_reference(x: DecodeInputs) -> Splats:
     """Decode the visible anchors in plain torch: the definition of `decode`.
 
@@ -115,9 +126,8 @@ def decode_reference(x: DecodeInputs) -> Splats:
     factors = torch.exp(x.log_scales.index_select(0, x.visible))[:, None, :]
     offsets = x.offsets.index_select(0, x.visible)
     covariances = mlp(inputs, x.covariance_head).reshape(-1, num_offsets, 7)
-    bits = torch.arange(num_offsets, device=x.visible.device)
-    used = x.used_offsets.index_select(0, x.visible)[:, None].bitwise_right_shift(bits) & 1
-    opacities = torch.where(used == 1, torch.tanh(mlp(inputs, x.opacity_head)), -1)
+    used = unpack_bits(x.used_offsets.index_select(0, x.visible), num_offsets)
+    opacities = torch.where(used, torch.tanh(mlp(inputs, x.opacity_head)), -1)
     return Splats(
         means=(centres[:, None] + offsets * factors[..., :3]).reshape(-1, 3),
         quats=_unit_quats(covariances[..., 3:].reshape(-1, 4)),
