@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import math
 import re
-import shlex
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
+from chronoscene.bench.job import command_line
 from chronoscene.bench.results import RunRecord
 from chronoscene.bench.summary import (
     PAPER_METRICS,
@@ -23,6 +23,7 @@ from chronoscene.bench.summary import (
     summarise,
 )
 from chronoscene.bench.tables import period_title
+from chronoscene.bench.tradeoff import as_configurations
 from chronoscene.io.pages import render_page
 from chronoscene.io.staging import staged_folder
 from chronoscene.methods import MethodSpec, installed_methods, load_spec
@@ -202,7 +203,7 @@ class _Site:
         part = summarise(runs)
         for row in part.query("quantity == 'psnr' and column == 'macro'").itertuples():
             printed = of_paper.get(self.scene_of[like.scene])
-            run = next(r for r in runs if r.config_hash == row.config_hash)
+            (run,) = as_configurations([r for r in runs if r.config_hash == row.config_hash][:1])
             yield {
                 "scene": like.scene,
                 "label": row.label,
@@ -210,23 +211,13 @@ class _Site:
                 "cell": {**_cell(row), "best": False, "tied": False},
                 "difference": "" if printed is None else f"{row.mean - printed:+.2f}",
                 "seeds": row.seeds,
-                "command": command_of(run),
+                "command": command_line("SCENE", dict(run), run.seed),
             }
 
 
 def spec_of(method: str) -> MethodSpec | None:
     """The spec of an installed method; nothing that an entry names is imported."""
     return load_spec(method) if method in installed_methods() else None
-
-
-def command_of(run: RunRecord) -> str:
-    """The command that makes such a run again."""
-    words = ["chronoscene", "bench", "SCENE", "--method", run.method, "--strategy", run.strategy]
-    words += ["--preset", run.preset, "--seed", str(run.seed)]
-    for part in filter(None, run.variant.split(",")):
-        name, _, value = part.partition("=")
-        words += [f"--{name}", value] if name in ("budget", "iterations") else ["--set", part]
-    return shlex.join(words)
 
 
 Column = tuple[str, str, str]

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import re
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
@@ -235,6 +236,34 @@ class Job:
             "seed": self.seed,
             "device": self.device,
         }
+
+
+OPTIONS = ("iterations", "budget", "separate_iterations", "max_width")
+"""What a variant names that is an option of ``bench`` and none of the method."""
+
+
+def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None) -> str:
+    """The command that trains a configuration.
+
+    Args:
+        scene: Argument that stands for its folder.
+        config: ``method``, ``strategy``, ``preset`` and ``variant`` (`Job.with_variant`).
+        seed: None leaves the option out.
+    """
+    words = ["chronoscene", "bench", scene]
+    for name in ("method", "strategy", "preset"):
+        words += [f"--{name}", config[name]]
+    words += [] if seed is None else ["--seed", str(seed)]
+    # A comma inside of a value is followed by no name.
+    for assignment in filter(None, re.split(r",(?=\w+=)", config["variant"])):
+        name, _, value = assignment.partition("=")
+        if name == "iterations" and "+" in value:
+            words += ["--continue-to", value.rpartition("+")[2]]
+        elif name in OPTIONS:
+            words += [f"--{name.replace('_', '-')}", value]
+        else:
+            words += ["--set", assignment]
+    return shlex.join(words)
 
 
 def deciding_options(config: Any) -> dict[str, Any]:

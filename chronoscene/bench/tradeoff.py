@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.bench.job import command_line
 from chronoscene.bench.results import RunRecord
 from chronoscene.bench.summary import (
     PAPER_METRICS,
@@ -246,7 +245,7 @@ def choose(records: Sequence[RunRecord], limits: Limits, wanted: str) -> list[st
             else:
                 continue
             fits_somewhere = True
-            sentences.append(f"{place}: {_sentence(best)}: {command_line(best)}")
+            sentences.append(f"{place}: {_sentence(best)}: {command_line('DIR', best)}")
     if not fits_somewhere:
         raise ConfigError(
             wanted,
@@ -275,27 +274,3 @@ def _sentence(config: dict[str, Any]) -> str:
         f"{config['label']} reaches {config['psnr_text']} dB after {config['seconds_text']} s of "
         f"training with a model of {in_words(config[SIZE])}"
     )
-
-
-OPTIONS = ("iterations", "budget", "separate_iterations", "max_width")
-"""What a variant names that is an option of ``bench`` and none of the method."""
-
-
-def command_line(config: dict[str, Any]) -> str:
-    """The command that trains a configuration.
-
-    Args:
-        config: ``method``, ``strategy``, ``preset`` and ``variant``.
-    """
-    words = ["--method", config["method"], "--strategy", config["strategy"]]
-    words += ["--preset", config["preset"]]
-    # A comma inside of a value is followed by no name.
-    for assignment in filter(None, re.split(r",(?=\w+=)", config["variant"])):
-        name, _, value = assignment.partition("=")
-        if name == "iterations" and "+" in value:
-            words += ["--continue-to", value.rpartition("+")[2]]
-        elif name in OPTIONS:
-            words += [f"--{name.replace('_', '-')}", value]
-        else:
-            words += ["--set", assignment]
-    return f"chronoscene bench DIR {shlex.join(words)}"

@@ -1,12 +1,13 @@
 """Budgets are parsed, progress never leaves 0..1, shares add up."""
 
+import shlex
 from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.bench.job import Job, StopRule, parse_duration
+from chronoscene.bench.job import Job, StopRule, command_line, parse_duration
 from chronoscene.errors import ConfigError
 from chronoscene.methods import load_spec
 
@@ -112,3 +113,16 @@ def test_folders_have_names_that_file_systems_take():
 )
 def test_variants_are_named_by_what_differs_from_the_preset(changes, variant):
     assert replace(JOB, **changes).with_variant(load_spec("toy_methods:MEAN")).variant == variant
+
+
+def test_the_command_names_what_differs_from_the_preset():
+    variant = 'iterations=50,heads=["a", "b"],budget=90s,separate_iterations=each,max_width=800'
+    config = {"method": "m", "strategy": "joint", "preset": "fast", "variant": variant}
+    assert shlex.split(command_line("DIR", config))[9:] == [
+        *("--iterations", "50", "--set", 'heads=["a", "b"]', "--budget", "90s"),
+        *("--separate-iterations", "each", "--max-width", "800"),
+    ]
+    config["variant"] = "iterations=20+50"
+    assert command_line("DIR", config).endswith(" --continue-to 50")
+    config["variant"] = "sh_degree=2,budget=90s"
+    assert command_line("DIR", config, 0).endswith("--seed 0 --set sh_degree=2 --budget 90s")

@@ -1,7 +1,5 @@
 """Fronts by hand, devices apart, means over common scenes, and the configuration for limits."""
 
-import shlex
-
 import numpy as np
 import pytest
 from made_runs import record
@@ -11,7 +9,6 @@ from chronoscene.bench.tradeoff import (
     Limits,
     as_configurations,
     choose,
-    command_line,
     front_points,
     front_tables,
     on_front,
@@ -135,17 +132,6 @@ def test_where_nothing_fits_the_nearest_is_named():
     untrained = [run("foreign", 20.0, None)]
     with pytest.raises(ConfigError, match="found no run that was trained"):
         choose(untrained, Limits(psnr=1.0), "--target-psnr 1")
-
-
-def test_the_command_names_what_differs_from_the_preset():
-    variant = 'iterations=50,heads=["a", "b"],budget=90s,separate_iterations=each,max_width=800'
-    config = {"method": "m", "strategy": "joint", "preset": "fast", "variant": variant}
-    assert shlex.split(command_line(config))[9:] == [
-        *("--iterations", "50", "--set", 'heads=["a", "b"]', "--budget", "90s"),
-        *("--separate-iterations", "each", "--max-width", "800"),
-    ]
-    config["variant"] = "iterations=20+50"
-    assert command_line(config).endswith(" --continue-to 50")
 
 
 def test_unusual_widths_are_named():

@@ -15,7 +15,7 @@ from made_runs import write_scored
 from chronoscene.errors import CheckpointError, SceneError
 from leaderboard.entries import read_entries
 from leaderboard.published import load_published
-from leaderboard.site import command_of, write_site
+from leaderboard.site import write_site
 from leaderboard.submit import submit
 
 NASTY = "May & \"June\" 'x'"
@@ -141,9 +141,11 @@ def test_scenes_of_one_name_have_rows_of_their_own(make_run, tmp_path):
         assert "23.00" in text and "12.50" in text
 
 
-def test_commands_make_the_run_again(entries):
-    run = entries[0].records[0].model_copy(update={"variant": "sh_degree=2,budget=90s"})
-    assert command_of(run).endswith("--seed 0 --set sh_degree=2 --budget 90s")
+def test_commands_make_the_run_again(make_run, tmp_path):
+    submit([make_run(variant="sh_degree=2,budget=90s", max_width=800)], tmp_path / "e")
+    write_site(read_entries(tmp_path / "e"), load_published(), tmp_path / "site")
+    page = (tmp_path / "site/method/3dgs.html").read_text(encoding="utf-8")
+    assert "--seed 0 --set sh_degree=2 --budget 90s --max-width 800<" in page
 
 
 def test_pictures_come_only_from_the_runs_of_an_entry(entries, make_run, tmp_path):
