@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from itertools import compress
 from typing import Any, NamedTuple
+
+import numpy as np
+
+from chronoscene.bench.tradeoff import on_front
 
 WIDTH, HEIGHT = 440, 300
 LEFT, RIGHT, TOP, BOTTOM = 52, 16, 14, 44
@@ -21,15 +26,6 @@ class Point(NamedTuple):
     label: str
     cost: float
     quality: float
-
-
-def front(points: Iterable[Point]) -> list[Point]:
-    """The points to which none is superior, by their cost: no cheaper one reaches as much."""
-    best: list[Point] = []
-    for point in sorted(points, key=lambda p: (p.cost, -p.quality)):
-        if not best or point.quality > best[-1].quality:
-            best.append(point)
-    return best
 
 
 def plot(points: Sequence[Point], *, cost: str, quality: str) -> dict[str, Any] | None:
@@ -55,9 +51,11 @@ def plot(points: Sequence[Point], *, cost: str, quality: str) -> dict[str, Any] 
     def y(value: float) -> float:
         return round(TOP + (top - value) / (top - bottom) * (HEIGHT - TOP - BOTTOM), 1)
 
-    best, heights = front(points), _label_heights([y(p.quality) for p in points])
-    corners = [f"M{x(best[0].cost)} {y(best[0].quality)}"]
-    corners += [f"H{x(p.cost)} V{y(p.quality)}" for p in best[1:]]
+    heights = _label_heights([y(value) for value in values])
+    best = on_front(np.array([p.cost for p in points]), np.array(values)).tolist()
+    front = sorted(compress(points, best), key=lambda p: p.cost)
+    corners = [f"M{x(front[0].cost)} {y(front[0].quality)}"]
+    corners += [f"H{x(p.cost)} V{y(p.quality)}" for p in front[1:]]
     return {
         "size": (WIDTH, HEIGHT),
         "box": (LEFT, TOP, WIDTH - RIGHT, HEIGHT - BOTTOM),
@@ -70,10 +68,10 @@ def plot(points: Sequence[Point], *, cost: str, quality: str) -> dict[str, Any] 
                 "x": x(p.cost),
                 "y": y(p.quality),
                 "height": height,
-                "best": p in best,
+                "best": is_best,
                 "left": x(p.cost) > WIDTH / 2,
             }
-            for p, height in zip(points, heights, strict=True)
+            for p, height, is_best in zip(points, heights, best, strict=True)
         ],
         "across": [(x(tick), f"{tick:g}") for tick in _log_ticks(10**low, 10**high)],
         "up": [(y(tick), f"{tick:g}") for tick in _ticks(bottom, top)],

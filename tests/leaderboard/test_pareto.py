@@ -5,14 +5,9 @@ from itertools import pairwise
 
 import pytest
 
-from leaderboard.pareto import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Point, front, plot
+from leaderboard.pareto import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Point, plot
 
 POINTS = [Point("a", 10, 20), Point("b", 100, 30), Point("c", 50, 19), Point("d", 100, 25)]
-
-
-def test_front():
-    assert [p.label for p in front(POINTS)] == ["a", "b"]
-    assert [p.label for p in front([Point("x", 1, 5), Point("y", 2, 5)])] == ["x"]
 
 
 def test_points_lie_inside_and_in_order():
@@ -26,6 +21,8 @@ def test_points_lie_inside_and_in_order():
     share = (points["c"]["x"] - points["a"]["x"]) / (points["b"]["x"] - points["a"]["x"])
     assert share == pytest.approx(math.log10(5), abs=2e-3)
     assert [p["label"] for p in made["points"] if p["best"]] == ["a", "b"]
+    made = plot([Point("y", 2, 5), Point("x", 1, 5)], cost="s", quality="dB")
+    assert [p["label"] for p in made["points"] if p["best"]] == ["x"]
 
 
 def test_ticks_are_round_and_inside():
