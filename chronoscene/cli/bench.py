@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,38 @@ from chronoscene.io.staging import check_outside
 SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 
 FOLDER = click.Path(path_type=Path, file_okay=False)
+_TRAINING = (
+    click.option("--preset", default="balanced", show_default=True, help="Preset of the methods."),
+    click.option(
+        "--iterations", type=click.IntRange(min=1), help="Stop after this many iterations."
+    ),
+    click.option(
+        "--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Number of seeds."
+    ),
+    click.option(
+        "--set",
+        "assignments",
+        multiple=True,
+        help="Set an option of the methods, as KEY=VALUE or METHOD.KEY=VALUE. May be repeated.",
+    ),
+    click.option(
+        "--threads",
+        type=click.IntRange(min=1),
+        help="Number of threads.  [default: one per processor]",
+    ),
+    click.option(
+        "--device",
+        type=click.Choice(["auto", "cpu", "cuda"]),
+        default="auto",
+        show_default=True,
+        help="Device to train and render on.",
+    ),
+)
+
+
+def training_options(command: Any) -> Any:
+    """The options that ``bench`` and ``study`` share."""
+    return reduce(lambda found, option: option(found), reversed(_TRAINING), command)
 
 
 @click.command("bench")
@@ -38,13 +71,19 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
     help=f"One or several of {', '.join(STRATEGIES)}, separated by commas.",
 )
 @reading_options("the scenes")
-@click.option("--preset", default="balanced", show_default=True, help="Preset of the methods.")
+@training_options
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="First seed. Equal seeds give equal models on one machine's CPU, but not with --budget.",
+)
 @click.option(
     "--budget",
     help="Stop after this time on the training clock, such as 90s, 5m or 1h30m. Schedules follow "
     "the clock then, and equal seeds do not give equal models.",
 )
-@click.option("--iterations", type=click.IntRange(min=1), help="Stop after this many iterations.")
 @click.option(
     "--continue-to",
     type=click.IntRange(min=1),
@@ -70,22 +109,6 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
     "iterations and budget or each get them.",
 )
 @click.option(
-    "--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Number of seeds."
-)
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="First seed. Equal seeds give equal models on one machine's CPU, but not with --budget.",
-)
-@click.option(
-    "--set",
-    "assignments",
-    multiple=True,
-    help="Set an option of the methods, as KEY=VALUE or METHOD.KEY=VALUE. May be repeated.",
-)
-@click.option(
     "--max-width",
     type=click.IntRange(min=1),
     default=MAX_WIDTH,
@@ -105,16 +128,6 @@ FOLDER = click.Path(path_type=Path, file_okay=False)
     default=PHOTO_DISK / 1e9,
     show_default=True,
     help="Disk space below --out in GB for decoded photos, if they do not fit into memory.",
-)
-@click.option(
-    "--threads", type=click.IntRange(min=1), help="Number of threads.  [default: one per processor]"
-)
-@click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="Device to train and render on.",
 )
 @LPIPS_WEIGHTS
 @RUNS_OUT

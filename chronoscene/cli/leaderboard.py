@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.output import check_place, tell_written, writing_to
+from chronoscene.cli.results import RUNS
 from leaderboard.entries import read_entries
 from leaderboard.published import load_published
 from leaderboard.site import write_site
@@ -14,13 +15,7 @@ from leaderboard.submit import submit
 
 
 @click.command("submit")
-@click.argument(
-    "folders",
-    metavar="RUN...",
-    nargs=-1,
-    required=True,
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-)
+@RUNS
 @click.option(
     "--to",
     type=click.Path(path_type=Path, file_okay=False),
@@ -30,9 +25,9 @@ from leaderboard.submit import submit
 def submit_command(folders: tuple[Path, ...], to: Path) -> None:
     """Add finished runs to the entries of the leaderboard.
 
-    RUN is the folder of a run, or one with many. An entry is a JSON file with the values of all
-    test views, what the runs cost, and the hashes of the predictions, which are checked. Seeds of
-    one setting are in one file; a seed that is there is replaced.
+    Each of RUNS is the folder of a run, or one with many. An entry is a JSON file with the values
+    of all test views, what the runs cost, and the hashes of the predictions, which are checked.
+    Seeds of one setting are in one file; a seed that is there is replaced.
     """
     with writing_to("--to", to):
         written = submit(folders, to)

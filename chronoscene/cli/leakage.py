@@ -10,7 +10,7 @@ import click
 from chronoscene.bench.leakage import COLUMNS, leakage_table, measure_leakage
 from chronoscene.bench.opening import open_run
 from chronoscene.bench.results import ROW_COLUMNS
-from chronoscene.cli.output import check_file, emit, terminal_width
+from chronoscene.cli.output import OUT_FILE, check_file, emit, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.cli.render import DEVICE, RUN, SCENE
 from chronoscene.errors import ConfigError
@@ -32,11 +32,7 @@ from chronoscene.io import tables
     show_default=True,
     help="Output format; csv has every view.",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Write to this file instead of the terminal.",
-)
+@OUT_FILE
 @SCENE
 @DEVICE
 def command(

@@ -18,6 +18,9 @@ from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import printable
 
 FILE = "a file that can be written"
+OUT_FILE = click.option(
+    "--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal."
+)
 
 
 def emit(text: str, out: Path | None, *, option: str = "--out") -> None:

@@ -14,7 +14,7 @@ from chronoscene.bench.scoring import rescore
 from chronoscene.bench.stage_figure import draw_stages
 from chronoscene.bench.summary import in_region, read_runs
 from chronoscene.bench.tables import MAX_PERIODS, format_runs
-from chronoscene.cli.output import emit, terminal_width
+from chronoscene.cli.output import OUT_FILE, emit, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.io.tables import FORMATS
@@ -24,6 +24,13 @@ from leaderboard.published import load_published
 SOME_FAILED = 1  # Exit status when a run could not be scored
 
 
+RUNS = click.argument(
+    "folders",
+    metavar="RUNS...",
+    nargs=-1,
+    required=True,
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+)
 LPIPS_WEIGHTS = click.option(
     "--lpips-weights",
     type=click.Path(path_type=Path, exists=True),
@@ -93,13 +100,7 @@ def print_runs(out: Path) -> None:
 
 
 @click.command("table")
-@click.argument(
-    "folders",
-    metavar="RUNS...",
-    nargs=-1,
-    required=True,
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-)
+@RUNS
 @click.option(
     "--format",
     "style",
@@ -130,11 +131,7 @@ def print_runs(out: Path) -> None:
 @click.option(
     "--periods", is_flag=True, help=f"Show every period where there are more than {MAX_PERIODS}."
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Write to this file instead of the terminal.",
-)
+@OUT_FILE
 def table(
     folders: tuple[Path, ...],
     style: str,

@@ -12,6 +12,7 @@ import click
 
 from chronoscene.cli.convert import reading_options
 from chronoscene.cli.output import (
+    OUT_FILE,
     check_file,
     check_place,
     emit,
@@ -98,9 +99,7 @@ class Request:
     show_default=True,
     help="Output format.",
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal."
-)
+@OUT_FILE
 @click.option(
     "--figures",
     type=click.Path(path_type=Path),

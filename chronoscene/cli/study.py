@@ -11,7 +11,7 @@ from chronoscene.bench.job import check_device
 from chronoscene.bench.runner import BenchSettings
 from chronoscene.bench.study import find_study, read_study, run_study
 from chronoscene.bench.study_tables import study_texts
-from chronoscene.cli.bench import FOLDER, SOME_FAILED, parse_assignments
+from chronoscene.cli.bench import FOLDER, SOME_FAILED, parse_assignments, training_options
 from chronoscene.cli.convert import reading_options
 from chronoscene.cli.methods import look_here_for
 from chronoscene.cli.output import check_place, emit, terminal_width
@@ -25,28 +25,7 @@ ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 @click.argument("name", metavar="NAME|FILE.toml")
 @click.argument("scenes", metavar="DIR...", nargs=-1, required=True, type=FOLDER)
 @reading_options("the scenes")
-@click.option("--preset", default="balanced", show_default=True, help="Preset of the methods.")
-@click.option("--iterations", type=click.IntRange(min=1), help="Stop after this many iterations.")
-@click.option(
-    "--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Number of seeds."
-)
-@click.option(
-    "--set",
-    "assignments",
-    multiple=True,
-    help="Set an option of the methods in all rows that do not set it, as KEY=VALUE or "
-    "METHOD.KEY=VALUE. May be repeated.",
-)
-@click.option(
-    "--threads", type=click.IntRange(min=1), help="Number of threads.  [default: one per processor]"
-)
-@click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    default="auto",
-    show_default=True,
-    help="Device to train and render on.",
-)
+@training_options
 @LPIPS_WEIGHTS
 @RUNS_OUT
 def command(name: str, seeds: int, assignments: tuple[str, ...], out: Path, **options: Any) -> None:
@@ -54,8 +33,8 @@ def command(name: str, seeds: int, assignments: tuple[str, ...], out: Path, **op
 
     NAME is a study that comes with a method, such as components of ChronoGS, or FILE.toml one of
     your own; docs/studies.md describes both. The runs are those of bench, of which finished ones
-    are kept. The table says what was published beside what was measured, and is written to --out as
-    Markdown, CSV and JSON, too.
+    are kept; --set is for the rows that do not set the option themselves. The table says what was
+    published beside what was measured, and is written to --out as Markdown, CSV and JSON, too.
     """
     check_outside(out, options["scenes"], option="--out")
     check_place("--out", out)

@@ -29,7 +29,8 @@ from chronoscene.bench.tradeoff import (
     front_points,
     front_tables,
 )
-from chronoscene.cli.output import emit, tell_written, terminal_width, writing_to
+from chronoscene.cli.output import OUT_FILE, emit, tell_written, terminal_width, writing_to
+from chronoscene.cli.results import RUNS
 from chronoscene.errors import ConfigError
 from chronoscene.io import tables
 from chronoscene.io.tables import FORMATS
@@ -39,13 +40,7 @@ FIGURE = "tradeoff.png"
 
 
 @click.command("tradeoff")
-@click.argument(
-    "folders",
-    metavar="RUNS...",
-    nargs=-1,
-    required=True,
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-)
+@RUNS
 @click.option(
     "--format",
     "style",
@@ -54,11 +49,7 @@ FIGURE = "tradeoff.png"
     show_default=True,
     help="Output format; csv has the points of the fronts and all others.",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Write to this file instead of the terminal.",
-)
+@OUT_FILE
 @click.option(
     "--figures",
     type=click.Path(path_type=Path, file_okay=False),

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from chronoscene.cli.convert import reading_options
-from chronoscene.cli.output import check_file, check_place, emit
+from chronoscene.cli.output import OUT_FILE, check_file, check_place, emit
 from chronoscene.cli.progress import announce, tracked
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
@@ -48,9 +48,7 @@ def _explain(context: click.Context, option: click.Parameter, value: str | None)
     show_default=True,
     help="Output format.",
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal."
-)
+@OUT_FILE
 @click.option(
     "--sarif", type=click.Path(path_type=Path), help="Also write a SARIF report to this file."
 )
