@@ -63,10 +63,6 @@ def command(
         emit(tables.csv_text(ROW_COLUMNS, map(astuple, rows)), out)
         return
     made = leakage_table(rows, run.record.period_labels, run.record.label)
-    if style == "table":
-        text = tables.boxed_text(made, width=terminal_width(out))
-    else:
-        text = tables.markdown(made) if style == "markdown" else tables.latex(made)
-    emit(text, out)
+    emit(tables.text_of(made, style, width=terminal_width(out)), out)
     if absent := [title for key, (title, _) in COLUMNS.items() if key not in there]:
         click.echo(f"no truth, or nothing rendered, for: {', '.join(absent)}", err=True)

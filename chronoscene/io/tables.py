@@ -239,6 +239,13 @@ def _latex_row(cells: Iterable[str]) -> str:
     return "{}" + row if row.startswith(("[", "*")) else row
 
 
+def text_of(table: Table, style: str, *, width: int | None = None, cmidrules: bool = False) -> str:
+    """A table in one of the `FORMATS` that people read; options as in the functions for them."""
+    if style == "latex":
+        return latex(table, cmidrules=cmidrules)
+    return markdown(table) if style == "markdown" else boxed_text(table, width=width)
+
+
 _LATEX = str.maketrans(
     {c: f"\\{c}" for c in "&%$#_{}"}
     | {

@@ -168,7 +168,7 @@ def _period_names(counts: Sequence[SceneCount]) -> list[str]:
     return [*(f"Period {i}" for i in range(periods)), "Total"]
 
 
-def _table(counts: Sequence[SceneCount], images: str = "images", points: str = "points") -> Table:
+def _table(counts: Sequence[SceneCount], images: str, points: str) -> Table:
     """The table as it is read."""
     heads = [("Scene", "")]
     for name in _period_names(counts):
@@ -205,10 +205,8 @@ def format_counts(
         heads = [name.lower().replace(" ", "_") for name in _period_names(counts)]
         columns = ["scene", *(f"{h}_{what}" for h in heads for what in ("images", "points"))]
         return tables.csv_text(columns, count_table(counts))
-    if style == "latex":
-        return tables.latex(_table(counts, "Images", "Points"), cmidrules=True)
-    table = _table(counts)
-    return tables.markdown(table) if style == "markdown" else tables.boxed_text(table, width=width)
+    names = ("Images", "Points") if style == "latex" else ("images", "points")
+    return tables.text_of(_table(counts, *names), style, width=width, cmidrules=True)
 
 
 def document(

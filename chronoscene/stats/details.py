@@ -98,10 +98,7 @@ def format_details(
         return document(scenes, [s.counts for s in statistics], unreadable)
     if style == "csv":
         return _csv(statistics)
-    table = _table(statistics)
-    if style == "latex":
-        return tables.latex(table)
-    return tables.markdown(table) if style == "markdown" else tables.boxed_text(table, width=width)
+    return tables.text_of(_table(statistics), style, width=width)
 
 
 def _csv(statistics: Sequence[SceneStatistics]) -> str:
