@@ -209,7 +209,7 @@ class _Site:
                 "label": row.label,
                 "effort": setting.effort,
                 "cell": {**_cell(row), "best": False, "tied": False},
-                "difference": "" if printed is None else f"{row.mean - printed:+.2f}",
+                "difference": "" if printed is None else f"{row.mean - printed:+z.2f}",
                 "seeds": row.seeds,
                 "command": command_line("SCENE", dict(run), run.seed),
             }

@@ -192,9 +192,9 @@ def with_texts(entries: DataFrame) -> DataFrame:
 
 
 def in_unit(quantity: str, value: float) -> str:
-    """A value in the unit and with the decimals in which tables show it."""
+    """A value in the unit and with the decimals in which tables show it; zero has no sign."""
     if quantity in all_metrics():
-        return f"{value:.{all_metrics()[quantity].decimals}f}"
+        return f"{value:z.{all_metrics()[quantity].decimals}f}"
     (cost,) = (cost for cost in COSTS if cost.name == quantity)
     return f"{value * cost.factor:.{cost.decimals}f}"
 

@@ -8,7 +8,7 @@ from made_runs import record, scored, smooth
 
 from chronoscene.bench.intervals import interval, resampled_means
 from chronoscene.bench.results import Row
-from chronoscene.bench.summary import over_scenes, published_entries, read_runs, summarise
+from chronoscene.bench.summary import in_unit, over_scenes, published_entries, read_runs, summarise
 from chronoscene.errors import CheckpointError
 from leaderboard.published import load_published
 
@@ -29,6 +29,10 @@ def test_statistics_by_hand():
     assert (value.mean, value.n, value.text) == (1_234_000.0, 1, "1.234")
     runs = [record(psnr=(float("inf"),)), record(seed=1, psnr=(1.0,))]
     assert summarise(runs).text[0] == "inf ± nan"
+
+
+def test_what_rounds_to_zero_has_no_sign():
+    assert [in_unit("psnr", value) for value in (-0.004, -0.006, 0.0)] == ["0.00", "-0.01", "0.00"]
 
 
 def test_entries_by_hand():
