@@ -33,6 +33,7 @@ from chronoscene.bench.results import (
     PREDICTIONS,
     SOURCE_FILE,
     read_config,
+    size_of,
     write_summary,
 )
 from chronoscene.bench.scoring import score_run
@@ -261,19 +262,15 @@ def _score(run: OpenRun, scene: Scene, store: ImageStore, variant: str, runs: Pa
         seconds += time.perf_counter() - before
         period = frame.period
         writer.add(frame.name, image, camera_period=period, rendered_period=period)
-    record, files = run.record, (run.folder / CHECKPOINT).rglob("*")
-    details = {"method": record.method, "strategy": record.strategy, "seed": record.seed}
-    writer.close(
-        kind="predictions", scene=scene.name, scene_hash=record.scene_hash, details=details
-    )
+    writer.close_run(run.record)
     changed = {
         "variant": variant,
-        "checkpoint_bytes": sum(file.stat().st_size for file in files if file.is_file()),
+        "checkpoint_bytes": size_of(run.folder / CHECKPOINT),
         "config_hash": read_config(run.folder)["config_hash"],
         "render_seconds": seconds / len(frames) if frames else None,
     }
-    truth = ground_truth_folder(runs, record.scene)
-    score_run(run.folder, record.model_copy(update=changed), truth, make_scorers())
+    truth = ground_truth_folder(runs, run.record.scene)
+    score_run(run.folder, run.record.model_copy(update=changed), truth, make_scorers())
 
 
 def spread(frames: Sequence[Frame], count: int) -> tuple[Frame, ...]:

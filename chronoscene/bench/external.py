@@ -73,15 +73,8 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
             model = " ".join(filter(None, ("trains", part.subfolder)))
             display.wait(f"{spec.title} {model}; what it prints goes to {staging / LOG}")
             trained.append(_run_part(job, spec, runner, scene, part, stop, writer))
-        writer.close(
-            kind="predictions",
-            scene=scene.name,
-            scene_hash=job.scene_hash,
-            details={"method": spec.name, "strategy": job.strategy, "seed": job.seed},
-        )
     primitives = [model.primitives for model in trained]
     iterations = [stop.iterations for stop in stops]
-    saved = (staging / results.CHECKPOINT).rglob("*")
     record = foreign_record(
         scene,
         f"{spec.title} is another program, which is watched from outside",
@@ -95,7 +88,7 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
         iterations=None if None in iterations else sum(filter(None, iterations)),
         primitives=None if None in primitives else sum(filter(None, primitives)),
         primitive=runner.unit,
-        checkpoint_bytes=sum(path.stat().st_size for path in saved if path.is_file()),
+        checkpoint_bytes=results.size_of(staging / results.CHECKPOINT),
         peak_memory_bytes=max(model.peak_memory_bytes for model in trained) or None,
         device=f"the program's choice, {processor_name()}",
         commit=job.commit,
@@ -107,6 +100,7 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
     )
     if job.seed and "seed" not in used_values(runner, ""):
         record.notices.append(f"{record.label}: {spec.title} takes no seed")
+    writer.close_run(record)
     with ProgressDisplay(job.label) as display:
         display.wait("scores")
         score_job(job, record)

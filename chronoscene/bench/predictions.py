@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from chronoscene.bench.results import GROUND_TRUTH
+from chronoscene.bench.results import GROUND_TRUTH, RunRecord
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.images.store import ImageStore
 from chronoscene.io.staging import needing_space, replacing, write_text_atomic
@@ -184,6 +184,15 @@ class ImageWriter:
         )
         write_manifest(self.folder, manifest)
         return manifest
+
+    def close_run(self, run: RunRecord) -> Manifest:
+        """`close` with what a run predicts."""
+        return self.close(
+            kind="predictions",
+            scene=run.scene,
+            scene_hash=run.scene_hash,
+            details={"method": run.method, "strategy": run.strategy, "seed": run.seed},
+        )
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:

@@ -52,6 +52,11 @@ class Row:
     value: float
 
 
+def size_of(folder: Path) -> int:
+    """Bytes of all files below a folder; 0 where there is none."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
 class RunRecord(BaseModel):
     """One run: one method, strategy, scene and seed."""
 

@@ -125,13 +125,6 @@ def run_job(job: Job) -> None:
             )
     found = (peak_memory_bytes() or 0, *(o.trained.peak_memory_bytes for o in outcomes))
     peaks = max(found) or None, _peak_device_memory(machine.device)
-    for writer in (*writers.values(), final):
-        writer.close(
-            kind="predictions",
-            scene=scene.name,
-            scene_hash=job.scene_hash,
-            details={"method": spec.name, "strategy": job.strategy, "seed": job.seed},
-        )
     columns = [f.name for f in fields(CurvePoint)]
     points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
     write_text_atomic(staging / results.CURVE_FILE, csv_text(columns, points))
@@ -140,6 +133,8 @@ def run_job(job: Job) -> None:
         record = _record(job, spec, scene, machine, outcomes, peaks, started)
         record.warmup_seconds = warmup_seconds
         record.notices = [*job.notices, *([notice] if notice else []), *_skips(job, record)]
+        for writer in (*writers.values(), final):
+            writer.close_run(record)
         score_job(job, record)
 
 
@@ -296,7 +291,6 @@ def _record(
     # The stages of a training leave one model.
     models = outcomes[-1:] if STRATEGIES[job.strategy].in_order else outcomes
     drawn = [model.drawn for model in models]
-    saved = [path for model in models for path in model.folder.rglob("*")]
     return results.RunRecord(
         method=spec.name,
         strategy=job.strategy,
@@ -312,7 +306,7 @@ def _record(
         primitives=sum(model.size.primitives for model in models),
         primitive=outcomes[0].size.unit,
         drawn=None if None in drawn or not tests else sum(filter(None, drawn)) / tests,
-        checkpoint_bytes=sum(path.stat().st_size for path in saved if path.is_file()),
+        checkpoint_bytes=sum(results.size_of(model.folder) for model in models),
         peak_memory_bytes=peaks[0],
         device=describe_device(machine.device, machine.threads),
         commit="; ".join(dict.fromkeys([*code, job.commit])),
