@@ -21,6 +21,7 @@ from chronoscene.bench.predictions import (
 )
 from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord, read_run, run_folders
 from chronoscene.bench.summary import kind_of
+from chronoscene.bench.tables import period_name
 from chronoscene.io.staging import replacing
 from chronoscene.metrics.psnr_ssim import psnr
 
@@ -160,7 +161,7 @@ def _draw_row(
             axis.imshow(image)
         axis.set_xlabel(psnr_text(image, photo, mask), fontsize=9)
     axes[0, 0].imshow(photo)
-    axes[0, 0].set_ylabel(shorten(period_title(entry.camera_period, labels), 26), fontsize=10)
+    axes[0, 0].set_ylabel(shorten(period_name(entry.camera_period, labels), 26), fontsize=10)
     axes[0, 0].set_xlabel(entry.view, fontsize=8)
     for axis in axes[0]:
         axis.add_patch(_frame(window))
@@ -201,12 +202,6 @@ def where_methods_differ(errors: Sequence[NDArray[np.float64]]) -> tuple[slice, 
     sums = upto[h:, w:] - upto[:-h, w:] - upto[h:, :-w] + upto[:-h, :-w]
     y, x = (int(i) for i in np.unravel_index(sums.argmax(), sums.shape))
     return slice(y, y + h), slice(x, x + w)
-
-
-def period_title(period: int, labels: dict[str, str]) -> str:
-    """The label of a period, or its number where it has none."""
-    label = labels.get(str(period), str(period))
-    return f"period {label}" if label == str(period) else label
 
 
 def psnr_text(

@@ -10,14 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene import __version__
-from chronoscene.bench.comparison_figure import (
-    Column,
-    by_scene,
-    chosen_views,
-    column_of,
-    period_title,
-    psnr_text,
-)
+from chronoscene.bench.comparison_figure import Column, by_scene, chosen_views, column_of, psnr_text
 from chronoscene.bench.predictions import (
     ImageEntry,
     ground_truth_folder,
@@ -28,7 +21,7 @@ from chronoscene.bench.predictions import (
 from chronoscene.bench.quality_curves import draw_curves
 from chronoscene.bench.results import Failure, RunRecord
 from chronoscene.bench.summary import summarise
-from chronoscene.bench.tables import footnotes, readable_tables
+from chronoscene.bench.tables import footnotes, period_name, readable_tables
 from chronoscene.io.pages import data_uri, render_page
 from chronoscene.io.tables import Table
 
@@ -130,7 +123,7 @@ def _shown_view(
         image = load_image(column.folder, column.entries[entry.view])
         method = column.title.replace("\n", " (") + ")"
         predictions.append((method, psnr_text(image, photo, mask), _picture(image)))
-    period = period_title(entry.camera_period, labels)
+    period = period_name(entry.camera_period, labels)
     return ShownView(entry.view, period, _picture(photo), tuple(predictions))
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from chronoscene.bench.comparison_figure import period_title
 from chronoscene.bench.regions import ALL
 from chronoscene.bench.results import RunRecord
 from chronoscene.bench.summary import in_unit, labelled
+from chronoscene.bench.tables import period_name
 from chronoscene.errors import ConfigError
 from chronoscene.io.tables import Table
 from chronoscene.metrics.registry import metric_info
@@ -64,7 +64,7 @@ def worst_views(scores: DataFrame, records: Sequence[RunRecord], metric: str) ->
         labels = next(run.period_labels for run in records if run.scene == scene)
         there = part.dropna(axis="columns", how="all")
         rows = [
-            [view, period_title(period, labels)]
+            [view, period_name(period, labels)]
             + ["-" if value != value else in_unit(metric, value) for value in values]
             for (_, period, view), values in zip(there.index, there.to_numpy(), strict=True)
         ]

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench.comparison_figure import period_title
 from chronoscene.bench.predictions import safe_name
 from chronoscene.bench.results import FIGURES, RunRecord, read_run, run_folders
 from chronoscene.bench.stages import stage_matrix
 from chronoscene.bench.summary import kind_of
+from chronoscene.bench.tables import period_name
 from chronoscene.io.staging import replacing
 from chronoscene.metrics.registry import metric_info
 
@@ -47,7 +47,7 @@ def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]]) -> None:
     from matplotlib.figure import Figure
 
     first = next(iter(rows.values()))[0]
-    names = [period_title(int(i), first.period_labels) for i in first.period_labels]
+    names = [period_name(i, first.period_labels) for i in first.period_labels]
     names = [shorten(name, 20) for name in names]
     there = first.aggregates["macro"]
     metrics = [metric for metric in METRICS if metric in there]

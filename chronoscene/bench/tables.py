@@ -273,10 +273,16 @@ def interval_text(entry: Mapping[Any, Any], prefix: str = "") -> str:
     return f"{difference} {text}".strip().replace("-", "\N{MINUS SIGN}")
 
 
+def period_name(period: int | str, labels: dict[str, str]) -> str:
+    """The label of a period, or its number where it has none."""
+    label = labels.get(str(period), str(period))
+    return f"period {label}" if label == str(period) else label
+
+
 def period_title(period: str, labels: dict[str, str]) -> str:
     """Heading of the column of a period: its number, and its label if it has one."""
-    label = labels.get(period, period)
-    return f"period {period}" if label == period else f"{period}: {label}"
+    name = period_name(period, labels)
+    return name if name == f"period {period}" else f"{period}: {name}"
 
 
 def _stage_tables(

@@ -11,7 +11,6 @@ from chronoscene.bench.comparison_figure import (
     draw_figures,
     first_seeds,
     mean_error,
-    period_title,
     where_methods_differ,
 )
 from chronoscene.bench.predictions import (
@@ -62,12 +61,6 @@ def test_error_is_the_mean_over_channels():
     np.testing.assert_allclose(mean_error(black, image), [[0.4, 0], [0, 0]])
     mask = np.array([[False, True], [True, True]])
     np.testing.assert_equal(mean_error(image, black, mask), [[np.nan, 0], [0, 0]])
-
-
-def test_period_titles():
-    assert period_title(1, {"1": "autumn"}) == "autumn"
-    assert period_title(1, {"1": "1"}) == "period 1"
-    assert period_title(2, {}) == "period 2"
 
 
 def test_what_a_mask_ignores_is_neither_error_nor_psnr(tmp_path):

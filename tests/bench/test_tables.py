@@ -11,7 +11,7 @@ from made_runs import record, scored
 from chronoscene.bench.results import Failure
 from chronoscene.bench.stages import transfer
 from chronoscene.bench.summary import ENTRY_COLUMNS, in_region, summarise
-from chronoscene.bench.tables import footnotes, format_runs, readable_tables
+from chronoscene.bench.tables import footnotes, format_runs, period_name, readable_tables
 from chronoscene.errors import ConfigError
 from chronoscene.io.tables import FORMATS
 from leaderboard.published import load_published
@@ -33,6 +33,12 @@ def grids(records, metrics=()):
 
 def notes(records, failures, metrics=()):
     return footnotes(summarise(records, metrics), records, failures, metrics)
+
+
+def test_period_names():
+    assert period_name(1, {"1": "autumn"}) == "autumn"
+    assert period_name(1, {"1": "1"}) == "period 1"
+    assert period_name(2, {}) == "period 2"
 
 
 def test_tables_mark_the_best_of_each_column():
