@@ -19,7 +19,7 @@ from chronoscene.bench.predictions import (
     read_manifest,
     safe_name,
 )
-from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord, read_run, run_folders
+from chronoscene.bench.results import FIGURES, PREDICTIONS, RunRecord
 from chronoscene.bench.summary import kind_of
 from chronoscene.bench.tables import period_name
 from chronoscene.io.staging import replacing
@@ -43,13 +43,15 @@ class Column:
     entries: dict[str, ImageEntry]
 
 
-def draw_figures(runs: Path, *, views_per_period: int = 1) -> list[Path]:
-    """Draw the comparison and the error maps of every scene; returns the files."""
+def draw_figures(
+    runs: Path, records: Sequence[RunRecord], *, views_per_period: int = 1
+) -> list[Path]:
+    """Draw the comparison and the error maps of every scene with runs; returns the files."""
     written = []
-    for scene, found in by_scene(runs).items():
-        columns = [column_of(folder, record) for folder, record in found]
+    for scene, found in by_scene(records).items():
+        columns = [column_of(record) for record in found]
         truth = ground_truth_folder(runs, scene)
-        labels = found[0][1].period_labels
+        labels = found[0].period_labels
         rows = chosen_views(truth, views_per_period)
         if not rows:  # trained on all photos
             continue
@@ -60,21 +62,20 @@ def draw_figures(runs: Path, *, views_per_period: int = 1) -> list[Path]:
     return written
 
 
-def by_scene(runs: Path) -> dict[str, list[tuple[Path, RunRecord]]]:
-    """The runs that are shown in pictures: `first_seeds` of each scene, with their folders."""
-    found: dict[str, list[tuple[Path, RunRecord]]] = {}
-    for folder in run_folders(runs):
-        record = read_run(folder)
-        found.setdefault(record.scene, []).append((folder, record))
+def by_scene(records: Sequence[RunRecord]) -> dict[str, list[RunRecord]]:
+    """The runs that are shown in pictures: `first_seeds` of each scene."""
+    found: dict[str, list[RunRecord]] = {}
+    for record in records:
+        found.setdefault(record.scene, []).append(record)
     return {scene: first_seeds(of_scene) for scene, of_scene in found.items()}
 
 
-def first_seeds(found: Sequence[tuple[Path, RunRecord]]) -> list[tuple[Path, RunRecord]]:
+def first_seeds(records: Sequence[RunRecord]) -> list[RunRecord]:
     """The lowest seed of each method, strategy, preset and variant."""
-    chosen: dict[tuple[str, str], tuple[Path, RunRecord]] = {}
-    for folder, record in sorted(found, key=lambda item: item[1].seed):
-        chosen.setdefault((record.method, kind_of(record)), (folder, record))
-    return sorted(chosen.values(), key=lambda item: str(item[0]))
+    chosen: dict[tuple[str, str], RunRecord] = {}
+    for record in sorted(records, key=lambda record: record.seed):
+        chosen.setdefault((record.method, kind_of(record)), record)
+    return sorted(chosen.values(), key=lambda record: str(record.folder))
 
 
 def chosen_views(truth: Path, per_period: int) -> list[ImageEntry]:
@@ -89,9 +90,9 @@ def chosen_views(truth: Path, per_period: int) -> list[ImageEntry]:
     return chosen
 
 
-def column_of(folder: Path, record: RunRecord) -> Column:
+def column_of(record: RunRecord) -> Column:
     """The predictions of a run."""
-    predictions = folder / PREDICTIONS
+    predictions = record.folder / PREDICTIONS
     entries = {e.view: e for e in read_manifest(predictions).images}
     title = f"{record.title}\n{kind_of(record)}"
     return Column(title, predictions, entries)

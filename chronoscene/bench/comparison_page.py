@@ -68,7 +68,7 @@ def comparison_page(
             are spread over the periods, and it says how many are left out.
     """
     entries = summarise(records)
-    found = by_scene(runs)
+    found = by_scene(records)
     views = _shown_views(runs, found, max_bytes)
     scenes = [
         {
@@ -92,13 +92,13 @@ def comparison_page(
 
 
 def _shown_views(
-    runs: Path, found: dict[str, list[tuple[Path, RunRecord]]], max_bytes: int
+    runs: Path, found: dict[str, list[RunRecord]], max_bytes: int
 ) -> dict[str, list[ShownView]]:
     """Views of each scene, as many of each period as there is room for."""
-    columns = {scene: [column_of(*run) for run in of_scene] for scene, of_scene in found.items()}
+    columns = {scene: [*map(column_of, of_scene)] for scene, of_scene in found.items()}
 
     def draw(scene: str, per_period: int) -> Iterator[ShownView]:
-        truth, labels = ground_truth_folder(runs, scene), found[scene][0][1].period_labels
+        truth, labels = ground_truth_folder(runs, scene), found[scene][0].period_labels
         for entry in chosen_views(truth, per_period):
             yield _shown_view(truth, entry, columns[scene], labels)
 

@@ -45,13 +45,13 @@ class Curves:
         return {line.method: (line.color, line.dash) for line in self.lines}
 
 
-def draw_curves(found: Sequence[tuple[Path, RunRecord]]) -> Curves | None:
+def draw_curves(records: Sequence[RunRecord]) -> Curves | None:
     """PSNR of the probe views against seconds of training, from ``curve.csv`` of some runs.
 
     A run has a line for each of its models, whose seconds are its own.
 
     Args:
-        found: Folders of runs on one scene, and what they say.
+        records: Runs on one scene, as from `chronoscene.bench.summary.read_runs`.
 
     Returns:
         None if nothing was probed.
@@ -60,8 +60,8 @@ def draw_curves(found: Sequence[tuple[Path, RunRecord]]) -> Curves | None:
 
     probes = [
         (i, record, model, points)
-        for i, (folder, record) in enumerate(found)
-        for model, points in _read(folder).items()
+        for i, record in enumerate(records)
+        for model, points in _read(record.folder).items()
     ]
     if not probes:
         return None

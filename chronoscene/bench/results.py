@@ -139,6 +139,8 @@ class RunRecord(BaseModel):
     notices: list[str]
     rows: Sequence[Row] = Field(default=(), exclude=True)
     """What ``rows.csv`` says of single views, where that was read; no part of ``run.json``."""
+    folder: Path = Field(default=Path(), exclude=True)
+    """Of the run, known where `rows` are."""
 
     @property
     def label(self) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.bench.predictions import safe_name
-from chronoscene.bench.results import FIGURES, RunRecord, read_run, run_folders
+from chronoscene.bench.results import FIGURES, RunRecord
 from chronoscene.bench.stages import stage_matrix
 from chronoscene.bench.summary import kind_of
 from chronoscene.bench.tables import period_name
@@ -25,10 +25,10 @@ WRITTEN = 10
 TITLE_WIDTH = 30  # Characters
 
 
-def draw_stages(runs: Path) -> list[Path]:
+def draw_stages(runs: Path, records: Sequence[RunRecord]) -> list[Path]:
     """Draw the runs in stages of every scene, means over their seeds; returns the files."""
     scenes: dict[str, dict[str, list[RunRecord]]] = {}
-    for record in map(read_run, run_folders(runs)):
+    for record in records:
         if record.stages:
             rows = scenes.setdefault(record.scene, {})
             title = f"{record.title}\n{fill(kind_of(record), TITLE_WIDTH, break_long_words=False)}"

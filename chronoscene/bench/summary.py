@@ -101,7 +101,7 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
 
 def read_with_rows(folder: Path) -> RunRecord:
     """A finished run with the values of its views."""
-    return read_run(folder).model_copy(update={"rows": read_rows(folder)})
+    return read_run(folder).model_copy(update={"rows": read_rows(folder), "folder": folder})
 
 
 def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:

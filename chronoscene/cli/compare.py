@@ -65,7 +65,7 @@ def command(
         width = terminal_width(out)
         emit("\n".join(boxed_text(table, width=width) for table in worst), out)
     with writing_to("RUNS", runs):
-        tell_written(*draw_figures(runs, views_per_period=views))
+        tell_written(*draw_figures(runs, records, views_per_period=views))
     if html is not None:
         text = comparison_page(runs, records, failures, worst)
         with writing_to("--html", html, expected=FILE):

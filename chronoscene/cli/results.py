@@ -93,10 +93,11 @@ def score(
 
 def print_runs(out: Path) -> None:
     """Print the tables of all runs in a folder, and the files that belong to all of them."""
-    text = format_runs(*read_runs([out]), "table", width=terminal_width(None))
+    records, failures = read_runs([out])
+    text = format_runs(records, failures, "table", width=terminal_width(None))
     emit(text + "\n", None)
-    paths = [out / RESULTS_FILE, out / ROWS_FILE, *draw_figures(out), *draw_stages(out)]
-    click.echo("\n".join(str(path) for path in paths))
+    figures = [*draw_figures(out, records), *draw_stages(out, records)]
+    click.echo("\n".join(map(str, (out / RESULTS_FILE, out / ROWS_FILE, *figures))))
 
 
 @click.command("table")

@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from chronoscene.bench.job import parse_duration
-from chronoscene.bench.results import FIGURES, Failure, RunRecord, run_folders
+from chronoscene.bench.results import FIGURES, Failure, RunRecord
 from chronoscene.bench.summary import COSTS, read_runs, summarise
 from chronoscene.bench.tables import COST_TITLES, footnotes, tables_text
 from chronoscene.bench.time_to_quality import (
@@ -91,11 +91,7 @@ def command(
         )
         emit("".join(f"{line}\n" for line in choose(records, limits, " ".join(given))), out)
         return
-    paths = (path for folder in folders for path in run_folders(folder))
-    curves = [
-        whole_curve(read_curve(path), run.strategy)
-        for path, run in zip(paths, records, strict=True)
-    ]
+    curves = [whole_curve(read_curve(run.folder), run.strategy) for run in records]
     points, times = front_points(records), readings(records, curves)
     emit(_text(points, times, _notes(records, failures), style, out), out)
     if points:

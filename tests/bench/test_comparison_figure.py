@@ -20,12 +20,13 @@ from chronoscene.bench.predictions import (
     read_manifest,
 )
 from chronoscene.bench.results import read_run
+from chronoscene.bench.summary import read_runs
 
 JOINT = "ring/mean-joint-balanced/seed0"
 
 
 def test_every_scene_gets_its_figures(runs):
-    paths = draw_figures(runs)
+    paths = draw_figures(runs, read_runs([runs])[0])
     assert [p.name for p in paths] == ["ring_comparison.png", "ring_errors.png"]
     image = cv2.imread(str(paths[0]))[..., ::-1]
     # Photos and predictions are there, each larger than a cell's half: nearly constant colours.
@@ -49,8 +50,9 @@ def test_one_column_per_method_and_strategy(runs):
     record = read_run(runs / JOINT)
     later = record.model_copy(update={"seed": 4})
     other = record.model_copy(update={"strategy": "pooled"})
-    found = [(runs / "c", later), (runs / "b", record), (runs / "a", other)]
-    assert first_seeds(found) == [(runs / "a", other), (runs / "b", record)]
+    for name, run in zip("abc", (other, record, later), strict=True):
+        run.folder = runs / name
+    assert first_seeds([later, record, other]) == [other, record]
 
 
 def test_error_is_the_mean_over_channels():

@@ -12,14 +12,14 @@ HEADER = "seconds,iteration,primitives,psnr,parameters,model\n"
 def run(folder, text, **changes):
     folder.mkdir()
     (folder / CURVE_FILE).write_text(HEADER + text)
-    return folder, record(**changes)
+    return record(folder=folder, **changes)
 
 
 def test_points_lie_on_the_scales_of_the_axes(tmp_path):
     joint = run(tmp_path / "a", "5,1,1,20,1,all\n10,2,1,24,1,all\n", method="a")
     parts = "2,1,1,21,1,period-0\n4,1,1,nan,1,period-0\n3,1,1,inf,1,period-1\n3,1,1,22,1,period-2\n"
     separate = run(tmp_path / "b", parts, method="b", strategy="separate")
-    curves = draw_curves([joint, separate, (tmp_path, record())])
+    curves = draw_curves([joint, separate, record(folder=tmp_path)])
     x, y = (
         {float(text): place for place, text in ticks} for ticks in (curves.x_ticks, curves.y_ticks)
     )
@@ -49,4 +49,4 @@ def test_more_methods_than_colors_have_dashes(tmp_path):
 
 
 def test_runs_of_other_programs_have_none(tmp_path):
-    assert draw_curves([(tmp_path, record())]) is None
+    assert draw_curves([record(folder=tmp_path)]) is None

@@ -14,6 +14,7 @@ from chronoscene.bench import results, runner
 from chronoscene.bench.comparison_figure import draw_figures
 from chronoscene.bench.predictions import read_manifest
 from chronoscene.bench.results import read_rows, read_run, run_folders
+from chronoscene.bench.summary import read_runs
 from chronoscene.bench.tables import format_runs
 from chronoscene.errors import ConfigError, DiskFullError, MetricUnavailableError, SceneError
 
@@ -217,7 +218,7 @@ def test_without_test_views_nothing_is_scored(scene_folder, bench_here, tmp_path
         outcome, _ = bench_here("toy_methods:MEAN", scenes=(folder,), strategies=strategies)
     record, rows = read_run(outcome.finished[0]), read_rows(outcome.finished[0])
     assert record.render_seconds is None and record.drawn is None and rows == []
-    assert draw_figures(tmp_path / "runs") == []
+    assert draw_figures(tmp_path / "runs", read_runs([tmp_path / "runs"])[0]) == []
     table = format_runs([record], [], "table")
     metrics = "psnr, ssim, ssim_valid, lpips_vgg, lpips_vgg_3dgs"
     reason = "trained on all photos: there are no test views"
