@@ -7,7 +7,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path, PureWindowsPath
 
 from chronoscene.errors import ConfigError, DiskFullError, SceneError
@@ -87,13 +87,17 @@ def write_text_atomic(path: Path, text: str) -> None:
 def staged_folder(out: Path) -> Iterator[Path]:
     """A temporary folder beside ``out``, renamed to it if the block succeeds, else deleted.
 
+    Folders above it are made, and a failure leaves none of these behind.
+
     Raises:
         SceneError: If ``out`` is a file or has content, or the disk refuses.
         DiskFullError: If there is no space for it.
     """
+    missing: list[Path] = []
     try:
         check_not_current(out)
         out = out.resolve()
+        missing = [folder for folder in out.parents if not folder.exists()]
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise SceneError(
                 out,
@@ -119,6 +123,10 @@ def staged_folder(out: Path) -> Iterator[Path]:
             found=error.strerror or str(error),
             todo="choose another folder",
         ) from error
+    finally:
+        with suppress(OSError):  # what has content stays
+            for folder in missing:
+                folder.rmdir()
 
 
 def check_not_current(out: Path) -> None:

@@ -102,7 +102,7 @@ def test_another_size_is_refused(score, images, tmp_path):
     message = r"b/1\.png: expected 12 x 8 or 24 x 16 pixels, .* found 23 x 16"
     with pytest.raises(ImageError, match=message):
         score(max_width=12)
-    assert not list((tmp_path / "runs").glob("ring/*/*"))
+    assert not (tmp_path / "runs/ring").exists()
 
 
 def test_names_of_files(scene, images):

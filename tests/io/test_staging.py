@@ -79,6 +79,16 @@ def test_a_full_disk_is_told_with_the_name_of_the_folder(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_block_that_fails_leaves_no_folder(tmp_path):
+    (tmp_path / "there").mkdir()
+    with pytest.raises(ValueError), staged_folder(tmp_path / "there/a/b/out"):
+        raise ValueError
+    assert [*tmp_path.rglob("*")] == [tmp_path / "there"]
+    with staged_folder(tmp_path / "there/a/b/out") as staged:
+        (staged / "file").touch()
+    assert (tmp_path / "there/a/b/out/file").is_file()
+
+
 def test_other_errors_of_the_system_are_no_full_disks(tmp_path):
     with pytest.raises(PermissionError), needing_space(tmp_path):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
