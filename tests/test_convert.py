@@ -127,7 +127,7 @@ def test_nothing_is_left_of_a_failure(make_scene_folder, tmp_path, target):
     (folder / "images/b/0003.png").unlink()
     with pytest.raises(SceneError, match=r"0003\.png: expected an image, found nothing"):
         convert(folder, tmp_path / "target/out", target=target)
-    assert list((tmp_path / "target").iterdir()) == []
+    assert not (tmp_path / "target").exists()
 
 
 @pytest.mark.skipif(getattr(os, "geteuid", int)() == 0, reason="root may write everywhere")

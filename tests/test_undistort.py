@@ -496,7 +496,7 @@ def test_a_damaged_image_leaves_nothing_behind(make_distorted, tmp_path):
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(ImageError, match=r"2\.png: expected an image that can be decoded"):
         undistort(scene, tmp_path / "target/out")
-    assert list((tmp_path / "target").iterdir()) == []
+    assert not (tmp_path / "target").exists()
 
 
 def test_kinds_of_files_that_cannot_be_written(make_distorted, tmp_path):
