@@ -15,9 +15,18 @@ import click
 
 from chronoscene.errors import ConfigError
 from chronoscene.io.staging import write_text_atomic
+from chronoscene.io.tables import FORMATS
 from chronoscene.io.wording import printable
 
 FILE = "a file that can be written"
+FORMAT = click.option(
+    "--format",
+    "style",
+    type=click.Choice(FORMATS),
+    default="table",
+    show_default=True,
+    help="Output format.",
+)
 OUT_FILE = click.option(
     "--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal."
 )

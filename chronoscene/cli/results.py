@@ -14,10 +14,9 @@ from chronoscene.bench.scoring import rescore
 from chronoscene.bench.stage_figure import draw_stages
 from chronoscene.bench.summary import in_region, read_runs
 from chronoscene.bench.tables import MAX_PERIODS, format_runs
-from chronoscene.cli.output import OUT_FILE, emit, terminal_width
+from chronoscene.cli.output import FORMAT, OUT_FILE, emit, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
-from chronoscene.io.tables import FORMATS
 from chronoscene.metrics.registry import METRICS, make_scorers, metric_info
 from leaderboard.published import load_published
 
@@ -102,14 +101,7 @@ def print_runs(out: Path) -> None:
 
 @click.command("table")
 @RUNS
-@click.option(
-    "--format",
-    "style",
-    type=click.Choice(FORMATS),
-    default="table",
-    show_default=True,
-    help="Output format.",
-)
+@FORMAT
 @click.option(
     "--metric",
     "metrics",

@@ -12,6 +12,7 @@ import click
 
 from chronoscene.cli.convert import reading_options
 from chronoscene.cli.output import (
+    FORMAT,
     OUT_FILE,
     check_file,
     check_place,
@@ -25,7 +26,6 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import find_scenes, model_notes, read_scene
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
-from chronoscene.io.tables import FORMATS
 from chronoscene.io.wording import printable
 from chronoscene.kernels.runtime import keep_freed_memory
 from chronoscene.stats.counts import (
@@ -91,14 +91,7 @@ class Request:
     show_default=True,
     help="How to count points. assigned: each once. seen: in every period whose images see it.",
 )
-@click.option(
-    "--format",
-    "output_format",
-    type=click.Choice(sorted(FORMATS)),
-    default="table",
-    show_default=True,
-    help="Output format.",
-)
+@FORMAT
 @OUT_FILE
 @click.option(
     "--figures",
@@ -125,7 +118,7 @@ class Request:
 def command(
     context: click.Context,
     folders: tuple[Path, ...],
-    output_format: str,
+    style: str,
     out: Path | None,
     **options: object,
 ) -> None:
@@ -161,9 +154,9 @@ def command(
     if counts:
         extra: Any = {"width": terminal_width(out), "unreadable": unreadable}
         if full:
-            text = format_details(full, output_format, **extra)
+            text = format_details(full, style, **extra)
         else:
-            text = format_counts(counts, output_format, **extra)
+            text = format_counts(counts, style, **extra)
         emit(text, out)
         written = []
         if (bars := request.figure("counts")) is not None:

@@ -29,11 +29,10 @@ from chronoscene.bench.tradeoff import (
     front_points,
     front_tables,
 )
-from chronoscene.cli.output import OUT_FILE, emit, tell_written, terminal_width, writing_to
+from chronoscene.cli.output import FORMAT, OUT_FILE, emit, tell_written, terminal_width, writing_to
 from chronoscene.cli.results import RUNS
 from chronoscene.errors import ConfigError
 from chronoscene.io import tables
-from chronoscene.io.tables import FORMATS
 from chronoscene.metrics.registry import metric_info
 
 FIGURE = "tradeoff.png"
@@ -41,14 +40,7 @@ FIGURE = "tradeoff.png"
 
 @click.command("tradeoff")
 @RUNS
-@click.option(
-    "--format",
-    "style",
-    type=click.Choice(FORMATS),
-    default="table",
-    show_default=True,
-    help="Output format; csv has the points of the fronts and all others.",
-)
+@FORMAT
 @OUT_FILE
 @click.option(
     "--figures",
@@ -75,8 +67,9 @@ def command(
 
     Draws Pareto fronts of PSNR, SSIM and LPIPS against training time, rendering rate, size and
     memory, and prints them; then the PSNR of the probe views after given times of training, and the
-    times until they have a given PSNR. With --budget, --max-bytes or --target-psnr it says in a
-    sentence which configuration to use, and nothing else. docs/benchmark.md, "Trade-off".
+    times until they have a given PSNR. CSV has the points of the fronts and all others. With
+    --budget, --max-bytes or --target-psnr it says in a sentence which configuration to use, and
+    nothing else. docs/benchmark.md, "Trade-off".
     """
     records, failures = read_runs(folders)
     records = as_configurations(records)
