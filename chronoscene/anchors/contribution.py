@@ -1,8 +1,8 @@
 """What anchors and their offsets add to images, and which of them carry nothing.
 
-What a Gaussian adds to a view, summed over the pixels, is its weight there: transmittance times
-falloff times opacity. Not in the papers of Scaffold-GS and ChronoGS, which prune anchors by their
-opacity: behind others, or too small to be seen, an anchor may be as opaque as it likes.
+What a Gaussian adds to a view is its weight, summed over the pixels. Not in the papers of
+Scaffold-GS and ChronoGS, which prune anchors by their opacity: behind others, or too small to be
+seen, an anchor may be as opaque as it likes.
 """
 
 from __future__ import annotations
@@ -16,22 +16,15 @@ from chronoscene.anchors.decode import unpack_bits
 from chronoscene.anchors.model import AnchorLayout, AnchorModel
 from chronoscene.methods import TrainingView, View
 from chronoscene.training.schedule import downscale_view
-from chronoscene.training.splatting import Splats, draw
+from chronoscene.training.splatting import Splats, weights_in
 
 
 def blending_weights(splats: Splats, view: View, layout: AnchorLayout) -> Tensor:
     """What Gaussians add to a view, in pixels. [L]"""
-    with torch.enable_grad():
-        colors = splats.colors.detach().requires_grad_()
-        raster = draw(
-            splats._replace(colors=colors),
-            view,
-            torch.zeros(3, device=colors.device),
-            near_plane=layout.near_plane,
-            antialiased=layout.antialiased,
-        )
-        (gradient,) = torch.autograd.grad(raster.image.sum(), colors)
-    return gradient[:, 0]  # the image is the sum of weights times colours
+    everywhere = torch.ones(view.height, view.width, 3, device=splats.means.device)
+    return weights_in(
+        splats, view, everywhere, near_plane=layout.near_plane, antialiased=layout.antialiased
+    )[:, 0]
 
 
 def weigh(model: AnchorModel, period_weights: Tensor, view: View) -> tuple[Tensor, Splats, Tensor]:

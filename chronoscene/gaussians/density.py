@@ -41,19 +41,21 @@ class GradientStatistics:
         """Count one view whose ``backward`` is done.
 
         Args:
-            info: Of a call with one camera. If it has absolute gradients, these count.
+            info: Of a call with one camera. If it has absolute gradients, these count. Gaussians
+                drawn before those that are counted are not in training.
             width: Of the image in pixels.
             height: The same.
             mask: Where the photo counts: the view does not count for Gaussians whose centre is
                 elsewhere in it. bool [H, W]
         """
         assert info.means2d.grad is not None
-        gradient = getattr(info.means2d, "absgrad", info.means2d.grad)[0]
+        mine = slice(info.means2d.shape[1] - len(self.sums), None)
+        gradient = getattr(info.means2d, "absgrad", info.means2d.grad)[0, mine]
         # Norm of d loss / d (u, v), with u and v in half image sizes: no matter the resolution.
         x, y = gradient[:, 0] * (0.5 * width), gradient[:, 1] * (0.5 * height)
-        seen = (info.radii[0] > 0).all(-1)
+        seen = (info.radii[0, mine] > 0).all(-1)
         if mask is not None:
-            seen &= centres_count(info.means2d[0].detach(), mask)
+            seen &= centres_count(info.means2d[0, mine].detach(), mask)
         self.sums += torch.where(seen, (x * x + y * y).sqrt(), 0.0)
         self.views += seen
 

@@ -154,6 +154,33 @@ def draw(
     )
 
 
+def weights_in(
+    splats: Splats, view: View, pixels: Tensor, *, near_plane: float, antialiased: bool = False
+) -> Tensor:
+    """What Gaussians add to a view: sums over the pixels of their weight times ``pixels``. [N, 3]
+
+    The weight is transmittance times falloff times opacity, what a colour is multiplied by.
+
+    Args:
+        splats: The Gaussians; their colours do not matter. [N]
+        view: The camera.
+        pixels: Three numbers for each pixel, such as 1 in a region and 0 elsewhere. [H, W, 3]
+        near_plane: As for `draw`.
+        antialiased: The same.
+    """
+    with torch.enable_grad():
+        colors = torch.zeros_like(splats.means).requires_grad_()
+        raster = draw(
+            splats._replace(colors=colors),
+            view,
+            torch.zeros(3, device=colors.device),
+            near_plane=near_plane,
+            antialiased=antialiased,
+        )
+        (gradient,) = torch.autograd.grad((raster.image[0] * pixels).sum(), colors)
+    return gradient
+
+
 def step_background(
     background: Tensor, config: SplattingConfig, *, seed: int, number: int
 ) -> Tensor:

@@ -69,6 +69,15 @@ def test_views_do_not_count_for_gaussians_in_what_their_mask_ignores():
     np.testing.assert_allclose(statistics.sums, [0.01, 0, 0.01, 0.01], rtol=1e-6)
 
 
+def test_gaussians_drawn_before_those_in_training_do_not_count():
+    info = view_of([[9.0, 9.0], [1e-3, 0.0]], [[1, 1], [1, 1]])
+    info.means2d.absgrad = torch.tensor([[[9.0, 9.0], [2e-3, 0.0]]])
+    mask = torch.ones(40, 20, dtype=torch.bool)
+    statistics = GradientStatistics(1, "cpu")
+    statistics.add(info, 20, 40, mask)
+    np.testing.assert_allclose(statistics.mean(), [0.02], rtol=1e-6)
+
+
 def test_a_small_gaussian_is_copied():
     parameters = rows(4)
     result = run_round(parameters, torch.tensor([0.0, 3e-4, 1e-4, 2e-4]))

@@ -7,12 +7,15 @@ import torch
 from chronoscene.errors import SceneError
 from chronoscene.methods import View
 from chronoscene.training.splatting import (
+    Splats,
     SplattingConfig,
     camera_centre_tensor,
     camera_tensors,
+    draw,
     finite_rows,
     rms_spacing,
     step_background,
+    weights_in,
 )
 
 
@@ -81,3 +84,20 @@ def test_a_random_background_follows_from_the_seed_and_the_step() -> None:
         [step_background(usual, config, seed=0, number=number) for number in range(300)]
     )
     assert 0 <= many.min() < 0.05 and 0.95 < many.max() < 1
+
+
+def test_weights_in_a_region_are_what_is_drawn_there():
+    """The image of white Gaussians is the sum of their weights."""
+    view = make_view()
+    means = torch.tensor([[0.0, 0.1, 0.5], [0.1, 0.0, 0.6], [0.0, 0.0, -5.0]])
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1)
+    splats = Splats(means, quats, torch.full((3, 3), 0.05), torch.full((3,), 0.8), torch.ones(3, 3))
+    pixels = torch.zeros(240, 320, 3)
+    pixels[..., 0] = 1.0
+    pixels[:, :170, 1] = 1.0
+    weights = weights_in(splats, view, pixels, near_plane=0.01)
+    image = draw(splats, view, torch.zeros(3), near_plane=0.01).image[0]
+    assert weights.shape == (3, 3) and not weights[2].any() and not weights[:, 2].any()
+    np.testing.assert_allclose(weights[:, 0].sum(), image[..., 0].sum(), rtol=1e-4)
+    np.testing.assert_allclose(weights[:, 1].sum(), image[:, :170, 0].sum(), rtol=1e-4)
+    assert 0 < weights[0, 1] < weights[0, 0]

@@ -1,0 +1,117 @@
+"""Where a photo shows something else than the render of the model before it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from baselines.cl_splats.config import CLSplatsConfig
+
+Image = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_ROUNDS = 4
+"""Of the fit of colours; each leaves out what the one before fits worse than most."""
+_DARK = 0.03
+"""Added before logarithms, so that noise in the dark is no change."""
+_FLAT = 0.03**2
+"""Variance below which there is no structure."""
+
+
+def change_scores(
+    render: NDArray[np.floating],
+    photo: NDArray[np.uint8],
+    counts: Mask | None,
+    config: CLSplatsConfig,
+) -> Image:
+    """How much each pixel has changed, 0 for not at all; the mean of two scales.
+
+        chromaticity + structure_weight (1 - structure) + brightness_weight brightness
+
+    Chromaticity is the sum over the channels of |l - mean l|, with l the difference of the
+    logarithms of both images in a window; brightness is |mean l|. Structure is the last factor of
+    SSIM. Before, gain and offset of each channel of the render are fitted to the photo, so that a
+    change of exposure or white balance is none of the scene.
+
+    Args:
+        render: 0..1. [H, W, 3]
+        photo: [H, W, 3]
+        counts: Where the photo counts; None for everywhere. The others have score 0. [H, W]
+        config: Weights and the size of the windows.
+    """
+    counts = np.ones(photo.shape[:2], bool) if counts is None else counts
+    if not counts.any():
+        return np.zeros(photo.shape[:2])
+    truth = photo / 255.0
+    image = _in_colours_of(np.asarray(render, np.float64), truth, counts)
+    truth = np.where(counts[..., None], truth, image)
+    total = np.zeros(photo.shape[:2])
+    for scale in (1, 2):
+        sigma = config.patch * scale * photo.shape[1]
+        logs = [np.log(_blur(x, sigma).clip(0) + _DARK) for x in (truth, image)]
+        difference = logs[0] - logs[1]
+        shift = difference.mean(-1)
+        total += np.abs(difference - shift[..., None]).sum(-1)
+        total += config.brightness_weight * np.abs(shift)
+        # What a short training leaves blurred is no change of structure.
+        grey = [_blur(x, sigma / 2).mean(-1) for x in (truth, image)]
+        total += config.structure_weight * (1 - _structure(grey[0], grey[1], sigma))
+    return np.where(counts, total / 2, 0.0)
+
+
+def change_mask(scores: Image, config: CLSplatsConfig) -> Mask:
+    """Pixels that have changed: a threshold, opening and closing, no small spots, dilation.
+
+    Args:
+        scores: [H, W]
+        config: Threshold and sizes.
+    """
+    width = scores.shape[1]
+    near = _disc(config.cleaning * width)
+    # At the border everything goes on as it is there.
+    mask = np.pad(scores >= config.change_threshold, len(near), mode="edge")
+    mask = ndimage.binary_closing(ndimage.binary_opening(mask, near), near)
+    mask = mask[len(near) : -len(near), len(near) : -len(near)]
+    spots, count = ndimage.label(mask)
+    areas = np.bincount(spots.ravel(), minlength=count + 1)
+    mask &= (areas >= config.min_area * scores.size)[spots]
+    return np.asarray(ndimage.binary_dilation(mask, _disc(config.dilation * width)), bool)
+
+
+def _in_colours_of(render: Image, photo: Image, counts: Mask) -> Image:
+    """The render with the gain and offset of each channel that suit the photo where nothing
+    changed."""
+    image, keep = render, counts
+    for _ in range(_ROUNDS):
+        source, target = render[keep], photo[keep]
+        mean, wanted = source.mean(0), target.mean(0)
+        spread = source - mean
+        # Flat images say nothing of the gain.
+        gain = ((spread * (target - wanted)).mean(0) + 1e-4) / ((spread**2).mean(0) + 1e-4)
+        image = wanted + gain.clip(0.25, 4.0) * (render - mean)
+        error = np.abs(image - photo).sum(-1)
+        keep = counts & (error <= 1.5 * np.median(error[counts]))
+    return image
+
+
+def _structure(one: Image, other: Image, sigma: float) -> Image:
+    """Covariance over variance, 1 where both are flat. [H, W]"""
+
+    def blur(values: Image) -> Image:
+        return np.asarray(ndimage.gaussian_filter(values, sigma))
+
+    mean, mean2 = blur(one), blur(other)
+    variances = blur(one * one) - mean**2 + blur(other * other) - mean2**2
+    return (2 * (blur(one * other) - mean * mean2) + _FLAT) / (variances + _FLAT)
+
+
+def _blur(image: Image, sigma: float) -> Image:
+    return np.asarray(ndimage.gaussian_filter(image, (sigma, sigma, 0)))
+
+
+def _disc(radius: float) -> Mask:
+    """A disc as a structuring element; one pixel where the radius is below 1."""
+    reach = int(radius)
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    return np.asarray(x**2 + y**2 <= radius**2)

@@ -1,0 +1,118 @@
+"""Training of CL-Splats: one period after the other, of each what has changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+
+from baselines.cl_splats.config import CLSplatsConfig
+from baselines.cl_splats.model import STRAYS, PeriodModel
+from chronoscene.gaussians.trainer import Due, GaussianTrainer
+from chronoscene.methods import StepReport, TrainingSet
+from chronoscene.training.checkpoint import TrainingState, parts
+from chronoscene.training.exposure import Exposure
+from chronoscene.training.schedule import ViewSampler
+
+_EXPOSURES = "exposures"  # Name of the stored transforms of all periods
+
+
+class CLSplatsTrainer(GaussianTrainer):
+    """Trains what `PeriodModel` has in training. Of several periods, each gets an equal share."""
+
+    config: CLSplatsConfig
+    model: PeriodModel
+    begin_period: Callable[[TrainingSet], object]
+    """Puts what has changed in a period into training."""
+    stage: int = 0
+    """Number of the period in training among those that have views."""
+
+    def __post_init__(self) -> None:
+        self.stages = by_period(self.train)
+        self.train = self.stages[0]
+        super().__post_init__()
+
+    def step(self, index: int, progress: float) -> StepReport:
+        count = len(self.stages)
+        # A third of three steps is a third, however it is rounded.
+        due = min(int(progress * count + 1e-9), count - 1)
+        while self.stage < due:
+            exposure = self.exposure.by_period()
+            self.begin_period(self.stages[self.stage + 1])
+            self._enter(self.stage + 1)
+            if exposure is not None:
+                self.exposure.begin(exposure)
+        report = super().step(index, max(progress * count - self.stage, 0.0))
+        if len(self.model.spheres) and (index + 1) % self.config.stray_interval == 0:
+            self._prune_strays()
+        return replace(report, primitives=len(self.model) + len(self.model.kept["means"]))
+
+    def _enter(self, stage: int) -> None:
+        """Train on the views of another period; everything begins anew."""
+        self.stage, self.train = stage, self.stages[stage]
+        self.model.period = self.train.views[0].period
+        self.timeline = self.timeline_class(self.config)
+        self.sampler = ViewSampler(len(self.train.views), self.seed, self.train.expect)
+        self.exposure = Exposure(self.config.exposure, self.train, self.background.device)
+        self.begin()
+
+    @torch.no_grad()
+    def _prune_strays(self) -> None:
+        """Count the Gaussians outside of all spheres, and prune those that stay there."""
+        p = self.model.parameters
+        x, y, z = p["means"].unbind(-1)
+        outside = torch.ones_like(x, dtype=torch.bool)
+        for a, b, c, radius in self.model.spheres:
+            outside &= (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2 > radius**2
+        strays = torch.where(outside, p[STRAYS] + 1, 0.0)
+        keep = strays < self.config.stray_checks
+        p[STRAYS].copy_(strays)
+        for name in list(p):
+            p[name] = self.optimizer.keep(name, keep)
+        self.statistics.sums = self.statistics.sums[keep]
+        self.statistics.views = self.statistics.views[keep]
+
+    def _update(self, due: Due) -> None:
+        """Opacities are reset in the first period only: others have few views to recover in."""
+        super()._update(replace(due, reset=due.reset and not len(self.model.kept["means"])))
+
+    def state(self) -> TrainingState:
+        state = super().state()
+        state.tensors.update({f"kept.{name}": t for name, t in self.model.kept.items()})
+        state.tensors["spheres"] = self.model.spheres
+        exposure = self.exposure.by_period()  # also of periods that are over
+        if exposure is not None:
+            state.tensors[_EXPOSURES] = exposure
+        state.values["stage"] = self.stage
+        return state
+
+    def load_state(self, state: TrainingState) -> None:
+        device = self.background.device
+        self._enter(state.values["stage"])
+        kept = parts(state.tensors, "kept")
+        self.model.keep({name: tensor.to(device) for name, tensor in kept.items()})
+        self.model.spheres = state.tensors["spheres"].to(device)
+        if _EXPOSURES in state.tensors:
+            self.exposure.begin(state.tensors[_EXPOSURES].to(device))
+        super().load_state(state)
+
+
+def by_period(train: TrainingSet) -> list[TrainingSet]:
+    """The views of one period after the other, for each a set."""
+    stages = []
+    for period in sorted({view.period for view in train.views}):
+        own = [i for i, view in enumerate(train.views) if view.period == period]
+        stages.append(_only(train, own))
+    return stages
+
+
+def _only(train: TrainingSet, own: Sequence[int]) -> TrainingSet:
+    """The set with some of its views."""
+    return replace(
+        train,
+        views=tuple(train.views[i] for i in own),
+        load_image=lambda i: train.load_image(own[i]),
+        load_mask=lambda i: train.load_mask(own[i]),
+        expect=lambda indices: train.expect([own[i] for i in indices]),
+    )

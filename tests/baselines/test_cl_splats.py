@@ -1,0 +1,402 @@
+"""CL-Splats: what it finds changed, what it optimises then, and that all else stays as it was."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+from toy_scene import ring_of_views, toy_scene
+
+from baselines.cl_splats import SPEC
+from baselines.cl_splats.changes import change_mask, change_scores
+from baselines.cl_splats.config import CLSplatsConfig
+from baselines.cl_splats.lifting import Comparison, enclose, new_points, vote
+from baselines.cl_splats.method import CLSplats
+from baselines.cl_splats.model import LIVES, STRAYS
+from baselines.cl_splats.trainer import CLSplatsTrainer, by_period
+from chronoscene.errors import ConfigError
+from chronoscene.gaussians.model import SHAPES
+from chronoscene.kernels.runtime import set_threads
+from chronoscene.methods import TrainingSet, build_config
+from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.training.checkpoint import load_tensors
+from chronoscene.training.splatting import Splats, draw
+
+STEPS = 100
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Scenes this small are quicker on one thread, most of all beside other work."""
+    set_threads(1)
+    yield
+    set_threads()
+
+
+def config(**changes: Any) -> CLSplatsConfig:
+    made = {"iterations": STEPS, "densify_interval": 20, "max_gaussians": 150}
+    made |= {"dilation": 0.0, "exposure": "none", **changes}
+    found: CLSplatsConfig = build_config(SPEC, preset="fast", overrides=made)
+    return found
+
+
+def stage(period: int) -> TrainingSet:
+    """The photos of the toy scene as those of a period."""
+    scene = toy_scene()
+    views = tuple(replace(view, period=period) for view in scene.views)
+    seen = np.ones((60, period + 1), bool)
+    return replace(scene, views=views, num_periods=period + 1, point_periods=seen)
+
+
+def second(method: CLSplats, *, repainted: bool = True) -> TrainingSet:
+    """Period 1: the model of period 0, with other colours on one side of it."""
+    there = deepcopy(method.model)
+    if repainted:
+        dc = there.parameters["sh_dc"].detach()
+        there.parameters["sh_dc"] = torch.where(side(there.parameters)[:, None], -dc.flip(1), dc)
+    splats = [there.splats(view, 0.0) for view in stage(0).views]
+    images = [
+        draw(splat, view, torch.zeros(3), near_plane=NEAR_PLANE).image[0].detach()
+        for splat, view in zip(splats, stage(0).views, strict=True)
+    ]
+    photos = [as_photo(image.numpy()) for image in images]
+    return replace(stage(1), load_image=photos.__getitem__)
+
+
+def side(parameters: dict[str, torch.Tensor]) -> torch.Tensor:
+    return parameters["means"][:, 0] > 0.1
+
+
+def run(method: CLSplats, steps: range = range(STEPS)) -> None:
+    for index in steps:
+        method.step(index, index / STEPS)
+
+
+def begun(**changes: Any) -> CLSplats:
+    """A method at the end of period 0."""
+    method = CLSplats(config(**changes))
+    method.setup(stage(0), seed=0, device="cpu")
+    run(method)
+    return method
+
+
+def trainer_of(method: CLSplats) -> CLSplatsTrainer:
+    assert method.trainer is not None
+    return method.trainer
+
+
+# Change detection
+
+
+def picture() -> np.ndarray:
+    """Soft coloured spots, 0.2..0.8. [120, 160, 3]"""
+    noise = gaussian_filter(np.random.default_rng(0).normal(size=(120, 160, 3)), (4, 4, 0))
+    return np.asarray(0.5 + 0.3 * noise / np.abs(noise).max())
+
+
+def as_photo(image: np.ndarray) -> np.ndarray:
+    return np.rint(255 * image.clip(0, 1)).astype(np.uint8)
+
+
+def test_a_planted_change_is_found_and_nothing_else() -> None:
+    image, options = picture(), config()
+    changed = np.zeros((120, 160), bool)
+    changed[40:70, 60:100] = True
+    photo = as_photo(np.where(changed[..., None], image[..., ::-1] * [0.3, 1.0, 1.2], image))
+    for exposed in (photo, as_photo(photo / 255 * [0.8, 0.7, 0.6] + 0.02)):
+        mask = change_mask(change_scores(image, exposed, None, options), options)
+        assert mask[changed].mean() > 0.95
+        assert mask[~changed].mean() < 0.06, "but for the dilation"
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.6, 1.2])
+def test_an_equal_image_has_not_changed_nor_has_its_exposure(gain: float) -> None:
+    image, options = picture(), config()
+    scores = change_scores(image, as_photo(image * gain + 0.01), None, options)
+    assert scores.max() < 0.1
+    assert not change_mask(scores, options).any()
+
+
+def test_brightness_counts_where_that_is_asked_for() -> None:
+    image = picture()
+    photo = as_photo(np.where(np.arange(160)[:, None] < 40, 0.4 * image, image))
+    left = [
+        change_scores(image, photo, None, config(structure_weight=0.0, brightness_weight=w))[:, :30]
+        for w in (0.0, 1.0)
+    ]
+    assert left[0].mean() < 0.1 and left[1].mean() > 0.5
+
+
+def test_ignored_pixels_neither_change_nor_matter() -> None:
+    image, options = picture(), config()
+    counts = np.ones((120, 160), bool)
+    counts[20:90, 20:90] = False
+    noise = np.random.default_rng(1).integers(0, 256, (120, 160, 3), np.uint8)
+    photo = np.where(counts[..., None], as_photo(image), noise)
+    scores = change_scores(image, photo, counts, options)
+    assert scores.max() < 0.1
+    assert not change_scores(image, noise, np.zeros_like(counts), options).any()
+
+
+def test_masks_have_no_small_spots_and_no_small_holes() -> None:
+    options = config(cleaning=0.02, min_area=0.002, dilation=0.0)
+    scores = np.zeros((100, 100))
+    scores[30:60, 30:60] = 1.0
+    scores[44:46, 44:46] = 0.0
+    clean = scores >= 0.5
+    clean[44:46, 44:46] = True
+    scores[80:82, 80:82] = 1.0
+    mask = change_mask(scores, options)
+    assert not mask[70:].any() and mask[44:46, 44:46].all()
+    assert (mask & clean).sum() > 0.95 * clean.sum() and not mask[~clean].any()
+
+
+# Lifting
+
+
+def two_gaussians() -> Splats:
+    """One on each side of the origin, along the axis of the ring of cameras."""
+    return Splats(
+        means=torch.tensor([[0.0, 0.0, 0.25], [0.0, 0.0, -0.25]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(2, 1),
+        scales=torch.full((2, 3), 0.05),
+        opacities=torch.full((2,), 0.9),
+        colors=torch.zeros(2, 3),
+    )
+
+
+def comparisons(upper: int, lower: int) -> list[Comparison]:
+    """Four views; the upper half has changed in some, the lower half in others."""
+    found = []
+    for i, view in enumerate(ring_of_views(4)):
+        changed = np.zeros((view.height, view.width), bool)
+        changed[: view.height // 2] = i < upper
+        changed[view.height // 2 :] = i < lower
+        photo = np.zeros((view.height, view.width, 3), np.uint8)
+        depth = np.full(changed.shape, np.inf)
+        found.append(Comparison(view, photo, np.ones_like(changed), changed, depth))
+    return found
+
+
+@pytest.mark.parametrize(("upper", "lower"), [(3, 1), (1, 3), (2, 4), (0, 0)])
+def test_gaussians_have_changed_if_they_have_in_most_of_the_views(upper: int, lower: int) -> None:
+    assert vote(two_gaussians(), comparisons(upper, lower), config()).tolist() == [
+        upper > 2, lower > 2
+    ]  # fmt: skip
+
+
+def test_views_that_do_not_see_a_gaussian_have_no_vote() -> None:
+    splats, found = two_gaussians(), comparisons(3, 0)
+    assert vote(splats, found, config()).tolist() == [True, False]
+    # Ignored in two of the three views, it is seen there no more.
+    nowhere = np.zeros_like(found[0].counts)
+    hidden = [replace(item, counts=nowhere, changed=nowhere) for item in found[:2]]
+    assert vote(splats, [*hidden, *found[2:]], config()).tolist() == [False, False]
+    # Behind a wall, which has changed, a Gaussian has not.
+    wall = Splats(
+        *(torch.cat([rows, rows[:1]]) for rows in splats[:2]),
+        torch.cat([splats.scales, torch.full((1, 3), 2.0)]),
+        torch.cat([splats.opacities, torch.ones(1)]),
+        torch.zeros(3, 3),
+    )
+    wall.means[2] = 0.5 * torch.from_numpy(camera_centre(found[0].view.cam_from_world))
+    in_front = [replace(item, changed=item.counts) for item in found[:1]]
+    assert vote(wall, in_front, config()).tolist() == [False, False, True]
+
+
+def test_new_gaussians_start_where_views_agree_on_a_change() -> None:
+    """A ball that appears in the middle: its silhouettes, and sparse points in it and elsewhere."""
+    found = []
+    for view in ring_of_views(8):
+        y, x = np.mgrid[: view.height, : view.width] + 0.5
+        K = view.K
+        near = np.hypot((x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]) < 0.1
+        photo = np.repeat(np.where(near, 200, 0)[..., None], 3, 2).astype(np.uint8)
+        depth = np.full(near.shape, 1.3)
+        found.append(Comparison(view, photo, np.ones_like(near), near, depth))
+    train = replace(
+        stage(1),
+        points=np.array([[0, 0, 0], [0.01, 0, 0], [0, 0, 0.3]], np.float32),
+        colors=np.full((3, 3), 7, np.uint8),
+        point_periods=np.array([[True, True], [False, True], [False, True]]),
+    )
+    far = two_gaussians()
+    generator = np.random.default_rng(0)
+    points, colors = new_points(far, found, train, config(samples=0), generator)
+    np.testing.assert_allclose(points, [[0.01, 0, 0]], atol=1e-7)
+    points, colors = new_points(far, found, train, config(samples=2_000), generator)
+    assert len(points) > 20
+    assert np.linalg.norm(points[1:], axis=1).max() < 0.2
+    assert (colors[1:] == 200).all()
+
+
+def test_spheres_enclose_clusters() -> None:
+    generator = np.random.default_rng(0)
+    clusters = [generator.uniform(-0.1, 0.1, (200, 3)) + np.eye(3)[0] * x for x in (-1.0, 1.0)]
+    spheres = enclose(np.concatenate(clusters), config(sphere_share=1.0), 1.0)
+    assert len(spheres) == 2
+    for sphere, points in zip(spheres[spheres[:, 0].argsort()], clusters, strict=True):
+        distances = np.linalg.norm(points - sphere[:3], axis=1)
+        assert sphere[3] == pytest.approx(distances.max() + 0.02)
+    assert enclose(np.zeros((0, 3)), config(), 1.0).shape == (0, 4)
+    assert enclose(np.zeros((1, 3)), config(), 1.0).tolist() == [[0.0, 0.0, 0.0, 0.02]]
+
+
+# Training
+
+
+def test_only_what_changed_is_optimised_and_earlier_periods_stay_to_the_bit() -> None:
+    method = begun()
+    before = {name: tensor.clone() for name, tensor in method.stored_tensors().items()}
+    first = [method.render(view, 0.0).rgb for view in stage(0).views]
+    count, train = len(before["means"]), second(method)
+    method.extend(train)
+    ended = method.model.kept[LIVES][:, 1] == 1
+    painted = side(before)
+    assert ended[painted].float().mean() > 0.5 > 0.2 > ended[~painted].float().mean()
+    run(method)
+    after = method.stored_tensors()
+    assert len(after["means"]) > count
+    for name in SHAPES:
+        assert torch.equal(after[name][:count], before[name]), name
+    assert (after[LIVES][:count, 0] == 0).all() and (after[LIVES][count:, 0] == 1).all()
+    again = [method.render(view, 0.0).rgb for view in stage(0).views]
+    np.testing.assert_array_equal(again, first)
+    photos = [train.load_image(i) / 255 for i in range(len(train.views))]
+    old, new = (
+        np.mean((np.stack([method.render(v, p).rgb for v in train.views]) - photos) ** 2)
+        for p in (0.0, 1.0)
+    )
+    assert new < 0.8 * old
+
+
+def test_gradients_reach_what_changed_and_nothing_else() -> None:
+    method = begun()
+    method.extend(second(method))
+    model, statistics = method.model, trainer_of(method).statistics
+    seen = {name: tensor.clone() for name, tensor in model.kept.items()}
+    method.step(0, 0.0)
+    for name in SHAPES:
+        assert model.parameters[name].grad is not None
+        assert not model.kept[name].requires_grad
+        assert torch.equal(model.kept[name], seen[name])
+    assert len(statistics.sums) == len(model)
+    assert (statistics.sums > 0).any()
+
+
+def test_where_nothing_changes_nothing_is_trained() -> None:
+    method = begun()
+    before = {name: tensor.clone() for name, tensor in method.stored_tensors().items()}
+    method.extend(second(method, repainted=False))
+    run(method)
+    assert len(method.model) == 0
+    for name, tensor in method.stored_tensors().items():
+        assert torch.equal(tensor, before[name]), name
+
+
+def test_what_lives_at_a_period_is_drawn_then_and_exported(tmp_path: Path) -> None:
+    method = begun()
+    method.extend(second(method))
+    run(method)
+    method.save(tmp_path)
+    loaded = CLSplats(config())
+    loaded.load(tmp_path, device="cpu")
+    views = stage(0).views
+    lives = load_tensors(tmp_path)[0][LIVES]
+    for period in (0, 1):
+        there = (lives[:, 0] <= period) & ((lives[:, 1] == 0) | (period < lives[:, 1]))
+        cloud = loaded.to_gaussians(period, views)
+        assert len(cloud.means) == int(there.sum()) < len(lives)
+        image = method.render(views[0], period).rgb
+        np.testing.assert_array_equal(loaded.render(views[0], period).rgb, image)
+    order = np.random.default_rng(0).permutation(len(lives))
+    loaded.permute(order)
+    assert torch.equal(loaded.stored_tensors()[LIVES], lives[order])
+
+
+def test_strays_are_pruned_unless_they_come_back() -> None:
+    method = begun(stray_checks=3)
+    method.extend(second(method))
+    trainer, means = trainer_of(method), method.model.parameters["means"]
+    count, place = len(means), means[0].clone()
+    away = torch.tensor([3.0, 0.0, 0.0])
+
+    def check(first: torch.Tensor) -> float:
+        with torch.no_grad():
+            method.model.parameters["means"][0] = first
+        trainer._prune_strays()
+        return float(method.model.parameters[STRAYS][0].detach())
+
+    assert [check(x) for x in (away, away, place, away, away)] == [1.0, 2.0, 0.0, 1.0, 2.0]
+    assert len(method.model) == count
+    check(away)
+    assert len(method.model) == count - 1 == len(trainer.statistics.sums)
+    method.step(0, 0.0)
+
+
+def test_a_training_goes_on_to_the_bit_within_a_period(tmp_path: Path) -> None:
+    folders = [tmp_path / name for name in ("training", "a", "b")]
+    for folder in folders:
+        folder.mkdir()
+    method = begun(stray_interval=10)
+    method.extend(second(method))
+    run(method, range(45))
+    method.save_training(folders[0])
+    run(method, range(45, STEPS))
+    method.save(folders[1])
+    again = begun(stray_interval=10)
+    again.extend(second(again))
+    again.load_training(folders[0])
+    run(again, range(45, STEPS))
+    again.save(folders[2])
+    assert (folders[1] / "model.json").read_bytes() == (folders[2] / "model.json").read_bytes()
+
+
+def test_opacities_are_reset_in_the_first_period_alone() -> None:
+    method = begun(reset_interval=5_000)
+    largest = []
+    method.extend(second(method))
+    for index in range(40):
+        method.step(index, index / STEPS)
+        largest.append(float(method.model.parameters["logit_opacities"].detach().max()))
+    assert min(largest) > -2
+    first = CLSplats(config(reset_interval=5_000))
+    first.setup(stage(0), seed=0, device="cpu")
+    run(first, range(18))
+    assert float(first.model.parameters["logit_opacities"].detach().max()) < -2
+
+
+def test_one_training_takes_the_periods_in_order() -> None:
+    """Under ``joint`` the model begins with the points of the first period, and never sees more."""
+    stages = [stage(0), second(begun())]
+    images = [part.load_image(i) for part in stages for i in range(10)]
+    seen = np.ones((60, 2), bool)
+    seen[:20, 0] = False
+    joint = replace(
+        stages[1],
+        views=stages[0].views + stages[1].views,
+        point_periods=seen,
+        load_image=images.__getitem__,
+    )
+    parts = by_period(joint)
+    assert [{v.period for v in part.views} for part in parts] == [{0}, {1}]
+    np.testing.assert_array_equal(parts[1].load_image(3), images[13])
+    method = CLSplats(config())
+    method.setup(joint, seed=0, device="cpu")
+    assert len(method.model) == 40
+    for index in range(STEPS):
+        method.step(index, index / STEPS)
+        assert trainer_of(method).stage == index // (STEPS // 2)
+        assert method.model.period == trainer_of(method).stage
+
+
+def test_random_moves_are_refused() -> None:
+    with pytest.raises(ConfigError, match="densification"):
+        config(densification="mcmc")
