@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from baselines.cl_splats.config import CLSplatsConfig
@@ -19,7 +20,10 @@ _EXPOSURES = "exposures"  # Name of the stored transforms of all periods
 
 
 class CLSplatsTrainer(GaussianTrainer):
-    """Trains what `PeriodModel` has in training. Of several periods, each gets an equal share."""
+    """Trains what `PeriodModel` has in training.
+
+    Of several periods, each gets a share of the steps by the number of its views.
+    """
 
     config: CLSplatsConfig
     model: PeriodModel
@@ -30,20 +34,23 @@ class CLSplatsTrainer(GaussianTrainer):
 
     def __post_init__(self) -> None:
         self.stages = by_period(self.train)
+        counts = np.cumsum([0, *(len(stage.views) for stage in self.stages)])
+        self.bounds = counts / counts[-1]
+        """Progress at which periods begin, and the end."""
         self.train = self.stages[0]
         super().__post_init__()
 
     def step(self, index: int, progress: float) -> StepReport:
-        count = len(self.stages)
         # A third of three steps is a third, however it is rounded.
-        due = min(int(progress * count + 1e-9), count - 1)
+        due = int((progress + 1e-9 >= self.bounds[1:-1]).sum())
         while self.stage < due:
             exposure = self.exposure.by_period()
             self.begin_period(self.stages[self.stage + 1])
             self._enter(self.stage + 1)
             if exposure is not None:
                 self.exposure.begin(exposure)
-        report = super().step(index, max(progress * count - self.stage, 0.0))
+        start, end = self.bounds[self.stage : self.stage + 2]
+        report = super().step(index, max(progress - start, 0.0) / (end - start))
         if len(self.model.spheres) and (index + 1) % self.config.stray_interval == 0:
             self._prune_strays()
         return replace(report, primitives=len(self.model) + len(self.model.kept["means"]))
