@@ -27,6 +27,8 @@ from chronoscene.synth.settings import KINDS
 @click.option("--points", type=int, help="Number of sparse points to aim for.")
 @click.option("--noise", type=float, help="Noise of observed point positions in pixels.")
 @click.option("--rebuilt", type=float, help="Share of the blocks that are torn down and rebuilt.")
+@click.option("--same-light", is_flag=True, default=None,
+              help="Sun, sky and season stay; only objects change.")  # fmt: skip
 @click.option("--off-centre/--centred", "off_centre", default=None,
               help="Principal point away from the image centre, or in it.")  # fmt: skip
 def command(out: Path, name: str, size: str | None, **changes: Any) -> None:

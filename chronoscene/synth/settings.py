@@ -47,6 +47,8 @@ class SynthSettings:
     rebuilt: float = _within(0.0, 1.0, 0.0)
     """Share of blocks that are torn down and rebuilt with another role at one period, in addition
     to the changes of every scene. At 1, little more than the streets remains."""
+    same_light: bool = False
+    """Whether sun, sky and season of the first period stay."""
     probe_spacing: float = _within(0.5, 50.0, 3.0)
     """Distance between the probes of indirect light."""
     noise: float = _within(0.0, 100.0, 0.0)

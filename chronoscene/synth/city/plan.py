@@ -60,7 +60,8 @@ def make_world(settings: SynthSettings) -> World:
     plan = make_plan(settings)
     n = settings.blocks
     core = np.array([[plan.x[1, 0], plan.y[1, 0]], [plan.x[n, 1], plan.y[n, 1]]])
-    world = World(settings.seed, make_lights(settings.seed, settings.periods), core)
+    lights = make_lights(settings.seed, settings.periods, same=settings.same_light)
+    world = World(settings.seed, lights, core)
     world.near = settings.kind == "street"
     _add_roads(world, plan)
     for (column, row), role in _roles(settings).items():

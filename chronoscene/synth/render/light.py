@@ -84,8 +84,9 @@ MOODS: tuple[Light, ...] = (
 """Lights in the order in which periods use them; neighbours differ in every respect."""
 
 
-def make_lights(seed: int, periods: int) -> list[Light]:
-    """One light per period: `MOODS` in order, each with the sun turned and varied slightly."""
+def make_lights(seed: int, periods: int, *, same: bool = False) -> list[Light]:
+    """One light per period: `MOODS` in order, each with the sun turned and varied slightly, or
+    the first of these for all."""
     rng = rng_for(seed, "light")
     turn = float(rng.uniform(0, 360))
     lights = []
@@ -102,7 +103,7 @@ def make_lights(seed: int, periods: int) -> list[Light]:
             sky_seed=100 * (p + 1) + seed % 89,
         )
         lights.append(light)
-    return lights
+    return [lights[0]] * periods if same else lights
 
 
 class SkyArgs(NamedTuple):

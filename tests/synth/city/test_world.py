@@ -76,6 +76,13 @@ def test_lights_and_dates_are_all_different(seed: int, periods: int) -> None:
     assert all(5 < light.elevation < 75 for light in lights)
 
 
+def test_the_light_can_stay() -> None:
+    world = make_world(preset("tiny", periods=4, same_light=True))
+    assert world.lights == make_lights(0, 1) * 4
+    assert len({p.date for p in make_periods(world)}) == 4
+    assert world.edits
+
+
 @pytest.mark.parametrize(
     "change",
     [{"periods": 0}, {"width": 3}, {"seed": -1}, {"kind": "submarine"}, {"noise": float("nan")}],
