@@ -29,11 +29,6 @@ class ChronoGSConfig(AnchorConfig):
     """MLPs that see the global feature; all three in paper and code. ``("color",)`` with
     ``period_dim`` 0 is Scaffold-GS with an appearance vector per period."""
 
-    period_sharing: float = 0.0
-    """Weight of a group lasso on the deviation of an anchor's period features from their mean:
-    anchors that need no deviation end with equal blocks, and one block is stored. Not in the
-    paper."""
-
     def __post_init__(self) -> None:
         super().__post_init__()
         check_choice("fusion", self.fusion, ("concat", "sum"))

@@ -6,14 +6,9 @@ names both. `model` holds what is special about it; the rest is shared with Scaf
 
 from __future__ import annotations
 
-from torch import Tensor
-
 from chronogs.config import ChronoGSConfig
 from chronogs.model import ChronoGSModel
-from chronogs.sharing import pack_features, share_periods, unpack_features
 from chronoscene.anchors.method import AnchorMethod
-from chronoscene.anchors.model import AnchorLayout
-from chronoscene.anchors.trainer import AfterUpdate
 
 
 class ChronoGS(AnchorMethod):
@@ -25,17 +20,3 @@ class ChronoGS(AnchorMethod):
 
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
         return super().rates(camera_extent) | {"global_features": self.config.global_lr}
-
-    def after_update(self) -> AfterUpdate | None:
-        weight = self.config.period_sharing
-        if not weight or self.num_periods == 1:
-            return None
-        return lambda model, rates: share_periods(model, rates["features"] * weight)
-
-    def stored_tensors(self) -> dict[str, Tensor]:
-        return pack_features(super().stored_tensors(), self._model.layout)
-
-    def restored_tensors(
-        self, stored: dict[str, Tensor], layout: AnchorLayout
-    ) -> dict[str, Tensor]:
-        return super().restored_tensors(unpack_features(stored, layout), layout)

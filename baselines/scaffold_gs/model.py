@@ -44,11 +44,10 @@ class ScaffoldModel(AnchorModel):
             model.heads = {**model.heads, BANK: bank}
         return model
 
-    def seen_features(self, centre: Tensor) -> tuple[Tensor, int]:
-        features, base_dim = super().seen_features(centre)
-        layout = self.layout
+    def seen_features(self, centre: Tensor) -> Tensor:
+        features, layout = super().seen_features(centre), self.layout
         if not layout.feature_bank:
-            return features, base_dim
+            return features
         distances = self.distances(centre)
         directions = (self.anchors - centre) / distances.clamp(min=MIN_DISTANCE)
         sight = torch.cat([directions, layout.distance_scale * distances], dim=1)
@@ -56,4 +55,4 @@ class ScaffoldModel(AnchorModel):
         own, rest = features[:, : layout.base_dim], features[:, layout.base_dim :]
         coarse, middle = own[:, ::4].repeat(1, 4), own[:, ::2].repeat(1, 2)
         mixed = weights[:, :1] * coarse + weights[:, 1:2] * middle + weights[:, 2:] * own
-        return torch.cat([mixed, rest], dim=1), base_dim
+        return torch.cat([mixed, rest], dim=1)

@@ -128,6 +128,10 @@ class AnchorConfig(SplattingConfig):
     """Once growth is over, the anchors are dropped that add least to the training views, as many as
     add no more than this share of the light of any period, and single offsets likewise. 0: none.
     Not in the papers."""
+    block_threshold: float = 0.0
+    """0: an anchor has a feature of its own for each period, as in ChronoGS. Otherwise all periods
+    have the same to begin with, and it is split where their gradients differ: the ratio of the
+    squares between and within periods above which it is, see `chronoscene.anchors.blocks`."""
     growth_levels: int = 3
     """Cell sizes that are tried, coarse to fine."""
     coarsest_cell: int = 16
@@ -214,4 +218,5 @@ _LOWER_BOUNDS: dict[str, float] = {
     "coarsest_cell": 1,
     "cell_refinement": 1,
     "unused_share": 0.0,
+    "block_threshold": 0.0,
 }

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.baking import bake
+from chronoscene.anchors.blocks import own_blocks, pack_blocks, unpack_blocks
 from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.contribution import pack_offsets, unpack_offsets
 from chronoscene.anchors.density import initial_anchors, resolve_voxel_size
-from chronoscene.anchors.model import LAYERS, PER_ANCHOR, AnchorLayout, AnchorModel
-from chronoscene.anchors.trainer import AfterUpdate, AnchorTrainer
+from chronoscene.anchors.model import FIXED, LAYERS, PER_ANCHOR, AnchorLayout, AnchorModel
+from chronoscene.anchors.trainer import AnchorTrainer
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
@@ -55,6 +56,7 @@ class AnchorMethod(SplattingMethod):
         rates = {
             "offsets": (start * camera_extent, end * camera_extent),
             "features": config.feature_lr,
+            "blocks": config.feature_lr,
             "log_scales": config.scaling_lr,
         }
         for head in HEADS:
@@ -65,10 +67,6 @@ class AnchorMethod(SplattingMethod):
         """Weights of the features that vary; here by their periods. [T]"""
         return period_weights(period, self.num_periods)
 
-    def after_update(self) -> AfterUpdate | None:
-        """What a method does to the features after each optimiser step; here nothing."""
-        return None
-
     def extended_table(self, table: Tensor, count: int) -> Tensor:
         """Global features for another training set; here those of a new period are copies of the
         last one's. [R, G] -> [count, G]"""
@@ -78,7 +76,7 @@ class AnchorMethod(SplattingMethod):
         self, stored: dict[str, Tensor], layout: AnchorLayout
     ) -> dict[str, Tensor]:
         """Inverse of `stored_tensors`."""
-        return unpack_offsets(stored, layout.offsets)
+        return unpack_blocks(unpack_offsets(stored, layout.offsets), layout.num_periods)
 
     @property
     def model(self) -> AnchorModel:
@@ -115,13 +113,14 @@ class AnchorMethod(SplattingMethod):
         assert self.trainer is not None, "setup comes first"
         layout, tensors = self.layout(train), self.model.tensors()
         tensors = {name: tensor.detach() for name, tensor in tensors.items()}
-        features, table = tensors["features"], tensors["global_features"]
-        blocks = features[:, layout.base_dim :].reshape(
-            len(features), self.num_periods, layout.period_dim
-        )
-        blocks = with_new_periods(blocks.transpose(0, 1), layout.num_periods).transpose(0, 1)
-        tensors["features"] = torch.cat([features[:, : layout.base_dim], blocks.flatten(1)], dim=1)
-        tensors["global_features"] = self.extended_table(table, layout.num_periods)
+        periods = layout.num_periods
+        if layout.period_dim:
+            rows = with_new_periods(tensors["block_rows"].T, periods).T.contiguous()
+            if not self.config.block_threshold:  # nobody shares
+                tensors["blocks"] = tensors["blocks"][rows].flatten(0, 1)
+                rows = own_blocks(len(rows), periods).to(rows)
+            tensors["block_rows"] = rows
+        tensors["global_features"] = self.extended_table(tensors["global_features"], periods)
         self._model = self.model_class.from_tensors(layout, tensors)
         self.go_on(train, self._make_trainer(train, self.trainer.seed))
 
@@ -135,7 +134,6 @@ class AnchorMethod(SplattingMethod):
             seed=seed,
             rates=self.rates(train.camera_extent),
             feature_rows=self.feature_rows(train),
-            after_update=self.after_update(),
         )
 
     def splats(self, view: View, period: float, appearance_period: float) -> Splats:
@@ -165,11 +163,11 @@ class AnchorMethod(SplattingMethod):
         )
 
     def stored_tensors(self) -> dict[str, Tensor]:
-        return pack_offsets(self.model.tensors())
+        return pack_blocks(pack_offsets(self.model.tensors()))
 
     def permute(self, order: NDArray[np.int64]) -> None:
         rows, tensors = torch.from_numpy(order), self._model.tensors()
-        for name in {"anchors", *PER_ANCHOR, "used_offsets"} & tensors.keys():
+        for name in {*FIXED, *PER_ANCHOR} & tensors.keys():
             tensors[name] = tensors[name][rows]
         self._model = self.model_class.from_tensors(self._model.layout, tensors)
 

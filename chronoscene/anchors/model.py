@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from chronoscene.anchors.blocks import own_blocks
 from chronoscene.anchors.config import HEADS, AnchorConfig
 from chronoscene.anchors.decode import DecodeInputs, HeadWeights, decode, decode_active
 from chronoscene.anchors.density import initial_log_scales
@@ -29,8 +30,9 @@ from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.training.splatting import Splats, camera_centre_tensor
 
 PER_ANCHOR = ("offsets", "features", "log_scales")  # Trained tensors with one row per anchor
-
-FIXED = ("anchors", "used_offsets")  # Tensors with one row per anchor that are not trained
+TABLES = (*PER_ANCHOR, "blocks")  # Trained tensors of which a view needs some rows
+FIXED = ("anchors", "used_offsets", "block_rows")  # Tensors that are not trained
+_TENSORS = ("anchors", *TABLES, "block_rows", "global_features")  # Beside the MLPs
 LAYERS = HeadWeights._fields
 BANK = "bank"  # Name of the MLP that mixes features, where there is one
 _ADDED_LATER = ("near_plane", "antialiased", "distance_heads", "distance_scale", "feature_bank")
@@ -69,11 +71,6 @@ class AnchorLayout:
     def mlps(self) -> tuple[str, ...]:
         """Names of all MLPs."""
         return (*HEADS, BANK) if self.feature_bank else HEADS
-
-    @property
-    def feature_dim(self) -> int:
-        """Stored numbers per anchor: base, then one block per period."""
-        return self.base_dim + self.num_periods * self.period_dim
 
     @classmethod
     def of(cls, config: AnchorConfig, num_periods: int) -> AnchorLayout:
@@ -115,7 +112,12 @@ class AnchorModel:
     offsets: Tensor
     """[A, k, 3]"""
     features: Tensor
-    """Base feature, then one block per period. [A, Fb + T * Fv]"""
+    """What all periods share. [A, Fb]"""
+    blocks: Tensor
+    """Features that vary: one or more for each anchor. [R, Fv]"""
+    block_rows: Tensor
+    """Which block an anchor has at a period; no two anchors share one. int64 [A, T], or [A, 0]
+    where nothing but the global feature varies."""
     log_scales: Tensor
     """Columns 0..2 for the offsets, 3..5 for the Gaussians. [A, 6]"""
     global_features: Tensor
@@ -145,15 +147,22 @@ class AnchorModel:
         for name in HEADS:
             inputs, outputs = cls.input_dim(layout, name), _OUTPUTS[name] * layout.offsets
             heads[name] = draw_mlp(inputs, layout.hidden_dim, outputs, generator)
-        shape = (len(anchors), layout.feature_dim)
+        count, periods = len(anchors), layout.num_periods
+        shape = (count, layout.base_dim + periods * layout.period_dim)
         features = draw_start(shape, config.feature_init, config.feature_init_scale, generator)
+        blocks = features[:, layout.base_dim :].reshape(count, periods, layout.period_dim)
+        if config.block_threshold:
+            blocks = blocks[:, :1]
+        rows = own_blocks(count, blocks.shape[1]).expand(-1, periods).contiguous()
         shape = (layout.num_periods, layout.global_dim)
         global_features = draw_start(shape, cls.global_start(config), 1.0, generator)
         return cls(
             layout,
             anchors=torch.from_numpy(anchors),
             offsets=torch.zeros(len(anchors), layout.offsets, 3),
-            features=features,
+            features=features[:, : layout.base_dim].contiguous(),
+            blocks=blocks.flatten(0, 1).contiguous(),
+            block_rows=rows if layout.period_dim else rows[:, :0],
             log_scales=torch.from_numpy(initial_log_scales(anchors)),
             global_features=global_features,
             heads=heads,
@@ -166,7 +175,7 @@ class AnchorModel:
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that is stored, by name."""
-        named = {name: getattr(self, name) for name in ("anchors", *PER_ANCHOR, "global_features")}
+        named = {name: getattr(self, name) for name in _TENSORS}
         for name, head in self.heads.items():
             named |= {f"{name}.{layer}": getattr(head, layer) for layer in LAYERS}
         if self.used_offsets is not None:
@@ -177,7 +186,7 @@ class AnchorModel:
     def from_tensors(cls, layout: AnchorLayout, tensors: Mapping[str, Tensor]) -> Self:
         """Inverse of `tensors`."""
         heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in LAYERS)) for h in layout.mlps}
-        named = {name: tensors[name] for name in ("anchors", *PER_ANCHOR, "global_features")}
+        named = {name: tensors[name] for name in _TENSORS}
         return cls(layout, **named, heads=heads, used_offsets=tensors.get("used_offsets"))
 
     def to(self, device: str | torch.device) -> Self:
@@ -214,7 +223,6 @@ class AnchorModel:
     def _decode_inputs(
         self, period_weights: Tensor, centre: Tensor, visible: Tensor
     ) -> DecodeInputs:
-        features, base_dim = self.seen_features(centre)
         opacity, covariance, color = (self._kernel_head(name) for name in HEADS)
         used = self.used_offsets
         if used is None:
@@ -222,7 +230,8 @@ class AnchorModel:
         return DecodeInputs(
             anchors=self.anchors,
             offsets=self.offsets,
-            features=features,
+            features=self.seen_features(centre),
+            blocks=self.blocks,
             log_scales=self._scales_in_use(),
             global_features=self.global_features,
             period_weights=period_weights,
@@ -232,22 +241,18 @@ class AnchorModel:
             camera_centre=centre,
             visible=visible,
             used_offsets=used,
-            base_dim=base_dim,
-            period_dim=self.layout.period_dim,
+            block_rows=self.block_rows,
         )
 
-    def seen_features(self, centre: Tensor) -> tuple[Tensor, int]:
-        """Features as the MLPs get them in a view, and how many of them all periods share."""
-        features, base_dim = self.features, self.layout.base_dim
+    def seen_features(self, centre: Tensor) -> Tensor:
+        """What all periods share, as the MLPs get it in a view. [A, F]"""
+        features = self.features
         if self.layout.direction == "full":  # a second base feature that nothing trains
-            offset = self.anchors - centre
-            features = torch.cat([features[:, :base_dim], offset, features[:, base_dim:]], dim=1)
-            base_dim += 3
+            features = torch.cat([features, self.anchors - centre], dim=1)
         if self.layout.distance_heads:
             distances = self.layout.distance_scale * self.distances(centre)
-            features = torch.cat([features[:, :base_dim], distances, features[:, base_dim:]], dim=1)
-            base_dim += 1
-        return features, base_dim
+            features = torch.cat([features, distances], dim=1)
+        return features
 
     def distances(self, centre: Tensor) -> Tensor:
         """Of the anchors from a camera. [A, 1]"""

@@ -7,7 +7,7 @@ same bytes for any number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
@@ -15,11 +15,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from chronoscene.anchors.blocks import COUNTERS as BLOCK_COUNTERS
+from chronoscene.anchors.blocks import (
+    BlockStatistics,
+    find_splits,
+    nearest_seen,
+    own_blocks,
+    share_equal,
+)
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.contribution import used_offsets
 from chronoscene.anchors.decode import pack_bits, unpack_bits
 from chronoscene.anchors.density import COUNTERS, AnchorRows, DensityStatistics, grow, prune_mask
-from chronoscene.anchors.model import FIXED, PER_ANCHOR, AnchorModel
+from chronoscene.anchors.model import FIXED, PER_ANCHOR, TABLES, AnchorModel
 from chronoscene.anchors.visibility import projected_centres
 from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
@@ -45,8 +53,6 @@ from chronoscene.training.splatting import (
     step_background,
 )
 
-AfterUpdate = Callable[[AnchorModel, Mapping[str, float]], None]
-
 _COOLED = 0.1  # Factor of the learning rates at the end of a cooldown
 _MARGIN = 1e-9
 """Shares of the training this close are equal: progress is a quotient of rounded numbers."""
@@ -69,24 +75,20 @@ class AnchorTrainer:
     """Learning rates by tensor name."""
     feature_rows: NDArray[np.int64]
     """Which of the features that vary each view has, mostly its period. [V]"""
-    after_update: AfterUpdate | None = None
-    """Called with the model and the learning rates after each step that changed the features;
-    every step then updates the features of all anchors."""
 
     def __post_init__(self) -> None:
         model, train, seed = self.model.requires_grad(), self.train, self.seed
         layout, tensors = model.layout, model.tensors()
         trained = {n: t for n, t in tensors.items() if n in self.rates and t.numel() > 0}
         self.rates = {name: self.rates[name] for name in trained}
-        varying = layout.num_periods if layout.period_dim else 0
-        blocks = [layout.base_dim, *[layout.period_dim] * varying]
         self.tables = {
             "offsets": make_table(model.offsets),
-            "features": make_table(model.features, blocks),
+            "features": make_table(model.features),
+            "blocks": make_table(model.blocks),
             # Culling reads the scales of all anchors in every step.
             "log_scales": DenseTable(model.log_scales),
         }
-        self.optimizer = Adam({n: t for n, t in trained.items() if n not in PER_ANCHOR})
+        self.optimizer = Adam({n: t for n, t in trained.items() if n not in TABLES})
         self._seen_layout = replace(layout, num_periods=1)
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
@@ -97,6 +99,7 @@ class AnchorTrainer:
         self.growth_generator = np.random.default_rng((seed, 1))
         self.noise_generator = np.random.default_rng((seed, 2))
         self.statistics: DensityStatistics | None = None
+        self.block_statistics: BlockStatistics | None = None
         self._dropped = False
 
     def step(self, index: int, progress: float) -> StepReport:
@@ -111,6 +114,7 @@ class AnchorTrainer:
             mask = None if mask is None else downscale_mask(mask, factor)
         loss, skipped = self._learn(view, photo, mask, position, done)
         resized = self._densify_if_due(index, done) or self._drop_if_due(done)
+        resized |= self._split_if_due(index, done)
         if skipped is None:
             self._update(done, resized=resized)
         self.optimizer.zero_grad()
@@ -159,17 +163,23 @@ class AnchorTrainer:
         )
         if collects and skipped is None:
             self._collect(view, visible, positions, splats.opacities, raster.info, counts)
+            if self.config.block_threshold and self.model.layout.period_dim:
+                self._collect_blocks(visible, row)
         return value, skipped
 
     def _seen(self, visible: Tensor, row: int) -> AnchorModel:
         """The visible anchors with one of the features that vary: a model of a single period."""
         tables, model = self.tables, self.model
-        blocks = (0, 1 + row) if model.layout.period_dim else (0,)
+        blocks = rows = model.block_rows[visible]
+        if model.layout.period_dim:
+            blocks, rows = rows[:, row], own_blocks(len(visible), 1).to(rows)
         return type(model)(
             self._seen_layout,
             anchors=model.anchors[visible],
             offsets=tables["offsets"].fetch(visible),
-            features=tables["features"].fetch(visible, blocks),
+            features=tables["features"].fetch(visible),
+            blocks=tables["blocks"].fetch(blocks.flatten()),
+            block_rows=rows,
             log_scales=tables["log_scales"].fetch(visible),
             global_features=model.global_features[row : row + 1],
             heads=model.heads,
@@ -184,6 +194,8 @@ class AnchorTrainer:
         sources["exposure"] = self.exposure.state()
         if self.statistics is not None:
             sources["statistics"] = {n: getattr(self.statistics, n) for n in COUNTERS}
+        if (blocks := self.block_statistics) is not None:
+            sources["block_statistics"] = {n: getattr(blocks, n) for n in BLOCK_COUNTERS}
         for prefix, source in sources.items():
             tensors |= {f"{prefix}.{name}": tensor for name, tensor in source.items()}
         values = {
@@ -198,9 +210,8 @@ class AnchorTrainer:
     def load_state(self, state: TrainingState) -> None:
         """Go on from what `state` gave, in a trainer that was made alike."""
         model, stored = self.model, parts(state.tensors, "model")
-        model.anchors = stored["anchors"].to(model.anchors)
-        if "used_offsets" in stored:
-            model.used_offsets = stored["used_offsets"].to(model.device)
+        for name in stored.keys() & set(FIXED):
+            setattr(model, name, stored[name].to(model.device))
         for name, tensor in model.tensors().items():
             if name not in FIXED and name not in self.tables:
                 tensor.copy_(stored[name])
@@ -213,6 +224,11 @@ class AnchorTrainer:
             self.statistics = self._new_statistics()
             for name in COUNTERS:
                 getattr(self.statistics, name).copy_(counters[name])
+        self.block_statistics = None
+        if counters := parts(state.tensors, "block_statistics"):
+            self.block_statistics = self._new_block_statistics()
+            for name in BLOCK_COUNTERS:
+                getattr(self.block_statistics, name).copy_(counters[name])
         self.sampler.drawn = state.values["views_drawn"]
         self._dropped = state.values["dropped"]
         self.growth_generator.bit_generator.state = state.values["growth_generator"]
@@ -274,14 +290,34 @@ class AnchorTrainer:
     def _grow(self, statistics: DensityStatistics) -> None:
         model = self.model
         rows = AnchorRows(*(getattr(model, name).detach() for name in AnchorRows._fields))
+        blocks = model.blocks.detach()[model.block_rows].flatten(1)
+        rows = rows._replace(features=torch.cat([rows.features, blocks], dim=1))
         new = grow(rows, statistics, self.config, self.voxel_size, self.growth_generator)
-        for name, table in self.tables.items():
-            setattr(model, name, table.extend(getattr(new, name)))
+        base, blocks = new.features.split([model.layout.base_dim, blocks.shape[1]], dim=1)
+        new = new._replace(features=base)
+        for name in PER_ANCHOR:
+            setattr(model, name, self.tables[name].extend(getattr(new, name)))
+        if model.layout.period_dim:
+            self._add_blocks(blocks.unflatten(1, (-1, model.layout.period_dim)))
+        else:
+            model.block_rows = model.anchors.new_empty(len(rows.anchors) + len(base), 0).long()
         model.anchors = torch.cat([model.anchors, new.anchors])
         if model.used_offsets is not None:
             every = model.used_offsets.new_full((len(new.anchors),), -1)
             model.used_offsets = torch.cat([model.used_offsets, every])
         statistics.extend(len(new.anchors))
+        if self.block_statistics is not None:
+            self.block_statistics.extend(len(new.anchors))
+
+    def _add_blocks(self, blocks: Tensor) -> None:
+        """Of new anchors. [N, T, Fv]"""
+        model, first = self.model, len(self.model.blocks)
+        if self.config.block_threshold:
+            values, rows = share_equal(blocks)
+        else:
+            values, rows = blocks.flatten(0, 1), own_blocks(*blocks.shape[:2]).to(model.device)
+        model.blocks = self.tables["blocks"].extend(values)
+        model.block_rows = torch.cat([model.block_rows, first + rows])
 
     def _prune(self, statistics: DensityStatistics) -> None:
         """Drop anchors and bound the scales. A model is never left without any anchor."""
@@ -295,11 +331,58 @@ class AnchorTrainer:
     def _keep(self, mask: Tensor) -> None:
         """Forget the anchors outside a mask. bool [A]"""
         model = self.model
-        for name, table in self.tables.items():
-            setattr(model, name, table.keep(mask))
+        for name in PER_ANCHOR:
+            setattr(model, name, self.tables[name].keep(mask))
         model.anchors = model.anchors[mask]
+        self._keep_blocks(model.block_rows[mask])
+        if self.block_statistics is not None:
+            self.block_statistics.keep(mask)
         if model.used_offsets is not None:
             model.used_offsets = model.used_offsets[mask]
+
+    def _keep_blocks(self, block_rows: Tensor) -> None:
+        """Forget the blocks that no anchor has."""
+        model = self.model
+        used = torch.zeros(len(model.blocks), dtype=torch.bool, device=model.device)
+        used[block_rows] = True
+        model.blocks = self.tables["blocks"].keep(used)
+        model.block_rows = (used.cumsum(0) - 1)[block_rows]
+
+    def _collect_blocks(self, visible: Tensor, row: int) -> None:
+        if self.block_statistics is None:
+            self.block_statistics = self._new_block_statistics()
+        for gradient in self.tables["blocks"].gradients():
+            self.block_statistics.update(visible, row, gradient)
+
+    def _new_block_statistics(self) -> BlockStatistics:
+        model = self.model
+        return BlockStatistics(
+            len(model), model.layout.num_periods, model.layout.period_dim, model.device
+        )
+
+    def _split_if_due(self, index: int, done: float) -> bool:
+        """Split blocks whose periods disagree; whether there are more blocks than before."""
+        config, statistics, model = self.config, self.block_statistics, self.model
+        if statistics is None:
+            return False
+        if done >= config.density_until - _MARGIN:
+            self.block_statistics = None
+            return False
+        if (index + 1) % config.density_interval:
+            return False
+        leaves = find_splits(statistics, model.block_rows, config.block_threshold)
+        # Those that leave a block together share the new one, its copy.
+        sources, copy = model.block_rows[leaves].unique(return_inverse=True)
+        rows = model.block_rows.clone()
+        rows[leaves] = len(model.blocks) + copy
+        model.block_rows = rows.gather(1, nearest_seen(statistics.seen))
+        statistics.fade(leaves.any(1))
+        if len(sources) == 0:
+            return False
+        for table in self.tables.values():
+            table.flush()
+        model.blocks = self.tables["blocks"].extend(model.blocks.detach()[sources])
+        return True
 
     def _drop_if_due(self, done: float) -> bool:
         """Once growth is over, drop what carries nothing; whether the rows of the anchors
@@ -333,17 +416,14 @@ class AnchorTrainer:
                 if name in rates:
                     table.step(rates[name])
         self._decay(rates, resized)
-        if self.after_update is not None and "features" in rates and not resized:
-            self.tables["features"].flush()
-            self.after_update(self.model, rates)
 
     @torch.no_grad()
     def _decay(self, rates: Mapping[str, float], resized: bool) -> None:
         """Decoupled weight decay; off unless configured."""
         config = self.config
-        if config.feature_decay and "features" in rates and not resized:
-            factor = 1.0 - rates["features"] * config.feature_decay
-            self.tables["features"].flush().mul_(factor)
+        for name in ("features", "blocks") if config.feature_decay and not resized else ():
+            if name in rates:
+                self.tables[name].flush().mul_(1.0 - rates[name] * config.feature_decay)
         if config.head_decay:
             for name, value in self.optimizer.params.items():
                 if name.endswith(".w1"):

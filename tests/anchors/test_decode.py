@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from chronoscene.anchors.blocks import own_blocks
 from chronoscene.anchors.decode import (
     DecodeInputs,
     HeadWeights,
@@ -39,7 +40,6 @@ class Problem:
     fixed: dict[str, Tensor]
     leaves: dict[str, Tensor]
     heads: tuple[HeadWeights, HeadWeights, HeadWeights]
-    dims: dict[str, int]
     grads: tuple[Tensor, ...]
 
     def run(self, function: Any) -> tuple[Splats, dict[str, Tensor]]:
@@ -57,7 +57,7 @@ class Problem:
         """Outputs."""
         names = ("opacity_head", "covariance_head", "color_head")
         named = dict(zip(names, heads, strict=True))
-        return function(DecodeInputs(**self.fixed, **leaves, **named, **self.dims))
+        return function(DecodeInputs(**self.fixed, **leaves, **named))
 
     def double(self) -> Problem:
         """The same numbers in float64."""
@@ -71,7 +71,6 @@ class Problem:
             {name: cast(tensor) for name, tensor in self.fixed.items()},
             {name: cast(tensor) for name, tensor in self.leaves.items()},
             tuple(HeadWeights(*map(cast, head)) for head in self.heads),  # type: ignore[arg-type]
-            self.dims,
             self.grads,
         )
 
@@ -116,15 +115,16 @@ def make_problem(
             "camera_centre": normal(3),
             "visible": chosen,
             "used_offsets": torch.full((anchors,), -1),
+            "block_rows": own_blocks(anchors, periods)[:, : periods if period else 0],
         },
         leaves={
             "offsets": leaf(anchors, offsets, 3),
-            "features": leaf(anchors, base + periods * period),
+            "features": leaf(anchors, base),
+            "blocks": leaf(anchors * periods, period),
             "log_scales": leaf(anchors, 6),
             "global_features": leaf(periods, shared),
         },
         heads=(head(offsets), head(7 * offsets), head(3 * offsets)),
-        dims={"base_dim": base, "period_dim": period},
         grads=tuple(normal(count, *shape) for shape in ((3,), (4,), (3,), (), (3,))),
     )
 
@@ -186,8 +186,8 @@ def test_definition_passes_gradcheck() -> None:
     flat = [*problem.leaves.values(), *(weight for head in problem.heads for weight in head)]
 
     def run(*tensors: Tensor) -> Splats:
-        leaves = dict(zip(problem.leaves, tensors[:4], strict=True))
-        heads = tuple(HeadWeights(*tensors[first : first + 4]) for first in (4, 8, 12))
+        leaves = dict(zip(problem.leaves, tensors[:5], strict=True))
+        heads = tuple(HeadWeights(*tensors[first : first + 4]) for first in (5, 9, 13))
         return problem.call(decode_reference, leaves, heads)
 
     assert torch.autograd.gradcheck(run, flat)
@@ -197,7 +197,7 @@ def test_definition_passes_gradcheck() -> None:
 def test_other_periods_and_hidden_anchors_get_exactly_nothing(function: Any) -> None:
     problem = make_problem(weights=(0.0, 1.0, 0.0))
     _, grads = problem.run(function)
-    blocks = grads["features"][:, 4:].reshape(-1, 3, 5)
+    blocks = grads["blocks"].view(-1, 3, 5)
     hidden = torch.ones(30, dtype=torch.bool)
     hidden[problem.fixed["visible"]] = False
     assert not blocks[:, [0, 2]].any()
@@ -214,8 +214,8 @@ def test_mixed_periods_mix_features_not_images(share: float) -> None:
     mixed, _ = problem.run(decode)
     same = make_problem(weights=(1.0, 0.0, 0.0))
     with torch.no_grad():
-        features = same.leaves["features"]
-        features[:, 4:9] = (1 - share) * features[:, 4:9] + share * features[:, 9:14]
+        blocks = same.leaves["blocks"].view(-1, 3, 5)
+        blocks[:, 0] = (1 - share) * blocks[:, 0] + share * blocks[:, 1]
         table = same.leaves["global_features"]
         table[0] = (1 - share) * table[0] + share * table[1]
     once, _ = same.run(decode)

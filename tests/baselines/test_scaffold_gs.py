@@ -15,6 +15,7 @@ from baselines.scaffold_gs.config import ScaffoldGSConfig
 from baselines.scaffold_gs.method import ScaffoldGS, ScaffoldGSPeriod
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
+from chronoscene.anchors.model import FIXED
 from chronoscene.errors import ConfigError
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, TrainingView, build_config
@@ -113,14 +114,16 @@ def test_feature_bank_and_distances_against_float64(
     found = []
     for dtype in (torch.float32, torch.float64):
         model = with_inputs(train_set, **options).model
-        tensors = {n: t.detach().to(dtype) for n, t in model.tensors().items()}
+        tensors = {n: t.detach() for n, t in model.tensors().items()}
+        tensors = {n: t if n in FIXED[1:] else t.to(dtype) for n, t in tensors.items()}
         model = type(model).from_tensors(model.layout, tensors).requires_grad()
         visible = torch.arange(0, len(model), 2)
         splats = model.decode(torch.ones(1, dtype=dtype), centre.to(dtype), visible)
         generator = torch.Generator().manual_seed(5)
         draws = {n: torch.randn(getattr(splats, n).shape, generator=generator) for n in names}
         sum((getattr(splats, n) * draw.to(dtype)).sum() for n, draw in draws.items()).backward()
-        found.append((splats, {n: t.grad for n, t in model.tensors().items() if n != "anchors"}))
+        trained = model.tensors().keys() - {*FIXED, "blocks"}
+        found.append((splats, {n: model.tensors()[n].grad for n in trained}))
     (ours, grads), (exact, expected) = found
     for name, grad in expected.items():
         assert grad is not None and grads[name] is not None, name

@@ -70,7 +70,7 @@ def method(noise_set: Callable[[int], TrainingSet]) -> Callable[..., ChronoGS]:
         if random_features:
             generator = torch.Generator().manual_seed(2)
             with torch.no_grad():
-                for tensor in (made.model.features, made.model.offsets):
+                for tensor in (made.model.features, made.model.blocks, made.model.offsets):
                     tensor.copy_(torch.randn(tensor.shape, generator=generator) * 0.3)
         return made
 

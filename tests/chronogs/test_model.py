@@ -10,7 +10,7 @@ import torch
 
 from chronogs.method import ChronoGS
 from chronoscene.anchors.config import HEADS
-from chronoscene.anchors.model import PER_ANCHOR, AnchorModel
+from chronoscene.anchors.model import TABLES, AnchorModel
 from chronoscene.errors import ConfigError
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.training.losses import mean_volume
@@ -27,9 +27,8 @@ def decode_all(model: AnchorModel, weights: list[float], centre: torch.Tensor = 
 @pytest.mark.parametrize(("num_periods", "official_columns"), [(3, 107), (4, 123)])
 def test_counts(method: Make, num_periods: int, official_columns: int) -> None:
     model = method(num_periods).model
-    per_anchor = sum(
-        tensor[0].numel() for n, tensor in model.tensors().items() if n in ("anchors", *PER_ANCHOR)
-    )
+    counted = ("anchors", *TABLES)
+    per_anchor = sum(t.numel() for n, t in model.tensors().items() if n in counted) / len(model)
     # The official file also holds a rotation (4) that is never anything but the identity.
     assert per_anchor == official_columns - 4
     assert sum(t.numel() for head in model.heads.values() for t in head) == 10_158
@@ -54,9 +53,9 @@ def gradient_blocks(made: ChronoGS, weights: list[float]) -> torch.Tensor:
     model = made.model.requires_grad()
     decoded = decode_all(model, weights)
     (decoded.opacities.sum() + decoded.colors.square().sum() + decoded.scales.sum()).backward()
-    grad = model.features.grad
+    grad = model.blocks.grad
     assert grad is not None
-    return grad[:, 16:].reshape(len(grad), 3, 16)
+    return grad[model.block_rows]
 
 
 def test_a_view_reaches_only_the_features_of_its_period(method: Make) -> None:
@@ -81,7 +80,7 @@ def test_fractional_periods_mix_features_before_the_mlp(method: Make, noise_set:
     halfway = made.render(view, 0.5).rgb
     model = made.model
     with torch.no_grad():
-        blocks = model.features[:, 16:].view(len(model), 3, 16)
+        blocks = model.blocks.view(len(model), 3, 16)
         blocks[:, 2] = 0.5 * (blocks[:, 0] + blocks[:, 1])
         model.global_features[2] = 0.5 * (model.global_features[0] + model.global_features[1])
     np.testing.assert_allclose(made.render(view, 2).rgb, halfway, atol=1e-5)
@@ -106,7 +105,7 @@ def test_gaussians_that_are_off_leave_the_background(method: Make, noise_set: Ca
     assert float(volume.detach()) == 0.0
     raster = draw(decoded, view, torch.zeros(3), near_plane=NEAR_PLANE)
     (raster.image.sum() + volume).backward()
-    for name in ("features", "offsets", "log_scales"):
+    for name in TABLES:
         grad = getattr(made.model, name).grad
         assert grad is None or not grad.any()
 
@@ -125,9 +124,8 @@ def test_geometry_and_appearance_of_different_periods(method: Make, noise_set: C
 
 def plain_inputs(model: AnchorModel, period: int, head: str, *, full: bool) -> torch.Tensor:
     """Inputs of an MLP written out, in the order of the trained columns."""
-    layout, base_dim, dim = model.layout, model.layout.base_dim, model.layout.period_dim
-    start = base_dim + period * dim
-    base, own = model.features[:, :base_dim], model.features[:, start : start + dim]
+    layout = model.layout
+    base, own = model.features, model.blocks[model.block_rows[:, period]]
     table = model.global_features[period].expand(len(model), -1)
     direction = model.anchors - CENTRE
     if not full:

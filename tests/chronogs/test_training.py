@@ -52,10 +52,10 @@ def test_learning_rates_at_start_middle_and_end(method: Make) -> None:
     assert at["color.b2"] == pytest.approx([8e-3, (8e-3 * 5e-5) ** 0.5, 5e-5])
     assert at["covariance.w2"] == pytest.approx([4e-3] * 3)
     assert at["offsets"] == pytest.approx([0.011, 0.0011, 0.00011])
-    assert at["features"] == pytest.approx([0.0075] * 3)
+    assert at["features"] == at["blocks"] == pytest.approx([0.0075] * 3)
     assert at["log_scales"] == pytest.approx([0.007] * 3)
     assert at["global_features"] == pytest.approx([0.05, 0.005, 0.0005])
-    trained = set(made.model.tensors()) - {"anchors"}
+    trained = set(made.model.tensors()) - {"anchors", "block_rows"}
     assert set(rates) == trained
 
 
@@ -117,6 +117,8 @@ def test_anchors_grow_and_only_mlps_move_in_that_step(
     assert report.primitives == len(made.model) > start
     torch.testing.assert_close(after["offsets"][:start], before["offsets"], rtol=0, atol=0)
     torch.testing.assert_close(after["features"][:start], before["features"], rtol=0, atol=0)
+    old, new = (at["blocks"][at["block_rows"][:start]] for at in (before, after))
+    torch.testing.assert_close(new, old, rtol=0, atol=0)
     assert not torch.equal(after["opacity.w1"], before["opacity.w1"])
     assert not after["offsets"][start:].any()
     made.step(12, 12 / 24)

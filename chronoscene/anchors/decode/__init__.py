@@ -49,7 +49,9 @@ class DecodeInputs(NamedTuple):
     offsets: Tensor
     """In units of the anchor's scale. [A, k, 3]"""
     features: Tensor
-    """Base feature, then one block per period. [A, Fb + T * Fv]"""
+    """What all periods share. [A, Fb]"""
+    blocks: Tensor
+    """What they do not; an anchor has one block or more. [R, Fv]"""
     log_scales: Tensor
     """Logarithms, in units of the training frame; 0:3 for offsets, 3:6 for Gaussians. [A, 6]"""
     global_features: Tensor
@@ -68,10 +70,9 @@ class DecodeInputs(NamedTuple):
     """Ascending indices of the anchors to decode. int64 [M]"""
     used_offsets: Tensor
     """Bit j says whether an anchor uses its offset j; what it does not has opacity -1. int64 [A]"""
-    base_dim: int
-    """Fb"""
-    period_dim: int
-    """Fv"""
+    block_rows: Tensor
+    """Which block an anchor has at a period; no two anchors share one. int64 [A, T], or [A, 0]
+    where blocks have no numbers."""
 
     @property
     def heads(self) -> tuple[HeadWeights, HeadWeights, HeadWeights]:
@@ -92,7 +93,7 @@ def unpack_bits(bits: Tensor, count: int) -> Tensor:
 def decode_reference(x: DecodeInputs) -> Splats:
     """Decode the visible anchors in plain torch: the definition of `decode`.
 
-    With e the period weights, f = (base, sum_s e_s period_s), d the unit vector from the camera to
+    With e the period weights, f = (base, sum_s e_s block_s), d the unit vector from the camera to
     the anchor and g = sum_s e_s global_s, every head sees the input (f, d, g) and
 
         opacity = tanh(o), color = sigmoid(c), scale = exp(log_scales[3:6]) sigmoid(s),
@@ -103,21 +104,19 @@ def decode_reference(x: DecodeInputs) -> Splats:
     Returns:
         splats: k to each visible anchor, anchor by anchor; opacities -1..1, colours 0..1. [M * k]
     """
-    num_offsets, num_periods = x.opacity_head.w2.shape[0], x.period_weights.shape[0]
-    check_shape(
-        "features", x.features, (x.anchors.shape[0], x.base_dim + num_periods * x.period_dim)
-    )
+    num_offsets = x.opacity_head.w2.shape[0]
     # Not x.features[x.visible], whose gradient would be sorted by rows.
-    rows = x.features.index_select(0, x.visible)
-    periods = rows[:, x.base_dim :].reshape(len(x.visible), num_periods, x.period_dim)
+    rows = x.block_rows.index_select(0, x.visible).flatten()
+    shape = (len(x.visible), x.block_rows.shape[1], x.blocks.shape[1])
+    blocks = x.blocks.index_select(0, rows).view(shape)
     centres = x.anchors.index_select(0, x.visible).detach()
     directions = centres - x.camera_centre.detach()
     lengths = directions.norm(dim=-1, keepdim=True)
     directions = torch.where(lengths > MIN_DISTANCE, directions / lengths, 0)
     inputs = torch.cat(
         (
-            rows[:, : x.base_dim],
-            torch.einsum("t,mtv->mv", x.period_weights, periods),
+            x.features.index_select(0, x.visible),
+            torch.einsum("t,mtv->mv", x.period_weights[: blocks.shape[1]], blocks),
             directions,
             (x.period_weights @ x.global_features).expand(len(x.visible), -1),
         ),
@@ -164,14 +163,16 @@ def decode_active(x: DecodeInputs) -> tuple[Splats, Tensor]:
 
 def _decode(x: DecodeInputs, above: np.float32) -> tuple[Splats, Tensor]:
     _check(x)
-    fixed = (x.anchors, x.period_weights, x.camera_centre, x.visible, x.used_offsets)
-    tensors = (x.offsets, x.features, x.log_scales, x.global_features)
+    fixed = (
+        x.anchors, x.period_weights, x.camera_centre, x.visible, x.used_offsets, x.block_rows
+    )  # fmt: skip
+    tensors = (x.offsets, x.features, x.blocks, x.log_scales, x.global_features)
     weights = [weight for head in x.heads for weight in head]
     floats = (*fixed[:3], *tensors, *weights)
     if devices.has_kernels(*floats):
         _check_visible(x.visible, len(x.anchors))
-        dims = (x.base_dim, x.period_dim)
-        *outputs, index = Decode.apply(dims, above, fixed, *tensors, *weights)
+        _check_block_rows(x.block_rows, len(x.blocks))
+        *outputs, index = Decode.apply(above, fixed, *tensors, *weights)
         return Splats(*outputs), index
     splats = decode_reference(x)
     index = (~(splats.opacities <= float(above))).nonzero()[:, 0]
@@ -184,13 +185,15 @@ def _check(x: DecodeInputs) -> None:
     hidden, count = x.opacity_head.w1.shape[0], x.opacity_head.b2.shape[0]
     check_shape("anchors", x.anchors, (rows, 3))
     check_shape("offsets", x.offsets, (rows, count, 3))
-    check_shape("features", x.features, (rows, x.base_dim + periods * x.period_dim))
+    check_shape("features", x.features, (rows, None))
+    check_shape("blocks", x.blocks, (None, None))
+    check_shape("block_rows", x.block_rows, (rows, periods if x.blocks.shape[1] else 0))
     check_shape("log_scales", x.log_scales, (rows, 6))
     check_shape("global_features", x.global_features, (periods, None))
     check_shape("camera_centre", x.camera_centre, (3,))
     check_shape("visible", x.visible, (None,))
     check_shape("used_offsets", x.used_offsets, (rows,))
-    inputs = x.base_dim + x.period_dim + 3 + x.global_features.shape[1]
+    inputs = x.features.shape[1] + x.blocks.shape[1] + 3 + x.global_features.shape[1]
     names = ("opacity", "covariance", "color")
     for name, head, width in zip(names, x.heads, (1, 7, 3), strict=True):
         check_shape(f"{name} head w1", head.w1, (hidden, inputs))
@@ -208,6 +211,17 @@ def _check_visible(visible: Tensor, rows: int) -> None:
             expected=f"ascending indices of {rows} anchors",
             found=f"{visible[:8].tolist()}, at most {int(visible.max())}",
             todo="pass indices of rows that exist, sorted, each once",
+        )
+
+
+def _check_block_rows(block_rows: Tensor, rows: int) -> None:
+    """Check the indices: the kernels read whatever they point at."""
+    if block_rows.numel() and not 0 <= int(block_rows.min()) <= int(block_rows.max()) < rows:
+        raise ShapeError(
+            "block_rows",
+            expected=f"indices of {rows} blocks",
+            found=f"{int(block_rows.min())} to {int(block_rows.max())}",
+            todo="pass indices of rows that exist",
         )
 
 

@@ -9,7 +9,13 @@ from __future__ import annotations
 from numba import prange
 from numpy import float32
 
-from chronoscene.anchors.decode.forward import factors, gather_inputs, hidden_layer, task_work
+from chronoscene.anchors.decode.forward import (
+    block_start,
+    factors,
+    gather_inputs,
+    hidden_layer,
+    task_work,
+)
 from chronoscene.anchors.decode.layout import BLOCK, CHUNK, CYCLE, Gradients
 from chronoscene.anchors.decode.second_layers import add_biases, add_offset
 from chronoscene.kernels.compilation import inner, kernel
@@ -154,16 +160,18 @@ def _hidden_layer_gradient(layout, weights, work, count, partial):  # type: igno
 @inner
 def _write_features(layout, source, anchor, d_x, at, out):  # type: ignore[no-untyped-def]
     """Spread the gradient of an input over the base and the periods that were mixed in."""
-    row = anchor * layout.row
+    row = anchor * layout.base
     for c in range(0, layout.base, LANES):
         grad = load_first(d_x, at + c, layout.base - c)
         store_first(out.features, row + c, grad, layout.base - c)
     for s in range(source.num_periods):
-        start = row + layout.base + read_index(source.periods, s) * layout.period
+        start = block_start(layout, source, anchor, s)
         for c in range(0, layout.period, LANES):
             left = layout.period - c
             grad = read(source.weights, s) * load_first(d_x, at + layout.base + c, left)
-            store_first(out.features, start + c, grad, left)
+            # Periods may share a block.
+            grad = load_first(out.blocks, start + c, left) + grad
+            store_first(out.blocks, start + c, grad, left)
 
 
 @inner
@@ -190,7 +198,7 @@ def _clear_rows(layout, source, begin, end, out):  # type: ignore[no-untyped-def
     if end < source.num_visible:
         last = read_index(source.visible, end - 1) + 1
     set_zero(out.offsets, 3 * layout.offsets * first, 3 * layout.offsets * last)
-    set_zero(out.features, layout.row * first, layout.row * last)
+    set_zero(out.features, layout.base * first, layout.base * last)
     set_zero(out.log_scales, 6 * first, 6 * last)
 
 

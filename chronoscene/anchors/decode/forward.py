@@ -64,11 +64,17 @@ def task_work(work, task, size):  # type: ignore[no-untyped-def]
 def _prefetch_inputs(layout, source, m):  # type: ignore[no-untyped-def]
     """Ask for the features of a later anchor: its row is far from those before."""
     if m < source.num_visible:
-        row = read_index(source.visible, m) * layout.row
-        prefetch(source.features, row)
+        anchor = read_index(source.visible, m)
+        prefetch(source.features, anchor * layout.base)
         for s in range(source.num_periods):
-            period = read_index(source.periods, s)
-            prefetch(source.features, row + layout.base + period * layout.period)
+            prefetch(source.blocks, block_start(layout, source, anchor, s))
+
+
+@inner
+def block_start(layout, source, anchor, s):  # type: ignore[no-untyped-def]
+    """First number of an anchor's block of the s-th period that is mixed in."""
+    at = anchor * source.all_periods + read_index(source.periods, s)
+    return read_index(source.block_rows, at) * layout.period
 
 
 @inner
@@ -76,15 +82,15 @@ def gather_inputs(layout, source, m, x, slot):  # type: ignore[no-untyped-def]
     """Write the input of the heads: base feature, mixed period feature, unit direction."""
     _prefetch_inputs(layout, source, m + AHEAD)
     anchor, at = read_index(source.visible, m), slot * layout.inputs_pad
-    row = anchor * layout.row
+    row = anchor * layout.base
     for c in range(0, layout.base, LANES):
         store(x, at + c, load_first(source.features, row + c, layout.base - c))
     # A store may run over into what comes next, which is written later.
     for c in range(0, layout.period, LANES):
         total = splat(ZERO)
         for s in range(source.num_periods):
-            start = row + layout.base + read_index(source.periods, s) * layout.period + c
-            part = load_first(source.features, start, layout.period - c)
+            start = block_start(layout, source, anchor, s) + c
+            part = load_first(source.blocks, start, layout.period - c)
             total = total + read(source.weights, s) * part
         store(x, at + layout.base + c, total)
     dx = read(source.anchors, 3 * anchor) - read(source.centre, 0)

@@ -36,13 +36,9 @@ OUTPUTS = (1, 7, 3)  # Per offset, of the heads for opacity, covariance and colo
 class Decode(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        dims: tuple[int, int],
-        above: np.float32,
-        fixed: tuple[Tensor, ...],
-        *tensors: Tensor,
+        ctx: Any, above: np.float32, fixed: tuple[Tensor, ...], *tensors: Tensor
     ) -> tuple[Tensor, ...]:
-        job = _Job(dims, fixed, tensors)
+        job = _Job(fixed, tensors)
         count = job.source.num_visible
         starts = torch.empty(count + 1, dtype=torch.int64)
         alphas = torch.empty(count * job.layout.offsets)
@@ -63,24 +59,25 @@ class Decode(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         # Read here although the job knows them too: torch checks that nobody changed them.
         saved = ctx.saved_tensors
-        fixed, tensors, outputs = saved[:5], saved[5:21], saved[21:]
+        fixed, tensors, outputs = saved[:6], saved[6:23], saved[23:]
         job = ctx.job
         grads = tuple(grad.contiguous() for grad in grads[:5])
         out = [torch.empty(tensor.shape) for tensor in tensors]
+        out[2].zero_()
         sizes = gradient_sizes(job.layout)
         chunks = max(1, -(-job.source.num_visible // CHUNK))
         partials = torch.empty(chunks, sum(sizes))
         partial = Gradients(*place(sizes, partials.data_ptr()))
         arguments = (job.layout, job.weights, job.source, _outputs(torch.empty(0), *outputs))
         output_gradients = OutputGradients(*(grad.data_ptr() for grad in grads))
-        anchor_gradients = AnchorGradients(*(tensor.data_ptr() for tensor in out[:3]))
+        anchor_gradients = AnchorGradients(*(tensor.data_ptr() for tensor in out[:4]))
         gradients = (output_gradients, anchor_gradients, partial, sum(sizes))
         decode_backward(*arguments, *gradients, *job.work)
         shared = torch.zeros_like(job.shared)
-        ends = (job.shared.data_ptr(), _heads(out[4:]), shared.data_ptr())
+        ends = (job.shared.data_ptr(), _heads(out[5:]), shared.data_ptr())
         unpack_gradients(job.layout, partial, job.heads, *ends)
-        out[3] = fixed[1].detach()[:, None] * shared
-        return None, None, None, *out
+        out[4] = fixed[1].detach()[:, None] * shared
+        return None, None, *out
 
 
 def _outputs(*tensors: Tensor) -> Outputs:
@@ -90,36 +87,39 @@ def _outputs(*tensors: Tensor) -> Outputs:
 class _Job:
     """Arguments of the kernels, and the memory behind them."""
 
-    def __init__(
-        self, dims: tuple[int, int], fixed: Sequence[Tensor], tensors: Sequence[Tensor]
-    ) -> None:
-        anchors, weights, centre, visible, used = (_plain(tensor) for tensor in fixed)
-        offsets, features, log_scales, global_features, *heads = (_plain(t) for t in tensors)
+    def __init__(self, fixed: Sequence[Tensor], tensors: Sequence[Tensor]) -> None:
+        anchors, weights, centre, visible, used, rows = (_plain(tensor) for tensor in fixed)
+        offsets, features, blocks, log_scales, global_features, *heads = (
+            _plain(tensor) for tensor in tensors
+        )
         self.layout = make_layout(
-            base=dims[0],
-            period=dims[1],
+            base=features.shape[1],
+            period=blocks.shape[1],
             shared=global_features.shape[1],
             hidden=heads[0].shape[0],
             offsets=offsets.shape[1],
-            row=features.shape[1],
         )
         periods = weights.nonzero()[:, 0]
         weights = weights[periods]
+        mixed = len(periods) if blocks.shape[1] else 0
         self.shared = (weights[:, None] * global_features[periods]).sum(0)
         self.heads = _heads(heads)
         self.source = Anchors(
             anchors=anchors.data_ptr(),
             offsets=offsets.data_ptr(),
             features=features.data_ptr(),
+            blocks=blocks.data_ptr(),
             log_scales=log_scales.data_ptr(),
             num_anchors=len(anchors),
             centre=centre.data_ptr(),
             visible=visible.data_ptr(),
             num_visible=len(visible),
             used_offsets=used.data_ptr(),
+            block_rows=rows.data_ptr(),
             periods=periods.data_ptr(),
             weights=weights.data_ptr(),
-            num_periods=len(periods),
+            num_periods=mixed,
+            all_periods=rows.shape[1],
         )
         sizes = weight_sizes(self.layout)
         packed = torch.zeros(sum(sizes))
@@ -129,8 +129,8 @@ class _Job:
         memory = torch.zeros(tasks * sum(sizes))
         self.work = (Work(*place(sizes, memory.data_ptr())), sum(sizes), tasks)
         # The kernels know addresses only, so this object keeps alive what is there.
-        plain = (anchors, weights, centre, visible, used, offsets, features, log_scales, periods)
-        self._alive = (*plain, *heads, packed, memory)
+        plain = (anchors, weights, centre, visible, used, rows, periods)
+        self._alive = (*plain, offsets, features, blocks, log_scales, *heads, packed, memory)
 
 
 def _plain(tensor: Tensor) -> Tensor:

@@ -52,13 +52,9 @@ class Layout(NamedTuple):
     quats_at: int
     colors_at: int
     outputs_pad: int
-    row: int
-    """Numbers in a row of ``features`` of an anchor, all periods."""
 
 
-def make_layout(
-    *, base: int, period: int, shared: int, hidden: int, offsets: int, row: int
-) -> Layout:
+def make_layout(*, base: int, period: int, shared: int, hidden: int, offsets: int) -> Layout:
     """Derive all sizes."""
 
     def padded(count: int) -> int:
@@ -83,7 +79,6 @@ def make_layout(
         quats_at=quats_at,
         colors_at=colors_at,
         outputs_pad=colors_at + padded(3 * offsets),
-        row=row,
     )
 
 
@@ -166,6 +161,7 @@ class Anchors(NamedTuple):
     anchors: int
     offsets: int
     features: int
+    blocks: int
     log_scales: int
     centre: int
     num_anchors: int
@@ -173,11 +169,15 @@ class Anchors(NamedTuple):
     num_visible: int
     used_offsets: int
     """Bits. int64"""
+    block_rows: int
+    """int64"""
     periods: int
     """Those of weight other than 0. int64"""
     weights: int
     """Their weights."""
     num_periods: int
+    all_periods: int
+    """Columns of ``block_rows``."""
 
 
 class Outputs(NamedTuple):
@@ -213,6 +213,8 @@ class AnchorGradients(NamedTuple):
 
     offsets: int
     features: int
+    blocks: int
+    """Zeros at first."""
     log_scales: int
 
 
