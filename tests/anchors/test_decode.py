@@ -86,6 +86,7 @@ def make_problem(
     shared: int = 2,
     hidden: int = 6,
     weights: tuple[float, ...] = (0.0, 1.0, 0.0),
+    shares: bool = False,
     seed: int = 0,
 ) -> Problem:
     generator = torch.Generator().manual_seed(seed)
@@ -108,6 +109,10 @@ def make_problem(
 
     chosen = torch.randperm(anchors, generator=generator)[:visible].sort().values
     count = len(chosen) * offsets
+    rows = own_blocks(anchors, periods)
+    if shares:  # periods of an anchor that have one block
+        leaders = torch.randint(0, periods, (anchors, periods), generator=generator)
+        rows = rows.gather(1, leaders)
     return Problem(
         fixed={
             "anchors": normal(anchors, 3),
@@ -115,7 +120,7 @@ def make_problem(
             "camera_centre": normal(3),
             "visible": chosen,
             "used_offsets": torch.full((anchors,), -1),
-            "block_rows": own_blocks(anchors, periods)[:, : periods if period else 0],
+            "block_rows": rows[:, : periods if period else 0],
         },
         leaves={
             "offsets": leaf(anchors, offsets, 3),
@@ -156,6 +161,7 @@ def assert_near(name: str, value: Tensor, truth: Tensor, tolerance: float) -> No
     shared=st.integers(0, 9),
     hidden=st.integers(1, 40),
     weights=st.lists(st.sampled_from([0.0, 0.3, 0.7, 1.0]), min_size=1, max_size=4),
+    shares=st.booleans(),
     seed=st.integers(0, 1000),
 )
 def test_equals_definition(visible: int, weights: list[float], **sizes: int) -> None:

@@ -7,7 +7,8 @@ analytically, so nothing of ours is on both sides.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +18,6 @@ from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.methods import TrainingSet, TrainingView
 from chronoscene.scene.similarity import Sim3
-
-pytestmark = pytest.mark.slow
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 BOX = np.array([[-0.3, -0.3, 0.0], [0.3, 0.3, 0.5]])
@@ -104,10 +103,10 @@ def make_views(period: int, angles: Array, radius: float, height: float) -> list
 
 
 def training_set(periods: tuple[int, ...]) -> TrainingSet:
-    """Views of some of the periods, numbered from 0."""
-    arc = np.linspace(-np.pi * 0.95, -0.05 * np.pi, 14)
+    """Views of some of the periods, numbered from 0, from other places in each."""
     truth, views = [], []
     for number, period in enumerate(periods):
+        arc = np.linspace(-np.pi * 0.95, -0.05 * np.pi, 14) + 0.08 * number
         for view in (*make_views(period, arc, 1.9, 1.2), *make_views(period, arc, 1.6, 0.8)):
             truth.append(trace(view.cam_from_world, period)[0])
             views.append(
@@ -136,17 +135,23 @@ def held_out(period: int) -> list[Held]:
     return [Held(v, *trace(v.cam_from_world, period)) for v in views]
 
 
-def train(periods: tuple[int, ...] = (0, 1), *, steps: int = STEPS, **options: int) -> ChronoGS:
+def train(
+    periods: tuple[int, ...] = (0, 1),
+    *,
+    steps: int = STEPS,
+    train_set: TrainingSet | None = None,
+    **options: Any,
+) -> ChronoGS:
     config = ChronoGSConfig(
         iterations=steps,
         offsets_per_anchor=5,
         voxel_size=0.5,
         voxel_unit="spacing",
         density_interval=25,
-        **options,  # type: ignore[arg-type]
+        **options,
     )
     made = ChronoGS(config)
-    made.setup(training_set(periods), seed=0, device="cpu")
+    made.setup(train_set or training_set(periods), seed=0, device="cpu")
     for index in range(steps):
         made.step(index, index / steps)
     return made
@@ -171,6 +176,46 @@ def box_of_period_1(held: Held) -> NDArray[np.bool_]:
     return trace(held.view.cam_from_world, 1)[1]
 
 
+LEAN = {"period_dim": 4, "base_dim": 28, "block_threshold": 16.0, "global_init": "zero"}
+
+
+def owners(made: ChronoGS) -> float:
+    """Share of the anchors that have more than one block."""
+    rows = made.model.block_rows
+    return float((rows != rows[:, :1]).any(1).float().mean())
+
+
+def test_where_nothing_changes_no_anchor_gets_a_block_of_its_own() -> None:
+    assert owners(train((1, 1, 1), steps=300, **LEAN)) < 0.01
+
+
+def test_a_period_with_one_image_shows_what_the_others_saw() -> None:
+    everything = training_set((0, 0, 0))
+    kept = [i for i, v in enumerate(everything.views) if v.period != 1 or i == 30]
+    assert sum(everything.views[i].period == 1 for i in kept) == 1
+    views = tuple(everything.views[i] for i in kept)
+    images = {n: everything.load_image(i) for n, i in enumerate(kept)}
+    made = train(train_set=replace(everything, views=views, load_image=images.__getitem__), **LEAN)
+    assert owners(made) < 0.1
+    assert psnr(made, 0, 1) > psnr(made, 0, 0) - 3.0
+
+
+def test_forty_periods() -> None:
+    made = train((0,) * 20 + (1,) * 20, **LEAN)
+    assert len(made.model.blocks) < 0.2 * made.model.block_rows.numel()
+    assert psnr(made, 0, 0) > 25.0
+
+
+@pytest.mark.slow
+def test_only_what_changes_gets_blocks() -> None:
+    whole = train(period_dim=4, base_dim=28)
+    shared = train(**LEAN)
+    assert 0.05 < owners(shared) < 0.3
+    for period in (0, 1):
+        assert psnr(shared, period, period) > psnr(whole, period, period) - 0.1
+
+
+@pytest.mark.slow
 def test_what_the_features_are_for() -> None:
     joint = train()
     whole = [psnr(joint, p, p) for p in (0, 1)]
