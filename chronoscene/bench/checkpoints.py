@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from chronoscene.bench.provenance import peak_memory_bytes
 from chronoscene.bench.results import CONFIG_FILE
 from chronoscene.errors import CheckpointError, DiskFullError
-from chronoscene.io.staging import sha256_of, write_text_atomic
+from chronoscene.io.staging import partial_name, remove_abandoned, sha256_of, write_text_atomic
 from chronoscene.methods import Method
 
 LOOP_FILE = "loop.json"
@@ -106,8 +106,7 @@ class Checkpoints:
         Raises:
             CheckpointError: If there are some, but all are damaged, or if `start` has none.
         """
-        for partial in self.folder.glob(".*.partial"):
-            shutil.rmtree(partial, ignore_errors=True)
+        remove_abandoned(self.folder, "*")
         started = [] if self.start is None else _checkpoints(self.start)
         problems = []
         for folder in (*_checkpoints(self.folder), *started):
@@ -148,7 +147,7 @@ class Checkpoints:
         state.peak_memory_bytes = max(state.peak_memory_bytes, peak_memory_bytes() or 0)
         if self.commit not in state.commits:
             state.commits.append(self.commit)
-        partial = self.folder / f".{state.iterations}.partial"
+        partial = self.folder / partial_name(str(state.iterations))
         settings = self.folder.parent / CONFIG_FILE
         try:
             partial.mkdir(parents=True, exist_ok=True)

@@ -21,7 +21,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from chronoscene.bench.results import GROUND_TRUTH, RunRecord
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.images.store import ImageStore
-from chronoscene.io.staging import needing_space, replacing, write_text_atomic
+from chronoscene.io.staging import needing_space, partial_name, replacing, write_text_atomic
 from chronoscene.scene import Scene
 
 MANIFEST = "manifest.json"
@@ -319,7 +319,7 @@ def freeze_ground_truth(
 def _write_ground_truth(
     folder: Path, scene: Scene, scene_hash: str, store: ImageStore, details: dict[str, int]
 ) -> None:
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    partial = folder.with_name(partial_name(folder.name))
     try:
         with needing_space(folder):
             writer = ImageWriter(partial)

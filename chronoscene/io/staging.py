@@ -5,13 +5,18 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
+import shutil
+import socket
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path, PureWindowsPath
 
 from chronoscene.errors import ConfigError, DiskFullError, SceneError
 
+BOOT = Path("/proc/sys/kernel/random/boot_id")  # Linux: another one after each start of the machine
 _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}  # Windows has no quotas of this kind
 
 
@@ -57,6 +62,46 @@ def needing_space(place: Path) -> Iterator[None]:
         raise full from error
 
 
+def partial_name(name: str) -> str:
+    """Temporary name of a file or folder: says which process of which machine writes it."""
+    return f".{name}.{_machine()}.{_boot()}.{os.getpid()}.partial"
+
+
+def remove_abandoned(folder: Path, name: str) -> None:
+    """Remove what ended processes of this machine, or this process, left unfinished in a folder.
+
+    Other machines may write to the same storage, and nobody here can see whether they still do.
+
+    Args:
+        folder: Where it is.
+        name: Pattern of the final names.
+    """
+    import psutil
+
+    for path in folder.glob(f".{name}.{_machine()}.*.partial"):
+        boot, pid = path.name.split(".")[-3:-1]
+        lives = boot == _boot() and int(pid) != os.getpid() and psutil.pid_exists(int(pid))
+        if not lives:
+            shutil.rmtree(path, ignore_errors=True)
+
+
+@cache
+def _machine() -> str:
+    """Name of this machine, without dots; of a long one, the beginning and a hash."""
+    name = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
+    return (
+        name if len(name) <= 32 else f"{name[:23]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    )
+
+
+@cache
+def _boot() -> str:
+    """What tells this start of the machine from earlier ones, whose processes have ended."""
+    with suppress(OSError):
+        return BOOT.read_text(encoding="ascii")[:8]
+    return "0"
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary name beside a file, renamed to it if the block succeeds, else deleted.
@@ -67,7 +112,7 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises:
         DiskFullError: If there is no space for it.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(partial_name(path.name))
     try:
         with needing_space(path):
             yield partial

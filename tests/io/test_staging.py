@@ -7,10 +7,13 @@ import re
 import pytest
 
 from chronoscene.errors import ConfigError, DiskFullError, SceneError
+from chronoscene.io import staging
 from chronoscene.io.staging import (
     check_outside,
     leads_out,
     needing_space,
+    partial_name,
+    remove_abandoned,
     replacing,
     staged_folder,
     write_text_atomic,
@@ -94,6 +97,29 @@ def test_other_errors_of_the_system_are_no_full_disks(tmp_path):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     with pytest.raises(SceneError, match="Permission denied"), staged_folder(tmp_path / "out"):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+def test_only_what_ended_processes_of_this_machine_left_is_removed(tmp_path):
+    own = tmp_path / partial_name("seed0")
+    _, name, machine, boot, pid, ending = own.name.split(".")
+
+    def leave(name=name, machine=machine, boot=boot, pid=2**22 + 1):
+        folder = tmp_path / f".{name}.{machine}.{boot}.{pid}.{ending}"
+        (folder / "checkpoint").mkdir(parents=True)
+        return folder
+
+    gone = [leave(), leave(boot="0ld", pid=os.getppid()), leave(pid=pid)]
+    kept = [leave(machine="another"), leave(pid=os.getppid()), leave(name="seed1")]
+    remove_abandoned(tmp_path, "seed0")
+    assert sorted(tmp_path.iterdir()) == sorted(kept)
+    assert own in gone
+
+
+@pytest.mark.parametrize("host", ["node-1.cluster.example", "a" * 63])
+def test_machines_have_short_names_without_dots(monkeypatch, host):
+    monkeypatch.setattr(staging.socket, "gethostname", lambda: host)
+    name = staging._machine.__wrapped__()
+    assert len(name) <= 32 and "." not in name and name != "a" * 32
 
 
 @pytest.mark.parametrize(
