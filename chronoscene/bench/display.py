@@ -1,27 +1,49 @@
-"""Progress of a training: a live bar on a terminal, one line per probe elsewhere."""
+"""Progress of a training, or of several: a live bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
 import math
+import threading
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from chronoscene.bench.job import StopRule
+from chronoscene.io.processes import Report
 from chronoscene.methods import StepReport
 
 REFRESH = 0.1  # Seconds between two updates of the bar
+REPORTING = 1.0  # The same of one that other processes report to
 SMOOTHING = 0.95  # Weight of the past in the loss that is shown
 
 
 class ProgressDisplay:
-    """Shows iteration, loss, probe PSNR, speed and time left of one model after another."""
+    """Shows iteration, loss, probe PSNR, speed and time left of one model after another.
 
-    def __init__(self, label: str, console: Console | None = None) -> None:
+    Args:
+        label: The run in words.
+        console: Where to show it.
+        report: Called with thousandths of the run instead, and with notes, as `RunsDisplay` takes
+            them.
+        models: How many there will be.
+    """
+
+    def __init__(
+        self,
+        label: str,
+        console: Console | None = None,
+        *,
+        report: Report | None = None,
+        models: int = 1,
+    ) -> None:
         self.label = label
-        self.console = console or Console(stderr=True)
-        self._live = self.console.is_terminal
+        self.console = console or Console(stderr=True, quiet=report is not None)
+        self._report, self._models, self._model = report, models, -1
+        self._live = self.console.is_terminal and report is None
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=12),
@@ -57,6 +79,7 @@ class ProgressDisplay:
         """Start over for the next model."""
         self._name = self.label if part == "all" else f"{self.label} {part}"
         self._stop, self._loss, self._psnr, self._shown = stop, None, None, 0.0
+        self._model += 1
         if self._task is not None:
             self._bar.remove_task(self._task)
         # The runner has named the run already, and a terminal may be 80 columns wide.
@@ -67,6 +90,8 @@ class ProgressDisplay:
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""
+        if self._report is not None:
+            self._report(f"{self._name}: {line}", 0, 0)
         self.console.print(f"{self._name}: {line}", highlight=False, markup=False, soft_wrap=True)
 
     def update(
@@ -77,6 +102,10 @@ class ProgressDisplay:
             past = report.loss if self._loss is None else self._loss
             self._loss = SMOOTHING * past + (1 - SMOOTHING) * report.loss
         now, progress = time.monotonic(), self._stop.progress(iteration, seconds)
+        if self._report is not None and now - self._shown > REPORTING:
+            self._shown = now
+            done = (self._model + progress) / self._models
+            self._report(self.status(iteration, seconds, psnr), round(1000 * done), 1000)
         if self._live and self._task is not None and (now - self._shown > REFRESH or progress == 1):
             self._shown = now
             status = self.status(iteration, seconds, psnr)
@@ -100,6 +129,81 @@ class ProgressDisplay:
         pieces.append(f"{iteration / max(seconds, 1e-9):.1f} it/s")
         if left is not None and left > 0:
             pieces.append(f"{format_time(left)} left")
+        return ", ".join(pieces)
+
+
+class RunsDisplay:
+    """Shows how many of several runs at a time have ended, their rate, and the time left."""
+
+    def __init__(
+        self, total: int, say: Callable[[str], None], console: Console | None = None
+    ) -> None:
+        self._total, self._ended = total, 0
+        self._say = say
+        self._shares: dict[str, float] = {}
+        self._began = time.monotonic()
+        self._lock = threading.Lock()
+        console = console or Console(stderr=True)
+        self._live = console.is_terminal
+        self._bar = Progress(
+            BarColumn(bar_width=12),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TextColumn("{task.description}", markup=False),
+            console=console,
+            transient=True,
+            disable=not self._live,
+        )
+
+    def __enter__(self) -> RunsDisplay:
+        self._task = self._bar.add_task(self.status(0.0), total=self._total)
+        self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        if self._live:
+            self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+        else:
+            self._say(line)
+
+    @contextmanager
+    def showing(self, label: str) -> Iterator[Report]:
+        """A function that takes the progress of a run; it has ended when the block does."""
+        with self._lock:
+            self._shares[label] = 0.0
+        try:
+            yield partial(self._update, label)
+        finally:
+            with self._lock:
+                del self._shares[label]
+                self._ended += 1
+            self._show(plain=True)
+
+    def _update(self, label: str, what: str, done: int, total: int) -> None:
+        if not total:
+            self.say(what)
+            return
+        self._shares[label] = done / total
+        self._show()
+
+    def _show(self, *, plain: bool = False) -> None:
+        with self._lock:
+            done = self._ended + sum(self._shares.values())
+            line = self.status(done)
+            self._bar.update(self._task, completed=done, description=line)
+        if plain and not self._live:
+            self._say(line)
+
+    def status(self, done: float) -> str:
+        """How far the runs are, in one line; ``done`` counts shares of those under way, too."""
+        pieces = [f"{self._ended} of {self._total} runs", f"{len(self._shares)} under way"]
+        seconds = time.monotonic() - self._began
+        if done:
+            pieces.append(f"{3600 * done / max(seconds, 1e-9):.3g} runs/h")
+            pieces.append(f"{format_time(seconds * (self._total - done) / done)} left")
         return ", ".join(pieces)
 
 

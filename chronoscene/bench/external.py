@@ -26,14 +26,16 @@ from chronoscene.bench.display import ProgressDisplay
 from chronoscene.bench.foreign_images import add_images, foreign_record
 from chronoscene.bench.job import Job, StopRule, used_values
 from chronoscene.bench.opening import write_source
+from chronoscene.bench.photos import read_scene_of
 from chronoscene.bench.predictions import ImageWriter, encode_png
 from chronoscene.bench.provenance import method_version, processor_name
 from chronoscene.bench.scoring import score_job
 from chronoscene.bench.strategies import Part, make_parts
 from chronoscene.errors import ImageError, ProgramError
-from chronoscene.formats import load_format, read_scene
+from chronoscene.formats import load_format
 from chronoscene.formats.shared.ply import count_vertices
 from chronoscene.images.store import ImageStore
+from chronoscene.io.processes import Report
 from chronoscene.io.programs import Usage, log_lines, run_program
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import shown
@@ -56,11 +58,11 @@ class Trained:
     notices: list[str]
 
 
-def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
-    """Train another program, import its images and score them; writes into ``job.staging`` only."""
+def run_external(job: Job, spec: MethodSpec, runner: Runner, report: Report | None) -> None:
+    """Train another program, import its images and score them; arguments as for `run_job`."""
     staging, document = Path(job.staging), job.document(spec)
     write_text_atomic(staging / results.CONFIG_FILE, json.dumps(document, indent=1) + "\n")
-    scene = read_scene(job.scene_root, format=job.scene_format, period_by=job.period_by)
+    scene = read_scene_of(job)
     parts = make_parts(
         scene, ImageStore(scene, max_width=job.max_width, memory_limit=0), job.strategy
     )
@@ -68,7 +70,7 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
     writer = ImageWriter(staging / results.PREDICTIONS)
     stops = job.stop_rules(spec, len(parts))
     trained = []
-    with ProgressDisplay(job.label) as display:
+    with ProgressDisplay(job.label, report=report) as display:
         for part, stop in zip(parts, stops, strict=True):
             model = " ".join(filter(None, ("trains", part.subfolder)))
             display.wait(f"{spec.title} {model}; what it prints goes to {staging / LOG}")
@@ -101,7 +103,7 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner) -> None:
     if job.seed and "seed" not in used_values(runner, ""):
         record.notices.append(f"{record.label}: {spec.title} takes no seed")
     writer.close_run(record)
-    with ProgressDisplay(job.label) as display:
+    with ProgressDisplay(job.label, report=report) as display:
         display.wait("scores")
         score_job(job, record)
 

@@ -85,6 +85,8 @@ class StopRule:
         return tuple(StopRule(base + (i < extra), seconds) for i in range(parts))
 
 
+LOCKS = ".locks"  # Folder beside the results, with a file for each run
+
 LONGEST_NAME = 180  # Characters; file systems allow 255 bytes, and special ones become longer
 
 SHARING = ("total", "each")
@@ -119,7 +121,6 @@ class Job:
     runs: str
     """Folder of all runs."""
     lpips_weights: str | None
-    commit: str
     period_by: str | None = None
     """As for `read_scene`."""
     notices: list[str] = field(default_factory=list)
@@ -141,6 +142,18 @@ class Job:
     """What differs from the preset, as `with_variant` writes it."""
     plugin_path: str | None = None
     """Folder from which ``module:SPEC`` may be imported."""
+    memory: int = 0
+    """Bytes of memory that the run is expected to take."""
+    commit: str = ""
+    """Of the code that runs it, which the worker asks for."""
+    reports: bool = False
+    """Whether progress is sent to the bench, which runs several jobs at a time, and not shown."""
+    moved: dict[str, str] = field(default_factory=dict)
+    """What the job names, to where the machine that runs it has a copy."""
+
+    def here(self, place: str) -> str:
+        """Where this machine has something that the job names."""
+        return self.moved.get(place, place)
 
     @property
     def folder(self) -> Path:

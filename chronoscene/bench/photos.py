@@ -14,6 +14,7 @@ from pathlib import Path
 from chronoscene.bench.job import Job
 from chronoscene.bench.results import PHOTOS
 from chronoscene.errors import ConfigError
+from chronoscene.formats import read_scene
 from chronoscene.images.disk_cache import DiskCache, files_of
 from chronoscene.images.store import ImageStore
 from chronoscene.io.wording import counted
@@ -30,6 +31,9 @@ _LIBRARIES = 500 * 10**6  # Bytes of a training's process before it has a model
 _STEP = 250
 """Bytes per pixel of a photo that a training step takes for images and their gradients (3DGS with
 few Gaussians, measured)."""
+_MODEL = 10**9
+"""Bytes of a model in training. Values, gradients and two moments of half a million Gaussians with
+59 numbers each take 0.47 GB, and as much again is for what is made of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,13 +102,26 @@ def open_store(scene: Scene, job: Job) -> ImageStore:
     )
 
 
-def check_room(scene: Scene, job: Job, runs: int) -> str:
+def read_scene_of(job: Job) -> Scene:
+    """The scene of a job, from where this machine has it."""
+    rule = None if job.period_by is None else job.here(job.period_by)
+    return read_scene(job.here(job.scene_root), format=job.scene_format, period_by=rule)
+
+
+def expected_memory(scene: Scene, job: Job) -> int:
+    """Bytes of memory that a run takes, with a model of half a million Gaussians."""
+    needs = photo_needs(scene, job)
+    return needs.in_memory + needs.training + _MODEL
+
+
+def check_room(scene: Scene, job: Job, runs: int, *, here: bool = True) -> str:
     """Check that memory and disk have room for the photos of a scene.
 
     Args:
         scene: What is trained on.
         job: One of its runs; the others have the same limits.
         runs: How many runs are to be done.
+        here: Whether this machine does them, so that its memory counts.
 
     Returns:
         What they take, in a line for the user.
@@ -113,7 +130,7 @@ def check_room(scene: Scene, job: Job, runs: int) -> str:
         ConfigError: If they have not; the message says which setting would do.
     """
     needs = photo_needs(scene, job)
-    _check_memory(scene, needs)
+    _check_memory(scene, needs, machine_memory()[1] if here else None)
     _check_disk(job, needs, (1 + runs) * needs.tests)
     photos = f"{counted(needs.count, 'training photo')}, {_gb(needs.total)} when decoded"
     kept = f", {_gb(needs.on_disk)} on disk" if needs.on_disk else ""
@@ -123,7 +140,7 @@ def check_room(scene: Scene, job: Job, runs: int) -> str:
     )
 
 
-def _check_memory(scene: Scene, needs: PhotoNeeds) -> None:
+def _check_memory(scene: Scene, needs: PhotoNeeds, free: int | None) -> None:
     least = needs.decoding + _AT_HAND * needs.largest
     if needs.allowed < least:
         width, height = max((f.camera.size for f in scene.select(split="train")), key=math.prod)
@@ -133,9 +150,8 @@ def _check_memory(scene: Scene, needs: PhotoNeeds) -> None:
             found=_gb(needs.allowed),
             todo=f"use --photo-memory {math.ceil(least / 1e7) / 100}",
         )
-    _, free = machine_memory()
     wanted = needs.in_memory + needs.training
-    if free < wanted:
+    if free is not None and free < wanted:
         smaller = math.floor((free - needs.training) / 1e7) / 100
         raise ConfigError(
             scene.name,

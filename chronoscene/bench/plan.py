@@ -10,9 +10,9 @@ from typing import Any
 
 from chronoscene.bench import results
 from chronoscene.bench.job import PHOTO_DISK, PHOTO_MEMORY, Job, check_job
-from chronoscene.bench.photos import check_room
+from chronoscene.bench.photos import check_room, expected_memory
 from chronoscene.bench.predictions import freeze_ground_truth
-from chronoscene.bench.provenance import code_version, scene_hash
+from chronoscene.bench.provenance import scene_hash
 from chronoscene.bench.strategies import STRATEGIES, check_scene, effective_strategy
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
@@ -67,6 +67,12 @@ class BenchSettings:
     """How their images are grouped into periods, where the format leaves a choice."""
     overwrite: bool = False
     """Whether finished runs with other settings may be replaced."""
+    jobs: int | None = None
+    """How many runs there are at a time; None for one, or as many as the cluster has room for."""
+    job_memory: int | None = None
+    """Bytes of memory that a run takes; None for an estimate."""
+    ray: str | None = None
+    """Address of the Ray cluster that they are run on; None for this machine."""
 
 
 def plan_jobs(settings: BenchSettings, say: Say) -> Plan:
@@ -83,23 +89,23 @@ def plan_jobs(settings: BenchSettings, say: Say) -> Plan:
             read_scene(path, format=settings.dataset_format, period_by=settings.period_by)
         )
     _check_names(scenes)
-    commit = code_version()
     plan: dict[Path, tuple[Job, MethodSpec]] = {}
     notices: dict[str, None] = {}
     for scene in scenes:
         check_scene(scene)
         say(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
         unfinished = 0
-        for job, spec in _scene_jobs(settings, scene, commit, specs):
+        for job, spec in _scene_jobs(settings, scene, specs):
             check_job(job, spec)
             job = job.with_variant(spec)
             if settings.continue_to is not None:
                 job = continued(job, spec, settings.continue_to)
+            job = replace(job, memory=settings.job_memory or expected_memory(scene, job))
             plan.setdefault(job.folder, (job, spec))
             notices.update(dict.fromkeys(job.notices))
             unfinished += spec.runner is None and not is_finished(job, spec, settings.overwrite)
         if unfinished:
-            say(check_room(scene, job, unfinished))
+            say(check_room(scene, job, unfinished, here=settings.ray is None))
         store = ImageStore(scene, max_width=settings.max_width, memory_limit=settings.photo_memory)
         freeze_ground_truth(settings.runs, scene, job.scene_hash, store, settings.max_width)
     for notice in notices:
@@ -168,7 +174,7 @@ def _check_names(scenes: list[Scene]) -> None:
 
 
 def _scene_jobs(
-    settings: BenchSettings, scene: Scene, commit: str, specs: list[tuple[str, MethodSpec]]
+    settings: BenchSettings, scene: Scene, specs: list[tuple[str, MethodSpec]]
 ) -> Iterator[tuple[Job, MethodSpec]]:
     """Every method, strategy and seed on one scene."""
     overrides = split_overrides(settings, [spec for _, spec in specs])
@@ -207,7 +213,6 @@ def _scene_jobs(
             device=settings.device,
             runs=str(settings.runs.resolve()),
             lpips_weights=str(settings.lpips_weights.resolve()) if settings.lpips_weights else None,
-            commit=commit,
             notices=[*notices, *([] if budget is None else [BUDGET_NOTICE])],
             plugin_path=str(Path.cwd()) if ":" in reference else None,
         )

@@ -139,7 +139,7 @@ def score_stages(folder: Path, record: RunRecord, truth: Path, scorers: Scorers)
 
 def score_job(job: Job, record: RunRecord) -> None:
     """`score_run` of a job, by all metrics that can be computed here."""
-    weights = Path(job.lpips_weights) if job.lpips_weights else None
+    weights = Path(job.here(job.lpips_weights)) if job.lpips_weights else None
     truth = ground_truth_folder(Path(job.runs), job.scene)
     score_run(Path(job.staging), record, truth, make_scorers(lpips_weights=weights))
 

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from chronoscene.bench.job import SHARING
 from chronoscene.bench.plan import BenchSettings, Plan, Say, plan_jobs, split_overrides
+from chronoscene.bench.pool import open_pool
 from chronoscene.bench.results import RUN_FILE
 from chronoscene.bench.runner import BenchOutcome, Execute, run_plan
 from chronoscene.bench.strategies import STRATEGIES
@@ -151,19 +152,20 @@ def run_study(
             say(line)
 
     plans: dict[str, Plan] = {}
-    for row in study.rows:
-        method = row.method or study.method
-        own = {key: as_typed(value) for key, value in row.options.items()}
-        changes = replace(
-            settings,
-            methods=(method,),
-            strategies=(row.strategy,),
-            separate_iterations=row.separate_iterations,
-            overrides=shared[specs[method].name] | own,
-        )
-        plans[row.label] = plan_jobs(changes, once)
-    plan = {job.folder: (job, spec) for job, spec in chain(*plans.values())}
-    outcome = run_plan(list(plan.values()), settings, say, execute=execute)
+    with open_pool(settings, say) as pool:
+        for row in study.rows:
+            method = row.method or study.method
+            own = {key: as_typed(value) for key, value in row.options.items()}
+            changes = replace(
+                settings,
+                methods=(method,),
+                strategies=(row.strategy,),
+                separate_iterations=row.separate_iterations,
+                overrides=shared[specs[method].name] | own,
+            )
+            plans[row.label] = plan_jobs(changes, once)
+        plan = {job.folder: (job, spec) for job, spec in chain(*plans.values())}
+        outcome = run_plan(list(plan.values()), settings, say, execute=execute, pool=pool)
     finished = {
         label: [job.folder for job, _ in rows if (job.folder / RUN_FILE).is_file()]
         for label, rows in plans.items()

@@ -12,7 +12,7 @@ import time
 import traceback
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
 from datetime import UTC, datetime
 from json import dumps
 from pathlib import Path
@@ -24,7 +24,7 @@ from chronoscene.bench.display import ProgressDisplay
 from chronoscene.bench.external import run_external
 from chronoscene.bench.job import Job, StopRule, check_device
 from chronoscene.bench.opening import write_source
-from chronoscene.bench.photos import open_store
+from chronoscene.bench.photos import open_store, read_scene_of
 from chronoscene.bench.predictions import (
     ImageWriter,
     ground_truth_folder,
@@ -33,6 +33,7 @@ from chronoscene.bench.predictions import (
     read_manifest,
 )
 from chronoscene.bench.provenance import (
+    code_version,
     describe_device,
     library_versions,
     method_version,
@@ -51,7 +52,6 @@ from chronoscene.bench.training_loop import (
     warm_up,
 )
 from chronoscene.errors import BackendError, ChronoSceneError, DiskFullError
-from chronoscene.formats import read_scene
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
@@ -82,17 +82,22 @@ class Machine:
     threads: int
 
 
-def run_job(job: Job) -> None:
-    """Train, save, render and score; writes into ``job.staging`` only."""
+def run_job(job: Job, report: Report | None = None) -> None:
+    """Train, save, render and score; writes into ``job.staging`` only.
+
+    Args:
+        job: What to run.
+        report: Called with the progress, which is not shown then.
+    """
     started = datetime.now(UTC).isoformat(timespec="seconds")
     spec, staging = load_spec(job.method), Path(job.staging)
     if spec.runner is not None:
-        run_external(job, spec, spec.runner)
+        run_external(job, spec, spec.runner, report)
         return
     keep_freed_memory()
     machine = Machine(pick_device(job.device, spec), set_threads(job.threads))
     write_text_atomic(staging / results.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
-    scene = read_scene(job.scene_root, format=job.scene_format, period_by=job.period_by)
+    scene = read_scene_of(job)
     takes_period = spec.period_input != "none"
     parts = make_parts(scene, open_store(scene, job), job.strategy, takes_period=takes_period)
     write_source(job, parts[0].train.training_from_world)
@@ -101,7 +106,7 @@ def run_job(job: Job) -> None:
     writers = {name: ImageWriter(staging / results.STAGES / name) for name in stages}
     final = ImageWriter(staging / results.PREDICTIONS)
     method, outcomes = _new_method(job, spec), []
-    with ProgressDisplay(job.label) as display:
+    with ProgressDisplay(job.label, report=report, models=len(parts)) as display:
         display.wait("warm-up: kernels compile at first use, for a minute or more")
         before = time.perf_counter()
         periods = parts[0].train.num_periods
@@ -128,7 +133,7 @@ def run_job(job: Job) -> None:
     columns = [f.name for f in fields(CurvePoint)]
     points = [astuple(point) for outcome in outcomes for point in outcome.trained.curve]
     write_text_atomic(staging / results.CURVE_FILE, csv_text(columns, points))
-    with ProgressDisplay(job.label) as display:
+    with ProgressDisplay(job.label, report=report) as display:
         display.wait("scores")
         record = _record(job, spec, scene, machine, outcomes, peaks, started)
         record.warmup_seconds = warmup_seconds
@@ -235,6 +240,7 @@ def _checkpoints(
     job: Job, spec: MethodSpec, part: Part, parts: int, display: ProgressDisplay
 ) -> Checkpoints:
     """Those of one model of the run."""
+    start = job.here(job.continues)
     return Checkpoints(
         folder=job.training / part.name,
         settings=job.document(spec),
@@ -242,7 +248,7 @@ def _checkpoints(
         every=job.checkpoint_seconds,
         # With several models, those that are done must not be trained again.
         keep_last=job.keep_training or parts > 1,
-        start=Path(job.continues) / results.TRAINING / part.name if job.continues else None,
+        start=Path(start) / results.TRAINING / part.name if start else None,
         say=display.say,
     )
 
@@ -344,15 +350,15 @@ def _skips(job: Job, record: results.RunRecord) -> list[str]:
     return [f"{job.label}: {n} of {steps} steps {why}" for why, n in reasons.items() if n]
 
 
-def execute(document: dict[str, Any], _: Report) -> None:
+def execute(document: dict[str, Any], report: Report) -> None:
     """Run the job in ``document``; every failure ends in ``failed.json``."""
-    job = Job(**document)
+    job = replace(Job(**document), commit=code_version())
     staging = Path(job.staging)
     if job.plugin_path is not None:
         sys.path.append(job.plugin_path)
     try:
         with needing_space(job.folder):
-            run_job(job)
+            run_job(job, report if job.reports else None)
     except DiskFullError:  # nothing can be recorded, and the other runs would fail as well
         raise
     except ChronoSceneError as error:

@@ -39,9 +39,27 @@ _TRAINING = (
         help="Set an option of the methods, as KEY=VALUE or METHOD.KEY=VALUE. May be repeated.",
     ),
     click.option(
+        "--jobs",
+        type=click.IntRange(min=1),
+        help="Number of runs at a time.  [default: 1; with --ray as many as have room]",
+    ),
+    click.option(
+        "--job-memory",
+        type=click.FloatRange(min=0, min_open=True),
+        callback=lambda _context, _option, value: value and round(value * 1e9),
+        help="Memory that a run takes, in GB: another one begins if so much is free.  "
+        "[default: an estimate]",
+    ),
+    click.option(
+        "--ray",
+        metavar="ADDRESS",
+        help="Address of the Ray cluster to run on; auto for that of this machine.",
+    ),
+    click.option(
         "--threads",
         type=click.IntRange(min=1),
-        help="Number of threads.  [default: one per processor]",
+        help="Number of threads of a run.  [default: one per processor, divided by --jobs; "
+        "with --ray those of the smallest machine]",
     ),
     click.option(
         "--device",
@@ -171,7 +189,8 @@ def command(
         seeds=tuple(range(seed, seed + seeds)),
         **options,
     )
-    check_device(settings.device)
+    if settings.ray is None:  # else the machine that runs a job checks its own
+        check_device(settings.device)
     outcome = run_bench(settings, lambda line: click.echo(line, err=True))
     report(outcome, out)
 

@@ -41,7 +41,8 @@ def command(name: str, seeds: int, assignments: tuple[str, ...], out: Path, **op
     file = find_study(name)
     study = read_study(file)
     look_here_for([study.method, *(row.method for row in study.rows)])
-    check_device(options["device"])
+    if options["ray"] is None:
+        check_device(options["device"])
     settings = BenchSettings(
         methods=(),
         runs=out,

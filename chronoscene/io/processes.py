@@ -10,11 +10,6 @@ A worker may start programs of others. `process_tree` finds all that they starte
 
 `map_parallel` maps a function over items in a pool. The commands use it for folders of scenes.
 
-To run benches somewhere else, on a cluster say, write a function with the signature of
-`chronoscene.bench.runner.run_in_process` that ships the job, calls
-`chronoscene.bench.worker.execute` there, and brings the staging folder back; pass it to
-`chronoscene.bench.runner.run_bench` as ``execute``.
-
 Modules that are needed only once work starts are imported inside functions: ``chronoscene --help``
 loads this module.
 """
@@ -128,11 +123,39 @@ class Outcome:
         return f"signal {signal.Signals(-self.status).name if known else -self.status}"
 
 
+class Stop:
+    """Ends the workers for which threads wait, as an interruption reaches the main thread alone."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self.workers: set[Popen[str]] = set()
+
+    def ask(self) -> None:
+        """End all workers; who waits for one, or wants to start another, gets a SystemExit."""
+        self.asked = True
+        for process in tuple(self.workers):
+            _end(process)
+
+    def check(self) -> None:
+        """Raise the SystemExit if `ask` was called."""
+        if self.asked:
+            raise SystemExit(1)
+
+
+def _end(worker: Popen[str]) -> None:
+    """Kill a worker, and end what it started."""
+    started = process_tree([worker.pid]) - {worker.pid}
+    worker.kill()  # not SIGTERM: a library's handler might take its time
+    worker.wait()
+    end_processes(started)
+
+
 def run_worker(
     function: str,
     job: Any,
     *,
     report: Report | None = None,
+    stop: Stop | None = None,
     log: IO[bytes] | None = None,
     inherited: Sequence[int] = (),
     environment: Mapping[str, str] | None = None,
@@ -146,6 +169,7 @@ def run_worker(
         function: ``module:name``. Takes the job and a `Report`; returns what JSON can hold.
         job: What JSON can hold.
         report: Called with the progress that the worker reports.
+        stop: Ends the worker, if the caller waits in another thread than the main one.
         log: File for everything that the worker and its libraries print; None for our stderr.
         inherited: File descriptors that stay open in the worker.
         environment: Variables that the worker has besides ours.
@@ -163,19 +187,24 @@ def run_worker(
         pass_fds=inherited,
         env={**os.environ, **(environment or {})},
     )
+    stop = stop or Stop()
+    stop.workers.add(process)
     try:
+        stop.check()
         assert process.stdin is not None
         with suppress(BrokenPipeError):  # it died already
             process.stdin.write(json.dumps(job))
             process.stdin.close()
         message = _listen(process, report)
-        return Outcome(process.wait(), message)
+        outcome = Outcome(process.wait(), message)
+        if message is None:
+            stop.check()
+        return outcome
     except BaseException:
-        started = process_tree([process.pid]) - {process.pid}
-        process.kill()  # not SIGTERM: a library's handler might take its time
-        process.wait()
-        end_processes(started)
+        _end(process)
         raise
+    finally:
+        stop.workers.discard(process)
 
 
 def _listen(process: Popen[str], report: Report | None) -> dict[str, Any] | None:

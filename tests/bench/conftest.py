@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from chronoscene.bench.execution import put_in_place
 from chronoscene.bench.job import Job
 from chronoscene.bench.results import Failure, read_run
-from chronoscene.bench.runner import BenchOutcome, BenchSettings, put_in_place, run_bench
+from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
 from chronoscene.bench.worker import execute
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.scene import Camera, Frame, Period, Points, Scene

@@ -5,7 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from chronoscene.bench.display import ProgressDisplay, format_time
+from chronoscene.bench import display as display_module
+from chronoscene.bench.display import ProgressDisplay, RunsDisplay, format_time
 from chronoscene.bench.job import StopRule
 from chronoscene.methods import StepReport
 
@@ -56,3 +57,39 @@ def test_the_loss_is_smoothed():
 )
 def test_times(seconds, text):
     assert format_time(seconds) == text
+
+
+def test_a_run_among_others_reports_its_share_and_notes(monkeypatch, capsys):
+    told = []
+    monkeypatch.setattr(display_module, "REPORTING", -1.0)
+    with ProgressDisplay("x", report=lambda *what: told.append(what), models=2) as display:
+        display.wait("warm-up")
+        for name in ("period-0", "period-1"):
+            display.begin(name, StopRule(10, None))
+            display.update(5, 1.0, StepReport(0.5, 7), 20.0)
+        display.say("going on")
+    shares = [(done, total) for _, done, total in told]
+    assert shares == [(250, 1000), (750, 1000), (0, 0)] and told[-1][0] == "x period-1: going on"
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("live", [True, False])
+def test_several_runs_have_one_bar(live):
+    buffer, said = io.StringIO(), []
+    console = Console(file=buffer, force_terminal=live, width=100, color_system=None)
+    display = RunsDisplay(4, said.append, console)
+    with display, display.showing("a") as report, display.showing("b") as other:
+        report("iteration 5", 500, 1000)
+        other("b: a note [x]", 0, 0)
+        display._bar.refresh()
+        status = display.status(0.5)
+    assert status.startswith("0 of 4 runs, 2 under way, ") and status.endswith(" left")
+    if live:
+        assert " 12% 0 of 4 runs, 2 under way" in buffer.getvalue() and said == []
+        assert "b: a note [x]" in buffer.getvalue() and "2 of 4 runs, 0 under" in buffer.getvalue()
+    else:
+        assert [line[:25] for line in said] == [
+            "b: a note [x]",
+            "1 of 4 runs, 1 under way,",
+            "2 of 4 runs, 0 under way,",
+        ]

@@ -10,7 +10,7 @@ from PIL import Image
 from chronoscene.bench import photos
 from chronoscene.bench.checkpoints import Checkpoints
 from chronoscene.bench.job import StopRule
-from chronoscene.bench.photos import check_room, open_store, photo_needs
+from chronoscene.bench.photos import check_room, expected_memory, open_store, photo_needs
 from chronoscene.bench.strategies import make_parts
 from chronoscene.bench.training_loop import train
 from chronoscene.errors import ConfigError
@@ -80,6 +80,14 @@ def test_the_line_says_what_is_taken(make_scene, job, free):
     assert line.endswith("training takes 0.50 GB and its model besides")
     job.photo_memory = LITTLE
     assert "GB in memory, 0.00 GB on disk; a" in check_room(make_scene(), job, runs=1)
+
+
+def test_memory_counts_where_the_run_will_be(make_scene, job, free):
+    free(10**6, 10**9)
+    with pytest.raises(ConfigError, match=r"expected 0\.50 GB of memory"):
+        check_room(make_scene(), job, runs=1)
+    check_room(make_scene(), job, runs=1, here=False)
+    assert 1.50e9 < expected_memory(make_scene(), job) < 1.51e9
 
 
 def big(scene):

@@ -142,6 +142,13 @@ def test_defaults(settings):
     assert asked.seeds == (0,) and asked.runs == Path("runs") and asked.max_width == 1600
     assert asked.iterations is None and asked.budget_seconds is None and asked.threads is None
     assert asked.device == "auto" and asked.lpips_weights is None and not asked.overwrite
+    assert (asked.jobs, asked.job_memory, asked.ray) == (None, None, None)
+
+
+def test_devices_of_a_cluster_are_not_looked_for_here(settings, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    asked = settings("a", "--method", "3dgs", "--device", "cuda", "--ray", "auto")
+    assert (asked.ray, asked.device) == ("auto", "cuda")
 
 
 def test_every_option_arrives(settings, tmp_path):
@@ -152,7 +159,9 @@ def test_every_option_arrives(settings, tmp_path):
         "--threads", "3", "--device", "cpu", "--separate-iterations", "each",
         "--lpips-weights", str(tmp_path), "--out", "elsewhere", "--overwrite",
         "--dataset-format", "wat", "--period-by", "year",
+        "--jobs", "4", "--job-memory", "1.5",
     )  # fmt: skip
+    assert (asked.jobs, asked.job_memory, asked.ray) == (4, 1_500_000_000, None)
     assert asked.scenes == (Path("a"), Path("b")) and asked.methods == ("3dgs", "chronogs")
     assert asked.strategies == ("joint", "separate") and asked.preset == "fast"
     assert asked.budget_seconds == 90 and asked.iterations == 7 and asked.seeds == (5, 6)

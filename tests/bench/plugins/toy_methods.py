@@ -129,6 +129,15 @@ class Peeking(MeanColour):
         self.colors += sum(zlib.crc32(photo.read_bytes()) for photo in photos) % 1000 / 1e9
 
 
+class Orphaned(MeanColour):
+    """Kills what has started its process."""
+
+    def step(self, index, progress):
+        os.kill(os.getppid(), signal.SIGKILL)
+        time.sleep(60)
+        raise AssertionError
+
+
 class Killed(MeanColour):
     def step(self, index, progress):
         os.kill(os.getpid(), signal.SIGKILL)
@@ -163,3 +172,4 @@ BAD_IMAGE = spec("bad-image", BadImage)
 FULL_DISK = spec("full-disk", FullDisk)
 PEEKING = spec("peeking", Peeking)
 KILLED = spec("killed", Killed)
+ORPHANED = spec("orphaned", Orphaned)
