@@ -14,6 +14,7 @@ from chronoscene.io.staging import disk_full
 
 COMMANDS = {
     "bench": "chronoscene.cli.bench:command",
+    "changes": "chronoscene.cli.changes:command",
     "check-method": "chronoscene.cli.check_method:check",
     "compare": "chronoscene.cli.compare:command",
     "compress": "chronoscene.cli.compress:command",

@@ -64,11 +64,11 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
     for plane, (x, y) in places.items():
         size = (box.edges[plane[0]] * scale, box.edges[plane[1]] * scale)
         axes = figure.add_axes((x / width, y / height, size[0] / width, size[1] / height))
-        image = _draw_points(axes, cloud, box, plane, size, colors, dots)
+        image = draw_points(axes, cloud, box, plane, size, colors, dots)
         if cameras:
             image.set_alpha(BEHIND)
             _draw_cameras(axes, cloud, box, plane, colors)
-        _label_axes(axes, plane, axis_names, size)
+        label_axes(axes, plane, axis_names, size)
     _write_texts(figure, cloud, box, (x_right / width, (y_top - GAP) / height))
     _draw_legend(figure, names, colors, columns, 1 - TITLE / height)
     canvas.save(figure, path)
@@ -117,7 +117,7 @@ def _dot_radius(cloud: Cloud, box: Box, scale: float, planes: Iterable[Plane]) -
     return dot_radius(len(shown), PATCH**2 * int(np.median(areas)))
 
 
-def _draw_points(
+def draw_points(
     axes: Any, cloud: Cloud, box: Box, plane: Plane, size: Size, colors: Sequence[str], dots: int
 ) -> Any:
     """The density of the points, as an image. ``dots``: their radius in pixels."""
@@ -151,7 +151,7 @@ def _draw_cameras(axes: Any, cloud: Cloud, box: Box, plane: Plane, colors: Seque
     axes.scatter(*centres.T, s=size, c=own, edgecolors="#333333", linewidths=0.3, zorder=3)
 
 
-def _label_axes(axes: Any, plane: Plane, names: Sequence[str], size: Size) -> None:
+def label_axes(axes: Any, plane: Plane, names: Sequence[str], size: Size) -> None:
     """Ticks and names on the outer sides; panels that share an axis name it once.
 
     There are as many ticks as fit.

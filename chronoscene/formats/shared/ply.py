@@ -12,7 +12,7 @@ import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,10 +54,26 @@ def count_vertices(path: Path) -> int:
 
 def write_points(path: Path, points: Points) -> None:
     """Write positions (double) and colours as a binary PLY file."""
-    fields = [*((axis, "<f8") for axis in "xyz"), *((colour, "u1") for colour in COLOURS)]
-    vertices = np.empty(len(points), fields)
-    for i, (axis, colour) in enumerate(zip("xyz", COLOURS, strict=True)):
-        vertices[axis], vertices[colour] = points.xyz[:, i], points.rgb[:, i]
+    write_vertices(path, points.xyz, points.rgb)
+
+
+def write_vertices(
+    path: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8], **columns: NDArray[Any]
+) -> None:
+    """Write positions (double), colours, and further columns as a binary PLY file.
+
+    Args:
+        path: The file.
+        xyz: [N, 3]
+        rgb: [N, 3]
+        columns: By their names; of a type that PLY has. [N]
+    """
+    columns = (
+        dict(zip("xyz", xyz.T, strict=True)) | dict(zip(COLOURS, rgb.T, strict=True)) | columns
+    )
+    vertices = np.empty(len(xyz), [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        vertices[name] = column
     PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(path)
 
 

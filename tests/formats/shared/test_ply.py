@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from chronoscene.errors import SceneError
-from chronoscene.formats.shared.ply import read_points, write_points
+from chronoscene.formats.shared.ply import read_points, write_points, write_vertices
 from chronoscene.scene import Points
 
 HEAD = "ply\nformat {form} 1.0\ncomment x\nelement vertex {count}\n{properties}end_header\n"
@@ -71,6 +71,18 @@ def test_agrees_with_another_reader(tmp_path):
     vertex = plyfile.PlyData.read(tmp_path / "p.ply")["vertex"]
     np.testing.assert_array_equal(np.stack([vertex[c] for c in "xyz"], 1), xyz)
     np.testing.assert_array_equal(np.stack([vertex[c] for c in ("red", "green", "blue")], 1), rgb)
+
+
+def test_further_columns(tmp_path):
+    xyz, rgb = np.arange(6.0).reshape(2, 3), np.arange(6, dtype=np.uint8).reshape(2, 3)
+    score = np.array([0.5, 2], np.float32)
+    write_vertices(tmp_path / "p.ply", xyz, rgb, score=score, period=np.array([0, 7], np.int32))
+    vertex = plyfile.PlyData.read(tmp_path / "p.ply")["vertex"]
+    assert vertex["score"].tolist() == [0.5, 2]
+    assert vertex["period"].tolist() == [0, 7]
+    again = read_points(tmp_path / "p.ply")
+    np.testing.assert_array_equal(again.xyz, xyz)
+    np.testing.assert_array_equal(again.rgb, rgb)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,78 @@
+"""Where the periods of a scene differ, seen from above: a panel for each pair of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.arrays import Array
+from chronoscene.figures import canvas
+from chronoscene.figures.cloud import Cloud, shown_box
+from chronoscene.figures.projections import draw_points, label_axes, readable
+
+COLORS: Mapping[str, str] = {
+    "unchanged": "#dedad2",
+    "unknown": "#8c8c8c",
+    "appearance": canvas.FOUR[1],
+    "gone": canvas.FOUR[0],
+    "new": canvas.FOUR[2],
+}
+"""Of the classes of places, which are numbered in this order."""
+FAINT = 2  # Classes that the others are drawn over
+WIDTH, GAP = 3.4, 0.15  # Of a panel, and between panels, in inches
+LEFT, RIGHT, BOTTOM, TOP, TITLE = 0.62, 0.15, 0.5, 0.62, 0.26
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """A pair of periods."""
+
+    title: str
+    xyz: Array
+    """Places. [N, 3]"""
+    classes: NDArray[np.int64]
+    """Of the places. [N]"""
+
+
+def draw_changes(cloud: Cloud, panels: Sequence[Panel], path: Path) -> None:
+    """Draw all pairs at one scale.
+
+    Args:
+        cloud: Of the scene; says which part of it is shown.
+        panels: What is drawn.
+        path: File to write; the suffix says the format.
+    """
+    box = shown_box(cloud, cameras=False)
+    columns = max(min(len(panels), 3), math.ceil(math.sqrt(len(panels))))
+    rows = math.ceil(len(panels) / columns)
+    size = (WIDTH, WIDTH * box.edges[1] / box.edges[0])
+    step = (WIDTH + GAP, size[1] + TITLE + GAP)
+    width = LEFT + columns * step[0] - GAP + RIGHT
+    height = BOTTOM + rows * step[1] - GAP - TITLE + TOP
+    figure = canvas.new_figure(width, height)
+    colors = list(COLORS.values())
+    for number, panel in enumerate(panels):
+        row, column = divmod(number, columns)
+        x, y = LEFT + column * step[0], BOTTOM + (rows - 1 - row) * step[1]
+        axes = figure.add_axes((x / width, y / height, size[0] / width, size[1] / height))
+        for layer in (panel.classes < FAINT, panel.classes >= FAINT):
+            shown = replace(cloud, xyz=panel.xyz[layer], period=panel.classes[layer])
+            shown, near, names = readable(shown, box)
+            draw_points(axes, shown, near, (0, 1), size, colors, 0)
+        label_axes(axes, (0, 1), names, size)
+        is_lowest = number + columns >= len(panels)
+        axes.tick_params(labelbottom=is_lowest, labelleft=column == 0)
+        axes.set_xlabel(names[0] if is_lowest else "", fontsize=9, labelpad=2)
+        axes.set_ylabel(names[1] if column == 0 else "", fontsize=9, labelpad=2)
+        axes.set_title(canvas.plain(panel.title), fontsize=9, pad=4)
+    corner = (LEFT / width, 1 - 0.1 / height)
+    entries = list(COLORS.items())
+    canvas.add_legend(
+        figure, entries, loc="upper left", bbox_to_anchor=corner, ncol=len(entries), borderpad=0
+    )
+    canvas.save(figure, path)

@@ -1,0 +1,51 @@
+"""Top views of changes: what is drawn where, and how many panels."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from chronoscene.bench.changes import CLASSES
+from chronoscene.figures.change_map import COLORS, Panel, draw_changes
+from chronoscene.figures.cloud import Cloud
+
+
+@pytest.fixture
+def cloud():
+    up = np.array([[0.0, 0.0, 1.0]])
+    xyz = np.random.default_rng(0).uniform([-20, -10, 0], [20, 10, 4], (3000, 3))
+    rows = {"centres": 50 * up, "directions": -up, "tops": np.array([[0.0, 1.0, 0.0]])}
+    period, camera_period = np.zeros(3000, int), np.zeros(1, int)
+    return Cloud("place", "metre", ("0",), xyz, period, **rows, camera_period=camera_period)
+
+
+def test_classes_have_their_colours_in_their_order():
+    assert tuple(COLORS) == CLASSES
+
+
+def test_changes_are_drawn_over_what_is_below_them(cloud, tmp_path):
+    rng = np.random.default_rng(0)
+    ground = rng.uniform([-20, -10, 0], [20, 10, 0], (200_000, 3))
+    patch = rng.uniform([10, 5, 0], [12, 7, 0], (5000, 3))
+    classes = np.repeat([0, CLASSES.index("new")], [len(ground), len(patch)])
+    draw_changes(
+        cloud, [Panel("a $b_c$", np.concatenate([ground, patch]), classes)], tmp_path / "x.png"
+    )
+    red, green, blue = np.moveaxis(
+        np.asarray(Image.open(tmp_path / "x.png"), int)[100:, :, :3], 2, 0
+    )
+    new = np.argwhere(blue - red > 40)
+    np.testing.assert_allclose(np.ptp(new, axis=0), 2 / 43 * 3.4 * 200, atol=4)  # 2 m of about 43
+    assert len(new) > 0.9 * np.prod(np.ptp(new, axis=0) + 1)
+    ground = np.argwhere((red - blue > 5) & (green < 235))
+    above, right = (new.mean(axis=0) - ground.mean(axis=0)) * (-1, 1)
+    np.testing.assert_allclose(right / above, 11 / 6, rtol=0.1)
+
+
+@pytest.mark.parametrize(("panels", "shape"), [(1, (1, 1)), (3, (1, 3)), (5, (2, 3)), (10, (3, 4))])
+def test_panels_in_rows(cloud, tmp_path, panels, shape):
+    panel = Panel("", cloud.xyz, np.zeros(3000, int))
+    draw_changes(cloud, [panel] * panels, tmp_path / "x.png")
+    width, height = Image.open(tmp_path / "x.png").size
+    one = 3.55 * 200, height / shape[0]
+    assert round(width / one[0]) == shape[1]
+    assert 0.4 * one[0] < one[1] < one[0]
