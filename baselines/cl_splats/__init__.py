@@ -21,7 +21,8 @@ SPEC = MethodSpec(
     title="CL-Splats",
     paper="Ackermann et al., CL-Splats: Continual Learning of Gaussian Splatting with Local "
     "Optimization, ICCV 2025",
-    licence="Apache-2.0 (written from descriptions of the paper and facts about the released code)",
+    licence="Apache-2.0 (written from descriptions of the paper; the official code is under the "
+    "MIT licence)",
     period_input="label",
     outputs=("rgb", "alpha", "depth"),
     devices=("cpu", "cuda"),
