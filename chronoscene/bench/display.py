@@ -18,6 +18,7 @@ from chronoscene.methods import StepReport
 
 REFRESH = 0.1  # Seconds between two updates of the bar
 REPORTING = 1.0  # The same of one that other processes report to
+KNOWN = 0.1  # Share of a run after which the time left is shown: before, it mostly starts
 SMOOTHING = 0.95  # Weight of the past in the loss that is shown
 
 
@@ -174,6 +175,7 @@ class RunsDisplay:
         """A function that takes the progress of a run; it has ended when the block does."""
         with self._lock:
             self._shares[label] = 0.0
+        self._show()
         try:
             yield partial(self._update, label)
         finally:
@@ -201,8 +203,8 @@ class RunsDisplay:
         """How far the runs are, in one line; ``done`` counts shares of those under way, too."""
         pieces = [f"{self._ended} of {self._total} runs", f"{len(self._shares)} under way"]
         seconds = time.monotonic() - self._began
-        if done:
-            pieces.append(f"{3600 * done / max(seconds, 1e-9):.3g} runs/h")
+        if done > KNOWN:
+            pieces.append(f"{3600 * done / max(seconds, 1e-9):,.1f} runs/h")
             pieces.append(f"{format_time(seconds * (self._total - done) / done)} left")
         return ", ".join(pieces)
 

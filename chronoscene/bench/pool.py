@@ -11,7 +11,7 @@ from typing import Protocol
 from chronoscene.bench import results
 from chronoscene.bench.execution import run_in_process
 from chronoscene.bench.job import Job
-from chronoscene.bench.plan import BenchSettings, Say
+from chronoscene.bench.plan import BenchSettings
 from chronoscene.io.processes import Report, Stop, process_tree
 from chronoscene.kernels.runtime import available_threads, machine_memory
 
@@ -40,7 +40,7 @@ class Pool(Protocol):
 
 
 @contextmanager
-def open_pool(settings: BenchSettings, say: Say) -> Iterator[Pool | None]:
+def open_pool(settings: BenchSettings) -> Iterator[Pool | None]:
     """Where the settings say that runs are executed; None for one after the other, here.
 
     Raises:
@@ -49,7 +49,7 @@ def open_pool(settings: BenchSettings, say: Say) -> Iterator[Pool | None]:
     if settings.ray is not None:
         from chronoscene.bench.ray_pool import open_ray
 
-        with open_ray(settings, say) as pool:
+        with open_ray(settings) as pool:
             yield pool
     else:
         jobs = settings.jobs or 1

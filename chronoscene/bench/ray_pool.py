@@ -24,7 +24,7 @@ import chronoscene
 from chronoscene.bench import results
 from chronoscene.bench.execution import put_in_place, run_in_process, run_staged, staged
 from chronoscene.bench.job import LOCKS, Job
-from chronoscene.bench.plan import BenchSettings, Say, is_obsolete
+from chronoscene.bench.plan import BenchSettings, is_obsolete
 from chronoscene.bench.predictions import ground_truth_folder
 from chronoscene.bench.provenance import code_version
 from chronoscene.bench.travel import (
@@ -35,7 +35,7 @@ from chronoscene.bench.travel import (
     read_pieces,
     write_piece,
 )
-from chronoscene.errors import CheckpointError, ChronoSceneError, ConfigError
+from chronoscene.errors import BackendError, CheckpointError, ChronoSceneError, ConfigError
 from chronoscene.formats.shared.grouping import TABLE
 from chronoscene.io.processes import Report, Stop
 from chronoscene.io.staging import needing_space, partial_name, remove_abandoned, write_text_atomic
@@ -129,7 +129,7 @@ class RemoteRun:
 
 
 @contextmanager
-def open_ray(settings: BenchSettings, say: Say) -> Iterator[RayPool]:
+def open_ray(settings: BenchSettings) -> Iterator[RayPool]:
     """A connection to the cluster at ``settings.ray``.
 
     Raises:
@@ -161,7 +161,7 @@ def open_ray(settings: BenchSettings, say: Say) -> Iterator[RayPool]:
     token.parent.mkdir(parents=True, exist_ok=True)
     try:
         write_text_atomic(token, token.stem)
-        yield RayPool(ray, settings, say, token)
+        yield RayPool(ray, settings, token)
     finally:
         token.unlink(missing_ok=True)
         ray.shutdown()
@@ -170,9 +170,9 @@ def open_ray(settings: BenchSettings, say: Say) -> Iterator[RayPool]:
 class RayPool:
     """The machines of a cluster; see `Pool`."""
 
-    def __init__(self, ray: Any, settings: BenchSettings, say: Say, token: Path) -> None:
+    def __init__(self, ray: Any, settings: BenchSettings, token: Path) -> None:
         self.stop = Stop()
-        self._ray, self._say, self._token = ray, say, token
+        self._ray, self._token = ray, token
         self._machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         processors = [int(machine.get("CPU", 0)) for machine in self._machines]
         self._threads = settings.threads or min(filter(None, processors), default=1)
@@ -189,7 +189,7 @@ class RayPool:
         with staged(job) as job:
             try:
                 self._run(job, report)
-            except (self._ray.exceptions.RayError, CheckpointError) as error:
+            except (self._ray.exceptions.RayError, BackendError, CheckpointError) as error:
                 shutil.rmtree(job.staging)
                 Path(job.staging).mkdir()
                 results.write_failure(Path(job.staging), job.failure(self._reason(error)))
@@ -199,7 +199,7 @@ class RayPool:
         """Fill the staging folder of a job by an actor of its own."""
         needs = {"CPU": job.threads or 1, "memory": job.memory, "GPU": int(self._on_gpu(job))}
         if not any(all(m.get(k, 0) >= n for k, n in needs.items()) for m in self._machines):
-            raise CheckpointError(
+            raise BackendError(
                 self._option,
                 expected=f"a machine with {needs['CPU']} processors, {job.memory / 1e9:.2f} GB of "
                 f"memory and {needs['GPU']} GPUs",
@@ -211,7 +211,7 @@ class RayPool:
         )
         remote = actor.remote()
         try:
-            machine = self._describe(remote)
+            machine = self._describe(remote, report)
             travels = "" if machine["shared"] else ", to and from which files travel"
             report(f"{job.label}: on {machine['host']}{travels}", 0, 0)
             document = asdict(replace(job, moved=self._send(remote, job, machine["shared"])))
@@ -224,13 +224,14 @@ class RayPool:
                 self._get(remote.run.remote(document), tell)
             else:
                 self._run_apart(remote, job, document, tell)
+            tell()
         except BaseException:
             self._ray.wait([remote.stop.remote()], timeout=GRACE)
             raise
         finally:
             self._ray.kill(remote)
 
-    def _describe(self, remote: Any) -> Any:
+    def _describe(self, remote: Any, report: Report) -> Any:
         """What the machine of an actor says of itself.
 
         Raises:
@@ -251,7 +252,7 @@ class RayPool:
         if commit != self._commit and (host, commit) not in self._told:
             self._told.add((host, commit))
             own = f"this machine that of {self._commit}"
-            self._say(f"note: {host} runs the code of {commit}, {own}; results name theirs")
+            report(f"note: {host} runs the code of {commit}, {own}; results name theirs", 0, 0)
         return found
 
     def _send(self, remote: Any, job: Job, shared: bool) -> dict[str, str]:

@@ -55,7 +55,7 @@ def run_bench(settings: BenchSettings, say: Say, *, execute: Execute | None = No
     Raises:
         ChronoSceneError: If anything asked for is wrong; nothing is trained then.
     """
-    with open_pool(settings, say) as pool:
+    with open_pool(settings) as pool:
         return run_plan(plan_jobs(settings, say), settings, say, execute=execute, pool=pool)
 
 
@@ -88,17 +88,17 @@ def run_plan(
     failures = []
     numbers = count(1)
 
-    def run(job: Job, spec: MethodSpec, execute: Execute, say: Say) -> None:
+    def run(job: Job, spec: MethodSpec, carry_out: Execute, tell: Say) -> None:
         number = next(numbers)
         if is_finished(job, spec, settings.overwrite):
-            say(f"[{number}/{len(todo)}] {job.label}: another command has finished it")
+            tell(f"[{number}/{len(todo)}] {job.label}: another command has finished it")
             return
         if is_obsolete(job, spec, settings.overwrite):
             shutil.rmtree(job.training)
-        say(f"[{number}/{len(todo)}] {job.label}")
-        if (failure := execute(job)) is not None:
+        tell(f"[{number}/{len(todo)}] {job.label}")
+        if (failure := carry_out(job)) is not None:
             failures.append(failure)
-            say(f"failed: {failure.reason}")
+            tell(f"failed: {job.label}: {failure.reason}")
 
     try:
         with stoppable():

@@ -152,7 +152,7 @@ def run_study(
             say(line)
 
     plans: dict[str, Plan] = {}
-    with open_pool(settings, say) as pool:
+    with open_pool(settings) as pool:
         for row in study.rows:
             method = row.method or study.method
             own = {key: as_typed(value) for key, value in row.options.items()}

@@ -75,11 +75,11 @@ def check_arrived(place: Path, digest: str) -> None:
 
 
 def find_copy(place: Path, digest: str, copies: Path) -> Path | None:
-    """What has that content on this machine: the same place, or a copy; None if nothing."""
-    if place.exists() and content_hash(place) == digest:
-        return place
+    """What has that content on this machine: a copy, or the same place; None if nothing."""
     copy = copies / digest / place.name
-    return copy if copy.exists() else None
+    if copy.exists():
+        return copy
+    return place if place.exists() and content_hash(place) == digest else None
 
 
 def keep_copy(arrived: Path, digest: str, copies: Path, name: str) -> Path:

@@ -81,8 +81,10 @@ def remove_abandoned(folder: Path, name: str) -> None:
     for path in folder.glob(f".{name}.{_machine()}.*.partial"):
         boot, pid = path.name.split(".")[-3:-1]
         lives = boot == _boot() and int(pid) != os.getpid() and psutil.pid_exists(int(pid))
-        if not lives:
+        if not lives and path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
+        elif not lives:
+            path.unlink(missing_ok=True)
 
 
 @cache

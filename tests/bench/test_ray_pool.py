@@ -20,6 +20,7 @@ from .test_interruption import wait_for
 
 pytest.importorskip("ray")
 APART = Path(__file__).parent / "plugins" / "apart"
+APART_ALONE = 2 * 10**9  # Bytes of memory that only the machine apart has, Ray is told
 NODE = {"object_store_memory": 80_000_000, "include_dashboard": False}
 
 
@@ -41,12 +42,26 @@ def cluster(toys, tmp_path_factory):
         patch.setenv("TOY_HOLD", f"7:{cache / 'hold'}")
         cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **NODE})
         try:
-            cluster.add_node(num_cpus=1, **NODE)
-            cluster.add_node(num_cpus=1, env_vars=apart, **NODE)
+            cluster.add_node(num_cpus=1, memory=APART_ALONE // 2, **NODE)
+            cluster.add_node(num_cpus=1, memory=APART_ALONE, env_vars=apart, **NODE)
             cluster.cache = cache
             yield cluster
         finally:
             cluster.shutdown()
+
+
+@pytest.fixture(autouse=True)
+def bounded():
+    """A cluster that does not answer fails a test, and does not stop the others."""
+
+    def late(number, frame):
+        raise TimeoutError("the test took longer than five minutes")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(300)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture
@@ -96,9 +111,10 @@ def test_results_are_those_of_a_local_run_with_and_without_shared_files(
         assert files_of(found) == files_of(one)
         ours, theirs = read_run(one), read_run(found)
         assert theirs.aggregates == ours.aggregates and theirs.commit == ours.commit
-    again, said = on_ray(**{**names, "iterations": None}, continue_to=20)
-    assert again.failures == () and len(again.finished) == 2
-    assert [read_run(folder).iterations for folder in again.finished] == [20, 20]
+    begun = {**names, "methods": names["methods"][:1], "iterations": None}
+    longer, said = on_ray(**begun, continue_to=20, job_memory=APART_ALONE)
+    assert longer.failures == () and read_run(longer.finished[0]).iterations == 20
+    assert sum("files travel" in line for line in said) == 1
 
 
 def test_a_run_that_fails_stops_nobody_else(on_ray):
@@ -168,13 +184,14 @@ def test_runs_end_with_their_bench_on_any_machine(number, on_ray, cluster, scene
         started = workers()
     finally:
         driver.send_signal(number)
-        driver.wait()
+        driver.wait(60)
     assert len(started) == 2
     wait_for(lambda: not process_tree(started), seconds=10.0)
     assert bool(list(runs.rglob("*.partial"))) == (number == signal.SIGKILL)
     hold.unlink()
-    outcome, _ = on_ray("MEAN", "BLIND", seeds=(7,))
-    assert len(outcome.finished) == 2 and not list(tmp_path.rglob("*.partial"))
+    if number == signal.SIGKILL:
+        outcome, _ = on_ray("MEAN", "BLIND", seeds=(7,))
+        assert len(outcome.finished) == 2 and not list(tmp_path.rglob("*.partial"))
 
 
 def test_without_ray_or_a_cluster(scene_folder, tmp_path, monkeypatch):

@@ -110,7 +110,8 @@ def test_only_what_ended_processes_of_this_machine_left_is_removed(tmp_path):
 
     gone = [leave(), leave(boot="0ld", pid=os.getppid()), leave(pid=pid)]
     kept = [leave(machine="another"), leave(pid=os.getppid()), leave(name="seed1")]
-    remove_abandoned(tmp_path, "seed0")
+    (tmp_path / gone[0].name.replace("seed0", "seed0.json")).touch()
+    remove_abandoned(tmp_path, "seed0*")
     assert sorted(tmp_path.iterdir()) == sorted(kept)
     assert own in gone
 
