@@ -5,7 +5,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -17,6 +19,7 @@ from chronoscene.errors import ConfigError
 from chronoscene.io.processes import process_tree
 
 from .test_interruption import wait_for
+from .test_job import JOB
 
 pytest.importorskip("ray")
 APART = Path(__file__).parent / "plugins" / "apart"
@@ -207,3 +210,20 @@ def test_without_ray_or_a_cluster(scene_folder, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"--ray 127.*: expected the package ray"):
         run_bench(settings, lambda line: None)
     assert not list(tmp_path.rglob("*.token"))
+
+
+def test_runs_get_what_the_machines_of_a_cluster_have(tmp_path):
+    machines = [{"CPU": 16.0, "GPU": 1.0}, {"CPU": 6.0}, {"memory": 1.0}]
+    nodes = [{"Alive": True, "Resources": machine} for machine in machines]
+    nodes.append({"Alive": False, "Resources": {"CPU": 2.0}})
+
+    def pool(**changes):
+        settings = BenchSettings((), (), tmp_path, ray="auto", **changes)
+        return ray_pool.RayPool(SimpleNamespace(nodes=lambda: nodes), settings, tmp_path)
+
+    assert pool().at_once == 3 and pool(threads=4).at_once == 5 and pool(jobs=2).at_once == 2
+    job = replace(JOB, method="3dgs", device="auto")
+    assert pool()._on_gpu(job) and pool()._on_gpu(replace(job, device="cuda"))
+    assert not pool()._on_gpu(replace(job, device="cpu")) and not pool()._on_gpu(JOB)
+    machines[0].pop("GPU")
+    assert not pool()._on_gpu(job) and not pool()._on_gpu(replace(job, method="toy_methods:MEAN"))
