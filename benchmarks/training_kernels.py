@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import platform
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import cycle
 
@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 
 from baselines.realtime_4dgs.slicing import SHAPES, slice_at, slice_reference
+from chronoscene.anchors.blocks import own_blocks
 from chronoscene.anchors.decode import (
     DecodeInputs,
     HeadWeights,
@@ -67,7 +68,8 @@ class Step:
         self.positions = torch.randn(anchors, 3, generator=g)
         self.leaves = (
             leaf(anchors, OFFSETS, 3),
-            leaf(anchors, BASE + PERIODS * PERIOD),
+            leaf(anchors, BASE),
+            leaf(PERIODS * anchors, PERIOD),
             leaf(anchors, 6),
             leaf(PERIODS, SHARED),
         )
@@ -76,6 +78,7 @@ class Step:
         self.centre = torch.randn(3, generator=g)
         self.visible = torch.arange(anchors)
         self.used_offsets = torch.full((anchors,), -1)
+        self.block_rows = own_blocks(anchors, PERIODS)
 
     def run(self, function: Callable[..., object]) -> object:
         """Decode everything."""
@@ -85,7 +88,7 @@ class Step:
         """What is decoded."""
         return DecodeInputs(
             self.positions, *self.leaves, self.weights, *self.heads, self.centre, self.visible,
-            self.used_offsets, base_dim=BASE, period_dim=PERIOD,
+            self.used_offsets, self.block_rows,
         )  # fmt: skip
 
     def parameters(self) -> list[Tensor]:
@@ -218,29 +221,35 @@ def time_adam(step: Step, repeats: int, reference: bool) -> None:
         report("torch.optim.Adam, fused", repeats, fused.step)
 
 
+class Tables:
+    """Features and blocks of anchors under one optimiser; a step reads some at one period."""
+
+    def __init__(self, kind: type[DenseTable | RowAdam], anchors: int, share: float) -> None:
+        self.features = kind(torch.zeros(anchors, BASE))
+        self.blocks = kind(torch.zeros(PERIODS * anchors, PERIOD))
+        self.block_rows = own_blocks(anchors, PERIODS)[:, 0]
+        self.views = (torch.arange(t, anchors, round(1 / share)) for t in cycle(range(10)))
+
+    def fetch(self) -> None:
+        """What the next view sees, with gradients."""
+        rows = next(self.views)
+        for table, read in ((self.features, rows), (self.blocks, self.block_rows[rows])):
+            leaf = table.fetch(read)
+            leaf.grad = torch.full_like(leaf, 1e-3)
+
+    def step(self) -> None:
+        """One of Adam."""
+        self.features.step(1e-3)
+        self.blocks.step(1e-3)
+
+
 def time_tables(anchors: int, repeats: int) -> None:
-    """Features of some anchors and one of three periods: fetched, and moved by Adam."""
-    blocks = [BASE, *[PERIOD] * PERIODS]
-    start = torch.zeros(anchors, sum(blocks))
+    """Features of some anchors at one of three periods: fetched, and moved by Adam."""
     for share in (0.5, 0.1):
         for name, kind in (("all rows", DenseTable), ("rows in view", RowAdam)):
-            table = kind(start.clone(), blocks)
-            turns = (torch.arange(t, anchors, round(1 / share)) for t in cycle(range(10)))
-            leaf = torch.zeros(0)
-
-            def fetch(
-                table: DenseTable | RowAdam = table, turns: Iterator[torch.Tensor] = turns
-            ) -> None:
-                nonlocal leaf
-                leaf = table.fetch(next(turns), (0, 1))
-                leaf.grad = torch.full_like(leaf, 1e-3)
-
-            report(
-                f"Adam, {name}, {100 * share:.0f} % of {anchors} in view",
-                repeats,
-                fetch,
-                partial(table.step, 1e-3),
-            )
+            tables = Tables(kind, anchors, share)
+            label = f"Adam, {name}, {100 * share:.0f} % of {anchors} in view"
+            report(label, repeats, tables.fetch, tables.step)
 
 
 def main() -> None:

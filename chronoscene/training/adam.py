@@ -241,13 +241,11 @@ class DenseTable:
 
     Args:
         value: The table. [R, ...]
-        blocks: Columns of each block; None for one block.
     """
 
-    def __init__(self, value: Tensor, blocks: Sequence[int] | None = None) -> None:
+    def __init__(self, value: Tensor) -> None:
         self._adam = Adam({"table": value.detach().requires_grad_()})
-        self._blocks = blocks
-        self._fetched: tuple[tuple[Tensor, ...], Tensor] | None = None
+        self._fetched: tuple[Tensor, Tensor] | None = None
 
     @property
     def value(self) -> Tensor:
@@ -259,25 +257,17 @@ class DenseTable:
         grad = None if self._fetched is None else self._fetched[1].grad
         return [] if grad is None else [grad]
 
-    def fetch(self, rows: Tensor, blocks: Sequence[int] = (0,)) -> Tensor:
-        """Copies of some rows and blocks, up to date, as a leaf that collects a gradient.
+    def fetch(self, rows: Tensor) -> Tensor:
+        """Copies of some rows, up to date, as a leaf that collects a gradient. [M, ...]
 
         `step` uses that gradient; the copies of an earlier call are forgotten. The table is left as
         it is.
 
         Args:
             rows: Each at most once. int64 [M]
-            blocks: Their columns come one after the other.
-
-        Returns:
-            [M, ...], with the table's own shape of a row if there is one block.
         """
-        cells: tuple[Tensor, ...] = (rows,)
-        if self._blocks is not None:
-            columns = torch.arange(sum(self._blocks), device=rows.device).split(list(self._blocks))
-            cells = (rows[:, None], torch.cat([columns[block] for block in blocks]))
-        leaf = self.value[cells].requires_grad_()
-        self._fetched = cells, leaf
+        leaf = self.value[rows].requires_grad_()
+        self._fetched = rows, leaf
         return leaf
 
     def step(self, rate: float) -> None:

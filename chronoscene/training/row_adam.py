@@ -1,4 +1,4 @@
-"""Adam for tables of which every step reads only some rows and columns.
+"""Adam for tables of which every step reads only some rows.
 
 A view sees a part of the anchors and needs the features of one period. Adam moves the others too:
 their first moment decays over some dozen steps, and they follow it. Here they catch up when they
@@ -8,7 +8,7 @@ are next read, all steps at once, so a step costs what it reads, however large t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -45,11 +45,9 @@ CHUNK = 256  # Rows that a task takes at a time
 ZERO = float32(0)
 
 
-def make_table(value: Tensor, blocks: Sequence[int] | None = None) -> RowAdam | DenseTable:
+def make_table(value: Tensor) -> RowAdam | DenseTable:
     """A `RowAdam` where its kernels run, else a `DenseTable`."""
-    if devices.has_kernels(value):
-        return RowAdam(value, blocks)
-    return DenseTable(value, blocks)
+    return RowAdam(value) if devices.has_kernels(value) else DenseTable(value)
 
 
 class RowAdam:
@@ -67,53 +65,45 @@ class RowAdam:
 
     Args:
         value: The table. [R, ...]
-        blocks: Columns of the blocks that are read together or not at all; None for one block.
     """
 
-    def __init__(self, value: Tensor, blocks: Sequence[int] | None = None) -> None:
+    def __init__(self, value: Tensor) -> None:
         self.value = value.detach().contiguous()
         self.steps = 0
         self._columns = int(np.prod(value.shape[1:]))
-        self._widths = np.array([self._columns] if blocks is None else blocks, np.int64)
-        self._starts = np.cumsum(self._widths) - self._widths
         self._mean, self._square = (torch.zeros_like(self.value) for _ in range(2))
-        self._stamps = np.zeros((len(value), len(self._widths)), np.int64)
+        self._stamps = np.zeros(len(value), np.int64)
         self._speeds: list[float] = []
         """rate / root of each step."""
         self._ways = self._new_ways()
         self._settled = np.empty(_HORIZON, np.float32)
         """The whole way of what was last read at each step, known up to `_HORIZON` steps ago; the
         rest is spare room."""
-        self._fetched: tuple[NDArray[np.int64], NDArray[np.int64], Tensor] | None = None
-        """Rows and places (see `_Part`) of the last copies, and these."""
+        self._fetched: tuple[Tensor, Tensor] | None = None
+        """Rows of the last copies, and these."""
 
-    def fetch(self, rows: Tensor, blocks: Sequence[int] = (0,)) -> Tensor:
-        numbers, chosen = rows.contiguous().numpy(), np.array(blocks, np.int64)
-        widths = self._widths[chosen]
-        starts = np.cumsum(widths) - widths
-        places = np.stack([chosen, self._starts[chosen], widths, starts], axis=1)
-        out = torch.empty(len(numbers), int(widths.sum()))
+    def fetch(self, rows: Tensor) -> Tensor:
+        rows = rows.contiguous()
+        out = torch.empty(len(rows), *self.value.shape[1:])
         # In units of the root of the second moment without bias correction.
         eps = float32(EPS * (1 - BETA2 ** max(self.steps, 1)) ** 0.5)
-        _fetch(*self._addresses(numbers, places), eps, out.data_ptr())
-        if len(self._widths) == 1:
-            out = out.view(len(numbers), *self.value.shape[1:])
-        self._fetched = numbers, places, out.requires_grad_()
+        _fetch(*self._addresses(rows), eps, out.data_ptr())
+        self._fetched = rows, out.requires_grad_()
         return out
 
     def gradients(self) -> list[Tensor]:
-        grad = None if self._fetched is None else self._fetched[2].grad
+        grad = None if self._fetched is None else self._fetched[1].grad
         return [] if grad is None else [grad]
 
     def step(self, rate: float) -> None:
         root = (1 - BETA2 ** (self.steps + 1)) ** -0.5
         corrected = rate / (1 - BETA1 ** (self.steps + 1))
-        if self._fetched is not None and (found := self._fetched[2].grad) is not None:
-            rows, places, copies = self._fetched
+        if self._fetched is not None and (found := self._fetched[1].grad) is not None:
+            rows, copies = self._fetched
             grads = found.contiguous()
             scalars = (float32(corrected), float32(root), float32(EPS))
             addresses = (copies.data_ptr(), grads.data_ptr())
-            _update(*self._addresses(rows, places), *addresses, scalars)
+            _update(*self._addresses(rows), *addresses, scalars)
         self._fetched = None
         self.steps += 1
         self._speeds.append(corrected / root)
@@ -130,8 +120,8 @@ class RowAdam:
         self.value.copy_(self.snapshot())
         gaps = self.steps - self._stamps
         for moments, beta in ((self._mean, BETA1), (self._square, BETA2)):
-            left = np.repeat((beta**gaps).astype(np.float32), self._widths, axis=1)
-            moments.mul_(torch.from_numpy(left).view(moments.shape))
+            left = torch.from_numpy((beta**gaps).astype(np.float32))
+            moments.view(len(left), self._columns).mul_(left[:, None])
         self._stamps[:] = self.steps
         return self.value
 
@@ -139,10 +129,9 @@ class RowAdam:
         if not (self._stamps < self.steps).any():
             return self.value
         fetched = self._fetched
-        everything = torch.arange(len(self.value))
-        copies = self.fetch(everything, range(len(self._widths))).detach()
+        copies = self.fetch(torch.arange(len(self.value))).detach()
         self._fetched = fetched
-        return copies.view(self.value.shape)
+        return copies
 
     def state(self) -> dict[str, Tensor]:
         settled = max(self.steps - _HORIZON + 1, 0)
@@ -185,19 +174,16 @@ class RowAdam:
         return self.value
 
     def _mark_all(self) -> None:
-        self._stamps = np.full((len(self.value), len(self._widths)), self.steps, np.int64)
+        self._stamps = np.full(len(self.value), self.steps, np.int64)
         self._fetched = None
 
-    def _addresses(
-        self, rows: NDArray[np.int64], places: NDArray[np.int64]
-    ) -> tuple[_Table, _Part, _Waits]:
+    def _addresses(self, rows: Tensor) -> tuple[_Table, _Rows, _Waits]:
         """The first arguments of both kernels."""
         tables = (self.value.data_ptr(), self._mean.data_ptr(), self._square.data_ptr())
-        columns = int(places[:, 2].sum())
         ways, settled = self._ways, self._settled
         return (
-            _Table(*tables, self._columns, self._stamps.ctypes.data, len(self._widths)),
-            _Part(rows.ctypes.data, len(rows), places.ctypes.data, len(places), columns),
+            _Table(*tables, self._columns, self._stamps.ctypes.data),
+            _Rows(rows.data_ptr(), len(rows)),
             _Waits(self.steps, ways.ctypes.data, len(ways) - 1, settled.ctypes.data),
         )
 
@@ -222,21 +208,15 @@ class _Table(NamedTuple):
     squares: int
     columns: int
     stamps: int
-    """Step up to which a row and block is done. int64 [R, blocks]"""
-    blocks: int
+    """Step up to which a row is done. int64 [R]"""
 
 
-class _Part(NamedTuple):
-    """Addresses and lengths of what a step reads of a table."""
+class _Rows(NamedTuple):
+    """The rows that a step reads, each once."""
 
-    rows: int
-    """Each once. int64 [M]"""
-    num_rows: int
-    places: int
-    """(block, first column, columns, first column in the copy) of each block. int64 [b, 4]"""
-    num_places: int
-    columns: int
-    """Of the copy."""
+    numbers: int
+    """Their address. int64 [M]"""
+    count: int
 
 
 class _Waits(NamedTuple):
@@ -261,9 +241,9 @@ def _clean(mean, square):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _wait_of(table, stamp_at, waits):  # type: ignore[no-untyped-def]
-    """Way, and what is left of the moments, of a row and block that was not read for a while."""
-    stamp = read_index(table.stamps, stamp_at)
+def _wait_of(table, row, waits):  # type: ignore[no-untyped-def]
+    """Way, and what is left of the moments, of a row that was not read for a while."""
+    stamp = read_index(table.stamps, row)
     gap = waits.now - stamp
     if gap <= waits.longest:
         at = WAY_PARTS * gap
@@ -272,20 +252,11 @@ def _wait_of(table, stamp_at, waits):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _place(table, part, m, b):  # type: ignore[no-untyped-def]
-    """Of block b of copy m: places of its stamp and numbers, its width, its place in the copy."""
-    row = read_index(part.rows, m)
-    stamp_at = row * table.blocks + read_index(part.places, 4 * b)
-    at = row * table.columns + read_index(part.places, 4 * b + 1)
-    to = m * part.columns + read_index(part.places, 4 * b + 3)
-    return stamp_at, at, read_index(part.places, 4 * b + 2), to
-
-
-@inner
-def _copy(table, at, width, way, eps, out, to):  # type: ignore[no-untyped-def]
-    """The numbers of one row and block after their wait."""
-    for c in range(0, width, LANES):
-        left = width - c
+def _copy(table, row, way, eps, out, m):  # type: ignore[no-untyped-def]
+    """The numbers of one row after their wait, as copy m."""
+    at, to = row * table.columns, m * table.columns
+    for c in range(0, table.columns, LANES):
+        left = table.columns - c
         value = load_first(table.values, at + c, left)
         if way != ZERO:
             mean = load_first(table.means, at + c, left)
@@ -295,21 +266,21 @@ def _copy(table, at, width, way, eps, out, to):  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def _fetch(table, part, waits, eps, out):  # type: ignore[no-untyped-def]
+def _fetch(table, rows, waits, eps, out):  # type: ignore[no-untyped-def]
     """Copy rows as they are at the present step to the address ``out``. [M, columns]"""
-    for task in prange((part.num_rows + CHUNK - 1) // CHUNK):
-        for m in range(task * CHUNK, min((task + 1) * CHUNK, part.num_rows)):
-            for b in range(part.num_places):
-                stamp_at, at, width, to = _place(table, part, m, b)
-                way, _, _ = _wait_of(table, stamp_at, waits)
-                _copy(table, at, width, way, eps, out, to)
+    for task in prange((rows.count + CHUNK - 1) // CHUNK):
+        for m in range(task * CHUNK, min((task + 1) * CHUNK, rows.count)):
+            row = read_index(rows.numbers, m)
+            way, _, _ = _wait_of(table, row, waits)
+            _copy(table, row, way, eps, out, m)
 
 
 @inner
-def _step(table, at, width, keep1, keep2, copies, grads, to, scalars):  # type: ignore[no-untyped-def]
+def _step(table, row, keep1, keep2, copies, grads, m, scalars):  # type: ignore[no-untyped-def]
     rate, root, eps = scalars
-    for c in range(0, width, LANES):
-        left = width - c
+    at, to = row * table.columns, m * table.columns
+    for c in range(0, table.columns, LANES):
+        left = table.columns - c
         grad = load_first(grads, to + c, left)
         mean = keep1 * load_first(table.means, at + c, left)
         mean = mean + GAIN1 * (grad - mean)
@@ -322,17 +293,16 @@ def _step(table, at, width, keep1, keep2, copies, grads, to, scalars):  # type: 
 
 
 @kernel(parallel=True)
-def _update(table, part, waits, copies, grads, scalars):  # type: ignore[no-untyped-def]
+def _update(table, rows, waits, copies, grads, scalars):  # type: ignore[no-untyped-def]
     """One step of Adam for rows that `_fetch` wrote to the address ``copies``.
 
     Args:
         grads: Address of the gradients of the copies.
         scalars: rate, root and eps, as in `adam_block`.
     """
-    for task in prange((part.num_rows + CHUNK - 1) // CHUNK):
-        for m in range(task * CHUNK, min((task + 1) * CHUNK, part.num_rows)):
-            for b in range(part.num_places):
-                stamp_at, at, width, to = _place(table, part, m, b)
-                _, keep1, keep2 = _wait_of(table, stamp_at, waits)
-                _step(table, at, width, keep1, keep2, copies, grads, to, scalars)
-                write_index(table.stamps, stamp_at, waits.now + 1)
+    for task in prange((rows.count + CHUNK - 1) // CHUNK):
+        for m in range(task * CHUNK, min((task + 1) * CHUNK, rows.count)):
+            row = read_index(rows.numbers, m)
+            _, keep1, keep2 = _wait_of(table, row, waits)
+            _step(table, row, keep1, keep2, copies, grads, m, scalars)
+            write_index(table.stamps, row, waits.now + 1)
