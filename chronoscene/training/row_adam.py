@@ -216,7 +216,7 @@ class _Rows(NamedTuple):
 
     numbers: int
     """Their address. int64 [M]"""
-    count: int
+    length: int
 
 
 class _Waits(NamedTuple):
@@ -268,8 +268,8 @@ def _copy(table, row, way, eps, out, m):  # type: ignore[no-untyped-def]
 @kernel(parallel=True)
 def _fetch(table, rows, waits, eps, out):  # type: ignore[no-untyped-def]
     """Copy rows as they are at the present step to the address ``out``. [M, columns]"""
-    for task in prange((rows.count + CHUNK - 1) // CHUNK):
-        for m in range(task * CHUNK, min((task + 1) * CHUNK, rows.count)):
+    for task in prange((rows.length + CHUNK - 1) // CHUNK):
+        for m in range(task * CHUNK, min((task + 1) * CHUNK, rows.length)):
             row = read_index(rows.numbers, m)
             way, _, _ = _wait_of(table, row, waits)
             _copy(table, row, way, eps, out, m)
@@ -300,8 +300,8 @@ def _update(table, rows, waits, copies, grads, scalars):  # type: ignore[no-unty
         grads: Address of the gradients of the copies.
         scalars: rate, root and eps, as in `adam_block`.
     """
-    for task in prange((rows.count + CHUNK - 1) // CHUNK):
-        for m in range(task * CHUNK, min((task + 1) * CHUNK, rows.count)):
+    for task in prange((rows.length + CHUNK - 1) // CHUNK):
+        for m in range(task * CHUNK, min((task + 1) * CHUNK, rows.length)):
             row = read_index(rows.numbers, m)
             _, keep1, keep2 = _wait_of(table, row, waits)
             _step(table, row, keep1, keep2, copies, grads, m, scalars)

@@ -126,3 +126,15 @@ def test_the_command_names_what_differs_from_the_preset():
     assert command_line("DIR", config).endswith(" --continue-to 50")
     config["variant"] = "sh_degree=2,budget=90s"
     assert command_line("DIR", config, 0).endswith("--seed 0 --set sh_degree=2 --budget 90s")
+
+
+@pytest.mark.parametrize(
+    ("label", "option"),
+    [("0.1dB", "--max-loss 0.1"), ("1e-05dB", "--max-loss 1e-05"), ("plain", "--plain")],
+)
+def test_two_commands_make_a_compressed_run(label, option):
+    variant = f"sh_degree=2,compressed={label},max_width=800"
+    config = {"method": "m", "strategy": "joint", "preset": "fast", "variant": variant}
+    train, compress = command_line("DIR", config).split(" && ")
+    assert train.endswith("--preset fast --set sh_degree=2 --max-width 800")
+    assert compress == f"chronoscene compress RUN {option}"
