@@ -17,24 +17,26 @@ TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check
 
 DEMO := demo
+# Tables and pages call a scene by the name of its folder.
+SCENE := $(DEMO)/demo
 DEMO_METHODS := chronogs,scaffold-gs,3dgs,4dgs
 DEMO_BUDGET := 90s
 
 .PHONY: demo leaderboard test lint clean distclean open3d-libraries
 
-demo: $(DEMO)/.scene
-	$(BIN)/chronoscene validate $(DEMO)/scene
-	$(BIN)/chronoscene stats $(DEMO)/scene
-	$(BIN)/chronoscene bench $(DEMO)/scene --method $(DEMO_METHODS) \
+demo: $(DEMO)/.made
+	$(BIN)/chronoscene validate $(SCENE)
+	$(BIN)/chronoscene stats $(SCENE)
+	$(BIN)/chronoscene bench $(SCENE) --method $(DEMO_METHODS) \
 		--budget $(DEMO_BUDGET) --out $(DEMO)/runs
-	@echo "The scene is in $(DEMO)/scene; tables, figures and predictions are in $(DEMO)/runs."
+	@echo "The scene is in $(SCENE); tables, figures and predictions are in $(DEMO)/runs."
 
 # The mark stands beside the scene: nothing is ever written into a dataset folder. A scene without
 # its mark is what an interrupted run left behind.
-$(DEMO)/.scene: | $(READY)
-	rm -rf $(DEMO)/scene
+$(DEMO)/.made: | $(READY)
+	rm -rf $(SCENE)
 	mkdir -p $(DEMO)
-	$(BIN)/chronoscene synth $(DEMO)/scene --preset demo
+	$(BIN)/chronoscene synth $(SCENE) --preset demo
 	touch $@
 
 SITE := build/leaderboard
