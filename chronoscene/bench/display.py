@@ -176,13 +176,11 @@ class RunsDisplay:
         with self._lock:
             self._shares[label] = 0.0
         self._show()
-        try:
-            yield partial(self._update, label)
-        finally:
-            with self._lock:
-                del self._shares[label]
-                self._ended += 1
-            self._show(plain=True)
+        yield partial(self._update, label)
+        with self._lock:  # an error ends the display, too
+            del self._shares[label]
+            self._ended += 1
+        self._show(plain=True)
 
     def _update(self, label: str, what: str, done: int, total: int) -> None:
         if not total:

@@ -91,9 +91,8 @@ def remove_abandoned(folder: Path, name: str) -> None:
 def _machine() -> str:
     """Name of this machine, without dots; of a long one, the beginning and a hash."""
     name = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
-    return (
-        name if len(name) <= 32 else f"{name[:23]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-    )
+    digest = hashlib.sha256(name.encode()).hexdigest()
+    return name if len(name) <= 32 else f"{name[:23]}-{digest[:8]}"
 
 
 @cache
