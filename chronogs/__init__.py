@@ -6,20 +6,22 @@ from typing import Any
 
 from chronoscene.methods import MethodSpec
 
-_SHORT: dict[str, Any] = {
+_FULL: dict[str, Any] = {
     "length_unit": "training",
     "voxel_size": 0.5,
     "voxel_unit": "spacing",
     "max_initial_anchors": 100_000,
     "max_anchors": 200_000,
+    "density_interval": 50,
 }
-"""For thousands of steps instead of tens of thousands. The voxel follows the sparse cloud, so the
-unit of the scene does not matter."""
+"""The sizes of the paper, for thousands of steps instead of tens of thousands. The voxel follows
+the sparse cloud, so the unit of the scene does not matter."""
 
-_LEAN: dict[str, Any] = _SHORT | {
+_SHORT: dict[str, Any] = _FULL | {
     "offsets_per_anchor": 5,
     "base_dim": 28,
     "period_dim": 4,
+    "global_init": "zero",
     "unused_share": 0.06,
     "feature_lr": (0.015, 0.0075),
     "opacity_lr": (0.004, 0.0004),
@@ -27,8 +29,8 @@ _LEAN: dict[str, Any] = _SHORT | {
     "antialiased": True,
     "cooldown": 0.2,
 }
-"""Two fifths of the numbers: docs/what-a-scene-requires.md and docs/generalisation.md have the
-trials."""
+"""Better with two fifths of the numbers: docs/what-a-scene-requires.md and docs/generalisation.md
+have the trials."""
 
 _TEXT: dict[str, Any] = {
     "fusion": "sum",
@@ -62,10 +64,10 @@ SPEC = MethodSpec(
     presets={  # what differs from the defaults, which are the paper's
         "paper": {},  # as released
         "paper-text": _TEXT,
-        "fast": _SHORT | {"iterations": 1_000, "density_interval": 40, "offsets_per_anchor": 5},
-        "balanced": _SHORT | {"iterations": 3_000, "density_interval": 50},
-        "lean": _LEAN | {"iterations": 3_000, "density_interval": 50},
-        "accurate": _SHORT | {"iterations": 8_000, "density_interval": 50},
+        "full": _FULL | {"iterations": 3_000},
+        "fast": _SHORT | {"iterations": 1_000, "density_interval": 40},
+        "balanced": _SHORT | {"iterations": 3_000},
+        "accurate": _SHORT | {"iterations": 8_000},
     },
     resumable=True,
 )
