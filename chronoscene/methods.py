@@ -443,8 +443,11 @@ def as_typed(value: Any) -> str:
 def _parse_like(place: str, value: Any, default: Any) -> Any:
     if not isinstance(value, str) or isinstance(default, str):
         return value
+    text = value.lower() if value.lower() in ("true", "false") else value
+    if isinstance(default, tuple) and text[:1] + text[-1:] == "()":
+        text = f"[{text[1:-1].rstrip(', ')}]"
     try:
-        parsed = json.loads(value.lower() if value.lower() in ("true", "false") else value)
+        parsed = json.loads(text)
         if isinstance(default, tuple) and isinstance(parsed, list):
             return tuple(parsed)
         if isinstance(default, float) and isinstance(parsed, int) and not isinstance(parsed, bool):

@@ -49,6 +49,11 @@ def test_overrides_are_parsed_like_the_default():
     assert isinstance(config.rate, float)
 
 
+@pytest.mark.parametrize("value", ["[3, 4]", "(3, 4)", "(3,4,)", "[3,4]"])
+def test_tuples_are_written_as_in_python_or_json(value):
+    assert build_config(SPEC, preset="fast", overrides={"sizes": value}).sizes == (3, 4)
+
+
 @pytest.mark.parametrize("value", ["fast", "1.5", "true", "[1]"])
 def test_values_of_another_type_are_refused(value):
     with pytest.raises(ConfigError, match="toy --set iterations: expected a value like 100"):
