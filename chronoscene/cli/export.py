@@ -61,5 +61,7 @@ def command(
         lines.append(
             "The exposure is in the colours; where the background shows, a viewer lacks it"
         )
+    if getattr(run.config, "antialiased", False):
+        lines.append("Switch on the antialiasing (Mip-Splatting) of the viewer, as in training")
     emit("\n".join(lines) + "\n", None)
     tell_written(out)

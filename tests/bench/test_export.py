@@ -88,6 +88,13 @@ def test_an_exposure_does_not_reach_the_background(trained, tmp_path):
         assert ("where the background shows, a viewer lacks it\n" in result.stdout) == said
 
 
+def test_a_viewer_has_to_use_the_filter_of_the_training(trained, tmp_path):
+    for method, said in (("chronogs", True), ("4dgs", False)):
+        arguments = ["export", str(trained[method]), "--period", "0", "--out"]
+        result = CliRunner().invoke(cli, [*arguments, str(tmp_path / "a.ply")])
+        assert ("Switch on the antialiasing" in result.stdout) == said
+
+
 def test_a_period_in_between_is_exported_and_not_measured(trained, tmp_path):
     assert export(trained["chronogs"], tmp_path / "a.ply", 0.5) == []
     assert len(read(tmp_path / "a.ply")[0]) > 0
