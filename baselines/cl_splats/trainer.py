@@ -81,7 +81,7 @@ class CLSplatsTrainer(GaussianTrainer):
         self.statistics.views = self.statistics.views[keep]
 
     def _update(self, due: Due) -> None:
-        """Opacities are reset in the first period only: others have few views to recover in."""
+        """Opacities are reset in the first period only, as released."""
         super()._update(replace(due, reset=due.reset and not len(self.model.kept["means"])))
 
     def state(self) -> TrainingState:
