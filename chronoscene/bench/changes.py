@@ -339,7 +339,7 @@ def score_map(run: OpenRun, scene: Scene, store: ImageStore, made: ChangeMap) ->
         view = np.concatenate([made.view_scores(shot, shown), difference], axis=2)
         scores.append(view[counted])
         masks.append(changes[counted])
-    if not masks:
+    if not any(map(len, masks)):
         return {}
     geometry, appearance, image = np.concatenate(scores).T
     truth = np.concatenate(masks)
