@@ -15,6 +15,9 @@ WIDTH, HEIGHT = 440, 300
 LEFT, RIGHT, TOP, BOTTOM = 52, 16, 14, 44
 """Space for the axes around the plot."""
 
+CHARACTER = 7.0  # Mean width of one in a label
+
+Box = tuple[float, float, float, float]  # Left, top, right, bottom
 
 LEAST_RATIO = 1.1
 """Of the largest cost and the smallest one in a plot."""
@@ -51,7 +54,7 @@ def plot(points: Sequence[Point], *, cost: str, quality: str) -> dict[str, Any] 
     def y(value: float) -> float:
         return round(TOP + (top - value) / (top - bottom) * (HEIGHT - TOP - BOTTOM), 1)
 
-    heights = _label_heights([y(value) for value in values])
+    labels = _place_labels([(x(p.cost), y(p.quality), p.label) for p in points])
     best = on_front(np.array([p.cost for p in points]), np.array(values)).tolist()
     front = sorted(compress(points, best), key=lambda p: p.cost)
     corners = [f"M{x(front[0].cost)} {y(front[0].quality)}"]
@@ -67,24 +70,50 @@ def plot(points: Sequence[Point], *, cost: str, quality: str) -> dict[str, Any] 
                 "label": p.label,
                 "x": x(p.cost),
                 "y": y(p.quality),
-                "height": height,
                 "best": is_best,
-                "left": x(p.cost) > WIDTH / 2,
+                "label_x": label[0],
+                "label_y": label[1],
+                "anchor": label[2],
             }
-            for p, height, is_best in zip(points, heights, best, strict=True)
+            for p, label, is_best in zip(points, labels, best, strict=True)
         ],
         "across": [(x(tick), f"{tick:g}") for tick in _log_ticks(10**low, 10**high)],
         "up": [(y(tick), f"{tick:g}") for tick in _ticks(bottom, top)],
     }
 
 
-def _label_heights(heights: Sequence[float]) -> list[float]:
-    """Heights of labels near those of their points, a line of text apart at least."""
-    found = [0.0] * len(heights)
-    highest = math.inf
-    for i in sorted(range(len(heights)), key=lambda i: -heights[i]):  # from the bottom up
-        found[i] = highest = min(heights[i] - 6, highest - 13)
-    return found
+def _place_labels(points: Sequence[tuple[float, float, str]]) -> list[tuple[float, float, str]]:
+    """Where labels begin, are centred or end: beside their points, above or below, where they
+    cover least of points, of labels before them and of what is outside the plot."""
+    inside = (LEFT, TOP, WIDTH - RIGHT, HEIGHT - BOTTOM)
+    boxes = [(x - 5, y - 5, x + 5, y + 5) for x, y, _ in points]
+    found = {}
+    for i in sorted(range(len(points)), key=lambda i: -len(points[i][2])):
+        x, y, label = points[i]
+        width = CHARACTER * len(label)
+        places = []
+        beside = [(x + 9, y + 4, "start"), (x - 9 - width, y + 4, "end")]
+        around = [
+            (x + move - share * width, height, anchor)
+            for height in (y - 9, y + 18, y - 23, y + 32)
+            for anchor, share, move in (("middle", 0.5, 0), ("start", 0, 4), ("end", 1, -4))
+        ]
+        for left, height, anchor in (around[0], *beside, *around[1:]):
+            box = (left, height - 11, left + width, height + 2)
+            covered = sum(_overlap(box, other) for other in boxes)
+            covered += width * 13 - _overlap(box, inside)
+            at = {"start": left, "middle": x, "end": left + width}[anchor]
+            places.append((covered, (round(at, 1), height, anchor), box))
+        _, place, box = min(places, key=lambda p: p[0])
+        found[i] = place
+        boxes.append(box)
+    return [found[i] for i in range(len(points))]
+
+
+def _overlap(a: Box, b: Box) -> float:
+    """Area that two boxes share."""
+    across, up = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
+    return max(across, 0.0) * max(up, 0.0)
 
 
 def _log_ticks(low: float, high: float) -> list[float]:

@@ -1,11 +1,11 @@
 """The front has what no cheaper method reaches; the plot puts it where the axes say."""
 
 import math
-from itertools import pairwise
+from itertools import combinations
 
 import pytest
 
-from leaderboard.pareto import BOTTOM, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Point, plot
+from leaderboard.pareto import BOTTOM, CHARACTER, HEIGHT, LEFT, RIGHT, TOP, WIDTH, Point, plot
 
 POINTS = [Point("a", 10, 20), Point("b", 100, 30), Point("c", 50, 19), Point("d", 100, 25)]
 
@@ -31,10 +31,18 @@ def test_ticks_are_round_and_inside():
     assert [text for _, text in made["up"]] == ["18", "20", "22", "24", "26", "28", "30"]
 
 
-def test_labels_do_not_cover_each_other():
-    close = [Point(str(i), 10 + 5 * i, 20 + i / 1000) for i in range(4)]
-    heights = sorted(p["height"] for p in plot(close, cost="s", quality="dB")["points"])
-    assert all(b - a >= 13 for a, b in pairwise(heights))
+def test_labels_do_not_cover_each_other_nor_points():
+    names = ["one", "a long name, with more", "three", "4"]
+    close = [Point(name, 10 * 1.2**i, 20 + i / 5) for i, name in enumerate(names)]
+    points = plot([*close, Point("far", 90, 30)], cost="s", quality="dB")["points"]
+    boxes = [(p["x"] - 5, p["y"] - 5, p["x"] + 5, p["y"] + 5) for p in points]
+    for p in points:
+        width = CHARACTER * len(p["label"])
+        left = p["label_x"] - width * {"start": 0, "middle": 0.5, "end": 1}[p["anchor"]]
+        assert left >= LEFT and left + width <= WIDTH - RIGHT
+        boxes.append((left, p["label_y"] - 11, left + width, p["label_y"] + 2))
+    for (a, b, c, d), (e, f, g, h) in combinations(boxes, 2):
+        assert min(c, g) <= max(a, e) or min(d, h) <= max(b, f)
 
 
 @pytest.mark.parametrize("costs", [[], [10], [90.0, 90.1, 90.2], [0, 10]])
