@@ -12,15 +12,17 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from chronoscene.errors import CheckpointError
+
 COUNTERS = ("count", "total", "squares", "seen")
 """Arrays of `BlockStatistics`."""
 _MIN_VIEWS = 3  # Of each side, before a block is split
 _FORGET = 0.9  # What counts of earlier gradients after a round
 
 
-def own_blocks(count: int, periods: int, first: int = 0) -> Tensor:
+def own_blocks(count: int, periods: int) -> Tensor:
     """Rows of blocks that nobody shares, anchor by anchor. int64 [count, T]"""
-    return torch.arange(first, first + count * periods).view(count, periods)
+    return torch.arange(count * periods).view(count, periods)
 
 
 def share_equal(blocks: Tensor) -> tuple[Tensor, Tensor]:
@@ -64,13 +66,23 @@ def pack_blocks(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def unpack_blocks(tensors: dict[str, Tensor], periods: int) -> dict[str, Tensor]:
-    """Inverse of `pack_blocks`."""
-    count = len(tensors["anchors"])
-    if tensors["blocks"].shape[1] == 0:
-        return tensors | {"block_rows": torch.empty(count, 0, dtype=torch.int64)}
+    """Inverse of `pack_blocks`.
+
+    Raises:
+        CheckpointError: If the periods named are not the first of any.
+    """
+    anchors = tensors["anchors"]
     if "block_leaders" not in tensors:
-        return tensors | {"block_rows": own_blocks(count, periods)}
+        columns = periods if tensors["blocks"].shape[1] else 0
+        return tensors | {"block_rows": own_blocks(len(anchors), columns).to(anchors.device)}
     first = tensors["block_leaders"].long()
+    if not (first < periods).all() or not _leads(first).gather(1, first).all():
+        raise CheckpointError(
+            "block_leaders",
+            expected=f"periods below {periods}, each the first with its block",
+            found="others",
+            todo="the file is damaged: train again",
+        )
     number = _leads(first).flatten().cumsum(0).view(first.shape) - 1
     others = {name: tensor for name, tensor in tensors.items() if name != "block_leaders"}
     return others | {"block_rows": number.gather(1, first)}

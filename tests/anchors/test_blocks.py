@@ -19,6 +19,7 @@ from chronoscene.anchors.blocks import (
     share_equal,
     unpack_blocks,
 )
+from chronoscene.errors import CheckpointError
 
 
 def shared_rows(anchors: int, periods: int, seed: int) -> tuple[int, Tensor]:
@@ -43,6 +44,17 @@ def test_what_is_stored_comes_back(anchors: int, periods: int, seed: int) -> Non
     assert set(restored) == set(tensors)
     assert torch.equal(restored["blocks"][restored["block_rows"]], values[rows])
     assert torch.equal(leaders(restored["block_rows"]), leaders(rows))
+
+
+@pytest.mark.parametrize("first", [[[0, 0, 9]], [[1, 1, 0]]])
+def test_damaged_files_are_refused(first: list[list[int]]) -> None:
+    stored = {
+        "anchors": torch.zeros(1, 3),
+        "blocks": torch.zeros(2, 1),
+        "block_leaders": torch.tensor(first, dtype=torch.uint8),
+    }
+    with pytest.raises(CheckpointError, match="each the first with its block"):
+        unpack_blocks(stored, 3)
 
 
 def test_equal_blocks_are_stored_once() -> None:
