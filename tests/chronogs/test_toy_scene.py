@@ -200,6 +200,13 @@ def test_a_period_with_one_image_shows_what_the_others_saw() -> None:
     assert psnr(made, 0, 1) > psnr(made, 0, 0) - 3.0
 
 
+def test_one_period_has_one_block_for_each_anchor() -> None:
+    made = train((0,), steps=100, **LEAN)
+    assert made.model.block_rows.shape == (len(made.model), 1)
+    assert len(made.model.blocks) == len(made.model)
+    assert psnr(made, 0, 0) > 20.0
+
+
 def test_forty_periods() -> None:
     made = train((0,) * 20 + (1,) * 20, **LEAN)
     assert len(made.model.blocks) < 0.2 * made.model.block_rows.numel()
