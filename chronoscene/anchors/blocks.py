@@ -12,10 +12,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from chronoscene.anchors.density import AnchorCounters
 from chronoscene.errors import CheckpointError
 
-COUNTERS = ("count", "total", "squares", "seen")
-"""Arrays of `BlockStatistics`."""
 _MIN_VIEWS = 3  # Of each side, before a block is split
 _FORGET = 0.9  # What counts of earlier gradients after a round
 
@@ -93,8 +92,10 @@ def _leads(first: Tensor) -> Tensor:
     return first == torch.arange(first.shape[1], device=first.device)
 
 
-class BlockStatistics:
+class BlockStatistics(AnchorCounters):
     """Gradients of the blocks, by anchor and period."""
+
+    names = ("count", "total", "squares", "seen")
 
     def __init__(self, anchors: int, periods: int, dim: int, device: torch.device) -> None:
         self.count, self.squares = torch.zeros(2, anchors, periods, device=device)
@@ -111,17 +112,6 @@ class BlockStatistics:
         self.seen[anchors, period] |= squares > 0
         self.squares[anchors, period] += squares
         self.total[anchors, period] += gradient
-
-    def extend(self, count: int) -> None:
-        """Make room for new anchors, which start with zeros."""
-        for name in COUNTERS:
-            old = getattr(self, name)
-            setattr(self, name, torch.cat([old, old.new_zeros(count, *old.shape[1:])]))
-
-    def keep(self, mask: Tensor) -> None:
-        """Forget the anchors outside a mask. bool [A]"""
-        for name in COUNTERS:
-            setattr(self, name, getattr(self, name)[mask])
 
     def fade(self, split: Tensor) -> None:
         """Forget a part of what was, and all of what was before a block was split. bool [A]"""

@@ -9,7 +9,8 @@ during a training stays on the device of the training.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -24,8 +25,6 @@ from chronoscene.training.splatting import rms_spacing
 
 MIN_DISTANCE = 1e-7
 """Lower bound of a neighbour distance: keeps the log-scales of coinciding points finite."""
-COUNTERS = ("opacity_sum", "visits", "motion", "grad_sum", "hits")
-"""Arrays of `DensityStatistics`."""
 
 
 def cell_indices(positions: Tensor, size: float) -> Tensor:
@@ -120,8 +119,36 @@ def initial_log_scales(anchors: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.repeat(column[:, None], 6, axis=1)
 
 
-class DensityStatistics:
+class AnchorCounters:
+    """Arrays with one row per anchor, which follow growth and pruning."""
+
+    names: ClassVar[tuple[str, ...]]
+
+    def state(self) -> dict[str, Tensor]:
+        """All arrays, by name."""
+        return {name: getattr(self, name) for name in self.names}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        """Restore what `state` gave, for as many anchors."""
+        for name in self.names:
+            getattr(self, name).copy_(state[name])
+
+    def extend(self, count: int) -> None:
+        """Make room for new anchors, which start with zeros."""
+        for name in self.names:
+            old = getattr(self, name)
+            setattr(self, name, torch.cat([old, old.new_zeros(count, *old.shape[1:])]))
+
+    def keep(self, mask: Tensor) -> None:
+        """Forget the anchors outside a mask. bool [A]"""
+        for name in self.names:
+            setattr(self, name, getattr(self, name)[mask])
+
+
+class DensityStatistics(AnchorCounters):
     """What training views said about each anchor and Gaussian since it was last judged."""
+
+    names = ("opacity_sum", "visits", "motion", "grad_sum", "hits")
 
     def __init__(self, anchors: int, offsets: int, device: str | torch.device = "cpu") -> None:
         self.opacity_sum, self.visits, self.motion = torch.zeros(3, anchors, device=device)
@@ -155,7 +182,7 @@ class DensityStatistics:
         seen = (visible, counted, positions, opacities, radii, means2d_grad)
         halves = (0.5 * width, 0.5 * height)
         if devices.has_kernels(opacities, self.visits):
-            counters = (getattr(self, name).numpy() for name in COUNTERS)
+            counters = (getattr(self, name).numpy() for name in self.names)
             _accumulate(*(tensor.numpy() for tensor in seen), *halves, *counters)
         else:
             self._add(*seen, *halves)
@@ -184,17 +211,6 @@ class DensityStatistics:
             sums = values.new_zeros(len(visible)).index_add_(0, row, values)
             total.index_add_(0, visible, sums * counted)
         self.visits.index_add_(0, visible, counted.to(norm))
-
-    def extend(self, count: int) -> None:
-        """Make room for new anchors, which start with zeros."""
-        for name in COUNTERS:
-            old = getattr(self, name)
-            setattr(self, name, torch.cat([old, old.new_zeros(count, *old.shape[1:])]))
-
-    def keep(self, mask: Tensor) -> None:
-        """Forget the anchors outside a mask. bool [A]"""
-        for name in COUNTERS:
-            setattr(self, name, getattr(self, name)[mask])
 
 
 _CHUNK = 512  # Anchors whose Gaussians one task looks up together

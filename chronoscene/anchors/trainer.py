@@ -15,7 +15,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.anchors.blocks import COUNTERS as BLOCK_COUNTERS
 from chronoscene.anchors.blocks import (
     BlockStatistics,
     find_splits,
@@ -26,7 +25,7 @@ from chronoscene.anchors.blocks import (
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.contribution import used_offsets
 from chronoscene.anchors.decode import pack_bits, unpack_bits
-from chronoscene.anchors.density import COUNTERS, AnchorRows, DensityStatistics, grow, prune_mask
+from chronoscene.anchors.density import AnchorRows, DensityStatistics, grow, prune_mask
 from chronoscene.anchors.model import FIXED, PER_ANCHOR, TABLES, AnchorModel
 from chronoscene.anchors.visibility import projected_centres
 from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
@@ -193,9 +192,9 @@ class AnchorTrainer:
         sources["adam"] = self.optimizer.state()
         sources["exposure"] = self.exposure.state()
         if self.statistics is not None:
-            sources["statistics"] = {n: getattr(self.statistics, n) for n in COUNTERS}
-        if (blocks := self.block_statistics) is not None:
-            sources["block_statistics"] = {n: getattr(blocks, n) for n in BLOCK_COUNTERS}
+            sources["statistics"] = self.statistics.state()
+        if self.block_statistics is not None:
+            sources["block_statistics"] = self.block_statistics.state()
         for prefix, source in sources.items():
             tensors |= {f"{prefix}.{name}": tensor for name, tensor in source.items()}
         values = {
@@ -222,13 +221,11 @@ class AnchorTrainer:
         self.statistics = None
         if counters := parts(state.tensors, "statistics"):
             self.statistics = self._new_statistics()
-            for name in COUNTERS:
-                getattr(self.statistics, name).copy_(counters[name])
+            self.statistics.load_state(counters)
         self.block_statistics = None
         if counters := parts(state.tensors, "block_statistics"):
             self.block_statistics = self._new_block_statistics()
-            for name in BLOCK_COUNTERS:
-                getattr(self.block_statistics, name).copy_(counters[name])
+            self.block_statistics.load_state(counters)
         self.sampler.drawn = state.values["views_drawn"]
         self._dropped = state.values["dropped"]
         self.growth_generator.bit_generator.state = state.values["growth_generator"]
