@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from chronoscene.anchors.config import HEADS, AnchorConfig
-from chronoscene.checks import check_choice
+from chronoscene.checks import check_at_least, check_choice
 from chronoscene.errors import ConfigError
 
 
@@ -17,6 +17,10 @@ class ChronoGSConfig(AnchorConfig):
     """Length of an anchor's feature per period (d_v); 0: without local changes."""
     global_dim: int = 32
     """Length of the feature of a period (d_g); 0: without global changes."""
+    block_threshold: float = 0.0
+    """0: an anchor has a feature of its own for each period (paper and code). Otherwise all periods
+    have the same to begin with, and it is split where their gradients differ: the ratio of the
+    squares between and within periods above which it is, see `chronoscene.anchors.blocks`."""
     fusion: str = "concat"
     """``concat``: base, period and global feature side by side (code); ``sum``: added (formula of
     the paper; needs equal lengths)."""
@@ -35,13 +39,8 @@ class ChronoGSConfig(AnchorConfig):
         check_choice("global_init", self.global_init, ("gaussian", "zero", "uniform"))
         for head in self.global_heads:
             check_choice("global_heads", head, HEADS)
-        if min(self.period_dim, self.global_dim) < 0:
-            raise ConfigError(
-                "period_dim, global_dim",
-                expected="0 or more",
-                found=f"{self.period_dim}, {self.global_dim}",
-                todo="correct the value",
-            )
+        for name in ("period_dim", "global_dim", "block_threshold"):
+            check_at_least(name, getattr(self, name), 0)
         lengths = (self.base_dim, self.period_dim, self.global_dim)
         if self.fusion == "sum" and len({n for n in lengths if n}) > 1:
             raise ConfigError(

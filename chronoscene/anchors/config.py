@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Self
 
-from chronoscene.checks import check_choice
+from chronoscene.checks import check_at_least, check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.training.splatting import SplattingConfig
 
@@ -128,10 +128,6 @@ class AnchorConfig(SplattingConfig):
     """Once growth is over, the anchors are dropped that add least to the training views, as many as
     add no more than this share of the light of any period, and single offsets likewise. 0: none.
     Not in the papers."""
-    block_threshold: float = 0.0
-    """0: an anchor has a feature of its own for each period, as in ChronoGS. Otherwise all periods
-    have the same to begin with, and it is split where their gradients differ: the ratio of the
-    squares between and within periods above which it is, see `chronoscene.anchors.blocks`."""
     growth_levels: int = 3
     """Cell sizes that are tried, coarse to fine."""
     coarsest_cell: int = 16
@@ -154,11 +150,7 @@ class AnchorConfig(SplattingConfig):
         for head in self.direction_heads:
             check_choice("direction_heads", head, HEADS)
         for name, low in _LOWER_BOUNDS.items():
-            value = getattr(self, name)
-            if value < low:
-                raise ConfigError(
-                    name, expected=f"at least {low}", found=str(value), todo="correct the value"
-                )
+            check_at_least(name, getattr(self, name), low)
         if self.unused_share and self.offsets_per_anchor > _MAX_OFFSETS:
             raise ConfigError(
                 "offsets_per_anchor",
@@ -218,5 +210,4 @@ _LOWER_BOUNDS: dict[str, float] = {
     "coarsest_cell": 1,
     "cell_refinement": 1,
     "unused_share": 0.0,
-    "block_threshold": 0.0,
 }

@@ -116,7 +116,7 @@ class AnchorMethod(SplattingMethod):
         periods = layout.num_periods
         if layout.period_dim:
             rows = with_new_periods(tensors["block_rows"].T, periods).T.contiguous()
-            if not self.config.block_threshold:  # nobody shares
+            if not self.model_class.block_threshold(self.config):  # nobody shares
                 tensors["blocks"] = tensors["blocks"][rows].flatten(0, 1)
                 rows = own_blocks(len(rows), periods).to(rows)
             tensors["block_rows"] = rows

@@ -88,6 +88,7 @@ class AnchorTrainer:
             "log_scales": DenseTable(model.log_scales),
         }
         self.optimizer = Adam({n: t for n, t in trained.items() if n not in TABLES})
+        self.block_threshold = model.block_threshold(self.config)
         self._seen_layout = replace(layout, num_periods=1)
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
@@ -162,7 +163,7 @@ class AnchorTrainer:
         )
         if collects and skipped is None:
             self._collect(view, visible, positions, splats.opacities, raster.info, counts)
-            if self.config.block_threshold and self.model.layout.period_dim:
+            if self.block_threshold and self.model.layout.period_dim:
                 self._collect_blocks(visible, row)
         return value, skipped
 
@@ -309,7 +310,7 @@ class AnchorTrainer:
     def _add_blocks(self, blocks: Tensor) -> None:
         """Of new anchors. [N, T, Fv]"""
         model, first = self.model, len(self.model.blocks)
-        if self.config.block_threshold:
+        if self.block_threshold:
             values, rows = share_equal(blocks)
         else:
             values, rows = blocks.flatten(0, 1), own_blocks(*blocks.shape[:2]).to(model.device)
@@ -367,7 +368,7 @@ class AnchorTrainer:
             return False
         if (index + 1) % config.density_interval:
             return False
-        leaves = find_splits(statistics, model.block_rows, config.block_threshold)
+        leaves = find_splits(statistics, model.block_rows, self.block_threshold)
         # Those that leave a block together share the new one, its copy.
         sources, copy = model.block_rows[leaves].unique(return_inverse=True)
         rows = model.block_rows.clone()

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import ClassVar, Self
 
-from chronoscene.checks import check_choice
+from chronoscene.checks import check_at_least, check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.training.splatting import SplattingConfig
 
@@ -123,13 +123,8 @@ class GaussianConfig(SplattingConfig):
         check_choice("densification", self.densification, ("adaptive", "mcmc"))
         super().__post_init__()
         for name, value in asdict(self).items():
-            if isinstance(value, str):
-                continue
-            low = self.minima.get(name, 0)
-            if not value >= low:
-                raise ConfigError(
-                    name, expected=f"at least {low}", found=str(value), todo="correct the value"
-                )
+            if not isinstance(value, str):
+                check_at_least(name, value, self.minima.get(name, 0))
         if self.densification == "mcmc" and not self.max_gaussians:
             raise ConfigError(
                 "max_gaussians",

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from chronoscene.checks import check_choice
-from chronoscene.errors import CheckpointError, ConfigError, SceneError, ShapeError
+from chronoscene.checks import check_at_least, check_choice
+from chronoscene.errors import CheckpointError, SceneError, ShapeError
 from chronoscene.methods import MethodSize, Prediction, Skipped, StepReport, TrainingSet, View
 from chronoscene.rasterizer import NEAR_PLANE, RasterInfo, Rasterization, rasterize
 from chronoscene.scene.gaussian_cloud import GaussianCloud
@@ -93,13 +93,7 @@ class SplattingConfig:
     def __post_init__(self) -> None:
         check_choice("exposure", self.exposure, KINDS)
         check_choice("length_unit", self.length_unit, ("world", "training"))
-        if not self.near_plane >= 0.0:
-            raise ConfigError(
-                "near_plane",
-                expected="at least 0.0",
-                found=str(self.near_plane),
-                todo="correct the value",
-            )
+        check_at_least("near_plane", self.near_plane, 0.0)
 
     def in_training_frame(self, training_from_world: float) -> Self:
         """The same options with all lengths in units of the training frame.
