@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import click
@@ -22,6 +22,8 @@ from chronoscene.formats.shared.ply import write_vertices
 from chronoscene.io.staging import check_outside, staged_folder
 from chronoscene.io.tables import boxed_text
 
+_ALL_PAIRS = 4  # Periods of which all pairs are compared unless the user chooses
+
 
 @click.command("changes")
 @RUN
@@ -36,7 +38,8 @@ from chronoscene.io.tables import boxed_text
     nargs=2,
     multiple=True,
     metavar="PERIOD PERIOD",
-    help="Compare these two, by number or label; may be repeated.  [default: all pairs]",
+    help="Compare these two, by number or label; may be repeated.  [default: all pairs of up to "
+    f"{_ALL_PAIRS} periods, of more each with the next]",
 )
 @SCENE
 @DEVICE
@@ -46,13 +49,13 @@ def command(
     """Map what changes between the periods of a finished run.
 
     OUT gets a point cloud in PLY format for each pair of periods, with scores and colours, a
-    picture of all pairs from above, and a table as CSV. Where gt/ of the scene has change masks,
+    picture of the pairs from above, and a table as CSV. Where gt/ of the scene has change masks,
     the map is scored by them, beside differences of images. docs/changes.md says what the scores
     mean.
     """
     run = open_run(folder, device=device)
     pairs = [_pair(run, *names) for names in between]
-    pairs = pairs or list(combinations(range(run.num_periods), 2))
+    pairs = pairs or usual_pairs(run.num_periods)
     if not pairs:
         raise ConfigError(
             folder, expected="a run of two periods or more", found="one", todo="open another run"
@@ -71,6 +74,13 @@ def command(
     tell_written(out)
     if not any(scores for _, scores in maps):
         click.echo(f"not scored: no change masks of test views in {found.root / 'gt'}", err=True)
+
+
+def usual_pairs(periods: int) -> list[tuple[int, int]]:
+    """The pairs that are compared unless the user chooses; they do not grow with the square of many
+    periods."""
+    numbers = range(periods)
+    return list(combinations(numbers, 2) if periods <= _ALL_PAIRS else pairwise(numbers))
 
 
 def _pair(run: OpenRun, *names: str) -> tuple[int, int]:

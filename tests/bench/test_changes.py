@@ -23,6 +23,7 @@ from chronoscene.bench.changes import (
 from chronoscene.bench.opening import open_run
 from chronoscene.bench.shots import Shot
 from chronoscene.cli import cli
+from chronoscene.cli.changes import usual_pairs
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.images import truth
 from chronoscene.methods import Prediction
@@ -310,6 +311,12 @@ def test_places_that_are_refused(run, scene, tmp_path):
     (tmp_path / "used/file").touch()
     with pytest.raises(SceneError, match="expected a new or empty folder, found one in use"):
         changes(run.folder, "--scene", scene.root, "--out", tmp_path / "used")
+
+
+def test_pairs_unless_the_user_chooses():
+    assert usual_pairs(1) == []
+    assert usual_pairs(3) == [(0, 1), (0, 2), (1, 2)]
+    assert usual_pairs(40) == [(period, period + 1) for period in range(39)]
 
 
 def test_a_run_of_one_period(run, monkeypatch, tmp_path):
