@@ -17,10 +17,10 @@ class ChronoGSConfig(AnchorConfig):
     """Length of an anchor's feature per period (d_v); 0: without local changes."""
     global_dim: int = 32
     """Length of the feature of a period (d_g); 0: without global changes."""
-    block_threshold: float = 0.0
-    """0: an anchor has a feature of its own for each period (paper and code). Otherwise all periods
-    have the same to begin with, and it is split where their gradients differ: the ratio of the
-    squares between and within periods above which it is, see `chronoscene.anchors.blocks`."""
+    merge_share: float = 0.0
+    """Once growth is over, features of an anchor at several periods become one where they are
+    alike, as many as raise the loss by no more than this share, by estimate: see
+    `chronoscene.anchors.blocks`. 0: none (paper and code)."""
     fusion: str = "concat"
     """``concat``: base, period and global feature side by side (code); ``sum``: added (formula of
     the paper; needs equal lengths)."""
@@ -39,7 +39,7 @@ class ChronoGSConfig(AnchorConfig):
         check_choice("global_init", self.global_init, ("gaussian", "zero", "uniform"))
         for head in self.global_heads:
             check_choice("global_heads", head, HEADS)
-        for name in ("period_dim", "global_dim", "block_threshold"):
+        for name in ("period_dim", "global_dim", "merge_share"):
             check_at_least(name, getattr(self, name), 0)
         lengths = (self.base_dim, self.period_dim, self.global_dim)
         if self.fusion == "sum" and len({n for n in lengths if n}) > 1:

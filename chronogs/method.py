@@ -18,5 +18,9 @@ class ChronoGS(AnchorMethod):
     model_class = ChronoGSModel
     config: ChronoGSConfig
 
+    @property
+    def merge_share(self) -> float:
+        return self.config.merge_share
+
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
         return super().rates(camera_extent) | {"global_features": self.config.global_lr}

@@ -34,11 +34,6 @@ class ChronoGSModel(AnchorModel):
         assert isinstance(config, ChronoGSConfig)
         return config.global_init
 
-    @classmethod
-    def block_threshold(cls, config: AnchorConfig) -> float:
-        assert isinstance(config, ChronoGSConfig)
-        return config.block_threshold
-
     @staticmethod
     def input_dim(layout: AnchorLayout, head: str) -> int:
         if layout.fusion == "concat":

@@ -1,44 +1,41 @@
 """Which anchors have features of their own for a period, and which share one block between periods.
 
-All anchors may have a block for each period, as in ChronoGS. Or they begin with one block for all
-periods, and the photos decide: where the gradients of some periods pull the block one way and those
-of the others another, farther than the scatter among the views of a period explains, it is split
-in two, which start as copies. A period in which an anchor was never seen has the block of
-the nearest period in which it was. Not in the paper.
+In ChronoGS all anchors have a block for each period. Here those that are alike may become one once
+growth is over, and the training goes on with what is left. To move a block by d raises the loss L
+of a view by about h |d|^2 / 2, where h is its curvature. L is a mean over N pixels; if their errors
+have independent signs, the squared gradient of L, for each of the F numbers of a block, is about
+h L / N, so that the loss rises by the share
+
+    w |d|^2,    w = N |g|^2 / (2 F L^2).
+
+With w summed over the views of a period, the least rise for one block instead of those of periods
+s and t is w_s w_t / (w_s + w_t) |b_s - b_t|^2, with their weighted mean: the linkage of Ward. A
+period that does not see an anchor has no weight, and takes over the block of a neighbour that does.
+Not in the paper.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
 import torch
+from numba import prange
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.density import AnchorCounters
 from chronoscene.errors import CheckpointError
+from chronoscene.kernels.compilation import kernel
+from chronoscene.training.devices import to_device
 
-_MIN_VIEWS = 3  # Of each side, before a block is split
-_FORGET = 0.9  # What counts of earlier gradients after a round
+_LEAST_LOSS = 1e-4
+_FORGET = 0.9  # What counts of earlier views after a round
 
 
 def own_blocks(count: int, periods: int) -> Tensor:
     """Rows of blocks that nobody shares, anchor by anchor. int64 [count, T]"""
     return torch.arange(count * periods).view(count, periods)
-
-
-def share_equal(blocks: Tensor) -> tuple[Tensor, Tensor]:
-    """Store equal blocks of an anchor once.
-
-    Args:
-        blocks: [N, T, Fv]
-
-    Returns:
-        values: Anchor by anchor, in the order of their first periods. [R, Fv]
-        rows: Which of them an anchor has at a period. int64 [N, T]
-    """
-    same = (blocks[:, :, None] == blocks[:, None]).all(-1)  # [N, T, T]
-    first = same.int().argmax(2)  # of the periods with this block
-    own = _leads(first)
-    number = own.flatten().cumsum(0).view(own.shape) - 1
-    return blocks[own], number.gather(1, first)
 
 
 def leaders(block_rows: Tensor) -> Tensor:
@@ -93,108 +90,133 @@ def _leads(first: Tensor) -> Tensor:
 
 
 class BlockStatistics(AnchorCounters):
-    """Gradients of the blocks, by anchor and period."""
+    """How much the loss depends on the blocks, by anchor and period."""
 
-    names = ("count", "total", "squares", "seen")
+    names = ("rise", "drawn", "off")
 
-    def __init__(self, anchors: int, periods: int, dim: int, device: torch.device) -> None:
-        self.count, self.squares = torch.zeros(2, anchors, periods, device=device)
-        """Views, and the sum of their squared gradients. [A, T]"""
-        self.total = torch.zeros(anchors, periods, dim, device=device)
-        """Sum of the gradients. [A, T, Fv]"""
-        self.seen = torch.zeros(anchors, periods, dtype=torch.bool, device=device)
-        """Whether a view has ever had a gradient. [A, T]"""
+    def __init__(self, anchors: int, periods: int, device: torch.device) -> None:
+        self.rise, self.drawn, self.off = torch.zeros(3, anchors, periods, device=device)
+        """Sums of w; views in which the anchor draws something, and in which all of its Gaussians
+        are switched off. [A, T]"""
+        self.views = torch.zeros((), dtype=torch.float64)
+        """All views."""
 
-    def update(self, anchors: Tensor, period: int, gradient: Tensor) -> None:
-        """Add one view; anchors without a gradient were not seen. [M], [M, Fv]"""
-        squares = gradient.square().sum(1)
-        self.count[anchors, period] += (squares > 0).to(squares)
-        self.seen[anchors, period] |= squares > 0
-        self.squares[anchors, period] += squares
-        self.total[anchors, period] += gradient
+    def update(
+        self,
+        anchors: Tensor,
+        period: int,
+        gradient: Tensor,
+        drawn: Tensor,
+        *,
+        loss: float,
+        pixels: int,
+    ) -> None:
+        """Add one view.
 
-    def fade(self, split: Tensor) -> None:
-        """Forget a part of what was, and all of what was before a block was split. bool [A]"""
-        for counter in (self.count, self.total, self.squares):
+        Args:
+            anchors: Those that were decoded. int64 [M]
+            period: Of the view.
+            gradient: Of the loss, with respect to their blocks. [M, Fv]
+            drawn: Whether any of an anchor's Gaussians is switched on. bool [M]
+            loss: The mean over the pixels.
+            pixels: How many there are.
+        """
+        scale = pixels / (2 * gradient.shape[1] * max(loss, _LEAST_LOSS) ** 2)
+        self.rise[anchors, period] += scale * gradient.square().sum(1)
+        self.drawn[anchors, period] += drawn
+        self.off[anchors, period] += ~drawn
+        self.views += 1
+
+    def fade(self) -> None:
+        """Forget a part of what was: the model was another."""
+        for counter in (self.rise, self.drawn, self.off, self.views):
             counter *= _FORGET
-            counter[split] = 0.0
+
+    def weights(self) -> Tensor:
+        """Sums of w. Views in which an anchor is switched off have no gradient, but a model that
+        switches it on shows it there: they count as one in which it is drawn does. [A, T]"""
+        mean = self.rise.sum(1, keepdim=True) / self.drawn.sum(1, keepdim=True).clamp_min(1)
+        return self.rise + self.off * mean
+
+    def state(self) -> dict[str, Tensor]:
+        return super().state() | {"views": self.views}
+
+    def load_state(self, state: Mapping[str, Tensor]) -> None:
+        super().load_state(state)
+        self.views.copy_(state["views"])
 
 
-def find_splits(statistics: BlockStatistics, block_rows: Tensor, threshold: float) -> Tensor:
-    """Which periods leave the block that they share with others.
-
-    In the direction in which the mean gradient of one period is farthest from that of the others,
-    the periods of a block are cut in two where the squares between the two parts are largest. The
-    block is split if these, for each number of the block, are more than ``threshold`` times
-    the squares within the periods for each degree of freedom, as in an analysis of variance.
+def merge_alike(blocks: Tensor, statistics: BlockStatistics, share: float) -> tuple[Tensor, Tensor]:
+    """Merge the blocks of anchors where that raises the loss least.
 
     Args:
-        statistics: What the periods asked for.
-        block_rows: As in `AnchorModel`. int64 [A, T]
-        threshold: On the ratio F.
+        blocks: One for each anchor and period. [A, T, Fv]
+        statistics: What they are worth.
+        share: Of the loss, by which it may rise in all, by the estimate above.
 
     Returns:
-        bool [A, T]; never all periods of a block that were seen.
+        first: The first of the periods that have the same block. int64 [A, T]
+        merged: Blocks of those; others mean nothing. [A, T, Fv]
     """
-    n, total, squares = statistics.count, statistics.total, statistics.squares
-    periods, dim = total.shape[1:]
-    leaves = torch.zeros_like(n, dtype=torch.bool)
-    # Seen periods of one block at a time: that of the first period, of the second and so on.
-    first = leaders(block_rows)
-    for leader in range(periods - 1):
-        member = (first == leader) & (n > 0)
-        active = (member.sum(1) > 1).nonzero()[:, 0]
-        if len(active) == 0:
-            continue
-        inside = member[active].to(n)
-        count, sums = n[active] * inside, total[active] * inside[..., None]
-        within = (squares[active] * inside).sum(1)
-        within -= (sums.square().sum(2) / count.clamp_min(1e-9)).sum(1)
-        freedom = (count.sum(1) - inside.sum(1)) * dim
-        apart, gap = _apart(count, sums)
-        # The period that is farthest off gives the direction; cuts are between sorted projections.
-        far = torch.where(inside > 0, apart, -1.0).argmax(1)
-        axis = gap[torch.arange(len(far), device=far.device), far]
-        along = (sums * axis[:, None]).sum(2) / count.clamp_min(1e-9)
-        order = torch.where(inside > 0, along, torch.inf).argsort(1)
-        low = count.gather(1, order).cumsum(1)
-        low_sums = sums.gather(1, order[..., None].expand_as(sums)).cumsum(1)
-        between, _ = _apart(low, low_sums, count.sum(1), sums.sum(1))
-        enough = (low >= _MIN_VIEWS) & (count.sum(1, keepdim=True) - low >= _MIN_VIEWS)
-        between, cut = torch.where(enough, between, 0.0).max(1)
-        ratio = (between / dim) / (within.clamp_min(1e-30) / freedom.clamp_min(1.0))
-        split = (ratio > threshold) & (freedom >= dim)
-        rank = order.argsort(1)
-        upper = (rank > cut[:, None]) & (inside > 0) & split[:, None]
-        leaves[active] |= upper
-    return leaves
+    values, weights = (
+        tensor.detach().cpu().double().numpy() for tensor in (blocks, statistics.weights())
+    )
+    costs, _, _ = agglomerate(values, weights, np.inf)
+    ordered = np.sort(costs, axis=None)
+    kept = np.cumsum(ordered) <= share * float(statistics.views)
+    limit = ordered[kept][-1] if kept.any() else -1.0
+    _, first, merged = agglomerate(values, weights, limit)
+    return to_device(first, blocks.device), to_device(merged.astype(np.float32), blocks.device)
 
 
-def _apart(
-    count: Tensor, sums: Tensor, all_count: Tensor | None = None, all_sums: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Squares between parts and the rest of their blocks, and the difference of the means.
+def agglomerate(
+    values: NDArray[np.float64], weights: NDArray[np.float64], limit: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Join the two clusters of periods of least cost, again and again, for each anchor on its own.
 
     Args:
-        count: Views of each part. [N, T]
-        sums: Of their gradients. [N, T, Fv]
-        all_count: Of the block; None for the sum of the parts. [N]
-        all_sums: Likewise. [N, Fv]
+        values: [A, T, F]
+        weights: [A, T]
+        limit: Cost above which clusters stay apart.
+
+    Returns:
+        costs: Of what was joined, in this order; the rest infinite. [A, T - 1]
+        first: First period of each cluster. [A, T]
+        values: Weighted means of the clusters, at their first periods. [A, T, F]
     """
-    all_count = count.sum(1) if all_count is None else all_count
-    all_sums = sums.sum(1) if all_sums is None else all_sums
-    rest = (all_count[:, None] - count).clamp_min(1e-9)
-    gap = sums / count.clamp_min(1e-9)[..., None] - (all_sums[:, None] - sums) / rest[..., None]
-    factor = count * rest / all_count[:, None].clamp_min(1e-9)
-    return factor * gap.square().sum(2), gap
+    anchors, periods, _ = values.shape
+    costs = np.full((anchors, periods - 1), np.inf)
+    first = np.tile(np.arange(periods), (anchors, 1))
+    values = values.copy()
+    _agglomerate(values, weights.copy(), limit, costs, first)
+    return costs, first, values
 
 
-def nearest_seen(seen: Tensor) -> Tensor:
-    """Of each period, the nearest in which an anchor was seen, the earlier of two; itself where
-    it was never seen at all. bool [A, T] -> int64 [A, T]"""
-    far = 2 * seen.shape[1]
-    numbers = torch.arange(seen.shape[1], device=seen.device).expand(seen.shape)
-    before = torch.where(seen, numbers, -far).cummax(1).values
-    after = torch.where(seen, numbers, far).flip(1).cummin(1).values.flip(1)
-    nearest = torch.where(numbers - before <= after - numbers, before, after)
-    return torch.where(seen.any(1, keepdim=True), nearest, numbers)
+@kernel(parallel=True)
+def _agglomerate(values, weights, limit, costs, first):  # type: ignore[no-untyped-def]
+    anchors, periods, dim = values.shape
+    for a in prange(anchors):
+        for step in range(periods - 1):
+            best, s, t = np.inf, -1, -1
+            for j in range(1, periods):
+                for i in range(j):
+                    if first[a, i] != i or first[a, j] != j:
+                        continue
+                    total = weights[a, i] + weights[a, j]
+                    squares = 0.0
+                    for f in range(dim):
+                        squares += (values[a, i, f] - values[a, j, f]) ** 2
+                    cost = weights[a, i] * weights[a, j] / total * squares if total > 0 else 0.0
+                    if cost < best or (cost == best and j - i < t - s):
+                        best, s, t = cost, i, j
+            if best > limit:
+                break
+            costs[a, step] = best
+            total = weights[a, s] + weights[a, t]
+            part = weights[a, t] / total if total > 0 else 0.0
+            for f in range(dim):
+                values[a, s, f] += part * (values[a, t, f] - values[a, s, f])
+            weights[a, s] = total
+            for period in range(periods):
+                if first[a, period] == t:
+                    first[a, period] = s

@@ -46,6 +46,11 @@ class AnchorMethod(SplattingMethod):
         """Sizes and rules of the model."""
         return AnchorLayout.of(self.config, train.num_periods)
 
+    @property
+    def merge_share(self) -> float:
+        """See `AnchorTrainer`."""
+        return 0.0
+
     def feature_rows(self, train: TrainingSet) -> NDArray[np.int64]:
         """Which of the features that vary each training view has; here that of its period. [V]"""
         return np.array([view.period for view in train.views])
@@ -107,8 +112,8 @@ class AnchorMethod(SplattingMethod):
     def extend(self, train: TrainingSet) -> None:
         """Train the anchors there are further: schedules, density control and moments begin anew.
 
-        The features of a new period start as copies of the last one's. Its sparse points are not
-        used.
+        The features of a new period start as copies of the last one's, and no periods share any.
+        Its sparse points are not used.
         """
         assert self.trainer is not None, "setup comes first"
         layout, tensors = self.layout(train), self.model.tensors()
@@ -116,10 +121,8 @@ class AnchorMethod(SplattingMethod):
         periods = layout.num_periods
         if layout.period_dim:
             rows = with_new_periods(tensors["block_rows"].T, periods).T.contiguous()
-            if not self.model_class.block_threshold(self.config):  # nobody shares
-                tensors["blocks"] = tensors["blocks"][rows].flatten(0, 1)
-                rows = own_blocks(len(rows), periods).to(rows)
-            tensors["block_rows"] = rows
+            tensors["blocks"] = tensors["blocks"][rows].flatten(0, 1)
+            tensors["block_rows"] = own_blocks(len(rows), periods).to(rows)
         tensors["global_features"] = self.extended_table(tensors["global_features"], periods)
         self._model = self.model_class.from_tensors(layout, tensors)
         self.go_on(train, self._make_trainer(train, self.trainer.seed))
@@ -134,6 +137,7 @@ class AnchorMethod(SplattingMethod):
             seed=seed,
             rates=self.rates(train.camera_extent),
             feature_rows=self.feature_rows(train),
+            merge_share=self.merge_share,
         )
 
     def splats(self, view: View, period: float, appearance_period: float) -> Splats:

@@ -151,9 +151,7 @@ class AnchorModel:
         shape = (count, layout.base_dim + periods * layout.period_dim)
         features = draw_start(shape, config.feature_init, config.feature_init_scale, generator)
         blocks = features[:, layout.base_dim :].reshape(count, periods, layout.period_dim)
-        if cls.block_threshold(config):
-            blocks = blocks[:, :1]
-        rows = own_blocks(count, blocks.shape[1]).expand(-1, periods).contiguous()
+        rows = own_blocks(count, periods)
         shape = (layout.num_periods, layout.global_dim)
         global_features = draw_start(shape, cls.global_start(config), 1.0, generator)
         return cls(
@@ -172,12 +170,6 @@ class AnchorModel:
     def global_start(cls, config: AnchorConfig) -> str:
         """How global features start, see `draw_start`; here like any embedding."""
         return "gaussian"
-
-    @classmethod
-    def block_threshold(cls, config: AnchorConfig) -> float:
-        """When a block that periods share is split; 0 where they share none. See
-        `chronoscene.anchors.blocks`."""
-        return 0.0
 
     def tensors(self) -> dict[str, Tensor]:
         """Everything that is stored, by name."""

@@ -15,13 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from chronoscene.anchors.blocks import (
-    BlockStatistics,
-    find_splits,
-    nearest_seen,
-    own_blocks,
-    share_equal,
-)
+from chronoscene.anchors.blocks import BlockStatistics, merge_alike, own_blocks
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.anchors.contribution import used_offsets
 from chronoscene.anchors.decode import pack_bits, unpack_bits
@@ -74,6 +68,8 @@ class AnchorTrainer:
     """Learning rates by tensor name."""
     feature_rows: NDArray[np.int64]
     """Which of the features that vary each view has, mostly its period. [V]"""
+    merge_share: float = 0.0
+    """By how much the loss may rise where periods come to share blocks; 0: they share none."""
 
     def __post_init__(self) -> None:
         model, train, seed = self.model.requires_grad(), self.train, self.seed
@@ -88,7 +84,6 @@ class AnchorTrainer:
             "log_scales": DenseTable(model.log_scales),
         }
         self.optimizer = Adam({n: t for n, t in trained.items() if n not in TABLES})
-        self.block_threshold = model.block_threshold(self.config)
         self._seen_layout = replace(layout, num_periods=1)
         self._one_period = torch.ones(1, device=model.device)
         self.background = torch.from_numpy(train.background).to(model.device)
@@ -114,7 +109,7 @@ class AnchorTrainer:
             mask = None if mask is None else downscale_mask(mask, factor)
         loss, skipped = self._learn(view, photo, mask, position, done)
         resized = self._densify_if_due(index, done) or self._drop_if_due(done)
-        resized |= self._split_if_due(index, done)
+        resized |= self._merge_if_due(index, done)
         if skipped is None:
             self._update(done, resized=resized)
         self.optimizer.zero_grad()
@@ -163,8 +158,8 @@ class AnchorTrainer:
         )
         if collects and skipped is None:
             self._collect(view, visible, positions, splats.opacities, raster.info, counts)
-            if self.block_threshold and self.model.layout.period_dim:
-                self._collect_blocks(visible, row)
+            if self.merge_share and self.model.block_rows.shape[1] > 1:
+                self._collect_blocks(visible, row, positions, value, view)
         return value, skipped
 
     def _seen(self, visible: Tensor, row: int) -> AnchorModel:
@@ -310,10 +305,7 @@ class AnchorTrainer:
     def _add_blocks(self, blocks: Tensor) -> None:
         """Of new anchors. [N, T, Fv]"""
         model, first = self.model, len(self.model.blocks)
-        if self.block_threshold:
-            values, rows = share_equal(blocks)
-        else:
-            values, rows = blocks.flatten(0, 1), own_blocks(*blocks.shape[:2]).to(model.device)
+        values, rows = blocks.flatten(0, 1), own_blocks(*blocks.shape[:2]).to(model.device)
         model.blocks = self.tables["blocks"].extend(values)
         model.block_rows = torch.cat([model.block_rows, first + rows])
 
@@ -346,40 +338,38 @@ class AnchorTrainer:
         model.blocks = self.tables["blocks"].keep(used)
         model.block_rows = (used.cumsum(0) - 1)[block_rows]
 
-    def _collect_blocks(self, visible: Tensor, row: int) -> None:
+    def _collect_blocks(
+        self, visible: Tensor, row: int, positions: Tensor, loss: float, view: TrainingView
+    ) -> None:
         if self.block_statistics is None:
             self.block_statistics = self._new_block_statistics()
+        drawn = torch.zeros(len(visible), dtype=torch.bool, device=visible.device)
+        drawn[positions // self.model.layout.offsets] = True
         for gradient in self.tables["blocks"].gradients():
-            self.block_statistics.update(visible, row, gradient)
+            self.block_statistics.update(
+                visible, row, gradient, drawn, loss=loss, pixels=view.width * view.height
+            )
 
     def _new_block_statistics(self) -> BlockStatistics:
         model = self.model
-        return BlockStatistics(
-            len(model), model.layout.num_periods, model.layout.period_dim, model.device
-        )
+        return BlockStatistics(len(model), model.layout.num_periods, model.device)
 
-    def _split_if_due(self, index: int, done: float) -> bool:
-        """Split blocks whose periods disagree; whether there are more blocks than before."""
-        config, statistics, model = self.config, self.block_statistics, self.model
+    @torch.no_grad()
+    def _merge_if_due(self, index: int, done: float) -> bool:
+        """Once growth is over, let periods share blocks that are alike; whether they now do."""
+        statistics, model = self.block_statistics, self.model
         if statistics is None:
             return False
-        if done >= config.density_until - _MARGIN:
-            self.block_statistics = None
+        if done < self.config.density_until - _MARGIN:
+            if (index + 1) % self.config.density_interval == 0:
+                statistics.fade()
             return False
-        if (index + 1) % config.density_interval:
-            return False
-        leaves = find_splits(statistics, model.block_rows, self.block_threshold)
-        # Those that leave a block together share the new one, its copy.
-        sources, copy = model.block_rows[leaves].unique(return_inverse=True)
-        rows = model.block_rows.clone()
-        rows[leaves] = len(model.blocks) + copy
-        model.block_rows = rows.gather(1, nearest_seen(statistics.seen))
-        statistics.fade(leaves.any(1))
-        if len(sources) == 0:
-            return False
+        self.block_statistics = None
         for table in self.tables.values():
             table.flush()
-        model.blocks = self.tables["blocks"].extend(model.blocks.detach()[sources])
+        first, merged = merge_alike(model.blocks[model.block_rows], statistics, self.merge_share)
+        model.blocks[model.block_rows] = merged
+        self._keep_blocks(model.block_rows.gather(1, first))
         return True
 
     def _drop_if_due(self, done: float) -> bool:

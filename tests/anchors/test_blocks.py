@@ -1,4 +1,4 @@
-"""Blocks of features that periods share, and when they part."""
+"""Blocks of features, and which periods come to share one."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from torch import Tensor
 
 from chronoscene.anchors.blocks import (
     BlockStatistics,
-    find_splits,
+    agglomerate,
     leaders,
-    nearest_seen,
-    own_blocks,
+    merge_alike,
     pack_blocks,
-    share_equal,
     unpack_blocks,
 )
 from chronoscene.errors import CheckpointError
+
+Array = NDArray[np.float64]
 
 
 def shared_rows(anchors: int, periods: int, seed: int) -> tuple[int, Tensor]:
@@ -57,78 +58,123 @@ def test_damaged_files_are_refused(first: list[list[int]]) -> None:
         unpack_blocks(stored, 3)
 
 
-def test_equal_blocks_are_stored_once() -> None:
-    blocks = torch.tensor([[[1.0], [2.0], [1.0]], [[3.0], [3.0], [3.0]], [[4.0], [5.0], [6.0]]])
-    values, rows = share_equal(blocks)
-    assert values.flatten().tolist() == [1, 2, 3, 4, 5, 6]
-    assert rows.tolist() == [[0, 1, 0], [2, 2, 2], [3, 4, 5]]
+def clusters_by_hand(values: Array, weights: Array) -> tuple[list[float], list[Array]]:
+    """Costs, and after each step the first period of each cluster, from the definition: the cost
+    is what the weighted squares around the means of the clusters rise by. [T, F], [T]"""
+
+    def squares(members: list[int]) -> float:
+        w, v = weights[members, None], values[members]
+        mean = (w * v).sum(0) / w.sum()
+        return float((w * (v - mean) ** 2).sum())
+
+    clusters = [[t] for t in range(len(values))]
+    costs, history = [], []
+    while len(clusters) > 1:
+        pairs = [(a, b) for a in clusters for b in clusters if a[0] < b[0]]
+        rises = [squares(a + b) - squares(a) - squares(b) for a, b in pairs]
+        a, b = pairs[int(np.argmin(rises))]
+        costs.append(min(rises))
+        clusters = [c for c in clusters if c not in (a, b)] + [sorted(a + b)]
+        first = {t: cluster[0] for cluster in clusters for t in cluster}
+        history.append(np.array([first[t] for t in range(len(values))]))
+    return costs, history
 
 
-def statistics_of(gradients: dict[tuple[int, int], list[list[float]]], shape: tuple[int, int, int]):  # type: ignore[no-untyped-def]
-    """Statistics of gradients that are given by anchor and period."""
-    found = BlockStatistics(*shape, torch.device("cpu"))
-    for (anchor, period), values in gradients.items():
-        for value in values:
-            found.update(torch.tensor([anchor]), period, torch.tensor([value]))
+@settings(max_examples=30)
+@given(st.integers(2, 7), st.integers(1, 4), st.integers(0, 1000))
+def test_clusters_are_those_of_the_definition(periods: int, dim: int, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    values = generator.normal(size=(1, periods, dim))
+    weights = generator.uniform(0.1, 3.0, (1, periods))
+    expected, history = clusters_by_hand(values[0], weights[0])
+    costs, first, _ = agglomerate(values, weights, np.inf)
+    np.testing.assert_allclose(costs[0], expected, rtol=1e-9)
+    assert (np.diff(costs[0]) >= -1e-12).all()  # a limit cuts the same steps off everywhere
+    assert (first == 0).all()
+    for steps, clusters in enumerate(history[:-1], start=1):
+        limit = (expected[steps - 1] + expected[steps]) / 2
+        costs, first, merged = agglomerate(values, weights, limit)
+        assert np.isfinite(costs).sum() == steps
+        np.testing.assert_array_equal(first[0], clusters)
+        for leader in set(clusters):
+            inside = clusters == leader
+            mean = np.average(values[0, inside], axis=0, weights=weights[0, inside])
+            np.testing.assert_allclose(merged[0, leader], mean, rtol=1e-9)
+
+
+def test_a_period_that_sees_nothing_takes_a_neighbour() -> None:
+    values, weights = np.arange(6.0).reshape(1, 6, 1), np.array([[0.0, 1, 0, 0, 1, 0]])
+    _, first, merged = agglomerate(values, weights, 0.0)
+    assert first.tolist() == [[0, 0, 0, 0, 4, 4]]
+    assert merged[0, [0, 4], 0].tolist() == [1.0, 4.0]
+
+
+def statistics_of(rise: list[list[float]], drawn: list[list[int]], off: list[list[int]]):  # type: ignore[no-untyped-def]
+    """After ten views with these sums, by anchor and period."""
+    found = BlockStatistics(len(rise), len(rise[0]), torch.device("cpu"))
+    found.rise, found.drawn, found.off = (torch.tensor(t).float() for t in (rise, drawn, off))
+    found.views += 10
     return found
 
 
-def views(mean: float, count: int = 6) -> list[list[float]]:
-    """Gradients that scatter about a mean."""
-    return [[mean + 0.1 * (-1) ** i, 0.05 * (-1) ** (i // 2)] for i in range(count)]
+def test_the_rise_of_the_loss_is_shared_among_all_anchors() -> None:
+    blocks = torch.tensor([[0.0, 1.0, 5.0], [0.0, 2.0, 2.1], [7.0, 7.0, 7.0]])[..., None]
+    found = statistics_of([[2.0] * 3] * 3, [[1] * 3] * 3, [[0] * 3] * 3)
+    # Costs are half of the squared differences times the weight: 0, 0, 0.01 and 1 first.
+    for share, expected in (
+        (0.0, [[0, 1, 2], [0, 1, 2], [0, 0, 0]]),
+        (0.002, [[0, 1, 2], [0, 1, 1], [0, 0, 0]]),
+        (0.102, [[0, 0, 2], [0, 1, 1], [0, 0, 0]]),
+        (100.0, [[0, 0, 0]] * 3),
+    ):
+        first, merged = merge_alike(blocks, found, share)
+        assert first.tolist() == expected
+    torch.testing.assert_close(merged[:2, 0, 0], torch.tensor([2.0, 4.1 / 3]))
+    assert merged.dtype == torch.float32
 
 
-def test_periods_that_pull_another_way_leave_together() -> None:
-    found = statistics_of(
-        {
-            **{(0, t): views(1.0 if t in (1, 3) else -1.0) for t in range(5)},
-            **{(1, t): views(0.5) for t in range(5)},
-            **{(2, t): views(-2.0 if t == 0 else 0.0) for t in (0, 2, 4)},
-            (3, 2): views(1.0),
-        },
-        (4, 5, 2),
-    )
-    rows = own_blocks(4, 1).repeat(1, 5)
-    leaves = find_splits(found, rows, 10.0)
-    one = leaves[0].nonzero()[:, 0].tolist()
-    assert one in ([1, 3], [0, 2, 4])
-    assert not leaves[1].any()
-    assert leaves[2].nonzero()[:, 0].tolist() in ([0], [2, 4])  # not those that were never seen
-    assert not leaves[3].any()
-    # Those that left do not part again.
-    rows[0, leaves[0]] = 4
-    assert not find_splits(found, rows, 10.0)[0].any()
+def test_what_is_switched_off_is_not_taken_for_unseen() -> None:
+    blocks = torch.tensor([[0.0, 3.0]])[..., None]
+    unseen = statistics_of([[0.0, 8.0]], [[0, 4]], [[0, 0]])
+    first, merged = merge_alike(blocks, unseen, 0.01)
+    assert first.tolist() == [[0, 0]] and merged[0, 0] == 3.0
+    switched_off = statistics_of([[0.0, 8.0]], [[0, 4]], [[4, 0]])
+    torch.testing.assert_close(switched_off.weights(), torch.tensor([[8.0, 8.0]]))
+    assert merge_alike(blocks, switched_off, 0.01)[0].tolist() == [[0, 1]]
 
 
-def test_few_views_split_nothing() -> None:
-    found = statistics_of({(0, 0): views(1.0, 2), (0, 1): views(-1.0)}, (1, 2, 2))
-    assert not find_splits(found, torch.zeros(1, 2, dtype=torch.int64), 1.0).any()
+def test_statistics_of_a_view() -> None:
+    found = BlockStatistics(3, 2, torch.device("cpu"))
+    gradient, drawn = torch.tensor([[0.1, 0.2], [0.0, 0.0]]), torch.tensor([True, False])
+    found.update(torch.tensor([2, 0]), 1, gradient, drawn, loss=0.5, pixels=100)
+    expected = 100 * 0.05 / (2 * 2 * 0.25)
+    torch.testing.assert_close(found.rise, torch.tensor([[0, 0], [0, 0], [0, expected]]))
+    assert found.drawn.tolist() == [[0, 0], [0, 0], [0, 1]]
+    assert found.off.tolist() == [[0, 1], [0, 0], [0, 0]]
+    found.fade()
+    assert found.views == 0.9 and found.off[0, 1] == pytest.approx(0.9)
+    copy = BlockStatistics(3, 2, torch.device("cpu"))
+    copy.load_state(found.state())
+    assert torch.equal(copy.rise, found.rise) and copy.views == found.views
 
 
-@pytest.mark.parametrize("periods", [2, 3, 8])
-def test_scatter_alone_splits_almost_nothing(periods: int) -> None:
-    generator = torch.Generator().manual_seed(periods)
-    found = BlockStatistics(1_000, periods, 4, torch.device("cpu"))
-    for _ in range(10):
-        for period in range(periods):
-            gradient = torch.randn(1_000, 4, generator=generator)
-            found.update(torch.arange(1_000), period, gradient)
-    rows = own_blocks(1_000, 1).repeat(1, periods)
-    assert find_splits(found, rows, 8.0).any(1).float().mean() < 0.01
-    assert find_splits(found, rows, 0.0).any(1).all()
+def test_the_estimate_is_the_curvature_of_a_mean_of_independent_errors() -> None:
+    """Pixels with errors of either sign, each moved by the block in a way of its own."""
+    generator = np.random.default_rng(0)
+    pixels, dim = 4_000, 4
+    errors = generator.normal(size=pixels)
+    slopes = generator.normal(size=(pixels, dim))
+    step = 0.05 * generator.normal(size=(400, dim))
 
+    def loss(at: Array) -> float:
+        return float(np.abs(errors + slopes @ at).mean())
 
-def test_a_period_without_a_view_takes_the_nearest() -> None:
-    seen = [[False, True, False, False, True, False], [False] * 6, [True] * 6]
-    found = nearest_seen(torch.tensor(seen)).tolist()
-    assert found == [[1, 1, 1, 4, 4, 4], list(range(6)), list(range(6))]
-
-
-def test_what_is_forgotten() -> None:
-    found = statistics_of({(0, 0): [[1.0]], (1, 0): [[2.0]]}, (2, 1, 1))
-    found.fade(torch.tensor([True, False]))
-    for counter in (found.count, found.squares, found.total):
-        assert counter[0].sum() == 0 < counter[1].sum()
-    torch.testing.assert_close(found.total[1] / found.count[1, 0], torch.tensor([[2.0]]))
-    assert found.total[1] < 2
-    assert found.seen.all()
+    zero = loss(np.zeros(dim))
+    gradients = []
+    for _ in range(200):  # other signs: other views of the same curvature
+        signs = generator.choice([-1.0, 1.0], pixels)
+        gradients.append((signs[:, None] * slopes).mean(0))
+    squares = np.square(gradients).sum(1).mean()
+    rise = pixels * squares / (2 * dim * zero**2) * np.square(step).sum(1)
+    measured = np.mean([(loss(d) + loss(-d)) / 2 / zero - 1 for d in step])
+    assert 0.5 < rise.mean() / measured < 2.0

@@ -176,7 +176,7 @@ def box_of_period_1(held: Held) -> NDArray[np.bool_]:
     return trace(held.view.cam_from_world, 1)[1]
 
 
-LEAN = {"period_dim": 4, "base_dim": 28, "block_threshold": 16.0, "global_init": "zero"}
+LEAN = {"period_dim": 4, "base_dim": 28, "merge_share": 0.01, "global_init": "zero"}
 
 
 def owners(made: ChronoGS) -> float:

@@ -22,7 +22,7 @@ OPTIONS = [
     ("scaffold-gs", {"random_background": True, "exposure": "image"}),
     ("chronogs", {"exposure": "period"}),
     ("chronogs", {"unused_share": 0.05, "cooldown": 0.2}),
-    ("chronogs", {"block_threshold": 0.5, "density_interval": 8}),
+    ("chronogs", {"merge_share": 0.5, "density_interval": 8}),
     ("4dgs", {"exposure": "period"}),
     ("gs-w", {"reference": "period", "exposure": "image"}),
     ("3dgs", {"densification": "mcmc", "max_gaussians": 350, "densify_interval": 8}),
