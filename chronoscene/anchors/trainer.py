@@ -39,6 +39,7 @@ from chronoscene.training.schedule import (
     log_linear,
 )
 from chronoscene.training.splatting import (
+    centre_gradients,
     centres_count,
     collect_gradients,
     draw,
@@ -142,6 +143,7 @@ class AnchorTrainer:
             background,
             near_plane=self.config.near_plane,
             antialiased=self.config.antialiased,
+            absgrad=self.config.absgrad,
             check_finite=False,
         )
         target = to_device(photo, self.model.device)
@@ -251,14 +253,13 @@ class AnchorTrainer:
         info: RasterInfo,
         mask: Tensor | None,
     ) -> None:
-        assert info.means2d.grad is not None
         if self.statistics is None:
             self.statistics = self._new_statistics()
         radii, counted = info.radii[0], None
         if mask is not None:
             radii = radii * centres_count(info.means2d[0].detach(), mask)[:, None]
             counted = centres_count(projected_centres(self.model.anchors[visible], view), mask)
-        facts = (positions, opacities.detach(), radii, info.means2d.grad[0])
+        facts = (positions, opacities.detach(), radii, centre_gradients(info))
         self.statistics.update(visible, *facts, view.width, view.height, counted)
 
     def _new_statistics(self) -> DensityStatistics:

@@ -69,10 +69,6 @@ class GaussianConfig(SplattingConfig):
     """Steps, not moments, from one round to the next: a round needs views, not time."""
     gradient_threshold: float = 0.0002
     """Mean norm of the gradient of the projected centre, in half image sizes (tau_pos)."""
-    absgrad: bool = False
-    """Take the sum over the pixels of absolute gradients instead, which does not cancel where a
-    Gaussian is too large for what it shows (Ye et al. 2024, AbsGS). They are larger: gsplat advises
-    ``gradient_threshold=0.0008``."""
     clone_scale: float = 0.01
     """Gaussians up to this scale, times the extent of the cameras, are copied; others split."""
     split_factor: float = 1.6

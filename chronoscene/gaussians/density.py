@@ -19,7 +19,7 @@ from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.model import axes_of, dot, logit, opacities_of, scales_of
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.devices import exp, normal
-from chronoscene.training.splatting import centres_count
+from chronoscene.training.splatting import centre_gradients, centres_count
 
 PARTS = 2  # Gaussians that a split one becomes
 
@@ -48,9 +48,8 @@ class GradientStatistics:
             mask: Where the photo counts: the view does not count for Gaussians whose centre is
                 elsewhere in it. bool [H, W]
         """
-        assert info.means2d.grad is not None
         mine = slice(info.means2d.shape[1] - len(self.sums), None)
-        gradient = getattr(info.means2d, "absgrad", info.means2d.grad)[0, mine]
+        gradient = centre_gradients(info)[mine]
         # Norm of d loss / d (u, v), with u and v in half image sizes: no matter the resolution.
         x, y = gradient[:, 0] * (0.5 * width), gradient[:, 1] * (0.5 * height)
         seen = (info.radii[0, mine] > 0).all(-1)

@@ -83,6 +83,10 @@ class SplattingConfig:
     trained on (Yu et al. 2024, Mip-Splatting)."""
     ssim_weight: float = 0.2
     """Weight of 1 - SSIM in the loss; L1 gets the rest."""
+    absgrad: bool = False
+    """Add Gaussians where the sum over the pixels of a centre's absolute gradients is large, which
+    does not cancel where a Gaussian is too large for what it shows (Ye et al. 2024, AbsGS). It is
+    larger, and so must be the threshold: gsplat advises 0.0008 for 3DGS."""
     random_background: bool = False
     """Train with another colour behind everything in each step, so that no Gaussian is missing
     where a photo shows that colour. Images are rendered with the usual background."""
@@ -146,6 +150,14 @@ def draw(
         absgrad=absgrad,
         check_finite=check_finite,
     )
+
+
+def centre_gradients(info: RasterInfo) -> Tensor:
+    """Of the projected centres after ``backward``, in pixels; absolute ones if they were asked for.
+    [N, 2]"""
+    assert info.means2d.grad is not None
+    found: Tensor = getattr(info.means2d, "absgrad", info.means2d.grad)[0]
+    return found
 
 
 def weights_in(

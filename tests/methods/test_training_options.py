@@ -16,6 +16,7 @@ OPTIONS = [
     ("3dgs", {"random_background": True}),
     ("3dgs", {"exposure": "image"}),
     ("3dgs", {"absgrad": True, "densify_interval": 8}),
+    ("scaffold-gs", {"absgrad": True, "density_interval": 8}),
     ("3dgs", {"antialiased": True}),
     ("scaffold-gs", {"antialiased": True}),
     ("scaffold-gs", {"feature_bank": True, "distance_heads": ("opacity", "color")}),
