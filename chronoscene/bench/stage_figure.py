@@ -42,7 +42,7 @@ def draw_stages(runs: Path, records: Sequence[RunRecord]) -> list[Path]:
 
 
 def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]]) -> None:
-    """One row of heat maps for each method, one column for each metric."""
+    """One row of heat maps for each metric, one column for each method."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -52,20 +52,20 @@ def _draw(path: Path, scene: str, rows: dict[str, list[RunRecord]]) -> None:
     there = first.aggregates["macro"]
     metrics = [metric for metric in METRICS if metric in there]
     side = 1.2 + 0.45 * min(len(names), 2 * WRITTEN)
-    size = ((1.0 + side) * len(metrics), (0.6 + side) * len(rows) + 0.8)
+    size = ((0.6 + side) * len(rows) + 1.0, (0.8 + side) * len(metrics) + 0.6)
     figure = Figure(figsize=size, layout="constrained", dpi=150)
     FigureCanvasAgg(figure)
-    axes: Any = figure.subplots(len(rows), len(metrics), squeeze=False)
-    for column, metric in zip(axes.T, metrics, strict=True):
+    axes: Any = figure.subplots(len(metrics), len(rows), squeeze=False)
+    for row, metric in zip(axes, metrics, strict=True):
         info = metric_info(metric)
         found = [
             np.mean([stage_matrix(run.stages, metric) for run in records], axis=0)
             for records in rows.values()
         ]
-        for axis, values, title in zip(column, found, rows, strict=True):
+        for axis, values, title in zip(row, found, rows, strict=True):
             image = _draw_matrix(axis, values, found, names, info.decimals, info.higher_is_better)
             axis.set_title(f"{title}\n{info.title}", fontsize=9)
-        figure.colorbar(image, ax=list(column), location="bottom", shrink=0.8, aspect=30)
+        figure.colorbar(image, ax=list(row), shrink=0.8, aspect=20)
     title = f"{scene}: test views of each period; below the red line, those of periods seen so far"
     figure.suptitle(title, fontsize=10)
     path.parent.mkdir(parents=True, exist_ok=True)
