@@ -29,7 +29,7 @@ from chronoscene.errors import CheckpointError
 from chronoscene.kernels.compilation import kernel
 from chronoscene.training.devices import to_device
 
-_LEAST_LOSS = 1e-4
+_LEAST_LOSS = 1e-4  # Photos that are black, and shown so, say nothing
 _FORGET = 0.9  # What counts of earlier views after a round
 
 
