@@ -255,6 +255,8 @@ def _score(run: OpenRun, scene: Scene, store: ImageStore, variant: str, runs: Pa
     """Render the test views of a run whose folder has its models, and write its record."""
     writer, seconds = ImageWriter(run.folder / PREDICTIONS), 0.0
     frames = scene.select(split="test")
+    for frame in frames[:1]:  # kernels compile, or are loaded, at first use
+        run.render(store.camera(frame), frame.cam_from_world, frame.period)
     for frame in frames:
         run.model(frame.period)
         before = time.perf_counter()
