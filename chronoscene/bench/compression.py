@@ -44,6 +44,7 @@ from chronoscene.compression.positions import Grid, morton
 from chronoscene.errors import ConfigError
 from chronoscene.images.store import ImageStore
 from chronoscene.io.staging import sha256_of, staged_folder, write_text_atomic
+from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import Method
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.metrics.registry import make_scorers
@@ -255,6 +256,7 @@ def _score(run: OpenRun, scene: Scene, store: ImageStore, variant: str, runs: Pa
     """Render the test views of a run whose folder has its models, and write its record."""
     writer, seconds = ImageWriter(run.folder / PREDICTIONS), 0.0
     frames = scene.select(split="test")
+    set_threads(run.record.threads)  # as the run that it is compared with
     for frame in frames[:1]:  # kernels compile, or are loaded, at first use
         run.render(store.camera(frame), frame.cam_from_world, frame.period)
     for frame in frames:
