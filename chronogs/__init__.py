@@ -22,6 +22,7 @@ _SHORT: dict[str, Any] = _FULL | {
     "base_dim": 28,
     "period_dim": 4,
     "global_init": "zero",
+    "trim_global": True,
     "merge_share": 0.01,
     "unused_share": 0.06,
     "feature_lr": (0.015, 0.0075),

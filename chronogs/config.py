@@ -17,6 +17,10 @@ class ChronoGSConfig(AnchorConfig):
     """Length of an anchor's feature per period (d_v); 0: without local changes."""
     global_dim: int = 32
     """Length of the feature of a period (d_g); 0: without global changes."""
+    trim_global: bool = False
+    """Whether it is no longer than the number of periods less one: as the MLPs have a bias, that
+    many numbers tell the periods apart as freely as more would. One period has none then. Not in
+    the paper."""
     merge_share: float = 0.0
     """Once growth is over, features of an anchor at several periods become one where they are
     alike, as many as raise the loss by no more than this share, by estimate: see
@@ -41,6 +45,13 @@ class ChronoGSConfig(AnchorConfig):
             check_choice("global_heads", head, HEADS)
         for name in ("period_dim", "global_dim", "merge_share"):
             check_at_least(name, getattr(self, name), 0)
+        if self.fusion == "sum" and self.trim_global:
+            raise ConfigError(
+                "trim_global",
+                expected="False with fusion=sum, which adds features of one length",
+                found="True",
+                todo="set trim_global=false, or use fusion=concat",
+            )
         lengths = (self.base_dim, self.period_dim, self.global_dim)
         if self.fusion == "sum" and len({n for n in lengths if n}) > 1:
             raise ConfigError(

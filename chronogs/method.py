@@ -6,9 +6,13 @@ names both. `model` holds what is special about it; the rest is shared with Scaf
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from chronogs.config import ChronoGSConfig
 from chronogs.model import ChronoGSModel
 from chronoscene.anchors.method import AnchorMethod
+from chronoscene.anchors.model import AnchorLayout
+from chronoscene.methods import TrainingSet
 
 
 class ChronoGS(AnchorMethod):
@@ -17,6 +21,12 @@ class ChronoGS(AnchorMethod):
     name = "chronogs"
     model_class = ChronoGSModel
     config: ChronoGSConfig
+
+    def layout(self, train: TrainingSet) -> AnchorLayout:
+        layout = super().layout(train)
+        if not self.config.trim_global:
+            return layout
+        return replace(layout, global_dim=min(layout.global_dim, train.num_periods - 1))
 
     @property
     def merge_share(self) -> float:

@@ -116,16 +116,19 @@ class AnchorMethod(SplattingMethod):
         Its sparse points are not used.
         """
         assert self.trainer is not None, "setup comes first"
-        layout, tensors = self.layout(train), self.model.tensors()
-        tensors = {name: tensor.detach() for name, tensor in tensors.items()}
+        layout, seed = self.layout(train), self.trainer.seed
         periods = layout.num_periods
+        tensors = self.model.tensors() | self.model.longer_global(
+            layout.global_dim, np.random.default_rng((seed, 3, periods))
+        )
+        tensors = {name: tensor.detach() for name, tensor in tensors.items()}
         if layout.period_dim:
             rows = with_new_periods(tensors["block_rows"].T, periods).T.contiguous()
             tensors["blocks"] = tensors["blocks"][rows].flatten(0, 1)
             tensors["block_rows"] = own_blocks(len(rows), periods).to(rows)
         tensors["global_features"] = self.extended_table(tensors["global_features"], periods)
         self._model = self.model_class.from_tensors(layout, tensors)
-        self.go_on(train, self._make_trainer(train, self.trainer.seed))
+        self.go_on(train, self._make_trainer(train, seed))
 
     def _make_trainer(self, train: TrainingSet, seed: int) -> AnchorTrainer:
         self.meta["layout"] = dataclasses.asdict(self._model.layout)

@@ -27,6 +27,7 @@ from chronoscene.anchors.visibility import visible_anchors
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import View
 from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.training.devices import to_device
 from chronoscene.training.splatting import Splats, camera_centre_tensor
 
 PER_ANCHOR = ("offsets", "features", "log_scales")  # Trained tensors with one row per anchor
@@ -305,6 +306,23 @@ class AnchorModel:
         if head not in layout.global_heads:
             table = zero_columns(w1, layout.global_dim)
         return base, period, directions, table
+
+    def longer_global(self, length: int, generator: np.random.Generator) -> dict[str, Tensor]:
+        """What changes where global features get more numbers, which are zero, so that images stay.
+
+        Their weights are drawn as `draw_mlp` does.
+        """
+        added = length - self.layout.global_dim
+        if added <= 0:
+            return {}
+        table = self.global_features
+        changed = {"global_features": torch.cat([table, zero_columns(table, added)], dim=1)}
+        for name in self.layout.global_heads:
+            w1 = self.heads[name].w1
+            bound = 1.0 / math.sqrt(w1.shape[1] + added)
+            drawn = generator.uniform(-bound, bound, (len(w1), added)).astype(np.float32)
+            changed[f"{name}.w1"] = torch.cat([w1, to_device(drawn, w1.device)], dim=1)
+        return changed
 
     def _kernel_head(self, name: str) -> HeadWeights:
         """Weights with the inputs of the kernel; one that the MLP does not see has zero columns."""

@@ -50,6 +50,7 @@ def test_reading_the_specs_imports_nothing_heavy() -> None:
         ({"direction_heads": ("colour",)}, "direction_heads: .*did you mean 'color'"),
         ({"period_dim": -1}, "period_dim: expected at least 0, found -1"),
         ({"merge_share": -1.0}, "merge_share: expected at least 0, found -1.0"),
+        ({"trim_global": True, "fusion": "sum"}, "trim_global: expected False with fusion=sum"),
         ({"iterations": 0}, "iterations: expected at least 1, found 0"),
         ({"voxel_size": -1.0}, "voxel_size: expected at least 0.0, found -1.0"),
         ({"near_plane": -1.0}, "near_plane: expected at least 0.0, found -1.0"),

@@ -194,6 +194,24 @@ def test_ablations_render_and_train(method: Make, noise_set: Callable, dims: dic
     assert np.array_equal(images[0], images[1]) == timeless
 
 
+def test_a_trimmed_global_feature_grows_with_the_periods(method: Make, noise_set: Callable) -> None:
+    made = method(1, trim_global=True)
+    view, widths = noise_set(1).views[0], []
+    for periods in (1, 2, 3):
+        if periods > 1:
+            before = made.render(view, periods - 2).rgb
+            made.extend(noise_set(periods))
+            np.testing.assert_allclose(made.render(view, periods - 2).rgb, before, atol=1e-6)
+        for i in range(4):
+            made.step(i, i / 4)
+        table = made.model.global_features.detach()
+        widths.append(table.shape)
+        assert torch.linalg.matrix_rank(table - table[0]) == periods - 1
+    assert widths == [(1, 0), (2, 1), (3, 2)]
+    weights = made.model.heads["color"].w1[:, -2:]
+    assert torch.linalg.matrix_rank(weights) == 2
+
+
 def test_features_that_are_added_need_one_length(method: Make) -> None:
     with pytest.raises(ConfigError, match=r"fusion=sum: .*found 16, 16, 32"):
         method(fusion="sum")

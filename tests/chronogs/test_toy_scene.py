@@ -176,7 +176,13 @@ def box_of_period_1(held: Held) -> NDArray[np.bool_]:
     return trace(held.view.cam_from_world, 1)[1]
 
 
-LEAN = {"period_dim": 4, "base_dim": 28, "merge_share": 0.01, "global_init": "zero"}
+LEAN = {
+    "period_dim": 4,
+    "base_dim": 28,
+    "merge_share": 0.01,
+    "global_init": "zero",
+    "trim_global": True,
+}
 
 
 def owners(made: ChronoGS) -> float:
@@ -200,8 +206,9 @@ def test_a_period_with_one_image_shows_what_the_others_saw() -> None:
     assert psnr(made, 0, 1) > psnr(made, 0, 0) - 3.0
 
 
-def test_one_period_has_one_block_for_each_anchor() -> None:
+def test_one_period_has_one_block_for_each_anchor_and_no_global_feature() -> None:
     made = train((0,), steps=100, **LEAN)
+    assert made.model.global_features.shape == (1, 0)
     assert made.model.block_rows.shape == (len(made.model), 1)
     assert len(made.model.blocks) == len(made.model)
     assert psnr(made, 0, 0) > 20.0
