@@ -32,7 +32,7 @@ STEPS = 3
 LOSS_TOLERANCE = {"cpu": 3e-6, "cuda": 1e-4}
 """Of the losses, relatively. Measured on a CPU: 7e-7. Not yet measured on a GPU, nor are these:"""
 IMAGE_TOLERANCE = {"cpu": 3e-4, "cuda": 1e-3}
-"""Of images after `STEPS`. Measured on a CPU: 2e-4. Of a thousand numbers one may be further off, since
+"""Of images after `STEPS`. Measured on a CPU: 2e-4. One number in a thousand may be further off, as
 the rasterizer leaves out what covers less than `ALPHA_MIN` of a pixel."""
 RENDER_TOLERANCE = {"cpu": 3e-6, "cuda": 1e-4}
 """Of images of one model. Measured on a CPU: 6e-7."""
