@@ -386,6 +386,13 @@ def check_stages(job: Job, spec: MethodSpec) -> None:
             found="one of them",
             todo="train anew with --iterations",
         )
+    if teachers := getattr(job.method_config(spec), "teachers", 0):
+        raise ConfigError(
+            f"{spec.name} --strategy {job.strategy}: teachers",
+            expected="0, as they would have to learn each further period as well",
+            found=str(teachers),
+            todo="set teachers=0, or use another strategy",
+        )
 
 
 def check_job(job: Job, spec: MethodSpec) -> None:

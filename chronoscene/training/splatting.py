@@ -31,6 +31,7 @@ from chronoscene.training.devices import to_device
 from chronoscene.training.exposure import KINDS, exposed, of_period, transformed
 from chronoscene.training.row_adam import RowAdam
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, evaluate
+from chronoscene.training.teachers import Lessons
 
 _EXPOSURE = "exposure"  # Name of the stored transforms
 _BACKGROUND_STREAM = 3  # Keeps the colours of `step_background` apart from other random choices
@@ -93,8 +94,13 @@ class SplattingConfig:
     exposure: str = "none"
     """``image`` | ``period``: learn an affine transform of the colours for each training image, or
     for each period. A rendered view has that of its period: `chronoscene.training.exposure`."""
+    teachers: int = 0
+    """How many models are trained first, in the first half of the training; the one that stays
+    learns from the photos and from what these show, on average, between the photos. Worth it in
+    long trainings: `chronoscene.training.teachers`. Not in any of the papers."""
 
     def __post_init__(self) -> None:
+        check_at_least("teachers", self.teachers, 0)
         check_choice("exposure", self.exposure, KINDS)
         check_choice("length_unit", self.length_unit, ("world", "training"))
         check_at_least("near_plane", self.near_plane, 0.0)
@@ -318,6 +324,7 @@ class SplattingMethod(ABC):
         self.trainer: Any = None
         """What `start` gave, which has an `Exposure` as ``exposure``; None after `load`."""
         self._exposure: Tensor | None = None
+        self._lessons: Lessons | None = None
 
     @abstractmethod
     def start(self, train: TrainingSet, *, seed: int, device: str) -> Any:
@@ -359,7 +366,16 @@ class SplattingMethod(ABC):
             "num_periods": train.num_periods,
             "background": background.tolist(),
         }
-        self.trainer = self.start(train, seed=seed, device=device)
+        if self.config.teachers:
+            self._lessons = Lessons(self.config.teachers, seed, train, device)
+            self._begin_lesson(self._lessons)
+        else:
+            self.trainer = self.start(train, seed=seed, device=device)
+
+    def _begin_lesson(self, lessons: Lessons) -> None:
+        """Begin the next model: a teacher, or the one that stays."""
+        train = lessons.training_set(lambda: type(self)(self.config))
+        self.trainer = self.start(train, seed=lessons.own_seed(), device=lessons.device)
 
     def go_on(self, train: TrainingSet, trainer: Any) -> None:
         """Put another trainer in place of the one before: the last part of `extend`.
@@ -374,6 +390,11 @@ class SplattingMethod(ABC):
 
     def step(self, index: int, progress: float) -> StepReport:
         assert self.trainer is not None, "setup comes first"
+        if (lessons := self._lessons) is not None:
+            while lessons.is_over(progress):
+                lessons.end(self, index)
+                self._begin_lesson(lessons)
+            index, progress = lessons.own_time(index, progress)
         return self.trainer.step(index, progress)
 
     def render(self, view: View, period: float) -> Prediction:
@@ -434,11 +455,16 @@ class SplattingMethod(ABC):
     def save_training(self, folder: Path) -> None:
         state = self.trainer.state()
         meta = {"method": self.name, "version": self.version, "values": state.values}
+        if self._lessons is not None:
+            meta["lessons"] = self._lessons.write(folder)
         save_tensors(folder, state.tensors, meta, stem=TRAINING)
 
     def load_training(self, folder: Path) -> None:
         tensors, meta = load_tensors(folder, method=self.name, stem=TRAINING)
         try:
+            if self._lessons is not None:
+                self._lessons.read(folder, meta["lessons"])
+                self._begin_lesson(self._lessons)
             self.trainer.load_state(TrainingState(tensors, meta["values"]))
         except (KeyError, RuntimeError, ShapeError) as error:
             raise CheckpointError(
