@@ -13,13 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
-from chronoscene.methods import Method, TrainingSet, TrainingView
+from chronoscene.methods import Prediction, TrainingSet, TrainingView, View
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 
 VIEWS_PER_PHOTO = 4
@@ -28,6 +29,17 @@ NEAREST = 4
 """Photos of the same period between which such a view may lie."""
 MEMORY = 2**29
 """Bytes that their images may take: with large photos there are fewer views."""
+
+
+class Teacher(Protocol):
+    """The part of `chronoscene.methods.Method` that teaching asks for."""
+
+    def render(self, view: View, period: float) -> Prediction: ...
+
+    def save(self, folder: Path) -> None: ...
+
+    def load(self, folder: Path, *, device: str) -> None: ...
+
 
 Files = Mapping[str, bytes]
 """A saved model: the content of its files, by name."""
@@ -55,7 +67,7 @@ class Lessons:
         done = len(self.taught)
         return done < self.count and progress >= (done + 1) / (2 * self.count) - 1e-9
 
-    def end(self, method: Method, index: int) -> None:
+    def end(self, method: Teacher, index: int) -> None:
         """Keep a teacher; the next model begins with the step of this number."""
         with TemporaryDirectory() as folder:
             method.save(Path(folder))
@@ -78,7 +90,7 @@ class Lessons:
             return self.seed
         return int(np.random.SeedSequence((self.seed, 4, number)).generate_state(1)[0])
 
-    def training_set(self, make: Callable[[], Method]) -> TrainingSet:
+    def training_set(self, make: Callable[[], Teacher]) -> TrainingSet:
         """What the present model learns from.
 
         Args:
@@ -109,7 +121,7 @@ class Lessons:
             expect=expect,
         )
 
-    def _load(self, files: Files, method: Method) -> Method:
+    def _load(self, files: Files, method: Teacher) -> Teacher:
         with TemporaryDirectory() as folder:
             for name, content in files.items():
                 (Path(folder) / name).write_bytes(content)
@@ -155,9 +167,7 @@ def views_between(train: TrainingSet, generator: np.random.Generator) -> list[Tr
         share, period = generator.random(), int(generator.integers(train.num_periods))
         pose = pose_between(poses[here], poses[there], share)
         name = f"between {number}"
-        views.append(
-            replace(train.views[here], cam_from_world=pose, name=name, period=period)
-        )
+        views.append(replace(train.views[here], cam_from_world=pose, name=name, period=period))
     return views
 
 
@@ -178,7 +188,7 @@ def pose_between(
     return pose
 
 
-def mean_image(teachers: Sequence[Method], view: TrainingView) -> NDArray[np.uint8]:
+def mean_image(teachers: Sequence[Teacher], view: TrainingView) -> NDArray[np.uint8]:
     """What the teachers show in a view at its period. [H, W, 3]"""
     total = sum(teacher.render(view, float(view.period)).rgb.clip(0, 1) for teacher in teachers)
     return np.asarray(total / len(teachers) * 255 + 0.5).astype(np.uint8)
