@@ -24,7 +24,7 @@ from chronoscene.methods import Prediction, TrainingSet, TrainingView, View
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 
 VIEWS_PER_PHOTO = 4
-"""How many views the teachers show."""
+"""Views that the teachers show, to each photo."""
 NEAREST = 4
 """Photos of the same period between which such a view may lie."""
 MEMORY = 2**29
@@ -150,7 +150,8 @@ def _prefix(number: int) -> str:
 
 
 def views_between(train: TrainingSet, generator: np.random.Generator) -> list[TrainingView]:
-    """Views at random places between a photo and one of the nearest of its period, at any period.
+    """Views at random places between a photo and one of the nearest of its period, at any period
+    that has photos.
 
     Their sizes and intrinsics are those of the photo.
     """
@@ -164,7 +165,7 @@ def views_between(train: TrainingSet, generator: np.random.Generator) -> list[Tr
         of_period = np.flatnonzero(periods == periods[here])
         _, near = cKDTree(centres[of_period]).query(centres[here], min(NEAREST + 1, len(of_period)))
         there = int(generator.choice(of_period[np.atleast_1d(near)]))
-        share, period = generator.random(), int(generator.integers(train.num_periods))
+        share, period = generator.random(), int(generator.choice(np.unique(periods)))
         pose = pose_between(poses[here], poses[there], share)
         name = f"between {number}"
         views.append(replace(train.views[here], cam_from_world=pose, name=name, period=period))
