@@ -24,7 +24,6 @@ from chronoscene.methods import (
     load_spec,
     method_names,
 )
-from chronoscene.rasterizer.constants import ALPHA_MIN
 from chronoscene.training import devices
 
 STEPS = 3
@@ -32,8 +31,7 @@ STEPS = 3
 LOSS_TOLERANCE = {"cpu": 3e-6, "cuda": 1e-4}
 """Of the losses, relatively. Measured on a CPU: 7e-7. Not yet measured on a GPU, nor are these:"""
 IMAGE_TOLERANCE = {"cpu": 3e-4, "cuda": 1e-3}
-"""Of images after `STEPS`. Measured on a CPU: 2e-4. One number in a thousand may be further off, as
-the rasterizer leaves out what covers less than `ALPHA_MIN` of a pixel."""
+"""Of images after `STEPS`. Measured on a CPU: 8e-5."""
 RENDER_TOLERANCE = {"cpu": 3e-6, "cuda": 1e-4}
 """Of images of one model. Measured on a CPU: 6e-7."""
 QUESTIONS = 3
@@ -101,15 +99,18 @@ def without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_first_steps_are_those_of_the_compiled_code(
-    compiled: Compiled, first_steps: tuple[list[float], np.ndarray], device: str
+    compiled: Compiled,
+    first_steps: tuple[list[float], np.ndarray],
+    device: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     losses, image = first_steps
     method = compiled.method(device)
     found = [method.step(i, i / tiny_training.STEPS).loss for i in range(STEPS)]
     np.testing.assert_allclose(found, losses, rtol=LOSS_TOLERANCE[device])
-    difference = np.abs(compiled.image(method) - image)
-    assert np.quantile(difference, 0.999) < IMAGE_TOLERANCE[device]
-    assert difference.max() < ALPHA_MIN
+    # By one code on a CPU: Gaussians of equal depth are drawn in an order that rounding decides.
+    monkeypatch.undo()
+    np.testing.assert_allclose(compiled.image(method), image, atol=IMAGE_TOLERANCE[device])
 
 
 def test_training_lowers_the_loss_and_the_checkpoint_moves_between_devices(
