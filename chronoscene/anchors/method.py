@@ -116,11 +116,10 @@ class AnchorMethod(SplattingMethod):
         Its sparse points are not used.
         """
         assert self.trainer is not None, "setup comes first"
-        layout, seed = self.layout(train), self.trainer.seed
+        layout, model, seed = self.layout(train), self.model, self.trainer.seed
         periods = layout.num_periods
-        tensors = self.model.tensors() | self.model.longer_global(
-            layout.global_dim, np.random.default_rng((seed, 3, periods))
-        )
+        generator = np.random.default_rng((seed, 3, periods))
+        tensors = model.tensors() | model.longer_global(layout.global_dim, generator)
         tensors = {name: tensor.detach() for name, tensor in tensors.items()}
         if layout.period_dim:
             rows = with_new_periods(tensors["block_rows"].T, periods).T.contiguous()

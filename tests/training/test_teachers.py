@@ -36,10 +36,10 @@ def lessons(count=2, seed=0):
     return Lessons(count, seed, tiny_training.make_training_set(2), "cpu")
 
 
-def own_times(made, steps, until=None):
+def own_times(made, steps):
     """Of all steps of a training of that length, with the number of teachers trained by then."""
     found = []
-    for index in range(until or steps):
+    for index in range(steps):
         while made.is_over(index / steps):
             made.end(Plain(), index)
         found.append((len(made.taught), *made.own_time(index, index / steps)))
