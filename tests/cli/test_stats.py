@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from skeletons.dataset import write_skeleton
 
+from benchmarks.data.skeletons.dataset import write_skeleton
 from chronoscene.cli import cli
 from chronoscene.cli.stats import against_paper
 from chronoscene.errors import ConfigError

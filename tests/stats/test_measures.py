@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from skeletons.dataset import write_skeleton
 
+from benchmarks.data.skeletons.dataset import write_skeleton
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.scene.geometry import camera_centre

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from skeletons.dataset import write_skeleton
 
+from benchmarks.data.skeletons.dataset import write_skeleton
 from chronoscene.formats import read_scene
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 from chronoscene.stats.measures import DEPTH_PERCENTILE, REACH_FACTOR, in_view, reproject

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from generated_registrations import CaseSettings, generate_case, pose_errors
 
+from benchmarks.registration.generated import CaseSettings, generate_case, pose_errors
 from chronoscene.registration.quality import certificate as certificate_module
 from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
 from chronoscene.registration.quality.certificate_json import pair_figures, period_figures, to_json

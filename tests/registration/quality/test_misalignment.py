@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from generated_registrations import CaseSettings, Generated, generate_case, pose_errors
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from benchmarks.registration.generated import CaseSettings, Generated, generate_case, pose_errors
 from chronoscene.registration.quality.misalignment import (
     measure,
     rotation_angle,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from generated_registrations import CaseSettings, generate_case
 
+from benchmarks.registration.generated import CaseSettings, generate_case
 from chronoscene.registration.output import inspect_registration
 from chronoscene.registration.quality import rays
 from chronoscene.registration.quality.rays import Rays, model_rays, place

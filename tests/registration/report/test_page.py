@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from generated_registrations import CaseSettings, generate_case
 from PIL import Image
 
+from benchmarks.registration.generated import CaseSettings, generate_case
 from chronoscene.registration.output import inspect_registration
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.rays import gather

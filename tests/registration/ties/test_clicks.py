@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from generated_registrations import pose_errors
 from PIL import Image, ImageOps
 
+from benchmarks.registration.generated import pose_errors
 from chronoscene.formats import read_scene
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.features.matching import Matched

@@ -7,8 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from generated_registrations import CAMERA, CaseSettings, Generated, generate_case, pose_errors
 
+from benchmarks.registration.generated import (
+    CAMERA,
+    CaseSettings,
+    Generated,
+    generate_case,
+    pose_errors,
+)
 from chronoscene.errors import SceneError
 from chronoscene.registration.quality.certificate import certify
 from chronoscene.registration.quality.verdict import judge

@@ -1,0 +1,42 @@
+"""gsplat's own reference in torch, the function behind its tests.
+
+Its projection and tile intersection are plain torch, but its compositing calls the compiled
+extension, so it runs only where gsplat's CUDA extension does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from benchmarks.rasterizer.peers import UnavailableError
+from benchmarks.rasterizer.scenes import Scene
+
+NAME = "gsplat torch"
+WHAT = "gsplat's pure-torch reference (_rasterization)"
+
+
+def make(scene: Scene) -> Callable[[bool], Tensor]:
+    """Rendering of a scene; tried once, so that what it lacks is said before anything is timed."""
+    try:
+        from gsplat.rendering import _rasterization
+    except Exception as error:
+        raise UnavailableError(f"{type(error).__name__}: {error}") from error
+
+    def run(backward: bool) -> Tensor:
+        scene.drop_gradients()
+        arrays = (*scene.gaussians, scene.viewmats, scene.Ks, scene.width, scene.height)
+        with torch.set_grad_enabled(backward):
+            image: Tensor = _rasterization(*arrays)[0]
+            if backward:
+                image.backward(scene.image_grad)
+        return image[0].detach()
+
+    try:
+        run(backward=False)
+    except Exception as error:  # whatever it fails with is what the table shall say
+        reason = str(error).strip().splitlines() or [""]
+        raise UnavailableError(f"{type(error).__name__}: {reason[0]}") from error
+    return run

@@ -1,0 +1,1 @@
+"""Registrations whose truth is known."""

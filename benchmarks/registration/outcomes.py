@@ -1,0 +1,112 @@
+"""Outcomes of registrations, and the call of the command; shared by the tiers of `accuracy.py`."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.registration.generated import pose_errors
+from chronoscene.registration.output import Inspection
+from chronoscene.registration.pipeline import Options
+from chronoscene.registration.quality.verdict import Verdict
+from chronoscene.registration.result import Registered
+from chronoscene.scene.geometry import camera_centre
+
+ROUTES = ("joint", "separate", "frozen")
+
+REFUSED = "refused"
+
+ROTATION, CENTRE = 0.1, 0.2
+"""Degrees, and percent of the extent, within which a registration is right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One case: errors of each period but the first, and the verdict."""
+
+    family: str
+    route: str
+    """Empty where there is no choice."""
+    periods: tuple[tuple[float, float, float, float], ...]
+    """Rotation median and largest, degrees; centre median and largest, percent of the extent."""
+    verdict: str
+    reason: str
+    seconds: float
+    """CPU time."""
+
+    @property
+    def right(self) -> bool:
+        return all(r < ROTATION and c < CENTRE for r, _, c, _ in self.periods)
+
+
+def judged(
+    family: str,
+    route: str,
+    model: Registered,
+    truth: np.ndarray,
+    verdict: Verdict,
+    seconds: float,
+    where: np.ndarray | None = None,
+) -> Outcome:
+    """Compare a registration with the truth [N, 4, 4], where that is known. [N]"""
+    where = np.ones(len(truth), bool) if where is None else where
+    rotation, centre = pose_errors(model.cam_from_world, truth, where & (model.periods == 0))
+    extent = true_extent(truth[where])
+    rows = []
+    for p in range(1, model.num_periods):
+        mine = where & (model.periods == p)
+        if not mine.any():
+            rows.append((np.inf,) * 4)
+            continue
+        r, c = rotation[mine], 100 * centre[mine] / extent
+        rows.append((np.median(r), r.max(), np.median(c), c.max()))
+    reason = verdict.findings[0].check if verdict.findings else ""
+    return Outcome(family, route, tuple(rows), verdict.level, reason, seconds)
+
+
+def refused(family: str, route: str, periods: int, seconds: float) -> Outcome:
+    """A command that ended with a message instead of a registration."""
+    return Outcome(family, route, ((np.inf,) * 4,) * (periods - 1), REFUSED, "", seconds)
+
+
+def true_extent(truth: np.ndarray) -> float:
+    """Diagonal of the box around the true cameras."""
+    return float(np.linalg.norm(np.ptp(camera_centre(truth), axis=0)))
+
+
+@contextmanager
+def work_folder(kept: Path | None) -> Iterator[Path]:
+    if kept is not None:
+        kept.mkdir(parents=True, exist_ok=True)
+        yield kept
+        return
+    with tempfile.TemporaryDirectory(prefix="chronoscene-") as folder:
+        yield Path(folder)
+
+
+def cpu_seconds() -> float:
+    """Seconds of this process and of those it started and waited for."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def options_for(work: Path, route: str | None) -> Options:
+    """Return the options of the command, with the page; None lets it choose the route."""
+    return Options(route=route, overwrite=True, work=work, page=True)  # type: ignore[arg-type]
+
+
+def print_outcome(outcome: Outcome, inspection: Inspection) -> None:
+    """Errors by period, the verdict, and what it rests on."""
+    for p, row in enumerate(outcome.periods, 1):
+        print(
+            f"  period {p}: rotation {row[0]:.4f} (largest {row[1]:.4f}) degrees, centre "
+            f"{row[2]:.4f} (largest {row[3]:.4f}) % of the extent"
+        )
+    findings = "; ".join(f"{f.check} {f.place}: {f.found}" for f in inspection.verdict.findings[:2])
+    print(f"  verdict {outcome.verdict} {findings}", flush=True)
