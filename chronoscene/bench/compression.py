@@ -41,8 +41,9 @@ from chronoscene.bench.strategies import period_part
 from chronoscene.compression.columns import Columns
 from chronoscene.compression.file import COMPRESSED_FILE, META_FILE, TENSOR_FILE, encode
 from chronoscene.compression.positions import Grid, morton
-from chronoscene.errors import ConfigError
+from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.images.store import ImageStore
+from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import sha256_of, staged_folder, write_text_atomic
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import Method
@@ -312,4 +313,4 @@ def _describe(model: Path, out: Path, file: str) -> None:
 
 
 def _meta(folder: Path) -> dict[str, Any]:
-    return dict(json.loads((folder / META_FILE).read_text(encoding="utf-8")))
+    return dict(read_json_document(folder / META_FILE, error=CheckpointError))

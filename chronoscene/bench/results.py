@@ -17,6 +17,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from chronoscene.errors import CheckpointError
+from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import csv_text
 
@@ -202,16 +203,14 @@ def read_config(folder: Path) -> dict[str, Any]:
         CheckpointError: If it is missing or damaged.
     """
     path = folder / CONFIG_FILE
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        found = "" if isinstance(document["config"]["method_config"], dict) else "none in it"
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        found = str(error)
-    if found:
-        raise CheckpointError(
-            path, expected="the config of the run", found=found, todo="delete the run"
-        )
-    return dict(document)
+    expected, todo = "the config of the run", "delete the run"
+    if not path.is_file():
+        raise CheckpointError(path, expected=expected, found="no such file", todo=todo)
+    document: dict[str, Any] = read_json_document(path, error=CheckpointError, todo=todo)
+    config = document.get("config")
+    if not isinstance(config, dict) or not isinstance(config.get("method_config"), dict):
+        raise CheckpointError(path, expected=expected, found="none in it", todo=todo)
+    return document
 
 
 def read_rows(folder: Path) -> list[Row]:

@@ -16,8 +16,8 @@ from chronoscene.bench.predictions import image_file
 from chronoscene.colmap.model import read_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats.shared import transforms
-from chronoscene.formats.shared.json_values import json_error, number, read_json
 from chronoscene.images.store import ImageStore, evaluation_size, resize_camera
+from chronoscene.io.documents import json_error, number, read_json_document
 from chronoscene.scene import Camera, Scene
 from chronoscene.scene.cameras import undistorted_camera
 from chronoscene.scene.orbit import orbit
@@ -168,7 +168,7 @@ def _of_model(run: OpenRun, folder: Path) -> Shots:
 
 def _of_path(run: OpenRun, path: Path) -> Shots:
     """A camera path as nerfstudio's viewer exports it."""
-    data = read_json(path, dict)
+    data = read_json_document(path)
     kind = data.get("camera_type", "perspective")
     if kind != "perspective":
         raise json_error(path, "perspective cameras", repr(kind), "export the path again")
@@ -211,7 +211,7 @@ def _world_from_file(path: Path) -> Sim3:
     """From the frame of a model of nerfstudio to the world; the same where no file tells it."""
     if not path.is_file():
         return Sim3(1.0, np.eye(3), np.zeros(3))
-    data = read_json(path, dict)
+    data = read_json_document(path)
     matrix = transforms.matrix(f"{path}: transform", data.get("transform"), (3, 4))
     scale = number(path, data, "scale")
     if scale is None or scale <= 0:

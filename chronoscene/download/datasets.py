@@ -17,7 +17,8 @@ from chronoscene.download.archives import ARCHIVES, archive_stem, open_archive, 
 from chronoscene.download.catalogue import Dataset
 from chronoscene.download.hub import list_files, request_headers
 from chronoscene.download.transfer import RemoteFile, check_space, fetch, missing_bytes
-from chronoscene.errors import ConfigError, DownloadError
+from chronoscene.errors import ConfigError, DownloadError, SceneError
+from chronoscene.io.documents import read_json_document
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import counted, in_words, shown
@@ -225,9 +226,9 @@ def _check_names(dataset: Dataset, scenes: Collection[str], known: Collection[st
 
 def _read_record(out: Path) -> _Record:
     try:
-        content = json.loads((out / RECORD).read_text("utf-8"))
+        content = read_json_document(out / RECORD)
         return _Record(dict(content["scenes"]), dict(content["archives"]))
-    except (OSError, ValueError, KeyError, TypeError):
+    except (SceneError, ValueError, KeyError, TypeError):
         return _Record({}, {})
 
 

@@ -15,11 +15,11 @@ from chronoscene.formats.shared.json_values import (
     parse_periods,
     parse_world,
     period_items,
-    read_json,
     world_item,
 )
 from chronoscene.images.masks import MASKS, find_masks
 from chronoscene.images.store import ImageSource, Progress, place_images
+from chronoscene.io.documents import read_json_document, read_text
 from chronoscene.io.staging import leads_out, staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame, splits
 
@@ -56,7 +56,7 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
         SceneError: If files are missing, damaged, or contradict each other.
     """
     path = Path(path)
-    entries, problems = splits.parse_split_text(splits.read_text(path / SPLIT))
+    entries, problems = splits.parse_split_text(read_text(path / SPLIT))
     raise_first(path / SPLIT, problems)
     model = model or _read_model(path)
     for image in model.images:
@@ -160,7 +160,7 @@ def read_tests(path: Path, names: list[str], periods: dict[str, int]) -> tuple[s
     """Names of the test images, and the rule that chose them in words."""
     if not (path / TEST).exists():
         return splits.default_tests(periods), splits.DEFAULT_RULE
-    entries = splits.parse_test_text(splits.read_text(path / TEST))
+    entries = splits.parse_test_text(read_text(path / TEST))
     tests, problems = splits.assign_tests(names, entries)
     raise_first(path / TEST, problems)
     return tests, TEST
@@ -182,7 +182,7 @@ def read_periods(path: Path, count: int) -> tuple[Period, ...]:
         )
     if not (path / PERIODS).exists():
         return tuple(Period(i, str(i)) for i in range(count))
-    return parse_periods(path / PERIODS, read_json(path / PERIODS, list), count)
+    return parse_periods(path / PERIODS, read_json_document(path / PERIODS, list), count)
 
 
 def read_world(path: Path) -> WorldFrame:
@@ -190,7 +190,7 @@ def read_world(path: Path) -> WorldFrame:
     place = path / WORLD
     if not place.exists():
         return WorldFrame()
-    return parse_world(place, read_json(place, dict))
+    return parse_world(place, read_json_document(place))
 
 
 def write(

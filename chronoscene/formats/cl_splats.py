@@ -21,10 +21,10 @@ from pathlib import Path
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared import colmap_layout, transforms
 from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
-from chronoscene.formats.shared.json_values import read_json
 from chronoscene.formats.shared.ply import read_points
 from chronoscene.formats.shared.transforms import CameraTable, Shot
 from chronoscene.images.store import ImageSource, Progress
+from chronoscene.io.documents import read_json_document
 from chronoscene.scene import Camera, Points, Scene
 from chronoscene.scene.cameras import PINHOLE_MODELS, as_pinhole
 from chronoscene.scene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
@@ -126,7 +126,7 @@ def _read_level(path: Path, period_by: str) -> Scene:
 
 def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list[Shot]:
     place = path / folder / file
-    data = read_json(place, dict)
+    data = read_json_document(place)
     shots = []
     for i, frame in enumerate(transforms.read_frames(place, data)):
         where = f"{place}: frames[{i}]"

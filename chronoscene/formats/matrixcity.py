@@ -29,9 +29,9 @@ from chronoscene.errors import SceneError
 from chronoscene.formats.shared import transforms
 from chronoscene.formats.shared.colmap_layout import scan
 from chronoscene.formats.shared.grouping import Grouped, group_labels, natural_key, rule_error
-from chronoscene.formats.shared.json_values import json_error, read_json
 from chronoscene.formats.shared.transforms import CameraTable, Shot
 from chronoscene.images.decoding import image_size
+from chronoscene.io.documents import json_error, read_json_document
 from chronoscene.scene import Period, Points, Scene, WorldFrame
 from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
@@ -182,7 +182,7 @@ def _pose_files(path: Path) -> list[PoseFile]:
 
 def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[Shot]:
     place = path / file.folder / file.name
-    data = read_json(place, dict)
+    data = read_json_document(place)
     shots: list[Shot] = []
     for i, frame in enumerate(transforms.read_frames(place, data)):
         where = f"{place}: frames[{i}]"

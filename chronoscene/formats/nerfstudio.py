@@ -32,18 +32,16 @@ from chronoscene.formats.chronoscene import MAX_COORDINATE, MAX_PERIODS, check_n
 from chronoscene.formats.matrixcity import RAW_KEY
 from chronoscene.formats.shared import grouping, transforms
 from chronoscene.formats.shared.json_values import (
-    json_error,
-    number,
     parse_periods,
     parse_world,
     period_items,
-    read_json,
     world_item,
 )
 from chronoscene.formats.shared.ply import read_points, write_points
 from chronoscene.formats.shared.transforms import CameraTable, Shot
 from chronoscene.images.masks import mask_place
 from chronoscene.images.store import ImageSource, Progress, place_images
+from chronoscene.io.documents import json_error, number, read_json_document
 from chronoscene.io.staging import staged_folder
 from chronoscene.scene import Camera, Period, Points, Scene, WorldFrame
 from chronoscene.scene.similarity import Sim3
@@ -83,7 +81,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     """
     path = Path(path)
     place = path / FILE
-    data = read_json(place, dict)
+    data = read_json_document(place)
     frames = transforms.read_frames(place, data)
     named = _by_name(path, frames)
     shots, tests, rule = _apply_lists(path, data, _read_shots(path, data, named), named)
@@ -107,7 +105,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
 
 def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
-    data = read_json(path / FILE, dict)
+    data = read_json_document(path / FILE)
     frames = transforms.read_frames(path / FILE, data)
     depths = sum("depth_file_path" in frame for frame in frames)
     found = [f"depth maps of {depths} frames are not read"] if depths else []

@@ -26,8 +26,9 @@ from chronoscene.colmap.model import Model
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared import colmap_layout
 from chronoscene.formats.shared.grouping import group_dates
+from chronoscene.io.documents import read_text
 from chronoscene.scene import Scene
-from chronoscene.scene.splits import NameIndex, parse_test_text, read_text
+from chronoscene.scene.splits import NameIndex, parse_test_text
 
 NAME = "neusc"
 MARKS = "dense/images/ with dates in the names, and dense/sparse/"  # What `matches` looks for

@@ -23,7 +23,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from chronoscene.errors import DiskFullError, RegistrationError
+from chronoscene.errors import DiskFullError, RegistrationError, SceneError
+from chronoscene.io.documents import read_json_document
 from chronoscene.io.processes import Report, run_worker
 from chronoscene.io.staging import write_text_atomic
 
@@ -101,10 +102,10 @@ class Stages:
 def read_record(path: Path) -> dict[str, Any] | None:
     """A dictionary from a JSON file; None if there is none that can be read."""
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        record: dict[str, Any] = read_json_document(path)
+    except SceneError:
         return None
-    return record if isinstance(record, dict) else None
+    return record
 
 
 @contextmanager

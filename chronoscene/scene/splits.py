@@ -76,33 +76,6 @@ class NameEntry:
     name: str
 
 
-def read_text(path: Path) -> str:
-    """Read a small text file written by any common editor (UTF-8 with or without BOM, UTF-16).
-
-    Raises:
-        SceneError: If it is missing or not text.
-    """
-    try:
-        return decode_text(path.read_bytes())
-    except UnicodeDecodeError:
-        found, todo = "bytes that are not UTF-8", "save it as UTF-8"
-    except FileNotFoundError:
-        found, todo = "nothing", "check the path"
-    except IsADirectoryError:
-        found, todo = "a folder", "name a file"
-    except OSError as error:
-        found = error.strerror or "a file that cannot be read"
-        todo = "make it readable, or check the path"
-    raise SceneError(path, expected="a text file", found=found, todo=todo)
-
-
-def decode_text(data: bytes) -> str:
-    """Decode UTF-8 or, where a byte order mark says so, UTF-16 (as some Windows shells write)."""
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return data.decode("utf-16")
-    return data.decode("utf-8-sig")
-
-
 def parse_split_text(text: str) -> tuple[list[SplitEntry], list[Problem]]:
     """Parse ``<image name> <period id>`` lines.
 

@@ -23,11 +23,13 @@ from torch import Tensor
 from chronoscene.compression.file import COMPRESSED_FILE, META_FILE, read_compressed
 from chronoscene.compression.file import TENSOR_FILE as TENSOR_FILE
 from chronoscene.errors import CheckpointError
+from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import replacing, sha256_of, write_text_atomic
 
 TRAINING = "training"
 """Stem of the files that hold a training."""
 FORMAT_VERSION = 1
+DAMAGED = "the file is damaged or was edited: copy it again or train again"
 
 
 class TrainingState(NamedTuple):
@@ -109,14 +111,11 @@ def load_tensors(
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
-    try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
+    if not path.is_file():
         todo = "name the folder that a finished training wrote"
-        raise _refusal(path, "the description of a trained model", "no such file", todo) from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise _refusal(path, "JSON", str(error)) from error
-    if not isinstance(meta, dict) or "tensors_sha256" not in meta:
+        raise _refusal(path, "the description of a trained model", "no such file", todo)
+    meta: dict[str, Any] = read_json_document(path, error=CheckpointError, todo=DAMAGED)
+    if "tensors_sha256" not in meta:
         raise _refusal(path, "an object with the key 'tensors_sha256'", "none")
     if (version := meta.get("format_version")) != FORMAT_VERSION:
         todo = "use the version of the software that wrote it, or train again"
@@ -124,10 +123,5 @@ def _read_meta(path: Path) -> dict[str, Any]:
     return meta
 
 
-def _refusal(
-    path: Path,
-    expected: str,
-    found: str,
-    todo: str = "the file is damaged or was edited: copy it again or train again",
-) -> CheckpointError:
+def _refusal(path: Path, expected: str, found: str, todo: str = DAMAGED) -> CheckpointError:
     return CheckpointError(path, expected=expected, found=found, todo=todo)

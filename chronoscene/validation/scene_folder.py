@@ -23,6 +23,7 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, read_periods
 from chronoscene.formats.shared.colmap_layout import Assigned
 from chronoscene.images.masks import MASKS, mask_name, mask_place
+from chronoscene.io.documents import decode_text
 from chronoscene.scene import Camera, Period, Scene, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.splits import NameEntry, Problem, SplitEntry
@@ -414,7 +415,7 @@ def read_text_file(path: Path) -> TextFile | None:
         if not path.is_file():  # a pipe would block
             return None
         data = path.read_bytes()
-        text = splits.decode_text(data)
+        text = decode_text(data)
         return None if "\0" in text else TextFile(data, text)  # UTF-16 without its mark
     except (OSError, UnicodeDecodeError):
         return None

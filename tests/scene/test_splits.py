@@ -17,7 +17,6 @@ from chronoscene.scene.splits import (
     _image_keys,
     assign_periods,
     assign_tests,
-    decode_text,
     default_tests,
     format_split_text,
     parse_split_text,
@@ -63,11 +62,6 @@ def test_any_text_gives_entries_or_problems_for_every_line(text):
     assert len(lines) == len(parsed) + len(problems)
     assert len(lines) == len(parse_test_text(text))
     assert all(e.period >= 0 and e.name for e in parsed)
-
-
-@given(texts, st.sampled_from(["utf-8", "utf-8-sig", "utf-16"]))
-def test_encodings(text, encoding):
-    assert decode_text(text.lstrip("\ufeff").encode(encoding)) == text.lstrip("\ufeff")
 
 
 def test_every_bad_line_is_reported():

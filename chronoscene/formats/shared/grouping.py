@@ -17,9 +17,10 @@ from pathlib import Path
 
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.shared.json_values import is_iso_date
+from chronoscene.io.documents import read_text
 from chronoscene.io.wording import shown
 from chronoscene.scene import Period
-from chronoscene.scene.splits import NameIndex, read_text
+from chronoscene.scene.splits import NameIndex
 
 Grouped = tuple[dict[str, int], tuple[Period, ...]]
 """Period of each image, and the periods."""

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from chronoscene.formats.chronoscene import MAX_COORDINATE
 from chronoscene.formats.shared.grouping import Grouped
-from chronoscene.formats.shared.json_values import json_error, number
 from chronoscene.images.decoding import image_size
+from chronoscene.io.documents import json_error, number
 from chronoscene.scene import Camera, Frame, Points, Scene
 from chronoscene.scene.cameras import CAMERA_MODELS, MAX_SIDE
 from chronoscene.scene.splits import IMAGE_SUFFIXES, split_of

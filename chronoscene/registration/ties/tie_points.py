@@ -20,7 +20,7 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
 from chronoscene.geodesy import Georeference
-from chronoscene.scene.splits import read_text
+from chronoscene.io.documents import read_text
 
 COLUMNS = {
     "point": ("point", "point id", "point_id", "id", "name", "label"),
