@@ -15,10 +15,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from chronoscene.bench.regions import ALL
-from chronoscene.bench.results import Row, RunRecord
-from chronoscene.bench.scoring import aggregate
-from chronoscene.bench.summary import COSTS
+from chronoscene.bench.files.records import Row, RunRecord
+from chronoscene.bench.report.summary import COSTS
+from chronoscene.bench.score.regions import ALL
+from chronoscene.bench.score.scoring import aggregate
 from chronoscene.errors import ConfigError
 from chronoscene.io.staging import leads_out
 from chronoscene.metrics.registry import all_metrics

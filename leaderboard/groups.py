@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from chronoscene.bench.results import RunRecord
+from chronoscene.bench.files.records import RunRecord
 
 
 class Setting(NamedTuple):

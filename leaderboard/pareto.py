@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from chronoscene.bench.tradeoff import on_front
+from chronoscene.bench.report.tradeoff import on_front
 
 WIDTH, HEIGHT = 440, 300
 LEFT, RIGHT, TOP, BOTTOM = 52, 16, 14, 44

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench.predictions import ImageEntry, ground_truth_folder, load_image, read_manifest
-from chronoscene.bench.results import PREDICTIONS, RunRecord, read_run, run_folders
+from chronoscene.bench.files.ground_truth import ground_truth_folder
+from chronoscene.bench.files.predictions import ImageEntry, load_image, read_manifest
+from chronoscene.bench.files.records import PREDICTIONS, RunRecord, read_run, run_folders
 from chronoscene.formats.shared.grouping import natural_key
 from leaderboard.entries import Entry, EntryRun
 

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from chronoscene.bench.job import command_line
-from chronoscene.bench.results import RunRecord
-from chronoscene.bench.summary import (
+from chronoscene.bench.files.command_line import command_line
+from chronoscene.bench.files.records import RunRecord
+from chronoscene.bench.report.published import PublishedTable
+from chronoscene.bench.report.summary import (
     PAPER_METRICS,
     SIZE,
     in_unit,
@@ -22,8 +23,8 @@ from chronoscene.bench.summary import (
     published_entries,
     summarise,
 )
-from chronoscene.bench.tables import period_title
-from chronoscene.bench.tradeoff import as_configurations
+from chronoscene.bench.report.tables import period_title
+from chronoscene.bench.report.tradeoff import as_configurations
 from chronoscene.io.pages import render_page
 from chronoscene.io.staging import staged_folder
 from chronoscene.methods import MethodSpec, installed_methods, load_spec
@@ -32,7 +33,6 @@ from leaderboard.entries import Entry
 from leaderboard.groups import Setting, comparable, setting_of
 from leaderboard.pareto import Point, plot
 from leaderboard.pictures import find_runs, gallery
-from leaderboard.published import PublishedTable
 
 if TYPE_CHECKING:
     from pandas import DataFrame

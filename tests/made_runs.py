@@ -5,9 +5,10 @@ from zlib import crc32
 
 import numpy as np
 
-from chronoscene.bench.predictions import ImageWriter, ground_truth_folder
-from chronoscene.bench.results import PREDICTIONS, Row, RunRecord, write_run
-from chronoscene.bench.scoring import aggregate
+from chronoscene.bench.files.ground_truth import ground_truth_folder
+from chronoscene.bench.files.predictions import ImageWriter
+from chronoscene.bench.files.records import PREDICTIONS, Row, RunRecord, write_run
+from chronoscene.bench.score.scoring import aggregate
 
 
 def record(method="chronogs", seed=0, *, psnr=(20.0, 30.0), ssim=None, **changes):

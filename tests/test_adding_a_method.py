@@ -14,7 +14,7 @@ from chronoscene.scene.similarity import Sim3
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/adding-a-method.md").read_text(encoding="utf-8")
-EXAMPLE = ROOT / "chronoscene/cli/skeleton"
+EXAMPLE = ROOT / "chronoscene/cli/methods/skeleton"
 
 
 def shown_files():

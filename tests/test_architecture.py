@@ -14,7 +14,13 @@ LAYERS = (
     ("chronogs", "baselines", "chronoscene.__main__"),
     ("chronoscene.cli",),
     ("leaderboard",),
-    ("chronoscene.bench", "chronoscene.registration", "chronoscene.figures", "chronoscene.synth"),
+    ("chronoscene.bench.study", "chronoscene.bench.contract"),
+    ("chronoscene.bench.run", "chronoscene.bench.train"),
+    ("chronoscene.bench.report", "chronoscene.bench.use"),
+    ("chronoscene.bench.score",),
+    ("chronoscene.bench.plan",),
+    ("chronoscene.bench.files", "chronoscene.bench"),
+    ("chronoscene.registration", "chronoscene.figures", "chronoscene.synth"),
     ("chronoscene.stats", "chronoscene.validation", "chronoscene.download"),
     ("chronoscene.anchors", "chronoscene.gaussians"),
     ("chronoscene.training",),
@@ -24,7 +30,7 @@ LAYERS = (
     ("chronoscene.images",),
     ("chronoscene.colmap",),
     ("chronoscene.scene",),
-    ("chronoscene.compression", "chronoscene.io", "chronoscene.geodesy", "leaderboard.published"),
+    ("chronoscene.compression", "chronoscene.io", "chronoscene.geodesy"),
     ("chronoscene.kernels",),
     ("chronoscene.checks",),
     ("chronoscene.errors", "chronoscene.arrays"),
@@ -35,7 +41,7 @@ TORCH_SIDE = {f"chronoscene.{name}" for name in ("anchors", "gaussians", "traini
 """Rooms that need torch and are used by methods only."""
 
 
-SKELETON = set((ROOT / "chronoscene/cli/skeleton").rglob("*.py"))
+SKELETON = set((ROOT / "chronoscene/cli/methods/skeleton").rglob("*.py"))
 
 
 def modules() -> dict[str, Path]:

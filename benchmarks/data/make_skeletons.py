@@ -13,7 +13,7 @@ from pathlib import Path
 
 from benchmarks.data.skeletons.dataset import write_dataset
 from chronoscene.cli.progress import progress_bar
-from chronoscene.cli.synth import parse_size
+from chronoscene.cli.scenes.synth import parse_size
 from chronoscene.errors import ChronoSceneError
 
 

@@ -23,10 +23,10 @@ import numpy as np
 from baselines.cl_splats import SPEC
 from baselines.cl_splats.changes import change_mask, change_scores
 from baselines.cl_splats.method import CLSplats
-from chronoscene.bench.job import StopRule
-from chronoscene.bench.predictions import encode_png
-from chronoscene.bench.strategies import Part, make_parts
-from chronoscene.bench.training_loop import seed_everything
+from chronoscene.bench.files.predictions import encode_png
+from chronoscene.bench.plan.parts import Part, make_parts
+from chronoscene.bench.plan.stop import StopRule
+from chronoscene.bench.train.loop import seed_everything
 from chronoscene.formats import read_scene
 from chronoscene.images.store import MAX_WIDTH, ImageStore
 from chronoscene.images.truth import UNCHANGED, load_changes, truth_place

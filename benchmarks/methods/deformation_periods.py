@@ -22,9 +22,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from chronoscene.bench.opening import open_run
-from chronoscene.bench.rendering import render_shots
-from chronoscene.bench.shots import find_shots
+from chronoscene.bench.use.cameras import find_shots
+from chronoscene.bench.use.rendering import render_shots
+from chronoscene.bench.use.trained_run import open_run
 from chronoscene.metrics.psnr_ssim import psnr
 
 CELL = 2.0  # Inches per image

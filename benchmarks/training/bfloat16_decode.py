@@ -33,9 +33,9 @@ from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
 from chronoscene.anchors.decode import HeadWeights
 from chronoscene.anchors.model import HEADS
-from chronoscene.bench.provenance import code_version, processor_name
-from chronoscene.bench.strategies import make_parts
-from chronoscene.bench.training_loop import render_bytes
+from chronoscene.bench.files.provenance import code_version, processor_name
+from chronoscene.bench.plan.parts import make_parts
+from chronoscene.bench.train.loop import render_bytes
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
 from chronoscene.kernels.matmul import product

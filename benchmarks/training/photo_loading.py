@@ -35,13 +35,13 @@ import chronoscene  # noqa: F401
 import numpy as np
 from PIL import Image
 
-from chronoscene.bench.job import StopRule
-from chronoscene.bench.photos import open_store
-from chronoscene.bench.plan import BenchSettings, plan_jobs
-from chronoscene.bench.provenance import code_version, peak_memory_bytes, processor_name
-from chronoscene.bench.results import PHOTOS
-from chronoscene.bench.strategies import Part, make_parts
-from chronoscene.bench.training_loop import forget_peak_memory, train
+from chronoscene.bench.files.provenance import code_version, peak_memory_bytes, processor_name
+from chronoscene.bench.files.records import PHOTOS
+from chronoscene.bench.plan.memory import open_store
+from chronoscene.bench.plan.parts import Part, make_parts
+from chronoscene.bench.plan.plan import BenchSettings, plan_jobs
+from chronoscene.bench.plan.stop import StopRule
+from chronoscene.bench.train.loop import forget_peak_memory, train
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.formats import read_scene
 from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads

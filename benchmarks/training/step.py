@@ -51,15 +51,19 @@ from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.anchors.model import AnchorModel
 from chronoscene.anchors.trainer import AnchorTrainer
-from chronoscene.bench.job import check_device
-from chronoscene.bench.provenance import code_version, library_versions, processor_name
-from chronoscene.bench.strategies import Part, make_parts
+from chronoscene.bench.files.provenance import code_version, library_versions, processor_name
+from chronoscene.bench.plan.parts import Part, make_parts
 from chronoscene.formats import read_scene
 from chronoscene.gaussians import model as gaussian_model
 from chronoscene.gaussians import trainer as gaussian_trainer
 from chronoscene.gaussians.density import GradientStatistics
 from chronoscene.images.store import ImageStore
-from chronoscene.kernels.runtime import available_threads, keep_freed_memory, set_threads
+from chronoscene.kernels.runtime import (
+    available_threads,
+    check_device,
+    keep_freed_memory,
+    set_threads,
+)
 from chronoscene.methods import method_names
 from chronoscene.rasterizer.cpu import Render
 from chronoscene.training import losses, splatting

@@ -23,9 +23,9 @@ import numpy as np
 from chronogs import SPEC
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
-from chronoscene.bench.provenance import code_version, processor_name
-from chronoscene.bench.strategies import Part, make_parts
-from chronoscene.bench.training_loop import render_bytes, seed_everything
+from chronoscene.bench.files.provenance import code_version, processor_name
+from chronoscene.bench.plan.parts import Part, make_parts
+from chronoscene.bench.train.loop import render_bytes, seed_everything
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
 from chronoscene.kernels.runtime import keep_freed_memory, set_threads

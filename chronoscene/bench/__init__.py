@@ -1,9 +1,9 @@
 """The benchmark: scenes and methods go in, runs with scores, tables and figures come out.
 
-In the order of a run: `plan` lists the runs, each a `job`; `runner` executes them one by one in
-`worker` processes. A worker builds the training sets (`strategies`), owns the loop
-(`training_loop`, shown by `display`) and writes images with a manifest (`predictions`). Scores come
-from these files alone (`scoring`), so a metric can be corrected without training again. `results`
-holds the records with what made them (`provenance`); `tables` and `comparison_figure` show them.
-Nothing here but `worker` and what it calls imports torch.
+In the order of a run: `plan` lists the runs; `run` starts a process for each; `train` is that process:
+the training loop, checkpoints and test views; `score` compares images with the ground truth. `files`
+holds the formats of all that a run leaves on disk, so a metric can be corrected without training
+again. `report` makes tables, figures and pages of finished runs, `study` asks a question about a
+method by several runs, `use` opens a trained run again, and `contract` checks plug-ins.
+Only `train`, `use` and `contract` reach torch, and only through a method.
 """

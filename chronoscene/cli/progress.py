@@ -1,7 +1,7 @@
 """Progress of long commands: one bar on a terminal, else a plain line for each step, on stderr.
 
-`chronoscene bench` has a bar of its own for trainings, `chronoscene.bench.display`: it shows the
-loss, and trainings may end by the clock.
+`chronoscene bench` has its own bar for trainings, `chronoscene.bench.train.progress`, which shows
+the loss and handles trainings that end by the clock.
 """
 
 from __future__ import annotations

@@ -37,3 +37,10 @@ def in_words(size: int) -> str:
         if size >= bytes_each:
             return f"{size / bytes_each:,.1f} {unit}"
     return f"{size / 1000:.1f} kB"
+
+
+def format_time(seconds: float) -> str:
+    """``m:ss`` or ``h:mm:ss``."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -105,3 +105,23 @@ def keep_freed_memory() -> bool:
     return bool(
         mallopt(_M_MMAP_THRESHOLD, _MAX_MMAP_THRESHOLD) and mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
     )
+
+
+def check_device(device: str) -> None:
+    """Check on the machine that will train that it has the device.
+
+    Raises:
+        BackendError: If a GPU is asked for that is not there, or its kernels are not.
+    """
+    if device != "cuda":
+        return
+    import torch
+
+    if not torch.cuda.is_available():
+        raise BackendError(
+            "--device cuda",
+            expected="a CUDA device and a torch build for it",
+            found=f"torch {torch.__version__} without one",
+            todo="use --device cpu",
+        )
+    gsplat_release()

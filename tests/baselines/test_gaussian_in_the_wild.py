@@ -24,7 +24,7 @@ from baselines.gaussian_in_the_wild.networks import (
     start_networks,
 )
 from baselines.gaussian_in_the_wild.trainer import WildTrainer, central_views
-from chronoscene.bench import tiny_training
+from chronoscene.bench.contract import tiny_training
 from chronoscene.errors import ConfigError
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, View, build_config

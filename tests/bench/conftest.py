@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.bench.execution import put_in_place
-from chronoscene.bench.job import Job
-from chronoscene.bench.results import Failure, read_run
-from chronoscene.bench.runner import BenchOutcome, BenchSettings, run_bench
-from chronoscene.bench.worker import execute
+from chronoscene.bench.files.records import Failure, read_run
+from chronoscene.bench.plan.job import Job
+from chronoscene.bench.run.process import put_in_place
+from chronoscene.bench.run.runner import BenchOutcome, BenchSettings, run_bench
+from chronoscene.bench.train.worker import execute
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
 
@@ -165,7 +165,7 @@ def execute_here(job: Job) -> Failure | None:
 @pytest.fixture
 def bench_here(scene_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     """The same of any method in this process, not warmed up."""
-    monkeypatch.setattr("chronoscene.bench.worker.warm_up", lambda *args, **options: None)
+    monkeypatch.setattr("chronoscene.bench.train.worker.warm_up", lambda *args, **options: None)
 
     def run(*methods: str, **changes: Any) -> tuple[BenchOutcome, list[str]]:
         said: list[str] = []
@@ -214,7 +214,7 @@ def trained(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
     runs, finished = tmp_path_factory.mktemp("trained"), []
     common: dict[str, Any] = {"scenes": (scene_folder,), "runs": runs, "preset": "fast"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("chronoscene.bench.worker.warm_up", lambda *args, **options: None)
+        patch.setattr("chronoscene.bench.train.worker.warm_up", lambda *args, **options: None)
         for methods, strategy in ((("chronogs", "3dgs-period"), "joint"), (("4dgs",), "separate")):
             settings = BenchSettings(
                 **common, methods=methods, strategies=(strategy,), iterations=12

@@ -4,7 +4,7 @@ import pytest
 
 from chronoscene.bench import contract
 from chronoscene.bench.contract import CHECKS, check_method
-from chronoscene.bench.returned import MethodError
+from chronoscene.bench.train.checks import MethodError
 
 
 @pytest.fixture

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-import chronoscene.cli.methods as methods_module
+import chronoscene.cli.methods.methods as methods_module
 from baselines import external
 from baselines.external import prepare
-from chronoscene.bench.results import read_run
+from chronoscene.bench.files.records import read_run
 from chronoscene.errors import ProgramError
 from chronoscene.formats import load_format, read_scene
 from chronoscene.images.decoding import load_rgb

@@ -10,8 +10,9 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from chronoscene.cli import cli, results
+from chronoscene.cli import cli
 from chronoscene.cli.output import check_file, check_place, emit, writing_to
+from chronoscene.cli.report import results
 from chronoscene.errors import ConfigError
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.bench.changes import CLASSES
+from chronoscene.bench.use.changes import CLASSES
 from chronoscene.figures.change_map import COLORS, Panel, draw_changes
 from chronoscene.figures.cloud import Cloud
 

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from chronoscene.bench.results import read_rows, read_run, write_run
+from chronoscene.bench.files.records import read_rows, read_run, write_run
 from chronoscene.errors import CheckpointError, ConfigError
 from leaderboard.entries import read_entries
 from leaderboard.submit import submit

@@ -10,7 +10,7 @@ import pytest
 
 from chronoscene.bench.contract import CHECKS
 from chronoscene.bench.contract.subject import PAUSE, NotApplicableError, Subject
-from chronoscene.bench.tiny_training import STEPS
+from chronoscene.bench.contract.tiny_training import STEPS
 from chronoscene.methods import method_names
 from chronoscene.training.losses import _PhotometricLoss
 

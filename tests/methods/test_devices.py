@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from chronoscene.bench import tiny_training
+from chronoscene.bench.contract import tiny_training
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import (
     Method,

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chronoscene.bench import tiny_training
+from chronoscene.bench.contract import tiny_training
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object, load_spec
 from chronoscene.training.schedule import downscale_view

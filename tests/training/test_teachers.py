@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chronoscene.bench import tiny_training
+from chronoscene.bench.contract import tiny_training
 from chronoscene.methods import Prediction, build_config, import_object, load_spec
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training import teachers

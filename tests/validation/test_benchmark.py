@@ -2,7 +2,7 @@
 
 import pytest
 
-from chronoscene.bench.strategies import make_parts
+from chronoscene.bench.plan.parts import make_parts
 from chronoscene.errors import SceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore

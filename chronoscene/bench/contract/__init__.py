@@ -2,7 +2,7 @@
 
 `CHECKS` has one function for each rule; ``chronoscene check-method`` calls all of them, and so do
 our tests for the methods that come with ChronoScene. Methods are trained on painted balls,
-`chronoscene.bench.tiny_training`, on a CPU.
+`chronoscene.bench.contract.tiny_training`, on a CPU.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import dataclasses
 import json
 
 from chronoscene.bench.contract.subject import Subject, demand, python
-from chronoscene.bench.returned import refuse
+from chronoscene.bench.train.checks import refuse
 from chronoscene.methods import build_config
 
 HEAVY = {"torch", "numba", "open3d", "cv2", "matplotlib", "pycolmap"}

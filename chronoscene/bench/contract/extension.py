@@ -7,7 +7,7 @@ import json
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench import tiny_training
+from chronoscene.bench.contract import tiny_training
 from chronoscene.bench.contract.subject import (
     PAUSE,
     NotApplicableError,

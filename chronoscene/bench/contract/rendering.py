@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.bench.contract.subject import NotApplicableError, Subject, demand, resized
-from chronoscene.bench.returned import check_prediction
+from chronoscene.bench.train.checks import check_prediction
 from chronoscene.methods import Prediction, View
 
 

@@ -20,7 +20,7 @@ from chronoscene.bench.contract.subject import (
     same_files,
     tensors_of,
 )
-from chronoscene.bench.returned import check_size, refuse
+from chronoscene.bench.train.checks import check_size, refuse
 from chronoscene.errors import CheckpointError
 
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import safe_open
 
-from chronoscene.bench import tiny_training
-from chronoscene.bench.returned import refuse
+from chronoscene.bench.contract import tiny_training
+from chronoscene.bench.train.checks import refuse
 from chronoscene.methods import (
     Method,
     MethodSpec,

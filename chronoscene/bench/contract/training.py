@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.bench import tiny_training
+from chronoscene.bench.contract import tiny_training
 from chronoscene.bench.contract.subject import (
     NotApplicableError,
     Subject,
@@ -16,7 +16,7 @@ from chronoscene.bench.contract.subject import (
     python,
     same_files,
 )
-from chronoscene.bench.returned import check_prediction, check_step
+from chronoscene.bench.train.checks import check_prediction, check_step
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import Method, TrainingSet, build_config, import_object
 
@@ -81,7 +81,7 @@ def equal_seeds_give_equal_bytes(subject: Subject) -> None:
     for folder in (out, cwd, tmp):
         folder.mkdir()
     done = python(
-        "-m", "chronoscene.bench.tiny_training", subject.name, str(out), cwd=cwd,
+        "-m", "chronoscene.bench.contract.tiny_training", subject.name, str(out), cwd=cwd,
         PYTHONHASHSEED="77", TMPDIR=str(tmp),
     )  # fmt: skip
     demand(done.returncode == 0, "training in another process", "success", done.stderr.strip())

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench import tiny_training
-from chronoscene.bench.job import StopRule
-from chronoscene.bench.strategies import Part, effective_strategy, make_parts
-from chronoscene.bench.training_loop import render_bytes, train
+from chronoscene.bench.contract import tiny_training
+from chronoscene.bench.plan.parts import Part, effective_strategy, make_parts
+from chronoscene.bench.plan.stop import StopRule
+from chronoscene.bench.train.loop import render_bytes, train
 from chronoscene.errors import ChronoSceneError
 from chronoscene.methods import Method, MethodSpec, StepReport, build_config, import_object
 from chronoscene.metrics.psnr_ssim import psnr

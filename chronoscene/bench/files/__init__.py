@@ -1,0 +1,1 @@
+"""Files of a run: records, predictions, frozen ground truth, and what made them."""

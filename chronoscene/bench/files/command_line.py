@@ -1,0 +1,40 @@
+"""Command that trains a configuration, as a person would type it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Mapping
+from typing import Any
+
+OPTIONS = ("iterations", "budget", "separate_iterations", "max_width")
+"""What a variant names that is an option of ``bench`` and none of the method."""
+
+
+def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None) -> str:
+    """The command that trains a configuration; for a compressed one, also that which compresses it.
+
+    Args:
+        scene: Argument that stands for its folder.
+        config: ``method``, ``strategy``, ``preset`` and ``variant`` (`Job.with_variant`, and what
+            `compress_run` adds to it).
+        seed: None leaves the option out.
+    """
+    words = ["chronoscene", "bench", scene]
+    for name in ("method", "strategy", "preset"):
+        words += [f"--{name}", config[name]]
+    words += [] if seed is None else ["--seed", str(seed)]
+    compress: list[str] = []
+    # A comma inside of a value is followed by no name.
+    for assignment in filter(None, re.split(r",(?=\w+=)", config["variant"])):
+        name, _, value = assignment.partition("=")
+        if name == "iterations" and "+" in value:
+            words += ["--continue-to", value.rpartition("+")[2]]
+        elif name == "compressed":
+            loss = ["--plain"] if value == "plain" else ["--max-loss", value.removesuffix("dB")]
+            compress = ["chronoscene", "compress", "RUN", *loss]
+        elif name in OPTIONS:
+            words += [f"--{name.replace('_', '-')}", value]
+        else:
+            words += ["--set", assignment]
+    return " && ".join(map(shlex.join, filter(None, (words, compress))))

@@ -1,0 +1,1 @@
+"""Planning: the user's settings and scenes go in, checked runs as data come out."""

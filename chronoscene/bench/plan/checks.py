@@ -1,0 +1,128 @@
+"""Checks of a planned run before anything is trained."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+from itertools import chain
+from string import Formatter
+
+from chronoscene.bench.files.strategies import STRATEGIES
+from chronoscene.bench.plan.job import SHARING, Job
+from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
+from chronoscene.formats import writable_formats
+from chronoscene.methods import MethodSpec, ProgramConfig, Runner, import_object
+
+VALUES = ("data", "output", "work", "iterations", "seconds", "seed")
+"""What a `Runner` may name besides the options of its config."""
+
+
+def used_values(runner: Runner, prefix: str) -> set[str]:
+    """Values that the commands of another program name."""
+    words = (prefix, *runner.version, *runner.train, *chain(*runner.render))
+    return {name for word in words for _, name, _, _ in Formatter().parse(word) if name}
+
+
+def check_runner(job: Job, spec: MethodSpec, runner: Runner) -> None:
+    """Check what another program needs before it is run.
+
+    Raises:
+        ConfigError: If a command names a value that does not exist or is not set, or the program
+            cannot be stopped by the clock.
+    """
+    config = job.method_config(spec)
+    if not isinstance(config, ProgramConfig):
+        raise ConfigError(
+            f"{spec.name}: {spec.config}",
+            expected="a ProgramConfig, or a class made from it",
+            found=type(config).__name__,
+            todo="correct the specification of the method",
+        )
+    options = dataclasses.asdict(config)
+    try:
+        shlex.split(config.prefix)
+        used = used_values(runner, config.prefix)
+    except ValueError as error:
+        raise ConfigError(
+            f"{spec.name} --set prefix",
+            expected="words as for a shell, with {work} and the like for values, {{ for a brace",
+            found=str(error),
+            todo="correct the prefix",
+        ) from error
+    for name in sorted(used):
+        check_choice(f"{spec.name}: commands", name, {*VALUES, *options})
+        if options.get(name) == "":
+            raise ConfigError(
+                f"{spec.name} --set {name}",
+                expected="a value, which its commands need",
+                found="none",
+                todo=f"pass --set {name}=..., as docs/other-programs.md says",
+            )
+    if job.budget_seconds is not None and "seconds" not in used:
+        raise ConfigError(
+            f"{spec.name} --budget",
+            expected="a program that ends by the clock",
+            found="one that ends after a number of iterations",
+            todo="use --iterations",
+        )
+    check_choice(f"{spec.name}: exports", runner.exports, writable_formats())
+
+
+def check_stages(job: Job, spec: MethodSpec) -> None:
+    """Check that a method can be trained in stages.
+
+    Raises:
+        ConfigError: If it cannot, or is to be trained further after the last one.
+    """
+    if spec.runner is not None or not hasattr(import_object(spec.method), "extend"):
+        raise ConfigError(
+            f"{spec.name} --strategy {job.strategy}",
+            expected="a method that can be trained on one period after the other",
+            found="one without extend",
+            todo="use another strategy, or write the function: docs/adding-a-method.md",
+        )
+    if job.keep_training:
+        raise ConfigError(
+            f"--keep-training, --continue-to with --strategy {job.strategy}",
+            expected="neither, as a stage ends for good when the next one begins",
+            found="one of them",
+            todo="train anew with --iterations",
+        )
+    if teachers := getattr(job.method_config(spec), "teachers", 0):
+        raise ConfigError(
+            f"{spec.name} --strategy {job.strategy}: teachers",
+            expected="0, as they would have to learn each further period as well",
+            found=str(teachers),
+            todo="set teachers=0, or use another strategy",
+        )
+
+
+def check_job(job: Job, spec: MethodSpec) -> None:
+    """Check the settings before anything is trained.
+
+    Raises:
+        ConfigError: If a preset, key, value or device does not exist.
+    """
+    if (job.keep_training or job.continued_from) and not spec.resumable:
+        raise ConfigError(
+            "--keep-training, --continue-to",
+            expected="methods that can be trained further",
+            found=spec.name,
+            todo="run this method without",
+        )
+    check_choice("--separate-iterations", job.separate_iterations, SHARING)
+    if STRATEGIES[job.strategy].in_order:
+        check_stages(job, spec)
+    if spec.runner is not None:
+        check_runner(job, spec, spec.runner)
+    if job.device != "auto":
+        check_choice(f"{spec.name} --device", job.device, spec.devices)
+    config = job.method_config(spec)
+    if not isinstance(getattr(config, "iterations", None), int) or config.iterations < 1:
+        raise ConfigError(
+            f"{spec.name}: iterations",
+            expected="a positive number",
+            found=repr(getattr(config, "iterations", None)),
+            todo="correct --iterations",
+        )

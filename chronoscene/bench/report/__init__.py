@@ -1,0 +1,1 @@
+"""Reports: finished runs go in; tables, intervals, trade-offs, figures and pages come out."""

@@ -1,0 +1,78 @@
+"""Published results, as data: what a paper printed, never what we measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.resources import files
+
+from pydantic import BaseModel, ConfigDict, model_validator
+
+
+class PublishedRow(BaseModel):
+    """One scene and method of a published table. PSNR in dB."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    group: str
+    scene: str
+    method: str
+    psnr: float
+    ssim: float
+    lpips_vgg_3dgs: float
+
+
+class FurtherTable(BaseModel):
+    """Any other table of a publication, with its own columns; None is a cell without a number."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    id: str
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str | int | float | None, ...], ...]
+
+    @model_validator(mode="after")
+    def _rectangular(self) -> FurtherTable:
+        if any(len(row) != len(self.columns) for row in self.rows):
+            raise ValueError("a row has more or fewer cells than there are columns")
+        return self
+
+
+class PublishedTable(BaseModel):
+    """A published table with what must be known to read it, and the other numbers of its paper."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    title: str
+    source: str
+    hardware: str
+    notes: tuple[str, ...]
+    rows: tuple[PublishedRow, ...]
+    memory_gb: Mapping[str, Mapping[str, float]]
+    """Group of scenes to method to the printed mean."""
+    methods: Mapping[str, str]
+    """Printed name of a method to its id, which is the name on the command line if there is one."""
+    tables: tuple[FurtherTable, ...]
+    inconsistencies: Mapping[str, str]
+    """What disagrees in the paper, or with what its authors released, by a short id."""
+
+    def mean(self, method: str, metric: str, *, group: str | None = None) -> float:
+        """Unweighted mean of a metric over the scenes of a group, or over all.
+
+        Raises:
+            KeyError: If no row matches.
+        """
+        values = [
+            getattr(row, metric)
+            for row in self.rows
+            if row.method == method and group in (None, row.group)
+        ]
+        if not values:
+            raise KeyError(f"{method} has no row in group {group}")
+        return sum(values) / len(values)
+
+
+def load_published(name: str = "chronogs_paper") -> PublishedTable:
+    """Read a published table that is shipped with this package."""
+    text = files(__package__).joinpath(f"{name}.json").read_text(encoding="utf-8")
+    return PublishedTable.model_validate_json(text)

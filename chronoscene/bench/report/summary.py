@@ -1,0 +1,383 @@
+"""What runs gave, as numbers: means and spread over seeds, intervals over views, differences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import mean, stdev
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.bench.files.records import (
+    Failure,
+    RunRecord,
+    read_failures,
+    read_rows,
+    read_run,
+    run_folders,
+)
+from chronoscene.bench.report.intervals import REPLICATES, interval, resampled_means, seed_margin
+from chronoscene.bench.score.regions import ALL
+from chronoscene.errors import CheckpointError, ConfigError
+from chronoscene.metrics.registry import all_metrics, metric_info
+
+if TYPE_CHECKING:
+    from pandas import DataFrame, Series
+
+    from chronoscene.bench.report.published import PublishedTable
+
+AGGREGATES = ("macro", "micro", "worst")
+TRANSFERS = ("forgetting", "backward_transfer", "forward_transfer")
+MEASURED = "measured"
+SIZE = "checkpoint_bytes"  # What papers print as memory
+MARKED = 3  # Ranks that are marked in tables
+PAPER_METRICS = ("psnr", "ssim", "lpips_vgg_3dgs")
+"""What papers on these methods print side by side."""
+UNKNOWN = np.full(REPLICATES, math.nan)
+"""Resampled means of what has no views, or of views that are not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """A column of the cost table."""
+
+    name: str
+    """Field of `RunRecord`."""
+    title: str
+    factor: float
+    decimals: int
+
+
+COSTS = (
+    Cost("seconds", "training [s]", 1.0, 1),
+    Cost("iterations", "iterations", 1.0, 0),
+    Cost("primitives", "primitives", 1.0, 0),
+    Cost("drawn", "drawn per view", 1.0, 0),
+    Cost("render_seconds", "rendering [ms]", 1e3, 1),
+    Cost(SIZE, "checkpoint [MB]", 1e-6, 3),
+    Cost("peak_memory_bytes", "peak memory [MB]", 1e-6, 0),
+    Cost("peak_device_memory_bytes", "peak GPU memory [MB]", 1e-6, 0),
+)
+
+ENTRY_COLUMNS = (
+    *("source", "scene", "method", "strategy", "preset", "variant", "config_hash"),
+    *("quantity", "column", "mean", "sd", "n", "low", "high"),
+    *("difference", "difference_low", "difference_high", "tied", "seeds", "device", "commit"),
+)
+"""Columns of CSV and JSON. ``source`` is ``measured`` or a publication; ``quantity`` is a metric,
+or a cost in the unit of `RunRecord`; ``column`` is ``period <id>``, ``macro``, ``micro``,
+``worst``, ``median`` or ``best`` (of the periods), or empty for costs; runs in stages have
+``<stage>: period <id>`` and `TRANSFERS`, too. ``sd`` is the sample
+standard deviation over ``n`` seeds, empty for one seed; ``low`` and ``high`` are the ends of the
+95 % interval over views. ``difference`` is that to the best mean of the same scene, quantity and
+column, with its interval over the same views; ``tied`` says that views or seeds do not tell the two
+apart.
+"""
+
+
+def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
+    """All finished runs below some folders, with their rows, and the failed ones.
+
+    Raises:
+        CheckpointError: If a folder holds neither.
+    """
+    records: list[RunRecord] = []
+    failures: list[Failure] = []
+    for folder in folders:
+        found = [read_with_rows(path) for path in run_folders(folder)]
+        failed = read_failures(folder)
+        if not found and not failed:
+            raise CheckpointError(
+                folder, expected="a folder of runs", found="no run in it", todo="run bench first"
+            )
+        records += found
+        failures += failed
+    return records, failures
+
+
+def read_with_rows(folder: Path) -> RunRecord:
+    """A finished run with the values of its views."""
+    return read_run(folder).model_copy(update={"rows": read_rows(folder), "folder": folder})
+
+
+def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
+    """Runs with the scores of a region in place of those of whole images.
+
+    Their scenes are called ``<scene> (<region>)`` and have the fingerprint of the change masks, so
+    they stand beside no other values. Runs of scenes without change masks are left out.
+
+    Raises:
+        ConfigError: If none is left.
+    """
+    found = [
+        run.model_copy(
+            update={
+                **run.regions[region],
+                "scene": f"{run.scene} ({region})",
+                "scene_hash": run.change_masks,
+                "rows": [replace(row, region=ALL) for row in run.rows if row.region == region],
+                "stages": {},  # these are of whole images
+                "transfer": {},
+            }
+        )
+        for run in records
+        if region in run.regions
+    ]
+    if not found:
+        raise ConfigError(
+            f"--region {region}",
+            expected="runs that were scored with change masks",
+            found="none",
+            todo="run chronoscene score RUNS --truth FOLDER first",
+        )
+    return found
+
+
+def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> DataFrame:
+    """Means and spread over seeds of everything that was measured, and what views leave uncertain.
+
+    Runs that differ in seed and device only are a group. Equal names with other scenes or configs
+    stay apart, and so do devices that ran the same seed: their ``label`` says in what they differ.
+
+    Args:
+        records: Runs of any scenes.
+        metrics: Names of those wanted; none for all.
+
+    Returns:
+        `ENTRY_COLUMNS`, ``label``, and what `with_texts` and `compared` add, one row per group,
+        quantity and column. What a run of a group lacks is left out.
+    """
+    import pandas as pd
+
+    if not records:
+        return pd.DataFrame(columns=[*ENTRY_COLUMNS, "label", "rank", "devices"])
+    runs = labelled(records).sort_values("seed", kind="stable")
+    in_group = runs.groupby(["scene", "label"], sort=False)
+    groups = in_group[["method", "strategy", "preset", "variant", "config_hash", "views"]].first()
+    groups["runs"] = in_group.size()
+    groups["seeds"] = in_group.seed.agg(lambda seeds: " ".join(map(str, seeds)))
+    groups["commit"] = in_group.commit.agg(lambda commits: " ".join(commits.unique()))
+    groups["device"] = in_group.device.agg(lambda devices: "; ".join(devices.unique()))
+    groups["devices"] = in_group.device.nunique()
+
+    numbers = [
+        (run.scene, label, *number)
+        for run, label in zip(records, runs.label.sort_index(), strict=True)
+        for number in _numbers(run, metric_names([run], metrics))
+    ]
+    keys = ["scene", "label", "quantity", "column"]
+    values = pd.DataFrame(numbers, columns=[*keys, "value", "resampled"]).groupby(keys, sort=False)
+    entries = values.value.agg(mean=mean, sd=_spread, n="size")
+    entries["resampled"] = [np.mean(list(part), axis=0) for _, part in values.resampled]
+    entries = entries.reset_index().join(groups, on=["scene", "label"])
+    order = {scene: i for i, scene in enumerate(dict.fromkeys(run.scene for run in records))}
+    entries = entries[entries.n == entries.runs].assign(source=MEASURED)
+    entries = entries.sort_values(
+        "scene", key=lambda scenes: scenes.map(order), kind="stable", ignore_index=True
+    )
+    return compared(with_texts(entries))
+
+
+def with_texts(entries: DataFrame) -> DataFrame:
+    """Entries with ``number``, the mean as it reads, and ``text``, which has the spread."""
+    numbers, texts = [], []
+    for quantity, value, sd, n in entries[["quantity", "mean", "sd", "n"]].itertuples(index=False):
+        numbers.append(in_unit(quantity, value))
+        texts.append(with_spread(quantity, value, None if n == 1 else sd))
+    return entries.assign(number=numbers, text=texts)
+
+
+def in_unit(quantity: str, value: float) -> str:
+    """A value in the unit and with the decimals in which tables show it; zero has no sign."""
+    if quantity in all_metrics():
+        return f"{value:z.{all_metrics()[quantity].decimals}f}"
+    (cost,) = (cost for cost in COSTS if cost.name == quantity)
+    return f"{value * cost.factor:.{cost.decimals}f}"
+
+
+def with_spread(quantity: str, value: float, sd: float | None) -> str:
+    """A mean as tables show it, with its spread if there is one."""
+    return in_unit(quantity, value) + ("" if sd is None else f" ± {in_unit(quantity, sd)}")
+
+
+def compared(entries: DataFrame) -> DataFrame:
+    """Entries with intervals, and those of metrics with what tells them from the best.
+
+    Adds ``low``, ``high``, ``difference``, ``difference_low``, ``difference_high`` and ``tied``, as
+    `ENTRY_COLUMNS` says, and ``rank``: 1 to `MARKED` where a table marks the entry, else 0. What
+    reads the same has the same rank, and the last of several is never marked.
+    """
+    low, high = interval(np.reshape([*entries.resampled], (-1, REPLICATES)))
+    entries = entries.assign(low=low, high=high, tied=False, rank=0)
+    entries[["difference", "difference_low", "difference_high"]] = math.nan
+    measured = entries[entries.quantity.isin(all_metrics()) & (entries.source == MEASURED)]
+    measured = measured[~measured.column.isin(TRANSFERS)]
+    for (_, quantity, _), part in measured.groupby(["scene", "quantity", "column"], sort=False):
+        ascending = not metric_info(str(quantity)).higher_is_better
+        ranks = part.number.astype(float).rank(method="min", ascending=ascending)
+        entries.loc[ranks.index[ranks <= min(MARKED, len(part) - 1)], "rank"] = ranks.astype(int)
+        best, *others = part.sort_values("mean", ascending=ascending, kind="stable").index
+        if others:
+            compare_with(entries, best, others)
+    return entries
+
+
+def compare_with(entries: DataFrame, reference: Any, others: Sequence[Any]) -> None:
+    """Fill in what tells some entries from another one, all named by their index."""
+    first, rest = entries.loc[reference], entries.loc[others]
+    difference = rest["mean"] - first["mean"]
+    gaps = np.stack(rest.resampled) - first.resampled
+    gaps[[views != first.views for views in rest.views]] = math.nan  # not paired
+    low, high = interval(gaps)
+    by_seeds = np.abs(difference) <= seed_margin(rest.sd, rest.n, first.sd, first.n)
+    tied = ((low <= 0) & (high >= 0)) | by_seeds
+    entries.loc[others, "difference"] = difference
+    entries.loc[others, "difference_low"] = low
+    entries.loc[others, "difference_high"] = high
+    entries.loc[others, "tied"] = tied
+
+
+def over_scenes(entries: DataFrame, name: str) -> DataFrame:
+    """Means of macro and costs over all scenes, as entries of a scene of that name.
+
+    Labels that lack a scene are left out.
+    """
+    import pandas as pd
+
+    chosen = entries[entries.column.isin(("macro", ""))]
+    rows = [
+        {
+            **part.iloc[0],
+            "scene": name,
+            "mean": mean(part["mean"]),
+            "sd": math.hypot(*part.sd) / len(part),
+            "n": min(part.n),
+            "resampled": np.mean(list(part.resampled), axis=0),
+            "views": frozenset().union(*part.views),
+        }
+        for _, part in chosen.groupby(["label", "quantity"], sort=False)
+        if len(part) == entries.scene.nunique()
+    ]
+    return compared(with_texts(pd.DataFrame(rows, columns=entries.columns)))
+
+
+def published_entries(table: PublishedTable, scenes: Iterable[str]) -> DataFrame:
+    """Entries of what a paper printed for scenes of these names, whose case does not matter.
+
+    The size is the printed mean over the group of the scene.
+    """
+    import pandas as pd
+
+    rows = []
+    for scene in scenes:
+        for row in (r for r in table.rows if r.scene.casefold() == scene.casefold()):
+            values = [(name, "macro", getattr(row, name)) for name in PAPER_METRICS]
+            values.append((SIZE, "", table.memory_gb[row.group][row.method] * 1e9))
+            rows += [(scene, row.method, *value) for value in values]
+    entries = pd.DataFrame(rows, columns=["scene", "method", "quantity", "column", "mean"])
+    entries = entries.assign(
+        source=table.title,
+        label=entries.method + " (published)",
+        device=table.hardware,
+        **dict.fromkeys(("n", "runs", "devices"), 1),
+        sd=math.nan,
+        resampled=[UNKNOWN] * len(rows),
+        views=[frozenset()] * len(rows),
+        **dict.fromkeys(("strategy", "preset", "variant", "config_hash", "seeds", "commit"), ""),
+    )
+    return compared(with_texts(entries))
+
+
+def labelled(records: Sequence[RunRecord]) -> DataFrame:
+    """What tells runs apart, one row per record; ``label`` is how tables call each."""
+    import pandas as pd
+
+    fields = ("scene", "method", "strategy", "preset", "variant", "config_hash", "seed", "device")
+    runs = pd.DataFrame(
+        [{name: getattr(run, name) for name in (*fields, "commit")} for run in records]
+    )
+    runs["views"] = [
+        frozenset((run.scene, row.camera_period, row.view) for row in run.rows) for run in records
+    ]
+    runs["label"] = [f"{run.title} ({kind_of(run)})" for run in records]
+    differences = pd.DataFrame(
+        {
+            "method": runs.method,
+            "scene": [f"scene {run.scene_hash[:6]}" for run in records],
+            "config": [f"config {run.config_hash[:6]}" for run in records],
+            "device": runs.device,
+        }
+    )
+    named = [runs.scene, runs.label]
+    differ = differences.groupby(named).transform("nunique") > 1
+    # Seeds of several devices are averaged; the same seed on two of them compares these.
+    same = [*named, runs.method, differences.scene, differences.config]
+    devices = runs.device.groupby([*same, runs.seed]).transform("nunique")
+    differ["device"] = devices.groupby(same).transform("max") > 1
+    for i, columns in enumerate(differ.to_numpy()):
+        if columns.any():
+            told = ", ".join(differences.loc[i, columns])
+            runs.loc[i, "label"] += f" [{told}]"
+    return runs
+
+
+def kind_of(run: RunRecord | Failure) -> str:
+    """Strategy and preset, and what differs from it."""
+    return ", ".join(filter(None, (run.strategy, run.preset, run.variant.replace(",", ", "))))
+
+
+def _numbers(
+    run: RunRecord, metrics: Sequence[str]
+) -> Iterable[tuple[str, str, float, NDArray[np.float64]]]:
+    """Quantity, column, value and resampled values of everything that a run gave, in the order of
+    the tables."""
+    views: dict[str, dict[int, dict[str, float]]] = {}  # Metric to period to view to value
+    for row in run.rows:
+        if row.region == ALL and row.rendered_period == row.camera_period:
+            of_metric = views.setdefault(row.metric, {})
+            of_metric.setdefault(row.camera_period, {})[row.view] = row.value
+    for metric in metrics:
+        higher = metric_info(metric).higher_is_better
+        over: dict[str, Callable[..., Any]] = {
+            "macro": np.mean,
+            "worst": np.min if higher else np.max,
+            "median": np.median,
+            "best": np.max if higher else np.min,
+        }
+        known = sorted((int(i), v[metric]) for i, v in run.periods.items() if metric in v)
+        values = {f"period {i}": value for i, value in known}
+        values |= {name: run.aggregates[name][metric] for name in AGGREGATES}
+        values |= {name: float(over[name]([v for _, v in known])) for name in ("median", "best")}
+        for stage, periods in run.stages.items():
+            of_stage = {f"{stage}: period {i}": v for i, v in periods.items()}
+            values |= {column: v[metric] for column, v in of_stage.items() if metric in v}
+        values |= {name: v[metric] for name, v in run.transfer.items() if metric in v}
+        resampled = {}
+        if metric in views:
+            by_period = views[metric]
+            means = {i: resampled_means(v, f"{run.scene}/{i}") for i, v in by_period.items()}
+            resampled = {f"period {i}": drawn for i, drawn in means.items()}
+            drawn, counts = list(means.values()), [len(v) for v in by_period.values()]
+            resampled |= {name: function(drawn, axis=0) for name, function in over.items()}
+            resampled["micro"] = np.average(drawn, axis=0, weights=counts)
+        for column, value in values.items():
+            yield metric, column, value, resampled.get(column, UNKNOWN)
+    for cost in COSTS:
+        if (value := getattr(run, cost.name)) is not None:
+            yield cost.name, "", float(value), UNKNOWN
+
+
+def _spread(values: Series) -> float:
+    """Sample standard deviation (n - 1); NaN for one value, or where one is infinite."""
+    return stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else math.nan
+
+
+def metric_names(records: Iterable[RunRecord], wanted: Sequence[str] = ()) -> list[str]:
+    """The metrics to show, in the order of the table of names: those wanted, or all there are."""
+    known = [metric_info(name).name for name in wanted]
+    there = {name for run in records for name in run.aggregates.get("macro", {})}
+    return [name for name in all_metrics() if name in there and (not known or name in known)]

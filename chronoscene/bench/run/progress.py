@@ -1,0 +1,91 @@
+"""Progress of a training, or of several: a live bar on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+from chronoscene.io.processes import Report
+from chronoscene.io.wording import format_time
+
+KNOWN = 0.1  # Share of a run after which the time left is shown: before, it mostly starts
+
+
+class RunsDisplay:
+    """Shows how many of several runs at a time have ended, their rate, and the time left."""
+
+    def __init__(
+        self, total: int, say: Callable[[str], None], console: Console | None = None
+    ) -> None:
+        self._total, self._ended = total, 0
+        self._say = say
+        self._shares: dict[str, float] = {}
+        self._began = time.monotonic()
+        self._lock = threading.Lock()
+        console = console or Console(stderr=True)
+        self._live = console.is_terminal
+        self._bar = Progress(
+            BarColumn(bar_width=12),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TextColumn("{task.description}", markup=False),
+            console=console,
+            transient=True,
+            disable=not self._live,
+        )
+
+    def __enter__(self) -> RunsDisplay:
+        self._task = self._bar.add_task(self.status(0.0), total=self._total)
+        self._bar.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        if self._live:
+            self._bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+        else:
+            self._say(line)
+
+    @contextmanager
+    def showing(self, label: str) -> Iterator[Report]:
+        """A function that takes the progress of a run; it has ended when the block does."""
+        with self._lock:
+            self._shares[label] = 0.0
+        self._show()
+        yield partial(self._update, label)
+        with self._lock:  # an error ends the display, too
+            del self._shares[label]
+            self._ended += 1
+        self._show(plain=True)
+
+    def _update(self, label: str, what: str, done: int, total: int) -> None:
+        if not total:
+            self.say(what)
+            return
+        self._shares[label] = done / total
+        self._show()
+
+    def _show(self, *, plain: bool = False) -> None:
+        with self._lock:
+            done = self._ended + sum(self._shares.values())
+            line = self.status(done)
+            self._bar.update(self._task, completed=done, description=line)
+        if plain and not self._live:
+            self._say(line)
+
+    def status(self, done: float) -> str:
+        """How far the runs are, in one line; ``done`` counts shares of those under way, too."""
+        pieces = [f"{self._ended} of {self._total} runs", f"{len(self._shares)} under way"]
+        seconds = time.monotonic() - self._began
+        if done > KNOWN:
+            pieces.append(f"{3600 * done / max(seconds, 1e-9):,.1f} runs/h")
+            pieces.append(f"{format_time(seconds * (self._total - done) / done)} left")
+        return ", ".join(pieces)

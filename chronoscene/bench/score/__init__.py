@@ -1,0 +1,1 @@
+"""Scoring: images and frozen ground truth go in, rows of metrics come out."""

@@ -1,0 +1,1 @@
+"""Use of trained runs: cameras, rendering, export, compression, changes and leakage."""

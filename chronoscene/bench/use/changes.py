@@ -1,0 +1,389 @@
+"""Where the periods of a finished run differ: places on its surfaces, with scores.
+
+Colours change with the light, depth does not. A place on a surface of one period is gone at another
+one if cameras that see it see farther there:
+
+    geometry = d / (k + n) * sum over n views of max(0, 1/z - 1/z'),
+
+where z and z' are the depths of the two periods at the pixel of the place, d is the usual distance
+of cameras, and k views without a change are added, so that one view proves little. The score is the
+relative change of depth at the distance d. A view counts if it sees the place, and nothing in front
+of it at the other period; near views count more, as errors of depth grow with its square.
+
+Where geometry stays, appearance is what the light does not explain: mean colours of a place at both
+periods, without their brightness, differ by more than one affine map for the whole scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from chronoscene.arrays import Array
+from chronoscene.bench.files.predictions import to_bytes
+from chronoscene.bench.use.cameras import Shot
+from chronoscene.bench.use.trained_run import OpenRun
+from chronoscene.errors import ConfigError
+from chronoscene.images.store import ImageStore
+from chronoscene.images.truth import load_changes, truth_place
+from chronoscene.io.tables import Table, csv_text
+from chronoscene.methods import Prediction
+from chronoscene.metrics.change import change_scores
+from chronoscene.scene import Camera, Frame, Scene
+from chronoscene.scene.cameras import project_points, unproject_pixels
+
+Mask = NDArray[np.bool_]
+Render = Callable[[Camera, Array, float], Prediction]
+"""As `OpenRun.render`: camera, pose, period."""
+
+MAX_WIDTH = 640
+"""Pixels: places lie farther apart than those of wider images."""
+COLUMNS = 160  # Pixels of a row of an image that become places
+CELL = 0.01  # Edge of the cells that hold one place each, in usual distances
+SAME = 0.1  # Relative difference of depth up to which a camera sees a place
+HIDDEN = 0.01  # Relative difference of depth from which something is in front of it
+UNCHANGED_VIEWS = 5  # k
+NEIGHBOURS = 4  # Places whose mean score a pixel has
+
+GEOMETRY = 0.015
+"""Score from which geometry has changed: 1.5 % of the depth at the usual distance."""
+APPEARANCE = 0.08
+"""Distance of colours, whose channels sum to 1, from which appearance has changed."""
+
+CLASSES = ("unchanged", "unknown", "appearance", "gone", "new")
+"""What `ChangeMap.classes` numbers. Gone are places on surfaces of the first period, new are those
+on surfaces of the second."""
+_DARK = 0.05  # Added to colours before their brightness is divided out: black has no hue
+_ROUNDS = 10  # Of reweighted least squares
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeMap:
+    """Places on the surfaces of two periods."""
+
+    periods: tuple[int, int]
+    xyz: Array
+    """In the world. [N, 3]"""
+    later: Mask
+    """Whether a place is on a surface of the second period, not of the first. [N]"""
+    known: Mask
+    """Whether a training camera of the other period sees the place. [N]"""
+    geometry: Array
+    """Score of change, 0 or more; 0 where unknown. [N]"""
+    appearance: Array
+    """Likewise; 0 where geometry has changed. [N]"""
+
+    @cached_property
+    def classes(self) -> NDArray[np.int64]:
+        """Of `CLASSES`. [N]"""
+        kinds = [~self.known, self.geometry >= GEOMETRY, self.appearance >= APPEARANCE]
+        return np.select(kinds, [1, np.where(self.later, 4, 3), 2], 0)
+
+    def shares(self) -> dict[str, float]:
+        """Share of each class but the first; gone and new are shares of their period's places."""
+        whole = (1, 1, np.mean(~self.later), np.mean(self.later))
+        shares = [np.mean(self.classes == i) / part for i, part in enumerate(whole, start=1)]
+        return dict(zip(CLASSES[1:], map(float, shares), strict=True))
+
+    @cached_property
+    def _sides(self) -> list[tuple[cKDTree, Array]]:
+        """Places of each period, and their scores. [n, 2]"""
+        scores = np.stack([self.geometry, self.appearance], axis=1)
+        return [(cKDTree(self.xyz[rows]), scores[rows]) for rows in (~self.later, self.later)]
+
+    def view_scores(self, shot: Shot, shown: Sequence[Prediction]) -> Array:
+        """Scores of geometry and appearance in a view: the larger of those of both surfaces.
+
+        Args:
+            shot: The camera.
+            shown: What it shows at the first and at the second period.
+
+        Returns:
+            [H, W, 2]
+        """
+        width, height = shot.camera.size
+        values = np.zeros((height, width, 2))
+        for (tree, scores), prediction in zip(self._sides, shown, strict=True):
+            depth = surface_depth(prediction)
+            near = range(1, 1 + min(NEIGHBOURS, tree.n))
+            _, places = tree.query(back_project(depth, shot), near)
+            at = np.isfinite(depth)
+            values[at] = np.maximum(values[at], scores[places].mean(axis=1))
+        return values
+
+
+def map_changes(render: Render, shots: Sequence[Shot], periods: tuple[int, int]) -> ChangeMap:
+    """Compare two periods.
+
+    Args:
+        render: Of the model, with depth in units of the world.
+        shots: Training cameras of the two periods.
+        periods: In their order.
+
+    Raises:
+        ConfigError: If one of them shows nothing.
+    """
+    found: dict[int, list[Array]] = {period: [np.zeros((0, 3))] for period in periods}
+    depths = []
+    for shot in shots:
+        assert shot.period is not None
+        depth = surface_depth(render(shot.camera, shot.cam_from_world, shot.period))
+        step = max(1, round(shot.camera.width / COLUMNS))
+        found[int(shot.period)].append(back_project(depth, shot, step))
+        depths.append(depth[::step, ::step].ravel())
+    places = {period: np.concatenate(parts) for period, parts in found.items()}
+    for period, xyz in places.items():
+        if not len(xyz):
+            raise ConfigError(
+                f"period {period}",
+                expected="surfaces in its training views",
+                found="none",
+                todo="compare other periods",
+            )
+    depth = np.concatenate(depths)
+    distance = float(np.median(depth[np.isfinite(depth)]))
+    surfaces = [_Surface(_thinned(xyz, CELL * distance)) for xyz in places.values()]
+    for shot in shots:
+        seen = [render(shot.camera, shot.cam_from_world, period) for period in periods]
+        for surface, period, shown in zip(surfaces, periods, (seen, seen[::-1]), strict=True):
+            surface.look(shot, *shown, is_other=shot.period != period)
+    known = np.concatenate([surface.other_views > 0 for surface in surfaces])
+    geometry = np.concatenate([distance * surface.score() for surface in surfaces])
+    (earlier, later), (later_own, earlier_other) = (surface.mean_colors() for surface in surfaces)
+    return ChangeMap(
+        periods,
+        xyz=np.concatenate([surface.xyz for surface in surfaces]),
+        later=np.repeat([False, True], [len(surface.xyz) for surface in surfaces]),
+        known=known,
+        geometry=np.where(known, geometry, 0),
+        appearance=unexplained(
+            np.concatenate([earlier, earlier_other]),
+            np.concatenate([later, later_own]),
+            known & (geometry < GEOMETRY),
+        ),
+    )
+
+
+class _Surface:
+    """Places on the surfaces of a period, and what the views say of them."""
+
+    def __init__(self, xyz: Array) -> None:
+        self.xyz = xyz
+        self.parallax, self.views = np.zeros(len(xyz)), np.zeros(len(xyz))
+        self.other_views = np.zeros(len(xyz))
+        self.colors = np.zeros((2, len(xyz), 3))
+
+    def look(self, shot: Shot, own: Prediction, other: Prediction, *, is_other: bool) -> None:
+        """Compare what a camera shows at the period of the surface with what it shows at the other.
+
+        Args:
+            shot: The camera.
+            own: At the period of the surface.
+            other: At the other one.
+            is_other: Whether the camera is one of the other period.
+        """
+        pose = shot.cam_from_world
+        local = self.xyz @ pose[:3, :3].T + pose[:3, 3]
+        xy = project_points(shot.camera, local)
+        with np.errstate(invalid="ignore"):
+            places = np.flatnonzero(((xy >= 0) & (xy < shot.camera.size)).all(axis=1))
+        column, row = xy[places].astype(int).T
+        z, near, far = local[places, 2], *(surface_depth(p)[row, column] for p in (own, other))
+        seen = (np.abs(near - z) < SAME * z) & (far >= (1 - HIDDEN) * near)
+        places, row, column = places[seen], row[seen], column[seen]
+        self.parallax[places] += np.maximum(0, 1 / near[seen] - 1 / far[seen])
+        self.views[places] += 1
+        self.other_views[places] += is_other
+        for total, shown in zip(self.colors, (own, other), strict=True):
+            total[places] += shown.rgb[row, column]
+
+    def score(self) -> Array:
+        """Of geometry, per unit of the usual distance. [N]"""
+        return self.parallax / (self.views + UNCHANGED_VIEWS)
+
+    def mean_colors(self) -> Array:
+        """At the period of the surface, and at the other one. [2, N, 3]"""
+        return self.colors / np.maximum(self.views, 1)[:, None]
+
+
+def surface_depth(prediction: Prediction) -> Array:
+    """Depth in units of the world, infinite where there is no surface. [H, W]"""
+    assert prediction.depth is not None
+    return np.where(prediction.depth > 0, prediction.depth, np.inf).astype(np.float64)
+
+
+def back_project(depth: Array, shot: Shot, step: int = 1) -> Array:
+    """Places in the world that the pixels of every ``step``-th row and column show. [n, 3]"""
+    rows, columns = np.indices(depth.shape)[:, ::step, ::step].reshape(2, -1)
+    z = depth[rows, columns]
+    kept = np.isfinite(z)
+    xy = np.stack([columns[kept], rows[kept]], axis=1).astype(np.float64) + 0.5
+    rays = unproject_pixels(shot.camera, xy)
+    local = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) * z[kept, None]
+    pose = shot.cam_from_world
+    return np.asarray((local - pose[:3, 3]) @ pose[:3, :3])
+
+
+def _thinned(xyz: Array, cell: float) -> Array:
+    """One place in each cell of a grid."""
+    _, first = np.unique(np.floor(xyz / cell), axis=0, return_index=True)
+    return xyz[np.sort(first)]
+
+
+def unexplained(first: Array, second: Array, counted: Mask) -> Array:
+    """What one affine map does not explain of how colours change, brightness aside.
+
+    It is fitted so that the distances are small in most places, few may be large.
+
+    Args:
+        first: RGB at the first period. [N, 3]
+        second: At the second. [N, 3]
+        counted: Places that count; the others have 0. [N]
+
+    Returns:
+        Distance of colours whose channels sum to 1. [N]
+    """
+    colors = [c[counted] + _DARK for c in (first, second)]
+    given, wanted = (c / c.sum(axis=1, keepdims=True) for c in colors)
+    given[:, 2] = 1  # the three channels sum to 1, so two are enough beside the constant
+    distances = np.ones(len(given))
+    for _ in range(_ROUNDS):
+        root = 1 / np.sqrt(np.maximum(distances, 1e-3))[:, None]
+        solution = np.linalg.lstsq(given * root, wanted * root, rcond=None)[0]
+        distances = np.linalg.norm(wanted - given @ solution, axis=1)
+    found = np.zeros(len(first))
+    found[counted] = distances
+    return found
+
+
+Compared = tuple[ChangeMap, Mapping[str, float]]
+"""A pair of periods, and the scores of its map."""
+SCORES = {
+    f"{name}_{metric}_{kind}": (f"{metric.upper()} {kind}", name)
+    for kind in ("geometry", "appearance")
+    for metric in ("ap", "f1")
+    for name in ("map", "image")
+}
+"""Keys of `score_map` with their headings, in the order of the table."""
+
+
+def map_run(run: OpenRun, scene: Scene, pairs: Sequence[tuple[int, int]]) -> Iterator[Compared]:
+    """The map of each pair of periods, and its scores where a truth is known.
+
+    Args:
+        run: Renders what is compared.
+        scene: Of the run.
+        pairs: Periods in their order.
+
+    Raises:
+        ConfigError: If its models cannot tell periods apart, or give no depth.
+        ImageError: If a file of the truth is damaged.
+    """
+    if not (run.tells_period or run.strategy.model_per_period):
+        raise _unfit(run, "models that know the periods", "one that is not told the period")
+    if "depth" not in run.spec.outputs:
+        raise _unfit(run, "a method that renders depth", "one that does not")
+    store = ImageStore(scene, max_width=_width(run))
+    for pair in pairs:
+        frames = [frame for frame in scene.select(split="train") if frame.period in pair]
+        made = map_changes(run.render, [_shot(store, frame) for frame in frames], pair)
+        yield made, score_map(run, scene, store, made)
+
+
+def _unfit(run: OpenRun, expected: str, found: str) -> ConfigError:
+    return ConfigError(
+        run.folder,
+        expected=expected,
+        found=f"{found}: {run.spec.title} under strategy {run.record.strategy}",
+        todo="open another run, such as one of chronogs under strategy joint",
+    )
+
+
+def _width(run: OpenRun) -> int:
+    return min(run.record.max_width, MAX_WIDTH)
+
+
+def _shot(store: ImageStore, frame: Frame) -> Shot:
+    return Shot(frame.name, store.camera(frame), frame.cam_from_world, frame.period)
+
+
+def score_map(run: OpenRun, scene: Scene, store: ImageStore, made: ChangeMap) -> dict[str, float]:
+    """How well a map tells changed pixels of test views from unchanged ones.
+
+    The pixels of all views of the two periods are taken together. The baseline is the difference
+    between the renders of both periods, with the threshold of Otsu.
+
+    Returns:
+        ``map_ap_geometry``, ``map_f1_geometry``, ``image_ap_geometry`` and so on; empty without
+        a truth.
+    """
+    scores: list[Array] = []
+    masks: list[NDArray[np.uint8]] = []
+    for frame in scene.select(split="test"):
+        other = sum(made.periods) - frame.period
+        path = scene.root / "gt" / truth_place("change", frame.name, other)
+        if frame.period not in made.periods or not path.is_file():
+            continue
+        shot, mask = _shot(store, frame), store.load_mask(frame)
+        changes = load_changes(path, shot.camera.size, _width(run))
+        shown = [run.render(shot.camera, shot.cam_from_world, p) for p in made.periods]
+        first, second = (to_bytes(prediction.rgb).astype(int) for prediction in shown)
+        difference = np.abs(first - second).mean(axis=2, keepdims=True).round()
+        counted = np.ones(changes.shape, bool) if mask is None else mask
+        view = np.concatenate([made.view_scores(shot, shown), difference], axis=2)
+        scores.append(view[counted])
+        masks.append(changes[counted])
+    if not any(map(len, masks)):
+        return {}
+    geometry, appearance, image = np.concatenate(scores).T
+    truth = np.concatenate(masks)
+    otsu, _ = cv2.threshold(image.astype(np.uint8), 0, 255, cv2.THRESH_OTSU)
+    by_map = {
+        "geometry": change_scores(geometry, truth, threshold=GEOMETRY),
+        "appearance": change_scores(appearance, truth, threshold=APPEARANCE),
+    }
+    by_image = change_scores(image, truth, threshold=otsu + 1)
+    return {
+        f"{name}_{metric}_{kind}": values[f"change_{metric}_{kind}"]
+        for kind in by_map
+        for name, values in (("map", by_map[kind]), ("image", by_image))
+        for metric in ("ap", "f1")
+        if f"change_{metric}_{kind}" in values
+    }
+
+
+def changes_table(rows: Sequence[Compared], labels: Mapping[str, str], title: str) -> Table:
+    """A row for each pair of periods.
+
+    Args:
+        rows: From `map_run`.
+        labels: Of the periods, by their ids.
+        title: Of the table.
+    """
+    shown = [key for key in SCORES if any(key in scores for _, scores in rows)]
+    heads = [("from", ""), ("to", ""), ("places", "")]
+    heads += [("of them [%]" if name == CLASSES[1] else "", name) for name in CLASSES[1:]]
+    heads += [SCORES[key] for key in shown]
+    lines = []
+    for made, scores in rows:
+        names = [labels[str(period)] for period in made.periods]
+        shares = [f"{100 * share:.1f}" for share in made.shares().values()]
+        values = [f"{scores[key]:.3f}" if key in scores else "-" for key in shown]
+        lines.append([*names, f"{len(made.xyz):,}", *shares, *values])
+    return Table(heads, lines, labels=2, title=title)
+
+
+def changes_csv(rows: Sequence[Compared]) -> str:
+    """The same with numbers of periods, shares instead of percentages, and all digits."""
+    columns = ("from", "to", "places", *CLASSES[1:], *SCORES)
+    lines = [
+        (*made.periods, len(made.xyz), *made.shares().values(), *(scores.get(k) for k in SCORES))
+        for made, scores in rows
+    ]
+    return csv_text(columns, lines)

@@ -1,0 +1,1 @@
+"""Commands on methods: listing, checking and beginning one."""

@@ -1,0 +1,90 @@
+"""``chronoscene check-method`` and ``new-method``: for those who write a method."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import click
+
+from chronoscene.cli.options import look_here_for
+from chronoscene.errors import ConfigError
+from chronoscene.io.staging import staged_folder
+
+SOME_FAILED = 1  # Exit status when the method breaks a rule
+
+EXAMPLE = "tinted-gaussians"
+SKELETON = Path(__file__).parent / "skeleton"
+"""The package of this name, which new methods are copies of."""
+KINDS = ("*.py", "*.toml", "*.md")  # Its own files; others are left there by Python and pip
+
+
+@click.command("check-method")
+@click.argument("name")
+def check(name: str) -> None:
+    """Check that the method NAME does what bench asks of methods.
+
+    NAME is that of an installed method, or module:SPEC. It is trained on made-up images on the CPU;
+    that takes about a minute. Each rule is a line; exit status 1 says that one was broken.
+    """
+    from chronoscene.bench.contract import check_method
+
+    look_here_for([name])
+    findings = []
+    for finding in check_method(name):
+        findings.append(finding)
+        if finding.problem is not None:
+            click.secho(f"FAILED  {finding.rule}\n        {finding.problem}", fg="red")
+        elif finding.left_out is not None:
+            click.echo(f"-       {finding.rule}: {finding.left_out}")
+        else:
+            click.echo(f"ok      {finding.rule}")
+    broken = sum(finding.problem is not None for finding in findings)
+    click.echo(f"{name}: {broken} of {len(findings)} rules broken")
+    if broken:
+        click.get_current_context().exit(SOME_FAILED)
+
+
+@click.command("new-method")
+@click.argument("name")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="New folder for the package.  [default: NAME]",
+)
+def new(name: str, out: Path | None) -> None:
+    """Write the package of a new method called NAME.
+
+    It is a method that works, to be changed: Gaussians with a tint per period.
+    """
+    if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name):
+        raise ConfigError(
+            "NAME",
+            expected="small letters and digits, in words joined by hyphens",
+            found=repr(name),
+            todo="choose a name like my-method",
+        )
+    out = out or Path(name)
+    with staged_folder(out) as staging:
+        for source in sorted(path for kind in KINDS for path in SKELETON.rglob(kind)):
+            target = staging / renamed(source.relative_to(SKELETON).as_posix(), name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(renamed(source.read_text(encoding="utf-8"), name), encoding="utf-8")
+    click.echo(
+        f"wrote {out}; next:\n"
+        f"  pip install --editable {out}\n"
+        f"  chronoscene check-method {name}\n"
+        f"  chronoscene bench SCENE --method {name} --preset fast"
+    )
+
+
+def renamed(text: str, name: str) -> str:
+    """A text of the example, with the new name in place of its own."""
+    for joined in ("-", "_", " ", ""):
+        old, new = (joined.join(word.split("-")) for word in (EXAMPLE, name))
+        text = text.replace(old, new).replace(_titled(EXAMPLE, joined), _titled(name, joined))
+    return text
+
+
+def _titled(name: str, joined: str) -> str:
+    return joined.join(word.capitalize() for word in name.split("-"))

@@ -1,0 +1,118 @@
+"""``chronoscene methods``: list the installed methods, or everything that one of them can do."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import indent
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from chronoscene.cli.options import look_here_for
+from chronoscene.cli.output import emit
+from chronoscene.methods import (
+    PROGRAM_GROUP,
+    MethodSpec,
+    Option,
+    as_typed,
+    load_spec,
+    method_names,
+    options_of,
+)
+
+
+@click.command("methods")
+@click.argument("name", required=False)
+@click.option(
+    "--runs",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("runs"),
+    show_default=True,
+    help="Folder of finished runs, which say what the method NAME costs.",
+)
+def command(name: str | None, runs: Path) -> None:
+    """List the installed methods, or describe the one called NAME.
+
+    A description has all options with default, meaning and values in the presets, and what the
+    finished runs of the method took. NAME may be module:SPEC.
+    """
+    if name is None:
+        list_methods()
+        return
+    look_here_for([name])
+    emit("\n".join(describe(load_spec(name), runs)) + "\n", None)
+
+
+def list_methods() -> None:
+    """Print a table of all installed methods, and one of other programs."""
+    console = Console()
+    table = Table(title="Methods")
+    for column in ("name", "title", "period input", "presets"):
+        table.add_column(column, no_wrap=column == "name")
+    for name in method_names():
+        spec = load_spec(name)
+        table.add_row(name, spec.title, spec.period_input, ", ".join(sorted(spec.presets)))
+    console.print(table)
+    if programs := method_names(PROGRAM_GROUP):
+        console.print(_program_table(programs))
+    console.print("chronoscene methods NAME describes one: paper, licence, options, costs.")
+
+
+def _program_table(names: tuple[str, ...]) -> Table:
+    """Methods that are other programs, which are installed on their own."""
+    table = Table(title="External programs, installed apart from ChronoScene")
+    for column in ("name", "title", "period input", "tested"):
+        table.add_column(column, no_wrap=column == "name")
+    for spec in map(load_spec, names):
+        tested = spec.runner.tested if spec.runner else ""
+        table.add_row(spec.name, spec.title, spec.period_input, tested)
+    return table
+
+
+def describe(spec: MethodSpec, runs: Path) -> Iterator[str]:
+    """Everything about a method, in lines."""
+    yield f"{spec.title} ({spec.name})"
+    yield f"paper: {spec.paper}"
+    yield f"licence: {spec.licence}"
+    yield f"period input: {spec.period_input}; outputs: {', '.join(spec.outputs)}; " + (
+        f"devices: {', '.join(spec.devices)}; can be resumed: {'yes' if spec.resumable else 'no'}"
+    )
+    yield f"presets: {', '.join(spec.presets)}"
+    if spec.runner is not None:
+        yield f"external program, installed apart from ChronoScene; {spec.runner.tested}; commands:"
+        for words in (spec.runner.train, *spec.runner.render):
+            yield indent(click.wrap_text(shlex.join(words), width=90), "    ")
+    yield "\nOptions, with their defaults; --set NAME=VALUE changes one:\n"
+    for option in options_of(spec):
+        yield describe_option(option)
+    yield f"\nCost:\n\n{describe_cost(spec, runs)}"
+
+
+def describe_option(option: Option) -> str:
+    """Name and default, values of presets, and the meaning below."""
+    presets: dict[str, list[str]] = {}
+    for preset, value in option.presets.items():
+        presets.setdefault(as_typed(value), []).append(preset)
+    others = "".join(f"; {', '.join(names)}: {value}" for value, names in presets.items())
+    text = click.wrap_text(option.meaning or "(no description)", width=80, initial_indent="")
+    return f"{option.name}={as_typed(option.default)}{others}\n{indent(text, '    ')}"
+
+
+def describe_cost(spec: MethodSpec, runs: Path) -> str:
+    """What finished runs took; without any, how to measure it."""
+    from chronoscene.bench.files.records import read_run, run_folders
+    from chronoscene.bench.report.tables import cost_tables
+    from chronoscene.io.tables import plain_text
+
+    records = [run for folder in run_folders(runs) if (run := read_run(folder)).method == spec.name]
+    if not records:
+        return (
+            f"No run of it in {runs}. Time and memory depend on scene, preset and machine:\n"
+            f"    chronoscene bench SCENE --method {spec.name} --preset balanced --out {runs}\n"
+            "measures them, and this command shows them then."
+        )
+    devices = dict.fromkeys(run.device for run in records)
+    return "\n".join([*map(plain_text, cost_tables(records)), f"measured on {'; '.join(devices)}"])

@@ -1,0 +1,172 @@
+"""Options and arguments that several commands share, and how their texts are parsed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chronoscene.errors import ConfigError
+from chronoscene.formats import format_names, load_format
+
+
+def _period_help() -> str:
+    known = {name: getattr(load_format(name), "PERIOD_BY", ()) for name in format_names()}
+    rules = "; ".join(f"{name}: {', '.join(by)}" for name, by in known.items() if by)
+    return f"How images are grouped into periods, where the format leaves a choice. {rules}."
+
+
+def reading_options(scene: str) -> Callable[[Any], Any]:
+    """The options ``--dataset-format`` and ``--period-by`` of a command that reads scenes."""
+    help = f"Format of {scene}.  [default: detected]"
+    format_option = click.option("--dataset-format", type=click.Choice(format_names()), help=help)
+    period_option = click.option("--period-by", metavar="RULE", help=_period_help())
+    return lambda command: format_option(period_option(command))
+
+
+RUNS = click.argument(
+    "folders",
+    metavar="RUNS...",
+    nargs=-1,
+    required=True,
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+)
+
+
+LPIPS_WEIGHTS = click.option(
+    "--lpips-weights",
+    type=click.Path(path_type=Path, exists=True),
+    help="Folder or file with the weights of LPIPS.",
+)
+
+
+RUNS_OUT = click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("runs"),
+    show_default=True,
+    help="Folder for the runs.",
+)
+
+
+def split_list(option: str, text: str) -> tuple[str, ...]:
+    """Items of a comma-separated list, each once.
+
+    Raises:
+        ConfigError: If an item is empty.
+    """
+    items = [item.strip() for item in text.split(",")]
+    if not all(items):
+        raise ConfigError(
+            option, expected="names separated by commas", found=repr(text), todo="correct the list"
+        )
+    return tuple(dict.fromkeys(items))
+
+
+RUN = click.argument("folder", metavar="RUN", type=click.Path(path_type=Path))
+
+
+SCENE = click.option(
+    "--scene",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="Where the scene of the run is now, if it has moved.",
+)
+
+
+STAGE = click.option(
+    "--stage",
+    type=click.IntRange(min=0),
+    help="For a run under strategy sequential: use its model as it was after the period with this "
+    "number.  [default: the last]",
+)
+
+
+DEVICE = click.option(
+    "--device",
+    type=click.Choice(["cpu", "cuda"]),
+    default="cpu",
+    show_default=True,
+    help="Device to render on.",
+)
+
+
+FOLDER = click.Path(path_type=Path, file_okay=False)
+
+
+_TRAINING = (
+    click.option("--preset", default="balanced", show_default=True, help="Preset of the methods."),
+    click.option(
+        "--iterations", type=click.IntRange(min=1), help="Stop after this many iterations."
+    ),
+    click.option(
+        "--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Number of seeds."
+    ),
+    click.option(
+        "--set",
+        "assignments",
+        multiple=True,
+        help="Set an option of the methods, as KEY=VALUE or METHOD.KEY=VALUE. May be repeated.",
+    ),
+    click.option(
+        "--jobs",
+        type=click.IntRange(min=1),
+        help="Number of runs at a time.  [default: 1; with --ray as many as have room]",
+    ),
+    click.option(
+        "--job-memory",
+        type=click.FloatRange(min=0, min_open=True),
+        callback=lambda _context, _option, value: value and round(value * 1e9),
+        help="Memory that a run takes, in GB: another one begins if so much is free.  "
+        "[default: an estimate]",
+    ),
+    click.option(
+        "--ray",
+        metavar="ADDRESS",
+        help="Address of the Ray cluster to run on; auto for that of this machine.",
+    ),
+    click.option(
+        "--threads",
+        type=click.IntRange(min=1),
+        help="Number of threads of a run.  [default: one per processor, divided by --jobs; "
+        "with --ray those of the smallest machine]",
+    ),
+    click.option(
+        "--device",
+        type=click.Choice(["auto", "cpu", "cuda"]),
+        default="auto",
+        show_default=True,
+        help="Device to train and render on.",
+    ),
+)
+
+
+def training_options(command: Any) -> Any:
+    """The options that ``bench`` and ``study`` share."""
+    return reduce(lambda found, option: option(found), reversed(_TRAINING), command)
+
+
+def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
+    """``KEY=VALUE`` texts as a mapping.
+
+    Raises:
+        ConfigError: If one has no ``=``.
+    """
+    parsed = {}
+    for text in assignments:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(
+                "--set", expected="KEY=VALUE", found=repr(text), todo="write KEY=VALUE"
+            )
+        parsed[key.strip()] = value.strip()
+    return parsed
+
+
+def look_here_for(names: Iterable[str]) -> None:
+    """Let ``module:SPEC`` name a plug-in under development in the current folder."""
+    if any(":" in name for name in names) and str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))

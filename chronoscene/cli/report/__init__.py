@@ -1,0 +1,1 @@
+"""Commands that read finished runs: tables, comparisons, trade-offs, the leaderboard."""

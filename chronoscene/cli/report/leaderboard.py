@@ -1,0 +1,61 @@
+"""``chronoscene submit`` and ``leaderboard``: results of finished runs as a site."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from chronoscene.bench.report.published import load_published
+from chronoscene.cli.options import RUNS
+from chronoscene.cli.output import check_place, tell_written, writing_to
+from leaderboard.entries import read_entries
+from leaderboard.site import write_site
+from leaderboard.submit import submit
+
+
+@click.command("submit")
+@RUNS
+@click.option(
+    "--to",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    help="Folder of entries, such as leaderboard/entries/measured.",
+)
+def submit_command(folders: tuple[Path, ...], to: Path) -> None:
+    """Add finished runs to the entries of the leaderboard.
+
+    Each of RUNS is the folder of a run, or one with many. An entry is a JSON file with the values
+    of all test views, what the runs cost, and the hashes of the predictions, which are checked.
+    Seeds of one setting are in one file; a seed that is there is replaced.
+    """
+    with writing_to("--to", to):
+        written = submit(folders, to)
+    tell_written(*written)
+
+
+@click.command("leaderboard")
+@click.argument("entries", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    help="New folder for the site.",
+)
+@click.option(
+    "--runs",
+    multiple=True,
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="Folder of the runs that entries were made of: pictures of their test views come from "
+    "there. May be repeated.",
+)
+def leaderboard_command(entries: Path, out: Path, runs: tuple[Path, ...]) -> None:
+    """Make a site of the measured ENTRIES and of what was published.
+
+    It needs no server: open its index.html.
+    """
+    check_place("--out", out)
+    found = read_entries(entries)
+    pictured = write_site(found, load_published(), out, runs)
+    click.echo(f"{len(found)} measured entries, {pictured} of them with pictures")
+    tell_written(out / "index.html")

@@ -1,0 +1,141 @@
+"""``chronoscene table`` and ``score``: what finished runs say, and scoring them again."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import click
+
+from chronoscene.bench.files.records import RESULTS_FILE, ROWS_FILE
+from chronoscene.bench.report.comparison_figure import draw_figures
+from chronoscene.bench.report.published import load_published
+from chronoscene.bench.report.stage_figure import draw_stages
+from chronoscene.bench.report.summary import in_region, read_runs
+from chronoscene.bench.report.tables import MAX_PERIODS, format_runs
+from chronoscene.bench.score.regions import ALL, REGIONS, freeze_change_masks
+from chronoscene.bench.score.scoring import rescore
+from chronoscene.cli.options import LPIPS_WEIGHTS, RUNS, split_list
+from chronoscene.cli.output import FORMAT, OUT_FILE, emit, terminal_width
+from chronoscene.cli.progress import progress_bar
+from chronoscene.metrics.registry import METRICS, make_scorers, metric_info
+
+SOME_FAILED = 1  # Exit status when a run could not be scored
+
+
+@click.command("score")
+@click.argument("runs", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option(
+    "--metric",
+    "metrics",
+    multiple=True,
+    help="Metrics to compute, as NAME[,NAME...]; the others keep their values. May be repeated.  "
+    "[default: all but those on request: "
+    f"{', '.join(name for name, info in METRICS.items() if info.on_request)}]",
+)
+@click.option(
+    "--truth",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="Also score what changes between periods, and what does not, apart: by the change masks "
+    "in this folder, which is laid out like the gt/ of a generated scene; or in SCENE/gt/ of a "
+    "folder of scenes.",
+)
+@LPIPS_WEIGHTS
+def score(
+    runs: Path, metrics: tuple[str, ...], truth: Path | None, lpips_weights: Path | None
+) -> None:
+    """Score the finished runs in RUNS again and print what changed.
+
+    Only the predictions of each run and the frozen ground truth are read; their hashes are checked.
+    Change masks are frozen with the ground truth, and later runs in RUNS are scored by them, too.
+    """
+    with progress_bar("load the metrics") as bar:
+        scorers = make_scorers(parse_metrics(metrics) or None, lpips_weights=lpips_weights)
+        if truth is not None:
+            freeze_change_masks(runs, truth)
+        outcomes = rescore(runs, scorers, progress=partial(bar, "runs"))
+    for outcome in outcomes:
+        name = outcome.folder.relative_to(runs)
+        if outcome.error is not None:
+            click.secho(f"{name}: error: {outcome.error}", fg="red", err=True)
+            continue
+        click.echo(f"{name}: {'; '.join(outcome.changes) or 'unchanged'}")
+        for metric in outcome.kept:
+            click.echo(f"{name}: {metric} kept from an earlier scoring")
+    for reason in dict.fromkeys(scorers.skipped.values()):
+        names = ", ".join(name for name, why in scorers.skipped.items() if why == reason)
+        click.echo(f"{names} not computed: {reason}")
+    if any(outcome.error is not None for outcome in outcomes):
+        click.get_current_context().exit(SOME_FAILED)
+
+
+def print_runs(out: Path) -> None:
+    """Print the tables of all runs in a folder, and the files that belong to all of them."""
+    records, failures = read_runs([out])
+    text = format_runs(records, failures, "table", width=terminal_width(None))
+    emit(text + "\n", None)
+    figures = [*draw_figures(out, records), *draw_stages(out, records)]
+    click.echo("\n".join(map(str, (out / RESULTS_FILE, out / ROWS_FILE, *figures))))
+
+
+@click.command("table")
+@RUNS
+@FORMAT
+@click.option(
+    "--metric",
+    "metrics",
+    multiple=True,
+    help="Metrics to show and nothing else, as NAME[,NAME...]. May be repeated.  [default: all]",
+)
+@click.option(
+    "--region",
+    type=click.Choice(REGIONS),
+    default=ALL,
+    show_default=True,
+    help="Part of the images that is scored; see chronoscene score --truth.",
+)
+@click.option(
+    "--published",
+    "with_published",
+    is_flag=True,
+    help="Show what the paper of ChronoGS printed for the scenes beside the runs.",
+)
+@click.option(
+    "--periods", is_flag=True, help=f"Show every period where there are more than {MAX_PERIODS}."
+)
+@OUT_FILE
+def table(
+    folders: tuple[Path, ...],
+    style: str,
+    metrics: tuple[str, ...],
+    region: str,
+    with_published: bool,
+    periods: bool,
+    out: Path | None,
+) -> None:
+    """Print the results in one or several folders of runs.
+
+    First come the means of all scenes, as papers print them. Then there is a table per scene and
+    metric, with each period, macro (the mean over periods), micro (the mean over views) and the
+    worst period, and one of costs. Several seeds give the mean, the sample standard deviation and
+    the number of runs. Intervals and differences are at 95 % over test views.
+    """
+    records, failures = read_runs(folders)
+    if region != ALL:
+        records = in_region(records, region)
+    published = load_published() if with_published else None
+    width = terminal_width(out)
+    wanted = parse_metrics(metrics)
+    text = format_runs(
+        records, failures, style, wanted, published=published, periods=periods, width=width
+    )
+    emit(text, out)
+
+
+def parse_metrics(texts: tuple[str, ...]) -> list[str]:
+    """Names of metrics from comma-separated lists.
+
+    Raises:
+        ConfigError: If there is no such metric.
+    """
+    return [metric_info(name).name for text in texts for name in split_list("--metric", text)]

@@ -1,0 +1,200 @@
+"""``chronoscene tradeoff``: quality against cost over finished runs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chronoscene.bench.files.records import FIGURES, Failure, RunRecord
+from chronoscene.bench.plan.stop import parse_duration
+from chronoscene.bench.report.summary import COSTS, read_runs, summarise
+from chronoscene.bench.report.tables import COST_TITLES, footnotes, tables_text
+from chronoscene.bench.report.time_to_quality import (
+    Reading,
+    read_curve,
+    readings,
+    time_tables,
+    whole_curve,
+)
+from chronoscene.bench.report.tradeoff import (
+    FrontPoint,
+    Limits,
+    as_configurations,
+    choose,
+    front_points,
+    front_tables,
+)
+from chronoscene.cli.options import RUNS
+from chronoscene.cli.output import FORMAT, OUT_FILE, emit, tell_written, terminal_width, writing_to
+from chronoscene.errors import ConfigError
+from chronoscene.io import tables
+from chronoscene.metrics.registry import metric_info
+
+FIGURE = "tradeoff.png"
+
+
+@click.command("tradeoff")
+@RUNS
+@FORMAT
+@OUT_FILE
+@click.option(
+    "--figures",
+    type=click.Path(path_type=Path, file_okay=False),
+    help=f"Folder for {FIGURE}.  [default: {FIGURES}/ in the first of RUNS]",
+)
+@click.option(
+    "--budget", help="Say which configuration to use for this training time, such as 90s or 5m."
+)
+@click.option("--max-bytes", help="The same for models of this size, such as 500kB, 10MB or 1GB.")
+@click.option(
+    "--target-psnr", type=float, help="The same for this PSNR in dB, in the least training time."
+)
+def command(
+    folders: tuple[Path, ...],
+    style: str,
+    out: Path | None,
+    figures: Path | None,
+    budget: str | None,
+    max_bytes: str | None,
+    target_psnr: float | None,
+) -> None:
+    """Show what quality costs in the finished runs in RUNS.
+
+    Draws Pareto fronts of PSNR, SSIM and LPIPS against training time, rendering rate, size and
+    memory, and prints them; then the PSNR of the probe views after given times of training, and the
+    times until they have a given PSNR. CSV has the points of the fronts and all others. With
+    --budget, --max-bytes or --target-psnr it says in a sentence which configuration to use, and
+    nothing else. docs/benchmark.md, "Trade-off".
+    """
+    records, failures = read_runs(folders)
+    records = as_configurations(records)
+    target = None if target_psnr is None else f"{target_psnr:g}"
+    typed = {"--budget": budget, "--max-bytes": max_bytes, "--target-psnr": target}
+    given = [f"{name} {value}" for name, value in typed.items() if value is not None]
+    if given:
+        limits = Limits(
+            seconds=None if budget is None else parse_duration(budget),
+            size=None if max_bytes is None else parse_size(max_bytes),
+            psnr=target_psnr,
+        )
+        emit("".join(f"{line}\n" for line in choose(records, limits, " ".join(given))), out)
+        return
+    curves = [whole_curve(read_curve(run.folder), run.strategy) for run in records]
+    points, times = front_points(records), readings(records, curves)
+    emit(_text(points, times, _notes(records, failures), style, out), out)
+    if points:
+        figure = (figures or folders[0] / FIGURES) / FIGURE
+        with writing_to("--figures", figure):
+            draw(points, figure, records)
+        tell_written(figure)
+
+
+def parse_size(text: str) -> float:
+    """Bytes of ``500kB``, ``10MB`` or ``1.5GB``.
+
+    Raises:
+        ConfigError: If the text is none of these or not positive.
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) ?(k|M|G)B", text)
+    size = float(found[1]) * {"k": 1e3, "M": 1e6, "G": 1e9}[found[2]] if found else 0.0
+    if not size:
+        raise ConfigError(
+            "--max-bytes",
+            expected="a positive size such as 500kB, 10MB or 1GB",
+            found=repr(text),
+            todo="write a number with the unit kB, MB or GB",
+        )
+    return size
+
+
+def _notes(records: Sequence[RunRecord], failures: Sequence[Failure]) -> list[str]:
+    """What a reader must know of the runs, and of widths that differ."""
+    notes = footnotes(summarise(records).assign(tied=False), records, failures)
+    if len(widths := sorted({run.max_width for run in records})) > 1:
+        sizes = ", ".join(map(str, widths))
+        notes.append(f"scored at several --max-width ({sizes}): smaller images are easier")
+    return notes
+
+
+def _text(
+    points: Sequence[FrontPoint],
+    times: Sequence[Reading],
+    notes: list[str],
+    style: str,
+    out: Path | None,
+) -> str:
+    """Everything but the figure, in one of the formats."""
+    if style == "csv":
+        rows = [list(asdict(point).values()) for point in points]
+        return tables.csv_text([field.name for field in fields(FrontPoint)], rows)
+    if style == "json":
+        from pydantic import ConfigDict, TypeAdapter
+
+        document: dict[str, Any] = {"fronts": points, "times": times, "notes": notes}
+        adapter = TypeAdapter(dict[str, Any], config=ConfigDict(ser_json_inf_nan="strings"))
+        return adapter.dump_json(document, indent=1).decode() + "\n"
+    made = [*front_tables(points), *time_tables(times)]
+    return tables_text(made, notes, style, width=terminal_width(out))
+
+
+def draw(points: Sequence[FrontPoint], path: Path, records: Sequence[RunRecord]) -> None:
+    """Draw all panels of some points; a row for each scene and metric.
+
+    Args:
+        points: As from `front_points`.
+        path: File to write.
+        records: The runs, for the note.
+    """
+    from chronoscene.figures.fronts import Panel, draw_fronts
+
+    names = list(dict.fromkeys(point.label for point in points))
+    numbers = {name: i + 1 for i, name in enumerate(names)}
+    groups: dict[str, dict[int, None]] = {}
+    panels: dict[tuple[str, str], dict[tuple[str, str], list[FrontPoint]]] = {}
+    for point in points:
+        groups.setdefault(point.method, {})[numbers[point.label]] = None
+        row = panels.setdefault((point.scene, point.metric), {})
+        row.setdefault((point.cost, point.device), []).append(point)
+    rows = [
+        [
+            Panel(
+                title=" on ".join(filter(None, (scene, device))),
+                x_label=_axis(cost),
+                y_label=metric_info(metric).title,
+                marks=[_mark(point, numbers[point.label]) for point in found],
+                lower_is_better=not metric_info(metric).higher_is_better,
+            )
+            for (cost, device), found in row.items()
+        ]
+        for (scene, metric), row in panels.items()
+    ]
+    devices = "; ".join(dict.fromkeys(run.device for run in records))
+    commits = ", ".join(dict.fromkeys(run.commit for run in records))
+    note = (
+        "Test views, means over periods. Filled: on the Pareto front, which the line follows. "
+        "Bars: standard deviation over seeds."
+        f"\nDevice: {devices}. Code: {commits}."
+    )
+    draw_fronts(rows, path, names=names, groups={k: list(v) for k, v in groups.items()}, note=note)
+
+
+def _axis(cost: str) -> str:
+    if cost == "render_seconds":
+        return "rendering [images/s]"
+    return COST_TITLES[cost]
+
+
+def _mark(point: FrontPoint, number: int) -> Any:
+    from chronoscene.figures.fronts import Mark
+
+    factor = next(known.factor for known in COSTS if known.name == point.cost)
+    x, spread = point.value * factor, (point.value_sd or 0.0) * factor
+    if point.cost == "render_seconds":
+        x = 1 / point.value
+        spread = x * (point.value_sd or 0.0) / point.value  # to first order
+    return Mark(number, x, point.quality, spread, point.quality_sd or 0.0, point.on_front)

@@ -1,0 +1,1 @@
+"""Commands that train methods or use trained runs: one file per command."""

@@ -1,0 +1,162 @@
+"""``chronoscene bench``: train methods on scenes, render the test views, score them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chronoscene.bench.files.records import read_failures
+from chronoscene.bench.files.strategies import STRATEGIES
+from chronoscene.bench.plan.job import PHOTO_DISK, PHOTO_MEMORY
+from chronoscene.bench.plan.stop import parse_duration
+from chronoscene.bench.run.runner import BenchOutcome, BenchSettings, run_bench
+from chronoscene.checks import check_choice
+from chronoscene.cli.options import (
+    FOLDER,
+    LPIPS_WEIGHTS,
+    RUNS_OUT,
+    look_here_for,
+    parse_assignments,
+    reading_options,
+    split_list,
+    training_options,
+)
+from chronoscene.cli.output import check_place
+from chronoscene.cli.report.results import print_runs
+from chronoscene.images.store import MAX_WIDTH
+from chronoscene.io.staging import check_outside
+from chronoscene.kernels.runtime import check_device
+
+SOME_FAILED = 1  # Exit status when a run failed; the others have their results
+
+
+@click.command("bench")
+@click.argument("scenes", metavar="DIR...", nargs=-1, required=True, type=FOLDER)
+@click.option(
+    "--method", "methods", required=True, help="Methods to run, as NAME[,NAME...] or module:SPEC."
+)
+@click.option(
+    "--strategy",
+    "strategies",
+    default="joint",
+    show_default=True,
+    help=f"One or several of {', '.join(STRATEGIES)}, separated by commas.",
+)
+@reading_options("the scenes")
+@training_options
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="First seed. Equal seeds give equal models on one machine's CPU, but not with --budget.",
+)
+@click.option(
+    "--budget",
+    help="Stop after this time on the training clock, such as 90s, 5m or 1h30m. Schedules follow "
+    "the clock then, and equal seeds do not give equal models.",
+)
+@click.option(
+    "--continue-to",
+    type=click.IntRange(min=1),
+    help="Train finished runs that kept their training further, up to this many iterations.",
+)
+@click.option(
+    "--checkpoint-every",
+    default="5m",
+    show_default=True,
+    help="Time between checkpoints, from which a run that was stopped goes on.",
+)
+@click.option(
+    "--keep-training",
+    is_flag=True,
+    help="Keep the last checkpoint of finished runs, for --continue-to.",
+)
+@click.option(
+    "--separate-iterations",
+    type=click.Choice(["total", "each"]),
+    default="total",
+    show_default=True,
+    help="Whether the models of strategy separate, or the stages of strategy sequential, share "
+    "iterations and budget or each get them.",
+)
+@click.option(
+    "--max-width",
+    type=click.IntRange(min=1),
+    default=MAX_WIDTH,
+    show_default=True,
+    help="Scale wider images down to this width in pixels, for training and evaluation.",
+)
+@click.option(
+    "--photo-memory",
+    type=click.FloatRange(min=0),
+    default=PHOTO_MEMORY / 1e9,
+    show_default=True,
+    help="Memory for training photos in GB, the decoding of them included.",
+)
+@click.option(
+    "--photo-disk",
+    type=click.FloatRange(min=0),
+    default=PHOTO_DISK / 1e9,
+    show_default=True,
+    help="Disk space below --out in GB for decoded photos, if they do not fit into memory.",
+)
+@LPIPS_WEIGHTS
+@RUNS_OUT
+@click.option(
+    "--overwrite", is_flag=True, help="Replace finished runs that were made with other settings."
+)
+def command(
+    methods: str,
+    strategies: str,
+    budget: str | None,
+    checkpoint_every: str,
+    photo_memory: float,
+    photo_disk: float,
+    seeds: int,
+    seed: int,
+    assignments: tuple[str, ...],
+    out: Path,
+    **options: Any,
+) -> None:
+    """Train, render and score methods on scenes.
+
+    Each run (one method, strategy, scene and seed) gets a folder below --out with its checkpoint,
+    predictions and scores. Finished runs are kept, so the same command resumes after an
+    interruption. docs/benchmark.md describes strategies, budget, seeds and files.
+    """
+    check_outside(out, options["scenes"], option="--out")
+    check_place("--out", out)
+    names = split_list("--method", methods)
+    look_here_for(names)
+    settings = BenchSettings(
+        methods=names,
+        runs=out,
+        strategies=tuple(
+            check_choice("--strategy", s, STRATEGIES) for s in split_list("--strategy", strategies)
+        ),
+        overrides=parse_assignments(assignments),
+        budget_seconds=None if budget is None else parse_duration(budget),
+        checkpoint_seconds=parse_duration(checkpoint_every, "--checkpoint-every"),
+        photo_memory=round(photo_memory * 1e9),
+        photo_disk=round(photo_disk * 1e9),
+        seeds=tuple(range(seed, seed + seeds)),
+        **options,
+    )
+    if settings.ray is None:  # else the machine that runs a job checks its own
+        check_device(settings.device)
+    outcome = run_bench(settings, lambda line: click.echo(line, err=True))
+    report(outcome, out)
+
+
+def report(outcome: BenchOutcome, out: Path) -> None:
+    """Print what is in the folder of runs, and why runs failed."""
+    if outcome.finished:
+        print_runs(out)
+    else:
+        for failure in read_failures(out):
+            click.echo(f"failed: {failure.scene}, {failure.method}: {failure.reason}", err=True)
+    if outcome.failures:
+        click.get_current_context().exit(SOME_FAILED)

@@ -1,0 +1,115 @@
+"""``chronoscene changes``: where the periods of a finished run differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import click
+import numpy as np
+
+from chronoscene.bench.use.changes import ChangeMap, changes_csv, changes_table, map_run
+from chronoscene.bench.use.trained_run import OpenRun, open_run
+from chronoscene.cli.options import DEVICE, RUN, SCENE
+from chronoscene.cli.output import emit, tell_written, terminal_width
+from chronoscene.cli.progress import tracked
+from chronoscene.errors import ConfigError
+from chronoscene.figures.canvas import rgb_of
+from chronoscene.figures.change_map import COLORS, Panel, draw_changes
+from chronoscene.figures.cloud import cloud_of
+from chronoscene.formats.shared.ply import write_vertices
+from chronoscene.io.staging import check_outside, staged_folder
+from chronoscene.io.tables import boxed_text
+
+_ALL_PAIRS = 4  # Periods of which all pairs are compared unless the user chooses
+
+
+@click.command("changes")
+@RUN
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="New folder for the point clouds, the picture and the table.",
+)
+@click.option(
+    "--between",
+    nargs=2,
+    multiple=True,
+    metavar="PERIOD PERIOD",
+    help="Compare these two, by number or label; may be repeated.  [default: all pairs of up to "
+    f"{_ALL_PAIRS} periods, of more each with the next]",
+)
+@SCENE
+@DEVICE
+def command(
+    folder: Path, out: Path, between: tuple[tuple[str, str], ...], scene: Path | None, device: str
+) -> None:
+    """Map what changes between the periods of a finished run.
+
+    OUT gets a point cloud in PLY format for each pair of periods, with scores and colours, a
+    picture of the pairs from above, and a table as CSV. Where gt/ of the scene has change masks,
+    the map is scored by them, beside differences of images. docs/changes.md says what the scores
+    mean.
+    """
+    run = open_run(folder, device=device)
+    pairs = [_pair(run, *names) for names in between]
+    pairs = pairs or usual_pairs(run.num_periods)
+    if not pairs:
+        raise ConfigError(
+            folder, expected="a run of two periods or more", found="one", todo="open another run"
+        )
+    found = run.scene(scene)
+    check_outside(out, [found.root], option="--out")
+    with staged_folder(out) as staged:
+        maps = list(tracked(map_run(run, found, pairs), "compare periods", total=len(pairs)))
+        for made, _ in maps:
+            _write_cloud(staged / "changes_{}_{}.ply".format(*made.periods), made)
+        (staged / "changes.csv").write_text(changes_csv(maps), encoding="utf-8", newline="\n")
+        panels = [_panel(made, run.record.period_labels) for made, _ in maps]
+        draw_changes(cloud_of(found), panels, staged / "changes.png")
+    table = changes_table(maps, run.record.period_labels, run.record.label)
+    emit(boxed_text(table, width=terminal_width(None)), None)
+    tell_written(out)
+    if not any(scores for _, scores in maps):
+        click.echo(f"not scored: no change masks of test views in {found.root / 'gt'}", err=True)
+
+
+def usual_pairs(periods: int) -> list[tuple[int, int]]:
+    """The pairs that are compared unless the user chooses; they do not grow with the square of many
+    periods."""
+    numbers = range(periods)
+    return list(combinations(numbers, 2) if periods <= _ALL_PAIRS else pairwise(numbers))
+
+
+def _pair(run: OpenRun, *names: str) -> tuple[int, int]:
+    """Two whole periods in their order."""
+    first, second = sorted(run.parse_period(name) for name in names)
+    if first == second or not (first.is_integer() and second.is_integer()):
+        raise ConfigError(
+            f"--between {' '.join(names)}",
+            expected="two periods of the scene",
+            found="the same one twice" if first == second else "a time between them",
+            todo="choose two of them",
+        )
+    return int(first), int(second)
+
+
+def _write_cloud(path: Path, made: ChangeMap) -> None:
+    """Places with the colours of their classes, scores, and the period of their surface."""
+    palette = np.array([rgb_of(color) for color in COLORS.values()]).astype(np.uint8)
+    write_vertices(
+        path,
+        made.xyz,
+        palette[made.classes],
+        geometry=made.geometry.astype(np.float32),
+        appearance=made.appearance.astype(np.float32),
+        known=made.known.astype(np.uint8),
+        period=np.where(made.later, *made.periods[::-1]).astype(np.int32),
+    )
+
+
+def _panel(made: ChangeMap, labels: Mapping[str, str]) -> Panel:
+    title = " \N{RIGHTWARDS ARROW} ".join(labels[str(period)] for period in made.periods)
+    return Panel(title, made.xyz, made.classes)

@@ -1,0 +1,49 @@
+"""``chronoscene compress``: a finished run with its models in few bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from chronoscene.bench.files.records import read_run
+from chronoscene.bench.use.compression import compress_run
+from chronoscene.bench.use.trained_run import open_run
+from chronoscene.cli.options import DEVICE, RUN, SCENE
+from chronoscene.cli.output import emit, tell_written
+from chronoscene.cli.progress import announce
+
+
+@click.command("compress")
+@RUN
+@click.option(
+    "--max-loss",
+    type=click.FloatRange(min=0, min_open=True),
+    default=0.1,
+    show_default=True,
+    help="How far the PSNR of training views may fall, in dB.",
+)
+@click.option("--plain", is_flag=True, help="Half floats and LZMA instead of rounding and coding.")
+@SCENE
+@DEVICE
+def command(folder: Path, max_loss: float, plain: bool, scene: Path | None, device: str) -> None:
+    """Compress the model of a finished run.
+
+    RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. The compressed model is a
+    run of its own beside it, with scores on the test views, and a row in chronoscene table.
+    """
+    run = open_run(folder, device=device)
+    announce("read the scene")
+    out = compress_run(
+        run, run.scene(scene), max_loss=None if plain else max_loss, progress=announce
+    )
+    before, after = run.record, read_run(out)
+    sizes = [record.checkpoint_bytes or 0 for record in (before, after)]
+    lines = [f"{sizes[0]:,} bytes -> {sizes[1]:,} bytes, {sizes[1] / sizes[0]:.1%}"]
+    lines += [
+        f"{name} {old:.3f} -> {after.aggregates['macro'][name]:.3f} on test views"
+        for name, old in before.aggregates.get("macro", {}).items()
+        if name in after.aggregates["macro"]
+    ]
+    emit("\n".join(lines) + "\n", None)
+    tell_written(out)

@@ -1,0 +1,67 @@
+"""``chronoscene export``: a finished run as a file of Gaussians for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from chronoscene.bench.use.export import export_gaussians, measure_loss
+from chronoscene.bench.use.trained_run import open_run
+from chronoscene.cli.options import DEVICE, RUN, SCENE, STAGE
+from chronoscene.cli.output import check_file, emit, tell_written
+from chronoscene.cli.progress import announce
+from chronoscene.formats.shared.gaussian_ply import write_gaussians
+from chronoscene.io.staging import check_outside
+from chronoscene.io.wording import counted
+
+
+@click.command("export")
+@RUN
+@click.option(
+    "--period", required=True, help="The period to export, by its number, its label or a fraction."
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    help="The PLY file to write.",
+)
+@SCENE
+@STAGE
+@DEVICE
+def command(
+    folder: Path, period: str, out: Path, scene: Path | None, stage: int | None, device: str
+) -> None:
+    """Write a period of a finished run as Gaussians.
+
+    RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. The file has the PLY format
+    of 3DGS, in the world of the scene. What changes with the direction is fitted to the training
+    views; the PSNR lost by that on the test views is printed.
+    """
+    run = open_run(folder, device=device, stage=stage)
+    check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
+    check_file("--out", out)
+    wanted = run.parse_period(period)
+    announce("read the scene")
+    trained_on = run.scene(scene)
+    announce("export")
+    gaussians = export_gaussians(run, trained_on, wanted)
+    write_gaussians(out, gaussians)
+    announce("measure")
+    loss = measure_loss(run, trained_on, wanted, gaussians)
+    lines = [f"{len(gaussians):,} Gaussians of period {period}"]
+    if loss is None:
+        lines.append("PSNR lost: not measured, as no test photo shows this period")
+    else:
+        lost = round(loss.model - loss.exported, 2) + 0.0  # never -0.00
+        pair = f"{loss.model:.2f} dB, exported {loss.exported:.2f} dB"
+        lines.append(f"PSNR on {counted(loss.views, 'test view')}: {pair}: {lost:.2f} dB lost")
+    if getattr(run.config, "exposure", "none") != "none":
+        lines.append(
+            "The exposure is in the colours; where the background shows, a viewer lacks it"
+        )
+    if getattr(run.config, "antialiased", False):
+        lines.append("Switch on the antialiasing (Mip-Splatting) of the viewer, as in training")
+    emit("\n".join(lines) + "\n", None)
+    tell_written(out)

@@ -1,0 +1,68 @@
+"""``chronoscene leakage``: what the periods of a finished run have of each other."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from pathlib import Path
+
+import click
+
+from chronoscene.bench.files.records import ROW_COLUMNS
+from chronoscene.bench.use.leakage import COLUMNS, leakage_table, measure_leakage
+from chronoscene.bench.use.trained_run import open_run
+from chronoscene.cli.options import DEVICE, RUN, SCENE
+from chronoscene.cli.output import OUT_FILE, check_file, emit, terminal_width
+from chronoscene.cli.progress import tracked
+from chronoscene.errors import ConfigError
+from chronoscene.io import tables
+
+
+@click.command("leakage")
+@RUN
+@click.option(
+    "--truth",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="Folder laid out like the gt/ of a generated scene.  [default: gt/ of the scene]",
+)
+@click.option(
+    "--format",
+    "style",
+    type=click.Choice(["table", "csv", "markdown", "latex"]),
+    default="table",
+    show_default=True,
+    help="Output format; csv has every view.",
+)
+@OUT_FILE
+@SCENE
+@DEVICE
+def command(
+    folder: Path, truth: Path | None, style: str, out: Path | None, scene: Path | None, device: str
+) -> None:
+    """Measure what leaks between the periods of a finished run.
+
+    Each test camera is rendered at every period and compared with the truth of a generated scene,
+    or with that in a folder: quality, changes that are missed, ghosts of other periods, depth.
+    docs/benchmark.md defines the columns.
+    """
+    check_file("--out", out)
+    run = open_run(folder, device=device)
+    found = run.scene(scene)
+    place = truth or found.root / "gt"
+    tests = len(found.select(split="test"))
+    views = tracked(measure_leakage(run, found, place), "render", total=tests)
+    rows = [row for view in views for row in view]
+    there = {(row.region, row.metric) for row in rows if row.camera_period != row.rendered_period}
+    if not there:
+        raise ConfigError(
+            place,
+            expected="change masks, or images of test views at other periods",
+            found="none of a test view",
+            todo="name a folder with --truth; DATASET.md describes it",
+        )
+    if style == "csv":
+        emit(tables.csv_text(ROW_COLUMNS, map(astuple, rows)), out)
+        return
+    made = leakage_table(rows, run.record.period_labels, run.record.label)
+    emit(tables.text_of(made, style, width=terminal_width(out)), out)
+    if absent := [title for key, (title, _) in COLUMNS.items() if key not in there]:
+        click.echo(f"no truth, or nothing rendered, for: {', '.join(absent)}", err=True)

@@ -1,0 +1,96 @@
+"""``chronoscene render``: pictures of a finished run, from any camera at any period."""
+
+from __future__ import annotations
+
+from mimetypes import guess_type
+from pathlib import Path
+
+import click
+
+from chronoscene.bench.use.cameras import VIEWS, find_shots, with_periods
+from chronoscene.bench.use.rendering import check_shots, is_animation, render_shots, write_pictures
+from chronoscene.bench.use.trained_run import open_run
+from chronoscene.cli.options import DEVICE, RUN, SCENE, STAGE
+from chronoscene.cli.output import check_file, check_place, tell_written
+from chronoscene.cli.progress import tracked
+from chronoscene.errors import ConfigError
+from chronoscene.io.staging import check_outside
+
+
+@click.command("render")
+@RUN
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="New folder for PNG files, or a file that ends in .mp4 or .webp.",
+)
+@click.option(
+    "--cameras",
+    default="test",
+    show_default=True,
+    help=f"{', '.join(VIEWS)}, the folder of a COLMAP model, or a JSON camera path of nerfstudio. "
+    "Poses are in the world of the scene; a dataparser_transforms.json beside a camera path is "
+    "undone.",
+)
+@click.option(
+    "--period",
+    help="A period, by its number, its label or a fraction; or FROM:TO, a range that an orbit or "
+    "path goes through, and that every other camera shows.  [default: that of each camera]",
+)
+@click.option("--appearance-period", help="Show the geometry in the light of this period.")
+@click.option(
+    "--frames",
+    type=click.IntRange(min=1),
+    default=120,
+    show_default=True,
+    help="Pictures of an orbit, or of a range of periods.",
+)
+@click.option(
+    "--fps",
+    type=click.FloatRange(min=0.1, max=240),
+    default=24,
+    show_default=True,
+    help="Pictures per second of a file.",
+)
+@SCENE
+@STAGE
+@DEVICE
+def command(
+    folder: Path,
+    out: Path,
+    cameras: str,
+    period: str | None,
+    appearance_period: str | None,
+    frames: int,
+    fps: float,
+    scene: Path | None,
+    stage: int | None,
+    device: str,
+) -> None:
+    """Render a finished run from any camera.
+
+    RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. An orbit goes around the
+    middle of the sparse points, at the height and distance of the cameras.
+    """
+    run = open_run(folder, device=device, stage=stage)
+    check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
+    if is_animation(out):
+        check_file("--out", out)
+    elif (guess_type(out)[0] or "").startswith(("image/", "video/")):
+        raise ConfigError(
+            "--out",
+            expected="a folder, or a file that ends in .mp4 or .webp",
+            found=str(out),
+            todo="choose one of them",
+        )
+    else:
+        check_place("--out", out)
+    periods = () if period is None else run.parse_periods(period)
+    appearance = None if appearance_period is None else run.parse_period(appearance_period)
+    shots = with_periods(find_shots(cameras, run, scene, frames), run, periods, frames)
+    check_shots(run, shots, out, appearance)
+    images = render_shots(run, shots, appearance_period=appearance)
+    names = (shot.name for shot in shots)
+    write_pictures(out, names, tracked(images, "render", total=len(shots)), fps=fps)
+    tell_written(out)

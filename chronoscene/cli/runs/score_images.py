@@ -1,0 +1,75 @@
+"""``chronoscene score-images``: the images of another program as a run beside those of bench."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from chronoscene.bench.files.records import write_summary
+from chronoscene.bench.score.images import score_images
+from chronoscene.cli.options import LPIPS_WEIGHTS, RUNS_OUT, reading_options
+from chronoscene.cli.output import check_place
+from chronoscene.cli.progress import progress_bar
+from chronoscene.cli.report.results import print_runs
+from chronoscene.formats import read_scene
+from chronoscene.images.store import MAX_WIDTH
+from chronoscene.io.staging import check_outside
+from chronoscene.metrics.registry import make_scorers
+
+
+@click.command("score-images")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--name", required=True, help="Name of the program, as tables show it.")
+@click.option(
+    "--map",
+    "table",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="CSV file with the columns file and view, where files are not named like the views.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Which of several trainings of the program it was; tables show their mean and spread.",
+)
+@reading_options("the scene")
+@click.option(
+    "--max-width",
+    type=click.IntRange(min=1),
+    default=MAX_WIDTH,
+    show_default=True,
+    help="Scale wider images down to this width in pixels, as bench does.",
+)
+@LPIPS_WEIGHTS
+@RUNS_OUT
+def command(
+    scene: Path,
+    folder: Path,
+    name: str,
+    table: Path | None,
+    seed: int,
+    dataset_format: str | None,
+    period_by: str | None,
+    max_width: int,
+    lpips_weights: Path | None,
+    out: Path,
+) -> None:
+    """Score images of the test views that another program made.
+
+    FOLDER has a PNG file for each test view of SCENE, named like it: b/0007.png or b/0007.jpg.png
+    for b/0007.jpg. Images have the size of the evaluation, or that of the photos. The result
+    becomes a run beside those of bench; docs/other-programs.md says more.
+    """
+    check_outside(out, [scene], option="--out")
+    check_place("--out", out)
+    with progress_bar(f"read {scene}") as bar:
+        whole = read_scene(scene, format=dataset_format, period_by=period_by)
+        bar("load the metrics", 0, 1)
+        scorers = make_scorers(lpips_weights=lpips_weights)
+        bar("score the images", 0, 1)
+        score_images(whole, folder, name, out, scorers, table=table, seed=seed, max_width=max_width)
+    write_summary(out)
+    print_runs(out)

@@ -1,0 +1,69 @@
+"""``chronoscene study``: run what answers a question about a method, and say the answer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from chronoscene.bench.run.runner import BenchSettings
+from chronoscene.bench.study.plan import find_study, read_study, run_study
+from chronoscene.bench.study.tables import study_texts
+from chronoscene.cli.options import (
+    FOLDER,
+    LPIPS_WEIGHTS,
+    RUNS_OUT,
+    look_here_for,
+    parse_assignments,
+    reading_options,
+    training_options,
+)
+from chronoscene.cli.output import check_place, emit, terminal_width
+from chronoscene.cli.runs.bench import SOME_FAILED
+from chronoscene.io.staging import check_outside
+from chronoscene.kernels.runtime import check_device
+
+ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
+
+
+@click.command("study")
+@click.argument("name", metavar="NAME|FILE.toml")
+@click.argument("scenes", metavar="DIR...", nargs=-1, required=True, type=FOLDER)
+@reading_options("the scenes")
+@training_options
+@LPIPS_WEIGHTS
+@RUNS_OUT
+def command(name: str, seeds: int, assignments: tuple[str, ...], out: Path, **options: Any) -> None:
+    """Run variants of a method on scenes, for one table.
+
+    NAME is a study that comes with a method, such as components of ChronoGS, or FILE.toml one of
+    your own; docs/studies.md describes both. The runs are those of bench, of which finished ones
+    are kept; --set is for the rows that do not set the option themselves. The table says what was
+    published beside what was measured, and is written to --out as Markdown, CSV and JSON, too.
+    """
+    check_outside(out, options["scenes"], option="--out")
+    check_place("--out", out)
+    file = find_study(name)
+    study = read_study(file)
+    look_here_for([study.method, *(row.method for row in study.rows)])
+    if options["ray"] is None:
+        check_device(options["device"])
+    settings = BenchSettings(
+        methods=(),
+        runs=out,
+        overrides=parse_assignments(assignments),
+        seeds=tuple(range(seeds)),
+        **options,
+    )
+    outcome, finished = run_study(study, settings, lambda line: click.echo(line, err=True))
+    if outcome.finished:
+        texts = study_texts(study, finished, outcome.failures, width=terminal_width(None))
+        emit(texts["table"], None)
+        for style, ending in ENDINGS.items():
+            emit(texts[style], out / f"study-{file.stem}.{ending}")
+    else:
+        for failure in outcome.failures:
+            click.echo(f"failed: {failure.scene}, {failure.method}: {failure.reason}", err=True)
+    if outcome.failures:
+        click.get_current_context().exit(SOME_FAILED)

@@ -1,0 +1,1 @@
+"""Commands on datasets: one file per command."""

@@ -1,0 +1,296 @@
+"""``chronoscene stats``: what is in scenes, by period: tables, figures and pages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+from chronoscene.cli.options import reading_options
+from chronoscene.cli.output import (
+    FORMAT,
+    OUT_FILE,
+    check_file,
+    check_place,
+    emit,
+    tell_written,
+    terminal_width,
+    writing_to,
+)
+from chronoscene.cli.progress import tracked
+from chronoscene.errors import ChronoSceneError
+from chronoscene.formats import find_scenes, model_notes, read_scene
+from chronoscene.io.processes import map_parallel
+from chronoscene.io.staging import check_outside
+from chronoscene.io.wording import printable
+from chronoscene.kernels.runtime import keep_freed_memory
+from chronoscene.stats.counts import (
+    COUNT_RULES,
+    CountRule,
+    SceneCount,
+    Unreadable,
+    count_scene,
+    format_counts,
+    in_paper_order,
+    published,
+)
+from chronoscene.stats.details import format_details
+from chronoscene.stats.measures import SceneStatistics, measure_scene
+
+Layout = Literal["full", "paper"]
+FIGURE_FORMATS = ("png", "pdf", "svg")
+
+SCENE_PARTS = ("sparse", "images")  # Folders that only scenes have
+
+SOME_FAILED, ALL_FAILED = 1, 2
+"""Exit status when scenes cannot be read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What to do with each scene."""
+
+    dataset_format: str | None
+    period_by: str | None
+    count: CountRule
+    layout: Layout
+    figures: Path | None
+    figure_format: str
+    cameras: bool
+    pages: Path | None
+
+    def figure(self, name: str) -> Path | None:
+        """Where the figure of a name goes, if figures are asked for."""
+        return self.figures and self.figures / f"{name}.{self.figure_format}"
+
+    def page(self, name: str) -> Path | None:
+        """Likewise for pages."""
+        return self.pages and self.pages / f"{name}.html"
+
+
+@click.command("stats")
+@click.argument(
+    "folders", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="DIR..."
+)
+@click.option(
+    "--layout",
+    type=click.Choice(["full", "paper"]),
+    default="full",
+    show_default=True,
+    help="full: everything that is measured, by period. paper: the table of images and points in "
+    "the paper.",
+)
+@click.option(
+    "--count",
+    type=click.Choice(COUNT_RULES),
+    default="assigned",
+    show_default=True,
+    help="How to count points. assigned: each once. seen: in every period whose images see it.",
+)
+@FORMAT
+@OUT_FILE
+@click.option(
+    "--figures",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    help="Draw the counts of all scenes, and the points of each scene, into this folder.",
+)
+@click.option(
+    "--figure-format",
+    type=click.Choice(FIGURE_FORMATS),
+    default="png",
+    show_default=True,
+    help="File format of the figures.",
+)
+@click.option("--cameras", is_flag=True, help="Also draw the cameras in the figures.")
+@click.option(
+    "--pages",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    help="Write an interactive page of each scene, for a browser, to this folder.",
+)
+@reading_options("the scenes")
+@click.pass_context
+def command(
+    context: click.Context,
+    folders: tuple[Path, ...],
+    style: str,
+    out: Path | None,
+    **options: object,
+) -> None:
+    """Print what a scene contains, by period.
+
+    That is images, points, tracks, error, overlap and coverage. DIR is a scene or a folder of
+    scenes. Periods are numbered from 0; "-" means that there is nothing to measure.
+
+    All periods of a scene share one point cloud, and the paper does not say how its table splits
+    it. Since its periods add up to the total, each point is counted once, in the period with the
+    most observations of it, the earliest of several. With --count seen, a point counts in every
+    period that sees it, and the periods add up to more than the total.
+
+    Tracks and observations of a period are those of its images. The error is the mean distance
+    between observation and projection. The baseline is the distance from a camera to the nearest
+    camera of its period, relative to the median depth of what it sees. The coverage is the share of
+    the occupied space in which a period sees points. "Also seen by" is the share of the points of a
+    period that another period sees, too; "In view of" is the share that lies in view of the cameras
+    of another period.
+
+    A scene that cannot be read is named and the others are reported. Exit status: 0 if all scenes
+    were read, 1 if some were, 2 if none was or the command is used wrongly.
+    """
+    request = Request(**options)  # type: ignore[arg-type]
+    paths = [p for f in folders for p in in_paper_order(_scenes(f, request))]
+    _check_places(request, out, paths)
+    items = list(zip(paths, _file_names(paths), strict=True))
+    work = map_parallel(partial(examine, request), items, lost=_lost)
+    results = list(tracked(work, "measure scenes", total=len(items)))
+    unreadable = [r for r in results if isinstance(r, Unreadable)]
+    full = [r for r in results if isinstance(r, SceneStatistics)]
+    counts = [s.counts for s in full] or [r for r in results if isinstance(r, SceneCount)]
+    if counts:
+        extra: Any = {"width": terminal_width(out), "unreadable": unreadable}
+        if full:
+            text = format_details(full, style, **extra)
+        else:
+            text = format_counts(counts, style, **extra)
+        emit(text, out)
+        written = []
+        if (bars := request.figure("counts")) is not None:
+            from chronoscene.figures.bars import draw_bars
+
+            with writing_to("--figures", bars):
+                draw_bars(counts, bars)
+            written = [bars]
+        for (_, name), result in zip(items, results, strict=True):
+            if not isinstance(result, Unreadable):
+                written += filter(None, (request.figure(f"{name}_points"), request.page(name)))
+        tell_written(*written)
+    notes = (f"{s.name}: {n}" for s in counts for n in model_notes(Path(s.path), s.format))
+    for remark in [*notes, *unseen(counts), *against_paper(counts)]:
+        click.echo(printable(remark), err=True)
+    for scene in unreadable:
+        click.secho(printable(f"error: {scene.error}"), fg="red", err=True)
+    if unreadable:
+        context.exit(SOME_FAILED if counts else ALL_FAILED)
+
+
+def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStatistics | Unreadable:
+    """Read one scene, measure it, and draw what is asked for.
+
+    Args:
+        request: What to do.
+        item: Folder of the scene, and the name of its figure and page.
+    """
+    path, name = item
+    keep_freed_memory()  # arrays as large as the model come and go
+    try:
+        scene = read_scene(path, format=request.dataset_format, period_by=request.period_by)
+    except ChronoSceneError as error:
+        return Unreadable(str(path), str(error))
+    except OSError as error:
+        return Unreadable(str(path), f"{error.filename or path}: {error.strerror or error}")
+    if (figure := request.figure(f"{name}_points")) is not None:
+        from chronoscene.figures.cloud import cloud_of
+        from chronoscene.figures.projections import draw_cloud
+
+        with writing_to("--figures", figure):
+            draw_cloud(cloud_of(scene), figure, cameras=request.cameras)
+    if (page := request.page(name)) is not None:
+        from chronoscene.figures.viewer import write_page
+
+        with writing_to("--pages", page):
+            write_page(scene, page)
+    if request.layout == "paper":
+        return count_scene(scene, count=request.count)
+    return measure_scene(scene, count=request.count)
+
+
+def _scenes(folder: Path, request: Request) -> list[Path]:
+    """The scenes of a folder, and beside them what looks like one, so that nothing is lost."""
+    found = find_scenes(folder, format=request.dataset_format, period_by=request.period_by)
+    if found == [folder]:
+        return found
+    beside = {p for name in SCENE_PARTS for p in folder.glob(f"*/{name}") if p.is_dir()}
+    return sorted({*found, *(p.parent for p in beside)})
+
+
+def _lost(item: tuple[Path, str]) -> Unreadable:
+    path = str(item[0])
+    return Unreadable(
+        path, f"{path}: the process died; if memory ran out, run stats on this scene alone"
+    )
+
+
+def _file_names(paths: Sequence[Path]) -> list[str]:
+    """Names of the scenes, numbered where folders of several places have the same name."""
+    names: list[str] = []
+    for path in paths:
+        folder = path.resolve().name or "scene"
+        plain = "".join(c if c.isprintable() else "_" for c in folder)
+        name, number = plain, 1
+        while name in names:
+            number += 1
+            name = f"{plain}_{number}"
+        names.append(name)
+    return names
+
+
+def _check_places(request: Request, out: Path | None, paths: Sequence[Path]) -> None:
+    """Make the folders for figures and pages; refuse to write into a scene."""
+    if out is not None:
+        check_outside(out, paths, option="--out")
+    check_file("--out", out)
+    for option, place in (("--figures", request.figures), ("--pages", request.pages)):
+        if place is not None:
+            check_outside(place, paths, option=option)
+            with writing_to(option, place, expected="a folder that can be made"):
+                place.mkdir(parents=True, exist_ok=True)
+            check_place(option, place)
+
+
+def unseen(counts: Sequence[SceneCount]) -> Iterator[str]:
+    """What there is to say about points that no image sees."""
+    for scene in counts:
+        if scene.points_without_period:
+            number = scene.points_without_period
+            yield (
+                f"{scene.name}: {number:,} {'point is' if number == 1 else 'points are'} seen by "
+                "no image: in the total, and in no period"
+            )
+
+
+def against_paper(counts: Sequence[SceneCount]) -> Iterator[str]:
+    """Whether scenes with names of the paper have its counts."""
+    same = []
+    for scene in counts:
+        paper = published(scene.name)
+        if paper is None:
+            continue
+        here = [(p.images, p.points) for p in scene.periods]
+        if here == list(paper):
+            same.append(scene.name)
+        else:
+            yield f"{scene.name}: {_difference(scene, paper)}"
+    if same:
+        yield f"images and points of all periods are those of the paper: {', '.join(same)}"
+
+
+def _difference(scene: SceneCount, paper: Sequence[tuple[int, int]]) -> str:
+    images, points = ([row[i] for row in paper] for i in (0, 1))
+    if [p.images for p in scene.periods] == images and scene.points == sum(points):
+        return (
+            "images of all periods and points in all are those of the paper, which does not say "
+            f"how it splits points into periods: it has {_listed(points)}"
+        )
+    return (
+        f"the paper has {_listed(images)} images and {_listed(points)} points in the periods of "
+        "its scene of this name"
+    )
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return " + ".join(f"{n:,}" for n in numbers)

@@ -1,0 +1,87 @@
+"""``chronoscene undistort``: a scene whose cameras are all PINHOLE."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import click
+
+from chronoscene.cli.options import reading_options
+from chronoscene.cli.output import emit
+from chronoscene.cli.progress import progress_bar
+from chronoscene.cli.scenes.reading import LINKS, describe, read_and_note
+from chronoscene.images.undistortion import CameraChange
+from chronoscene.io.staging import check_outside
+from chronoscene.scene.splits import split_hash
+from chronoscene.undistort import Undistortion, undistort
+
+
+@click.command("undistort")
+@click.argument("source", type=click.Path(path_type=Path), metavar="SCENE")
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option(
+    "--center", is_flag=True, help="Crop the images so that the principal point is in their centre."
+)
+@click.option(
+    "--threads",
+    type=click.IntRange(1),
+    help="Number of images processed at the same time.  [default: one per processor]",
+)
+@click.option(
+    "--link",
+    type=click.Choice(["hard", "sym"]),
+    help="Link images that do not change instead of copying them.",
+)
+@reading_options("SCENE")
+def command(
+    source: Path,
+    out: Path,
+    center: bool,
+    threads: int | None,
+    link: str | None,
+    dataset_format: str | None,
+    period_by: str | None,
+) -> None:
+    """Write SCENE with undistorted images to the new folder OUT.
+
+    All its cameras become PINHOLE. Observations of points move with the images; poses, periods and
+    split do not change. Images of cameras without distortion are copied; others become 8-bit RGB,
+    and what was transparent becomes a mask. SCENE is not changed. OUT is in the ChronoScene format.
+    """
+    check_outside(out, [source])
+    with progress_bar(f"read {source}") as bar:
+        done = undistort(
+            read_and_note(source, dataset_format, period_by),
+            out,
+            center=center,
+            threads=threads,
+            image_source=LINKS[link],
+            progress=partial(bar, "images"),
+        )
+    emit(report(done), None)
+
+
+def report(done: Undistortion) -> str:
+    """Sizes and losses, for people."""
+    lines = [f"{done.scene.root}: {describe(done.scene)}"]
+    lines += [f"  {_describe_change(change)}" for change in done.changes[:20]]
+    if len(done.changes) > 20:
+        lines.append(f"  ... and {len(done.changes) - 20} more cameras")
+    if done.observations_lost:
+        lines.append(
+            f"{done.observations_lost} observations outside of the new images, and "
+            f"{done.points_lost} points without any other, were dropped"
+        )
+    lines.append(f"split hash {split_hash(done.scene)}")
+    return "\n".join(lines) + "\n"
+
+
+def _describe_change(change: CameraChange) -> str:
+    source, target = change.source, change.target
+    fx, fy, cx, cy = target.params
+    what = "images copied" if change.is_copy else "images resampled"
+    return (
+        f"camera {target.camera_id}: {source.model} {source.width} x {source.height} -> PINHOLE "
+        f"{target.width} x {target.height}, f {fx:.2f} {fy:.2f}, c {cx:.2f} {cy:.2f}; {what}"
+    )

@@ -1,0 +1,168 @@
+"""``chronoscene validate``: every problem of a scene folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import partial
+from pathlib import Path
+
+import click
+
+from chronoscene.cli.options import reading_options
+from chronoscene.cli.output import OUT_FILE, check_file, check_place, emit
+from chronoscene.cli.progress import announce, tracked
+from chronoscene.io.processes import map_parallel
+from chronoscene.io.staging import check_outside
+from chronoscene.io.wording import counted, printable
+from chronoscene.kernels.runtime import keep_freed_memory
+from chronoscene.validation.repair.fix import fix_scene
+from chronoscene.validation.report.html import write_html
+from chronoscene.validation.report.json import write_json, write_sarif
+from chronoscene.validation.report.rule_list import describe_rule
+from chronoscene.validation.report.text import write_text
+from chronoscene.validation.rule import SceneReport, is_valid
+from chronoscene.validation.rules import choose_rules
+from chronoscene.validation.run import Reading, find_folders, lost_report, validate_scene
+from chronoscene.validation.scene_folder import Track, no_progress
+
+WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
+
+NOT_VALID = 1  # Exit status when there are errors
+
+
+def _explain(context: click.Context, option: click.Parameter, value: str | None) -> None:
+    """Print what is known about some rules, and end."""
+    if value is not None:
+        rules = choose_rules(_codes([value]), place="--explain")
+        emit("\n".join(map(describe_rule, rules)), None)
+        context.exit(0)
+
+
+@click.command("validate")
+@click.argument("folder", type=click.Path(path_type=Path), metavar="DIR")
+@click.option(
+    "--format",
+    "output_format",
+    type=click.Choice(sorted(WRITERS)),
+    default="text",
+    show_default=True,
+    help="Output format.",
+)
+@OUT_FILE
+@click.option(
+    "--sarif", type=click.Path(path_type=Path), help="Also write a SARIF report to this file."
+)
+@click.option(
+    "--html", type=click.Path(path_type=Path), help="Also write an HTML page to this file."
+)
+@click.option(
+    "--select",
+    multiple=True,
+    metavar="CODES",
+    help="Run these rules only, such as CS201,CS3,split-line.",
+)
+@click.option("--ignore", multiple=True, metavar="CODES", help="Do not run these rules.")
+@click.option(
+    "--explain",
+    metavar="CODES",
+    expose_value=False,
+    is_eager=True,
+    callback=_explain,
+    help="Print what these rules check and what to do about findings. CS means all rules.",
+)
+@click.option("--strict", is_flag=True, help="Warnings make a scene invalid, too.")
+@click.option(
+    "--decode/--no-decode",
+    default=False,
+    show_default=True,
+    help="Decode all images, which finds damaged and duplicate ones but takes time.",
+)
+@click.option(
+    "--fix",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    help="Write a corrected copy to this new folder and report what remains.",
+)
+@reading_options("the scenes")
+@click.pass_context
+def command(
+    context: click.Context,
+    folder: Path,
+    dataset_format: str | None,
+    period_by: str | None,
+    output_format: str,
+    out: Path | None,
+    sarif: Path | None,
+    html: Path | None,
+    select: tuple[str, ...],
+    ignore: tuple[str, ...],
+    strict: bool,
+    decode: bool,
+    fix: Path | None,
+) -> None:
+    """Check a scene or a folder of scenes and report all problems.
+
+    The scene itself is never changed. With --fix, the report and the exit status are those of the
+    corrected copy. --explain CS lists all rules.
+
+    Exit status: 0 if the scene is valid, 1 if there are errors (with --strict, also warnings), 2 if
+    there is no scene or the command is used wrongly.
+    """
+    reading = Reading(dataset_format, period_by)
+    check = partial(_check, _codes(select), _codes(ignore), decode, reading)
+    choose_rules(_codes(select), _codes(ignore))  # whatever is wrong with them is said first
+    folders = find_folders(folder)
+    for option, file in (("--out", out), ("--sarif", sarif), ("--html", html)):
+        if file is not None:
+            check_outside(file, folders, option=option)
+        check_file(option, file)
+    if fix is not None:
+        check_outside(fix, folders, option="--fix")
+        check_place("--fix", fix)
+        folders = _fix(folder, folders, fix, reading)
+    if len(folders) == 1:
+        announce(f"check {folders[0]}")
+        reports = [check(folders[0], track=tracked)]
+    else:
+        done = map_parallel(check, folders, lost=lost_report)
+        reports = list(tracked(done, "check scenes", total=len(folders)))
+    emit(WRITERS[output_format](reports, strict=strict), out)
+    for option, file, write in (("--sarif", sarif, write_sarif), ("--html", html, write_html)):
+        if file is not None:
+            emit(write(reports, strict=strict), file, option=option)
+    if not is_valid(reports, strict=strict):
+        context.exit(NOT_VALID)
+
+
+def _check(
+    select: list[str],
+    ignore: list[str],
+    decode: bool,
+    reading: Reading,
+    path: Path,
+    *,
+    track: Track = no_progress,
+) -> SceneReport:
+    """One scene, perhaps in a process of its own, which is given names of rules, not rules."""
+    keep_freed_memory()  # arrays as large as the model come and go
+    rules = choose_rules(select, ignore)
+    return validate_scene(path, rules=rules, decode=decode, track=track, reading=reading)
+
+
+def _fix(folder: Path, scenes: Sequence[Path], out: Path, reading: Reading) -> list[Path]:
+    """Corrected copies of the scenes; what was done goes to standard error."""
+    copies = []
+    for scene in scenes:
+        copy = out if scene == folder else out / scene.name
+        announce(f"correct {scene}")
+        repairs = fix_scene(scene, copy, reading)
+        click.echo(printable(f"{copy}: {counted(len(repairs), 'correction')}"), err=True)
+        for repair in repairs:
+            click.echo(printable(f"  {repair.code or 'also'}: {repair.text}"), err=True)
+        copies.append(copy)
+    return copies
+
+
+def _codes(values: Iterable[str]) -> list[str]:
+    """Options may be repeated, and each may have several codes with commas."""
+    return [code for value in values for code in value.split(",")]

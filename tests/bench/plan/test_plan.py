@@ -1,0 +1,35 @@
+"""Plans: whose overrides they are, and what a run differs in."""
+
+import shutil
+
+from chronoscene.bench.plan.plan import BenchSettings, first_difference, split_overrides
+from chronoscene.bench.use.trained_run import open_run
+from chronoscene.methods import load_spec
+
+
+def test_differences_are_named():
+    old = {"config": {"a": 1, "b": {"c": 2}}, "seed": 0}
+    new = {"config": {"a": 1, "b": {"c": 3}}, "seed": 0}
+    assert first_difference(old, new) == ("c 2", "c 3")
+
+
+def test_overrides_with_a_prefix_are_for_one_method(tmp_path):
+    settings = BenchSettings((), (), tmp_path, overrides={"blind.rate": "1", "rate": "2"})
+    specs = [load_spec("toy_methods:MEAN"), load_spec("toy_methods:BLIND")]
+    assert split_overrides(settings, specs) == {"mean": {"rate": "2"}, "blind": {"rate": "1"}}
+
+
+def test_periods_that_the_user_names_hold_for_the_whole_run(
+    bench_here, scene_folder, tmp_path, monkeypatch
+):
+    """For the planning, the training, and whoever opens the run from another folder."""
+    folder = tmp_path / "project"
+    shutil.copytree(scene_folder, folder)
+    (folder / "sparse/split.txt").unlink()
+    rows = [f"{name}/{i}.png,{i // 2}" for name in "ab" for i in range(4)]
+    (tmp_path / "periods.csv").write_text("\n".join(["file,period", *rows]))
+    monkeypatch.chdir(tmp_path)
+    outcome, _ = bench_here("toy_methods:MEAN", scenes=(folder,), period_by="table:periods.csv")
+    monkeypatch.chdir("/")
+    (run,) = map(open_run, outcome.finished)
+    assert [frame.period for frame in run.scene().frames] == [0, 0, 1, 1] * 2

@@ -1,0 +1,51 @@
+"""``chronoscene methods``: the list, and the description of one method."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from chronoscene.cli import cli
+from chronoscene.methods import load_spec, method_names, options_of
+
+PLUGINS = Path(__file__).parents[2] / "bench" / "plugins"
+
+
+def methods(*arguments):
+    result = CliRunner().invoke(cli, ["methods", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def test_the_list_has_every_method():
+    text = methods()
+    assert all(name in text for name in method_names())
+
+
+@pytest.mark.parametrize("name", [*method_names(), "baselines.external:SPLATFACTO"])
+def test_every_option_has_a_meaning(name):
+    assert [option.name for option in options_of(load_spec(name)) if not option.meaning] == []
+
+
+def test_a_description_has_defaults_presets_and_meanings(tmp_path):
+    text = methods("3dgs", "--runs", tmp_path)
+    assert text.startswith("3DGS (3dgs)\npaper: Kerbl et al., ")
+    assert "\niterations=30000; accurate: 8000; balanced: 3000; fast: 1000\n    Training st" in text
+    assert "\nstretch=false; accurate, balanced, fast: true\n    False: moment i is step i" in text
+    assert f"No run of it in {tmp_path}." in text
+
+
+def test_finished_runs_say_what_a_method_costs(monkeypatch, tmp_path, make_scene_folder):
+    monkeypatch.setitem(sys.modules, "toy_methods", None)
+    monkeypatch.delitem(sys.modules, "toy_methods")
+    monkeypatch.chdir(PLUGINS)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    scene = make_scene_folder({f"{p}/{i}.png": k for k, p in enumerate("ab") for i in range(3)})
+    runs = tmp_path / "runs"
+    bench = ["bench", str(scene), "--method", "toy_methods:MEAN", "--out", str(runs)]
+    assert CliRunner().invoke(cli, bench, catch_exceptions=False).exit_code == 0
+    text = methods("toy_methods:MEAN", "--runs", runs)
+    assert "rate=0.5\n    (no description)" in text
+    assert "Mean (joint, balanced) " in text and "peak memory [MB]" in text
+    assert "measured on cpu (" in text

@@ -1,0 +1,68 @@
+"""``chronoscene compare``: table, figures, page."""
+
+import csv
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from made_runs import scored
+
+from chronoscene.bench.files.ground_truth import ground_truth_folder
+from chronoscene.bench.files.predictions import ImageWriter
+from chronoscene.bench.files.records import PREDICTIONS, write_run
+from chronoscene.cli import cli
+from chronoscene.errors import ChronoSceneError
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """One run of two test views in one period, without ``curve.csv``."""
+    runs = tmp_path / "runs"
+    run = scored(psnr=[[20.0, 10.0]])
+    folder = runs / "plaza/chronogs-joint-fast/seed0"
+    folder.mkdir(parents=True)
+    write_run(folder, run, run.rows)
+    for place in (ground_truth_folder(runs, "plaza"), folder / PREDICTIONS):
+        writer = ImageWriter(place)
+        for row in run.rows:
+            pixels = np.zeros((8, 12, 3), np.uint8)
+            writer.add(row.view, pixels, camera_period=0, rendered_period=0)
+        writer.close(kind="predictions", scene="plaza", scene_hash="s", details={})
+    return runs
+
+
+def compare(*arguments):
+    result = CliRunner().invoke(cli, ["compare", *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def test_the_worst_views_are_printed_and_figures_drawn(runs, tmp_path):
+    page = tmp_path / "page.html"
+    result = compare(runs, "--html", page)
+    assert result.stdout.index("0/view1.png") < result.stdout.index("0/view0.png")
+    assert "10.00" in result.stdout and "plaza: PSNR [dB] (psnr)" in result.stdout
+    figures = [runs / "figures" / f"plaza_{name}.png" for name in ("comparison", "errors")]
+    written = [line for line in result.stderr.splitlines() if line.startswith("wrote ")]
+    assert written == [f"wrote {path}" for path in (*figures, page)]
+    text = page.read_text()
+    assert text.startswith("<!doctype html>") and text.count('class="slider"') == 2
+    assert "training time" not in text
+
+
+def test_csv_has_every_view_and_more_views_make_more_rows(runs, tmp_path):
+    table, figure = tmp_path / "table.csv", runs / "figures/plaza_comparison.png"
+    compare(runs, "--format", "csv", "--out", table)
+    small = figure.stat().st_size
+    rows = list(csv.DictReader(table.open()))
+    assert [row["view"] for row in rows] == ["0/view1.png", "0/view0.png"]
+    assert rows[0]["CHRONOGS (joint, fast)"] == "10.0" and rows[0]["period"] == "0"
+    compare(runs, "--views", 2)
+    assert figure.stat().st_size > small
+
+
+@pytest.mark.parametrize("metric", ["ssim", "nonsense"])
+def test_a_metric_that_is_not_there(runs, metric):
+    with pytest.raises(ChronoSceneError, match=metric):
+        compare(runs, "--metric", metric)
+    assert not (runs / "figures").exists()

@@ -1,0 +1,206 @@
+"""``chronoscene bench`` from the outside: options, output, exit status."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+import chronoscene.cli.runs.bench as bench_module
+from chronoscene.bench.files.records import Failure
+from chronoscene.bench.run.runner import BenchOutcome
+from chronoscene.cli import cli
+from chronoscene.errors import BackendError, ConfigError
+
+PLUGINS = Path(__file__).parents[2] / "bench" / "plugins"
+IMAGES = {f"{folder}/{i}.png": period for period, folder in enumerate("ab") for i in range(3)}
+TESTS = ["a/1.png", "b/1.png"]
+
+
+def chronoscene(*arguments, cwd=None):
+    """Run the command in a process of its own."""
+    code = "from chronoscene.cli import main; main()"
+    path = os.pathsep.join(filter(None, [str(PLUGINS), os.environ.get("PYTHONPATH")]))
+    return subprocess.run(
+        [sys.executable, "-P", "-c", code, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+
+
+def test_bench_score_and_table(make_scene_folder, tmp_path):
+    scene = make_scene_folder(IMAGES, tests=TESTS, name="place")
+    runs = tmp_path / "runs"
+    done = chronoscene(
+        "bench", scene, "--method", "toy_methods:MEAN,toy_methods:RAISES", "--out", runs,
+        "--set", "mean.rate=0.25", "--iterations", "12", "--threads", "1",
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert "place: PSNR [dB] (psnr), higher is better" in done.stdout
+    assert "Mean (joint, balanced, iterations=12, rate=0.25)" in done.stdout
+    assert (
+        "failed: place, raises (joint, balanced, iterations=12), seed 0: RuntimeError"
+        in done.stdout
+    )
+    for file in ("results.json", "rows.csv", "figures/place_comparison.png"):
+        assert str(runs / file) in done.stdout and (runs / file).is_file()
+    assert "[1/2] place: mean joint balanced iterations=12,rate=0.25 seed 0" in done.stderr
+    assert "Traceback" not in done.stderr
+    (record,) = json.loads((runs / "results.json").read_text())
+    assert record["method"] == "mean" and record["iterations"] == 12
+
+    again = chronoscene("score", runs)
+    assert again.returncode == 0, again.stderr
+    assert "place/mean-joint-balanced-iterations=12,rate=0.25/seed0: unchanged" in again.stdout
+
+    table = chronoscene("table", runs, "--format", "json", "--metric", "psnr")
+    assert table.returncode == 0, table.stderr
+    entries = json.loads(table.stdout)["entries"]
+    macro = [e["mean"] for e in entries if e["column"] == "macro"]
+    assert macro == [record["aggregates"]["macro"]["psnr"]]
+
+
+def test_runs_inside_a_scene_are_refused(make_scene_folder, tmp_path):
+    scene = make_scene_folder(IMAGES, tests=TESTS, name="place")
+    (tmp_path / "link").symlink_to(scene)
+    before = sorted(scene.rglob("*"))
+    for out in (scene / "runs", scene, tmp_path / "link" / "runs"):
+        with pytest.raises(ConfigError, match=r"^--out .*: expected a place outside the scene"):
+            bench_module.command.main(
+                [str(scene), "--method", "3dgs", "--out", str(out)], standalone_mode=False
+            )
+    assert sorted(scene.rglob("*")) == before
+
+
+def test_a_plug_in_in_the_current_folder(make_scene_folder, tmp_path):
+    scene = make_scene_folder(IMAGES, tests=TESTS)
+    source = (PLUGINS / "toy_methods.py").read_text().replace("toy_methods:", "my_method:")
+    (tmp_path / "my_method.py").write_text(source)
+    # A file that shadows a module of the standard library must do no harm in the worker.
+    (tmp_path / "bisect.py").write_text("raise RuntimeError('shadowed')\n")
+    done = chronoscene("bench", scene, "--method", "my_method:MEAN", "--out", "runs", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "runs/scene/mean-joint-balanced/seed0/run.json").is_file()
+
+
+@pytest.fixture
+def settings(monkeypatch):
+    """What the command asks of the harness, which does nothing here."""
+    seen = []
+
+    def run_bench(asked, say):
+        seen.append(asked)
+        return BenchOutcome((), 0, ())
+
+    monkeypatch.setattr(bench_module, "run_bench", run_bench)
+    monkeypatch.setattr(bench_module, "read_failures", lambda runs: [])
+
+    def invoke(*arguments):
+        result = CliRunner().invoke(cli, ["bench", *arguments], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        return seen[-1]
+
+    return invoke
+
+
+def test_a_device_that_is_not_there_is_refused_before_anything_is_read(
+    make_scene_folder, tmp_path, monkeypatch, set_gsplat
+):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("chronoscene.bench.plan.plan.read_scene", lambda path: pytest.fail("read"))
+    command = ["bench", str(make_scene_folder()), "--method", "3dgs", "--out", str(tmp_path / "r")]
+    result = CliRunner().invoke(cli, [*command, "--device", "cuda"])
+    assert isinstance(result.exception, BackendError)
+    assert str(result.exception).startswith("--device cuda: expected a CUDA device")
+    assert not (tmp_path / "r").exists()
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    set_gsplat("1.7.0")
+    result = CliRunner().invoke(cli, [*command, "--device", "cuda"])
+    assert str(result.exception).startswith("gsplat: expected version 1.5 or 1.6, found 1.7.0")
+    assert not (tmp_path / "r").exists()
+    result = CliRunner().invoke(cli, [*command, "--device", "cuda:3"])
+    assert result.exit_code == 2 and "'cuda:3' is not one of 'auto', 'cpu', 'cuda'" in result.stderr
+    assert not (tmp_path / "r").exists()
+
+
+@pytest.mark.parametrize("option", ["--budget", "--seed"])
+def test_help_does_not_promise_equal_models_of_budgets(option):
+    found = {o.opts[0]: o.help for o in bench_module.command.params if isinstance(o, click.Option)}
+    assert "qual seeds" in found[option] and "not" in found[option]
+
+
+def test_defaults(settings):
+    asked = settings("a", "--method", "chronogs")
+    assert asked.scenes == (Path("a"),) and asked.methods == ("chronogs",)
+    assert asked.strategies == ("joint",) and asked.preset == "balanced"
+    assert asked.seeds == (0,) and asked.runs == Path("runs") and asked.max_width == 1600
+    assert asked.iterations is None and asked.budget_seconds is None and asked.threads is None
+    assert asked.device == "auto" and asked.lpips_weights is None and not asked.overwrite
+    assert (asked.jobs, asked.job_memory, asked.ray) == (None, None, None)
+
+
+def test_devices_of_a_cluster_are_not_looked_for_here(settings, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    asked = settings("a", "--method", "3dgs", "--device", "cuda", "--ray", "auto")
+    assert (asked.ray, asked.device) == ("auto", "cuda")
+
+
+def test_every_option_arrives(settings, tmp_path):
+    asked = settings(
+        "a", "b", "--method", "3dgs, chronogs,3dgs", "--strategy", "joint,separate",
+        "--preset", "fast", "--budget", "1m30s", "--iterations", "7", "--seeds", "2",
+        "--seed", "5", "--set", "x=1", "--set", "chronogs.y=a=b", "--max-width", "320",
+        "--threads", "3", "--device", "cpu", "--separate-iterations", "each",
+        "--lpips-weights", str(tmp_path), "--out", "elsewhere", "--overwrite",
+        "--dataset-format", "wat", "--period-by", "year",
+        "--jobs", "4", "--job-memory", "1.5",
+    )  # fmt: skip
+    assert (asked.jobs, asked.job_memory, asked.ray) == (4, 1_500_000_000, None)
+    assert asked.scenes == (Path("a"), Path("b")) and asked.methods == ("3dgs", "chronogs")
+    assert asked.strategies == ("joint", "separate") and asked.preset == "fast"
+    assert asked.budget_seconds == 90 and asked.iterations == 7 and asked.seeds == (5, 6)
+    assert asked.overrides == {"x": "1", "chronogs.y": "a=b"}
+    assert (asked.max_width, asked.threads, asked.device) == (320, 3, "cpu")
+    assert asked.separate_iterations == "each" and asked.overwrite
+    assert asked.dataset_format == "wat" and asked.period_by == "year"
+    assert asked.lpips_weights == tmp_path and asked.runs == Path("elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--strategy", "both"], "expected one of joint, pooled, separate"),
+        (["--budget", "5"], "--budget: expected a positive time"),
+        (["--set", "x"], "--set: expected KEY=VALUE"),
+        (["--method", "a,,b"], "--method: expected names separated by commas"),
+    ],
+)
+def test_wrong_options_are_told(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        CliRunner().invoke(
+            cli, ["bench", "a", "--method", "chronogs", *arguments], catch_exceptions=False
+        )
+
+
+def test_unknown_methods_name_the_known_ones(make_scene_folder):
+    done = chronoscene("bench", make_scene_folder(IMAGES, tests=TESTS), "--method", "chronosg")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: --method: expected one of")
+    assert "did you mean 'chronogs'" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_failed_bench_has_status_1(monkeypatch):
+    failure = Failure(
+        method="m", strategy="joint", preset="fast", scene="s", seed=0, reason="because"
+    )
+    monkeypatch.setattr(bench_module, "run_bench", lambda *a: BenchOutcome((), 0, (failure,)))
+    monkeypatch.setattr(bench_module, "read_failures", lambda runs: [failure])
+    result = CliRunner().invoke(cli, ["bench", "a", "--method", "m"])
+    assert result.exit_code == 1
+    assert "failed: s, m: because" in result.output

@@ -1,0 +1,134 @@
+"""The command register: messages and exit status; tests/registration has the work itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from PIL import Image
+
+from chronoscene.cli import cli as main
+from chronoscene.cli.scenes import register
+from chronoscene.errors import ChronoSceneError, ConfigError, RegistrationError, SceneError
+
+
+def call(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(main, ["register", *map(str, arguments)])
+
+
+def photos(folder: Path, count: int) -> Path:
+    """Grey photos, all different."""
+    folder.mkdir(parents=True)
+    for i in range(count):
+        Image.fromarray(np.full((480, 640, 3), 10 * i, np.uint8)).save(folder / f"{i}.jpg")
+    return folder
+
+
+@pytest.mark.parametrize(("level", "status"), [("pass", 0), ("doubtful", 0), ("fail", 1)])
+def test_the_verdict_decides_on_the_exit_status(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, level: str, status: int
+) -> None:
+    def run(*inputs: Any, inspected: Any, **options: Any) -> Any:
+        verdict = SimpleNamespace(level=level)
+        inspected(SimpleNamespace(verdict=verdict, summary=f"verdict: {level}\n"))
+        return SimpleNamespace(
+            route="joint",
+            unit="metre",
+            labels=("a", "b"),
+            periods=np.array([0, 0, 1]),
+            unregistered_periods={"b/1.jpg": 1},
+            unregistered={"b/1.jpg": "no matches"},
+            points=np.zeros((5, 3)),
+        )
+
+    photos(tmp_path / "in/a", 2)
+    photos(tmp_path / "in/b", 2)
+    monkeypatch.setattr(register, "run", run)
+    done = call(tmp_path / "in", tmp_path / "out")
+    assert done.exit_code == status, done.output
+    assert "period 1 (b): 1 of 2 photos registered" in done.output
+    assert "b/1.jpg: no matches" in done.output and f"verdict: {level}" in done.output
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_too_few_photos_end_in_one_message(tmp_path: Path, count: int) -> None:
+    photos(tmp_path / "in/a", count)
+    done = call(tmp_path / "in", tmp_path / "out")
+    assert isinstance(done.exception, ChronoSceneError), done.output
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "places",
+    [["in/out"], ["out", "--work", "in/work"], ["out", "--into", "old", "--work", "old/work"]],
+)
+def test_nothing_goes_into_the_photos_or_the_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, places: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    photos(Path("in/a"), 3)
+    Path("old").mkdir()
+    before = sorted(Path().rglob("*"))
+    done = call("in", *places)
+    assert isinstance(done.exception, ConfigError), done.output
+    assert sorted(Path().rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        ("captures", "nothing there; check the path"),
+        ("notes.txt", "another file; check the path"),
+        ("empty", "no image files; copy the photos there"),
+    ],
+)
+def test_captures_that_are_missing_are_what_the_message_is_about(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str, found: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("notes.txt").write_text("mine")
+    Path("empty").mkdir()
+    done = call(given, "out")
+    assert str(done.exception) == (
+        f"{given}: expected a folder of photos, or a CSV table of images and their periods, "
+        f"found {found}"
+    )
+
+
+def test_the_current_folder_is_refused_before_any_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos(tmp_path / "in/a", 3)
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path / "out")
+    done = call(tmp_path / "in", ".")
+    assert isinstance(done.exception, SceneError), done.output
+    assert done.exception.found == "the current folder"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "out"]
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt(), SystemExit(143), None])
+def test_a_run_that_ends_early_says_what_the_work_folder_is_kept_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: BaseException | None
+) -> None:
+    """Ctrl-C, SIGTERM, or an error: here too few photos."""
+    photos(tmp_path / "in/a", 1 if end is None else 3)
+
+    def stop(*inputs: Any) -> None:
+        raise end or AssertionError
+
+    if end is not None:
+        monkeypatch.setattr("chronoscene.registration.pipeline.find_matches", stop)
+    done = call(tmp_path / "in", tmp_path / "out")
+    assert done.exit_code != 0
+    assert (
+        f"note: {tmp_path / 'out.work'} was kept: run the same command again to continue from "
+        "there, or delete the folder to start from scratch\n"
+    ) in done.stderr
+    assert (tmp_path / "out.work").is_dir()
+    if end is None:
+        assert isinstance(done.exception, RegistrationError)

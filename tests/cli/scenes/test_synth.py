@@ -1,0 +1,65 @@
+"""``chronoscene synth`` on the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from chronoscene.cli import cli
+from chronoscene.cli.scenes.synth import parse_size
+from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
+from chronoscene.formats import chronoscene as scene_format
+
+
+def call(*args: str) -> object:
+    return CliRunner().invoke(cli, ["synth", *args], catch_exceptions=False).exit_code
+
+
+def test_makes_the_scene_that_the_options_ask_for(tmp_path: Path) -> None:
+    out = tmp_path / "place"
+    options = "--preset tiny --periods 3 --size 40x30 --views 4 --points 60 --seed 5 --off-centre"
+    assert call(str(out), *options.split()) == 0
+    scene = scene_format.read(out)
+    camera = scene.frames[0].camera
+    assert scene.num_periods == 3
+    assert (camera.width, camera.height) == (40, 30)
+    assert camera.params[2] != 20
+    assert 0 < len(scene.points) <= 60
+
+
+@pytest.mark.parametrize(
+    ("option", "place"),
+    [
+        (["--size", "320"], "--size"),
+        (["--size", "0x10"], "--width"),
+        (["--size", "-4x10"], "--size"),
+        (["--preset", "huge"], "--preset"),
+        (["--periods", "0"], "--periods"),
+        (["--kind", "orbital"], "--kind"),
+        (["--views", "1"], "--views"),
+        (["--seed", "-2"], "--seed"),
+        (["--noise", "-1"], "--noise"),
+    ],
+)
+def test_bad_options(tmp_path: Path, option: list[str], place: str) -> None:
+    with pytest.raises(ConfigError, match=place):
+        call(str(tmp_path / "out"), *option)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_in_use(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(SceneError, match="choose another folder"):
+        call(str(tmp_path), "--preset", "tiny")
+
+
+def test_a_place_that_is_a_file(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ChronoSceneError):
+        call(str(tmp_path / "file" / "scene"), "--preset", "tiny")
+
+
+def test_size() -> None:
+    assert parse_size("320x240") == parse_size(" 320X240 ") == (320, 240)
