@@ -35,10 +35,10 @@ LAYERS = (
     ("chronoscene.checks",),
     ("chronoscene.errors", "chronoscene.arrays"),
 )
-"""From the top of the house down. A module imports from its own room and from lower layers."""
+"""From the top down. A module imports from its own package and from lower layers."""
 
 TORCH_SIDE = {f"chronoscene.{name}" for name in ("anchors", "gaussians", "training", "rasterizer")}
-"""Rooms that need torch and are used by methods only."""
+"""Packages that need torch and are used by methods only."""
 
 
 SKELETON = set((ROOT / "chronoscene/cli/methods/skeleton").rglob("*.py"))
@@ -73,17 +73,17 @@ def imports(name: str) -> set[str]:
 GRAPH = {name: imports(name) for name in MODULES}
 
 
+def package(name: str) -> str:
+    """Package of a module, in the words of `LAYERS`: the innermost one that has it."""
+    found = [p for packages in LAYERS for p in packages if name == p or name.startswith(f"{p}.")]
+    assert found, f"{name} is in no layer"
+    return max(found, key=len)
+
+
 def layer(name: str) -> int:
     """Height of a module, 0 at the bottom."""
-    for height, rooms in enumerate(reversed(LAYERS)):
-        if any(name == room or name.startswith(f"{room}.") for room in rooms):
-            return height
-    raise AssertionError(f"{name} is in no layer")
-
-
-def room(name: str) -> str:
-    """Room of a module, in the words of `LAYERS`."""
-    return next(r for rooms in LAYERS for r in rooms if name == r or name.startswith(f"{r}."))
+    heights = {p: height for height, packages in enumerate(reversed(LAYERS)) for p in packages}
+    return heights[package(name)]
 
 
 PACKAGED = [name for name in MODULES if name != "chronoscene"]
@@ -91,7 +91,7 @@ PACKAGED = [name for name in MODULES if name != "chronoscene"]
 
 @pytest.mark.parametrize("name", PACKAGED)
 def test_imports_point_down(name: str) -> None:
-    others = {t for t in GRAPH[name] if t != "chronoscene" and room(t) != room(name)}
+    others = {t for t in GRAPH[name] if t != "chronoscene" and package(t) != package(name)}
     upward = {t for t in others if layer(t) >= layer(name)}
     assert not upward, f"{name} imports {sorted(upward)}"
 
@@ -107,15 +107,15 @@ def test_torch_side_is_for_methods() -> None:
     users = {
         name: used
         for name in MODULES
-        if room_or_none(name) not in TORCH_SIDE | {"chronogs", "baselines"}
-        and (used := {t for t in GRAPH[name] if room_or_none(t) in TORCH_SIDE})
+        if package_or_none(name) not in TORCH_SIDE | {"chronogs", "baselines"}
+        and (used := {t for t in GRAPH[name] if package_or_none(t) in TORCH_SIDE})
     }
     assert not users
 
 
-def room_or_none(name: str) -> str | None:
-    """Room of a module; the package itself has none."""
-    return None if name == "chronoscene" else room(name)
+def package_or_none(name: str) -> str | None:
+    """Package of a module; the root has none."""
+    return None if name == "chronoscene" else package(name)
 
 
 def test_few_modules_at_the_root() -> None:

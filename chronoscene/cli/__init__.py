@@ -15,7 +15,7 @@ from chronoscene.io.staging import disk_full
 COMMANDS = {
     "bench": "chronoscene.cli.runs.bench:command",
     "changes": "chronoscene.cli.runs.changes:command",
-    "check-method": "chronoscene.cli.methods.methods.check_method:check",
+    "check-method": "chronoscene.cli.methods.check_method:check",
     "compare": "chronoscene.cli.report.compare:command",
     "compress": "chronoscene.cli.runs.compress:command",
     "convert": "chronoscene.cli.scenes.convert:command",
@@ -25,7 +25,7 @@ COMMANDS = {
     "leakage": "chronoscene.cli.runs.leakage:command",
     "leaderboard": "chronoscene.cli.report.leaderboard:leaderboard_command",
     "methods": "chronoscene.cli.methods.methods:command",
-    "new-method": "chronoscene.cli.methods.methods.check_method:new",
+    "new-method": "chronoscene.cli.methods.check_method:new",
     "register": "chronoscene.cli.scenes.register:command",
     "render": "chronoscene.cli.runs.render:command",
     "score": "chronoscene.cli.report.results:score",

@@ -17,8 +17,9 @@ from PIL import Image
 
 from chronoscene.bench.files.records import Failure, read_run
 from chronoscene.bench.plan.job import Job
+from chronoscene.bench.plan.plan import BenchSettings
 from chronoscene.bench.run.process import put_in_place
-from chronoscene.bench.run.runner import BenchOutcome, BenchSettings, run_bench
+from chronoscene.bench.run.runner import BenchOutcome, run_bench
 from chronoscene.bench.train.worker import execute
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.scene import Camera, Frame, Period, Points, Scene

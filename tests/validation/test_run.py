@@ -202,7 +202,8 @@ def test_each_image_a_period_of_its_own(scene):
 
 def test_torch_is_not_imported():
     code = (
-        "import sys, chronoscene.cli.validate, chronoscene.validation.rules as r; r.all_rules()\n"
+        "import sys, chronoscene.cli.scenes.validate\n"
+        "import chronoscene.validation.rules as r; r.all_rules()\n"
         "heavy = {'torch', 'numba', 'open3d', 'cv2', 'pandas', 'matplotlib'} & set(sys.modules)\n"
         "assert not heavy, heavy"
     )

@@ -10,8 +10,9 @@ import click
 from chronoscene.bench.files.records import read_failures
 from chronoscene.bench.files.strategies import STRATEGIES
 from chronoscene.bench.plan.job import PHOTO_DISK, PHOTO_MEMORY
+from chronoscene.bench.plan.plan import BenchSettings
 from chronoscene.bench.plan.stop import parse_duration
-from chronoscene.bench.run.runner import BenchOutcome, BenchSettings, run_bench
+from chronoscene.bench.run.runner import BenchOutcome, run_bench
 from chronoscene.checks import check_choice
 from chronoscene.cli.options import (
     FOLDER,

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from chronoscene.bench.run.runner import BenchSettings
+from chronoscene.bench.plan.plan import BenchSettings
 from chronoscene.bench.study.plan import find_study, read_study, run_study
 from chronoscene.bench.study.tables import study_texts
 from chronoscene.cli.options import (

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from chronoscene.bench.plan import memory as planning
 from chronoscene.bench.plan.memory import check_room, expected_memory, open_store, photo_needs
 from chronoscene.bench.plan.parts import make_parts
 from chronoscene.bench.plan.stop import StopRule
@@ -36,8 +37,8 @@ def free(monkeypatch):
     """Sets what is free: bytes of memory, bytes on disk."""
 
     def free(memory, disk):
-        monkeypatch.setattr(memory, "machine_memory", lambda: (10**12, memory))
-        monkeypatch.setattr(memory.shutil, "disk_usage", lambda path: SimpleNamespace(free=disk))
+        monkeypatch.setattr(planning, "machine_memory", lambda: (10**12, memory))
+        monkeypatch.setattr(planning.shutil, "disk_usage", lambda path: SimpleNamespace(free=disk))
 
     return free
 

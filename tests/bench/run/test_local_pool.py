@@ -17,8 +17,8 @@ from chronoscene.bench.run import local_pool
 from chronoscene.errors import DiskFullError
 from chronoscene.io.processes import process_tree
 
-from .test_interruption import wait_for
-from .test_job import JOB
+from ..plan.test_job import JOB
+from ..train.test_interruption import wait_for
 
 FILES = ("checkpoint/model.json", "predictions/manifest.json", "rows.csv", "source.json")
 
@@ -102,7 +102,8 @@ def test_a_run_that_is_alone_begins_without_memory(run_pool):
 SCRIPT = """
 import sys
 from pathlib import Path
-from chronoscene.bench.runner import BenchSettings, run_bench
+from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.run.runner import run_bench
 settings = BenchSettings(
     (Path(sys.argv[1]),), ("toy_methods:MEAN", "toy_methods:BLIND"), Path(sys.argv[2]), jobs=2
 )

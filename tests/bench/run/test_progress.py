@@ -6,8 +6,8 @@ import pytest
 from rich.console import Console
 
 from chronoscene.bench.plan.stop import StopRule
-from chronoscene.bench.run import progress as display_module
 from chronoscene.bench.run.progress import RunsDisplay
+from chronoscene.bench.train import progress as display_module
 from chronoscene.bench.train.progress import ProgressDisplay
 from chronoscene.io.wording import format_time
 from chronoscene.methods import StepReport

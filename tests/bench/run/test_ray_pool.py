@@ -13,13 +13,14 @@ import psutil
 import pytest
 
 from chronoscene.bench.files.records import read_run
+from chronoscene.bench.plan.plan import BenchSettings
 from chronoscene.bench.run import ray_pool
-from chronoscene.bench.run.runner import BenchSettings, run_bench
+from chronoscene.bench.run.runner import run_bench
 from chronoscene.errors import ConfigError
 from chronoscene.io.processes import process_tree
 
-from .test_interruption import wait_for
-from .test_job import JOB
+from ..plan.test_job import JOB
+from ..train.test_interruption import wait_for
 
 pytest.importorskip("ray")
 APART = Path(__file__).parents[1] / "plugins" / "apart"
@@ -148,7 +149,8 @@ def test_other_code_is_told_and_another_version_refused(on_ray, monkeypatch):
 SCRIPT = """
 import sys
 from pathlib import Path
-from chronoscene.bench.runner import BenchSettings, run_bench
+from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.run.runner import run_bench
 run_bench(
     BenchSettings(
         scenes=(Path(sys.argv[1]),),

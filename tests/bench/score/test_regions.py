@@ -17,8 +17,9 @@ from chronoscene.bench.files.predictions import (
     write_png,
 )
 from chronoscene.bench.files.records import read_rows, read_run
+from chronoscene.bench.plan.plan import BenchSettings
 from chronoscene.bench.report.summary import in_region, read_runs, summarise
-from chronoscene.bench.run.runner import BenchSettings, run_bench
+from chronoscene.bench.run.runner import run_bench
 from chronoscene.bench.score.regions import change_masks_hash, freeze_change_masks, regions_of
 from chronoscene.bench.score.scoring import rescore
 from chronoscene.errors import ConfigError

@@ -10,7 +10,7 @@ from chronoscene.bench.study.plan import Study, find_study, installed_studies, r
 from chronoscene.errors import ConfigError
 from chronoscene.methods import build_config, load_spec
 
-from .conftest import execute_here
+from ..conftest import execute_here
 
 TWO_ROWS = """
 title = "Rates"

@@ -17,7 +17,8 @@ from chronoscene.io.processes import process_tree
 SCRIPT = """
 import sys
 from pathlib import Path
-from chronoscene.bench.runner import BenchSettings, run_bench
+from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.run.runner import run_bench
 run_bench(
     BenchSettings(
         scenes=(Path(sys.argv[1]),),

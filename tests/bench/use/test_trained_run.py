@@ -10,7 +10,8 @@ import pytest
 
 from chronoscene.bench.files.predictions import load_image, read_manifest, to_bytes
 from chronoscene.bench.files.records import CONFIG_FILE, PREDICTIONS, SOURCE_FILE
-from chronoscene.bench.run.runner import BenchSettings, run_bench
+from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.run.runner import run_bench
 from chronoscene.bench.use.trained_run import OpenRun, open_run
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
 

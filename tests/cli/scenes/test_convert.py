@@ -81,7 +81,9 @@ def test_errors_are_one_line(make_scene_folder, tmp_path, monkeypatch, capsys, a
 
 
 def test_dataset_commands_do_not_need_torch():
-    names = ", ".join(f"chronoscene.cli.{name}" for name in ("convert", "split", "undistort"))
+    names = ", ".join(
+        f"chronoscene.cli.scenes.{name}" for name in ("convert", "split", "undistort")
+    )
     code = f"import sys, {names}; assert not {{'torch', 'open3d', 'pandas'}} & set(sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
