@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from chronoscene.validation.scene_folder import RawScene
+from chronoscene.validation.folder.scene_folder import RawScene
 
 Severity = Literal["error", "warning", "info"]
 

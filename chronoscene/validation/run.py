@@ -23,6 +23,7 @@ from chronoscene.images.masks import mask_place
 from chronoscene.images.store import place_image
 from chronoscene.io.wording import printable
 from chronoscene.validation.checks.reprojection import period_errors
+from chronoscene.validation.folder.scene_folder import Origin, RawScene, Track, no_progress
 from chronoscene.validation.rule import (
     SEVERITIES,
     Finding,
@@ -36,7 +37,6 @@ from chronoscene.validation.rule import (
 from chronoscene.validation.rules import all_rules
 from chronoscene.validation.rules.cs0_folder import RULES_ON_ORIGINS
 from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE
-from chronoscene.validation.scene_folder import Origin, RawScene, Track, no_progress
 
 RULE_FAILED = "CS000"
 """Code of the finding that a rule itself failed: a bug of ours, reported as such."""

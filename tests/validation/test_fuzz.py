@@ -13,7 +13,7 @@ from PIL import Image
 from chronoscene.colmap.model import read_raw_model
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats import read_scene
-from chronoscene.validation.checks.pixels import read_header, read_pixels_of
+from chronoscene.validation.folder.pixels import read_header, read_pixels_of
 from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.run import validate_scene
 

@@ -6,9 +6,9 @@ import pytest
 
 from chronoscene.errors import ConfigError
 from chronoscene.validation import rule
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import RULES
 from chronoscene.validation.rules import all_rules, choose_rules
-from chronoscene.validation.scene_folder import RawScene
 
 
 def codes(rules):

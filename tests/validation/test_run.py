@@ -86,7 +86,7 @@ def test_part_that_cannot_be_read_for_a_mistake_of_ours(scene, monkeypatch):
     def fails(folder):
         raise ZeroDivisionError("oh dear")
 
-    monkeypatch.setattr("chronoscene.validation.scene_folder.read_raw_model", fails)
+    monkeypatch.setattr("chronoscene.validation.folder.scene_folder.read_raw_model", fails)
     scene.path("sparse/split.txt").unlink()
     report = scene.validate()
     assert {f.code for f in report.findings} == {"CS000", "CS301"}
@@ -184,7 +184,7 @@ def test_what_the_reader_refuses_has_an_error(scene):
 
 
 def test_too_many_periods_for_a_table_of_points(scene, monkeypatch):
-    monkeypatch.setattr("chronoscene.validation.scene_folder.MAX_CELLS", 79)
+    monkeypatch.setattr("chronoscene.validation.folder.scene_folder.MAX_CELLS", 79)
     report = scene.validate()
     assert not report.findings
     skipped = {s.code for s in report.skipped if "too many periods" in s.reason}

@@ -15,6 +15,7 @@ from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import counted, printable
 from chronoscene.kernels.runtime import keep_freed_memory
+from chronoscene.validation.folder.scene_folder import Track, no_progress
 from chronoscene.validation.repair.fix import fix_scene
 from chronoscene.validation.report.html import write_html
 from chronoscene.validation.report.json import write_json, write_sarif
@@ -23,7 +24,6 @@ from chronoscene.validation.report.text import write_text
 from chronoscene.validation.rule import SceneReport, is_valid
 from chronoscene.validation.rules import choose_rules
 from chronoscene.validation.run import Reading, find_folders, lost_report, validate_scene
-from chronoscene.validation.scene_folder import Track, no_progress
 
 WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
 

@@ -1,15 +1,1 @@
-"""What rules compute: names, image files, photo metadata, observations, reprojection, frames."""
-
-from collections.abc import Hashable, Iterable
-from typing import TypeVar
-
-K = TypeVar("K", bound=Hashable)
-T = TypeVar("T")
-
-
-def grouped(pairs: Iterable[tuple[K, T]]) -> dict[K, list[T]]:
-    """Values by key, in the order of the pairs."""
-    groups: dict[K, list[T]] = {}
-    for key, value in pairs:
-        groups.setdefault(key, []).append(value)
-    return groups
+"""Quantities that several rules derive from a scene: dates and positions, reprojection errors."""

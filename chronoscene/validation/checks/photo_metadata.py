@@ -13,8 +13,8 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.geodesy import Georeference, median_longitude
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import SIGMA, Similarity, fit_robustly
-from chronoscene.validation.checks import grouped
-from chronoscene.validation.scene_folder import RawScene, derived
+from chronoscene.validation.folder.grouping import grouped
+from chronoscene.validation.folder.scene_folder import RawScene, derived
 
 MIN_DATES = 3  # Photos with a date from which the median date of a period is meaningful
 DAY = timedelta(days=1)  # Periods less than this apart may be confused by a time zone

@@ -18,8 +18,8 @@ from chronoscene.scene.cameras import unproject_pixels
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import Similarity, fit_robustly
 from chronoscene.scene.tracks import MIN_PARALLAX, intersect_rays
-from chronoscene.validation.checks import grouped
-from chronoscene.validation.scene_folder import RawScene, derived
+from chronoscene.validation.folder.grouping import grouped
+from chronoscene.validation.folder.scene_folder import RawScene, derived
 
 MIN_OBSERVATIONS = 10  # Observations of an image from which the median of its errors is meaningful
 

@@ -16,8 +16,8 @@ import numpy as np
 from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import counted
 from chronoscene.scene.splits import NameEntry, NameIndex, SplitEntry
-from chronoscene.validation.checks.names import PUNCTUATION, Spellings, spelling
-from chronoscene.validation.checks.observations import good_poses, observe
+from chronoscene.validation.folder.names import PUNCTUATION, Spellings, spelling
+from chronoscene.validation.folder.observations import good_poses, observe
 from chronoscene.validation.rules.cs1_poses import UNIT_TOLERANCE
 
 MIN_KEPT = 0.5

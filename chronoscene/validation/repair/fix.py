@@ -18,14 +18,14 @@ from chronoscene.images.masks import MASKS, mask_place
 from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
-from chronoscene.validation.checks import grouped
-from chronoscene.validation.checks.names import spelling
+from chronoscene.validation.folder.grouping import grouped
+from chronoscene.validation.folder.names import spelling
+from chronoscene.validation.folder.scene_folder import RawScene, TextFile, read_text_file
 from chronoscene.validation.repair import contents
 from chronoscene.validation.repair.contents import Repair
 from chronoscene.validation.rules.cs2_image_files import images_of_other_shape
 from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE, TEST_ELSEWHERE
 from chronoscene.validation.run import AS_DETECTED, Reading, is_project, other_format, quiet_numbers
-from chronoscene.validation.scene_folder import RawScene, TextFile, read_text_file
 
 
 def fix_scene(root: Path, out: Path, reading: Reading = AS_DETECTED) -> list[Repair]:

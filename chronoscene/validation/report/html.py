@@ -16,7 +16,7 @@ from PIL import Image
 from chronoscene import __version__
 from chronoscene.io.pages import data_uri, render_page
 from chronoscene.validation import rule
-from chronoscene.validation.checks.names import is_safe
+from chronoscene.validation.folder.names import is_safe
 from chronoscene.validation.rule import SEVERITIES, Finding, SceneReport, Severity, is_valid
 
 MAX_PICTURES = 24  # Pictures of one scene

@@ -12,7 +12,7 @@ import click
 
 from chronoscene.io.wording import counted
 from chronoscene.validation import rule
-from chronoscene.validation.checks import grouped
+from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.report.rule_list import COLOURS
 from chronoscene.validation.rule import SEVERITIES, Finding, SceneReport, Summary, is_valid
 

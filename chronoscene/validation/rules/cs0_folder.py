@@ -13,8 +13,8 @@ from chronoscene.formats import chronoscene as our_format
 from chronoscene.io.wording import shown
 from chronoscene.scene import Points
 from chronoscene.validation import rule
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene
 
 RULES_ON_ORIGINS = ("CS006", "CS007")
 """Codes of the rules that run on folders in other formats even if they cannot be read."""

@@ -22,9 +22,9 @@ from chronoscene.scene.cameras import (
 )
 from chronoscene.scene.geometry import camera_centre, rotation_from_quaternion
 from chronoscene.validation import rule
-from chronoscene.validation.checks.observations import good_poses
+from chronoscene.validation.folder.observations import good_poses
+from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene, derived
 
 VISIBLE = 0.5  # Pixels; distortion that moves no pixel this far may be dropped instead of undone
 

@@ -12,10 +12,10 @@ from chronoscene.formats.chronoscene import MODEL
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
 from chronoscene.validation import rule
-from chronoscene.validation.checks import grouped
-from chronoscene.validation.checks.names import is_portable, is_safe, spelling
+from chronoscene.validation.folder.grouping import grouped
+from chronoscene.validation.folder.names import is_portable, is_safe, spelling
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene
 
 MAX_ID = 2**31 - 2  # Largest id in COLMAP's databases
 

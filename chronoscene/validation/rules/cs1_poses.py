@@ -12,10 +12,10 @@ from chronoscene.arrays import Array
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation import rule
-from chronoscene.validation.checks.observations import good_poses
 from chronoscene.validation.checks.reprojection import image_errors, pose_limit
+from chronoscene.validation.folder.observations import good_poses
+from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene, derived
 
 UNIT_TOLERANCE = 1e-3  # Deviation of a quaternion's length from 1 beyond rounding in a text file
 

@@ -12,10 +12,10 @@ from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import quote
 from chronoscene.scene import Camera
 from chronoscene.validation import rule
-from chronoscene.validation.checks.names import Spellings
-from chronoscene.validation.checks.pixels import Header, Pixels
+from chronoscene.validation.folder.names import Spellings
+from chronoscene.validation.folder.pixels import Header, Pixels
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene
 
 KINDS = {
     ".jpg": ("JPEG", "MPO"),

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from chronoscene.images.masks import MASKS, MODES, mask_name, mask_place
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.validation import rule
-from chronoscene.validation.checks.names import Spellings
-from chronoscene.validation.checks.pixels import Header
+from chronoscene.validation.folder.names import Spellings
+from chronoscene.validation.folder.pixels import Header
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene
 
 
 @rule.error(

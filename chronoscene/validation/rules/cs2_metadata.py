@@ -14,10 +14,11 @@ from chronoscene.colmap.raw_model import RawImages
 from chronoscene.formats.chronoscene import PERIODS
 from chronoscene.io.wording import counted, shown
 from chronoscene.validation import rule
-from chronoscene.validation.checks import grouped, photo_metadata
+from chronoscene.validation.checks import photo_metadata
 from chronoscene.validation.checks.photo_metadata import GpsFit, dates_of, of_other_period
+from chronoscene.validation.folder.grouping import grouped
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene
 
 SLACK = 31  # Days by which the photos may miss the date in ``periods.json``
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from chronoscene.arrays import Array
 from chronoscene.io.wording import quote, shown
 from chronoscene.validation import rule
-from chronoscene.validation.checks import grouped
-from chronoscene.validation.checks.pixels import Pixels
+from chronoscene.validation.folder.grouping import grouped
+from chronoscene.validation.folder.pixels import Pixels
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene
 
 Greys = Mapping[str, NDArray[np.uint8]]
 

@@ -11,9 +11,9 @@ from chronoscene.formats.shared.grouping import NAME_PERIODS
 from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene.splits import DEFAULT_RULE, NameEntry, NameIndex, Problem, ProblemKind
 from chronoscene.validation import rule
-from chronoscene.validation.checks.names import Spellings
+from chronoscene.validation.folder.names import Spellings
+from chronoscene.validation.folder.scene_folder import RawScene, TextFile, derived
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene, TextFile, derived
 
 _SIMILAR = re.compile(r"(splits?|periods?)(\.(txt|csv|tsv))*", re.IGNORECASE)
 

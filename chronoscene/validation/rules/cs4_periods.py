@@ -8,9 +8,9 @@ from chronoscene.formats.chronoscene import SPLIT, TEST
 from chronoscene.io.wording import counted
 from chronoscene.scene.splits import SplitEntry, check_period_ids
 from chronoscene.validation import rule
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs3_split import meant_in_split, names_on_bad_lines, problem_hit
-from chronoscene.validation.scene_folder import RawScene
 
 MIN_TRAIN = 5  # Training views below which a period can hardly be reconstructed
 UNEVEN = 3  # Ratio between the number of test views of a period and its fair share

@@ -13,9 +13,9 @@ from chronoscene.scene.tracks import common_view
 from chronoscene.validation import rule
 from chronoscene.validation.checks.photo_metadata import fit_gps
 from chronoscene.validation.checks.reprojection import depth_percentiles, own_frames
+from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import NOTHING, Hit
 from chronoscene.validation.rules.cs1_cameras import pose_matrices
-from chronoscene.validation.scene_folder import RawScene, derived
 
 MIN_SHARED = 10  # Shared points from which a similarity between two periods can be told from chance
 MAX_BLOCK = 10_000_000  # Points times periods that are counted at a time

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import counted, shown
 from chronoscene.validation import rule
-from chronoscene.validation.checks.observations import Observations
+from chronoscene.validation.folder.observations import Observations
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene
 
 MAX_SHORT = 0.01  # Share of the points up to which short tracks do not matter
 MIN_COLOURED = 100  # Points from which their colours are judged

@@ -11,11 +11,11 @@ from chronoscene.colmap.raw_model import RawImages, RawPoints
 from chronoscene.io.wording import shown
 from chronoscene.validation import rule
 from chronoscene.validation.checks import reprojection
-from chronoscene.validation.checks.observations import Reprojection
 from chronoscene.validation.checks.reprojection import image_errors, own_frames, pose_limit
+from chronoscene.validation.folder.observations import Reprojection
+from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs1_poses import other_convention
-from chronoscene.validation.scene_folder import RawScene, derived
 
 MAX_OUTSIDE = 0.05  # Share of observations outside the image; undistortion leaves a few there
 MAX_BEHIND = 0.5  # Share of observations behind their camera. A consistent model has none.

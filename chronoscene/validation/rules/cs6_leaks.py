@@ -15,11 +15,11 @@ from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import shown
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.validation import rule
-from chronoscene.validation.checks import grouped
-from chronoscene.validation.checks.pixels import THUMBNAIL, Pixels
 from chronoscene.validation.checks.reprojection import typical_depth
+from chronoscene.validation.folder.grouping import grouped
+from chronoscene.validation.folder.pixels import THUMBNAIL, Pixels
+from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import Hit
-from chronoscene.validation.scene_folder import RawScene, derived
 
 SAME_PLACE = 1e-3
 """Distance of two cameras, in typical depths of the scene, below which they are in one place: it

@@ -18,11 +18,11 @@ from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
 from chronoscene.scene.splits import TEST_EVERY
 from chronoscene.validation import rule
-from chronoscene.validation.checks import grouped
-from chronoscene.validation.checks.pixels import Header
+from chronoscene.validation.folder.grouping import grouped
+from chronoscene.validation.folder.pixels import Header
+from chronoscene.validation.folder.scene_folder import RawScene, TextFile
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs3_split import test_elsewhere
-from chronoscene.validation.scene_folder import RawScene, TextFile
 
 GREY_MODES = ("1", "L", "LA", "La", "I", "I;16", "I;16B", "I;16L", "I;16N")
 """Pillow's modes without colour."""

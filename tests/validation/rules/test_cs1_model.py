@@ -3,9 +3,9 @@ import struct
 
 import pytest
 
-from chronoscene.validation.checks import pixels
-from chronoscene.validation.checks.names import is_portable
-from chronoscene.validation.scene_folder import RawScene
+from chronoscene.validation.folder import pixels
+from chronoscene.validation.folder.names import is_portable
+from chronoscene.validation.folder.scene_folder import RawScene
 
 CAMERAS, IMAGES, POINTS = (f"sparse/0/{stem}.txt" for stem in ("cameras", "images", "points3D"))
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.validation.checks.pixels import TAIL, read_header
-from chronoscene.validation.scene_folder import RawScene
+from chronoscene.validation.folder.pixels import TAIL, read_header
+from chronoscene.validation.folder.scene_folder import RawScene
 
 IMAGES, SPLIT = "sparse/0/images.txt", "sparse/split.txt"
 

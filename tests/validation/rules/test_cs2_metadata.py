@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.validation.scene_folder import RawScene
+from chronoscene.validation.folder.scene_folder import RawScene
 
 IMAGES, WORLD = "sparse/0/images.txt", "sparse/world.json"
 NAMES = [f"{p}{i:03d}.png" for p in "ab" for i in range(7)]

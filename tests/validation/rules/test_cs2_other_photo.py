@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rules.cs2_other_photo import sights
-from chronoscene.validation.scene_folder import RawScene
 
 POINTS = "sparse/0/points3D.txt"
 A, B = "images/a001.png", "images/a002.png"

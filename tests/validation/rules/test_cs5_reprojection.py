@@ -3,7 +3,7 @@ import pytest
 
 from chronoscene.scene.cameras import Camera, project_points
 from chronoscene.validation.checks.reprojection import image_errors
-from chronoscene.validation.scene_folder import RawScene
+from chronoscene.validation.folder.scene_folder import RawScene
 
 CAMERAS, IMAGES = "sparse/0/cameras.txt", "sparse/0/images.txt"
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.validation.checks.pixels import Pixels
+from chronoscene.validation.folder.pixels import Pixels
 from chronoscene.validation.rules.cs6_leaks import near_pairs, relit_pairs, twins
 
 TEST = "sparse/0/test.txt"

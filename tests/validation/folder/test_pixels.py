@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from chronoscene.validation.checks.pixels import has_end, jpeg_damage
+from chronoscene.validation.folder.pixels import has_end, jpeg_damage
 
 
 def jpeg(**options):

@@ -28,10 +28,11 @@ from chronoscene.scene import Camera, Period, Scene, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.splits import NameEntry, Problem, SplitEntry
 from chronoscene.scene.tracks import seen_by_period
-from chronoscene.validation.checks import grouped, observations, pixels
-from chronoscene.validation.checks.names import is_safe
-from chronoscene.validation.checks.observations import Observations, Reprojection
-from chronoscene.validation.checks.pixels import Header, Pixels, Track
+from chronoscene.validation.folder import observations, pixels
+from chronoscene.validation.folder.grouping import grouped
+from chronoscene.validation.folder.names import is_safe
+from chronoscene.validation.folder.observations import Observations, Reprojection
+from chronoscene.validation.folder.pixels import Header, Pixels, Track
 
 T = TypeVar("T")
 

@@ -21,7 +21,7 @@ from chronoscene.errors import ImageError
 from chronoscene.images.decoding import is_transparent, load_rgb
 from chronoscene.images.exif import ExifData, exif_of
 from chronoscene.io.staging import sha256_of
-from chronoscene.validation.checks import grouped
+from chronoscene.validation.folder.grouping import grouped
 
 T = TypeVar("T")
 Track = Callable[[Sequence[T], str], Iterable[T]]
