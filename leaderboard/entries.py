@@ -145,19 +145,20 @@ def read_entry(path: Path) -> Entry:
         raise refused(path, error.strerror or str(error)) from error
 
 
-def read_entries(folder: Path) -> list[Entry]:
-    """All entries of a folder, by the names of the files.
+def read_entries(folder: Path) -> dict[Path, Entry]:
+    """Read all entries below a folder, by file.
 
     Raises:
         ConfigError: If one is refused, or two are of the same runs.
     """
-    entries: dict[tuple[Any, ...], Entry] = {}
-    for path in sorted(folder.glob("*.json")):
-        entry = read_entry(path)
-        if entry.key in entries:
+    entries: dict[Path, Entry] = {}
+    keys = set()
+    for path in sorted(folder.rglob("*.json")):
+        entry = entries[path] = read_entry(path)
+        if entry.key in keys:
             raise refused(path, "an entry of the same method and setting as in another file")
-        entries[entry.key] = entry
-    return [*entries.values()]
+        keys.add(entry.key)
+    return entries
 
 
 def refused(place: Path, found: str) -> ConfigError:

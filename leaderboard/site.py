@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +43,7 @@ COSTS = {"seconds": "training [s]", SIZE: "size [MB]", "peak_memory_bytes": "mem
 
 
 def write_site(
-    entries: Sequence[Entry], published: PublishedTable, out: Path, runs: Iterable[Path] = ()
+    entries: Collection[Entry], published: PublishedTable, out: Path, runs: Iterable[Path] = ()
 ) -> int:
     """Write the site.
 
@@ -69,7 +69,7 @@ def write_site(
 class _Site:
     """All pages; methods and scenes have a name for their files each."""
 
-    def __init__(self, entries: Sequence[Entry], published: PublishedTable, folder: Path) -> None:
+    def __init__(self, entries: Collection[Entry], published: PublishedTable, folder: Path) -> None:
         self.published, self.folder = published, folder
         self.records = [record for entry in entries for record in entry.records]
         printed = published_entries(published, dict.fromkeys(row.scene for row in published.rows))
@@ -104,7 +104,7 @@ class _Site:
 
     def _page(self, template: str, file: str, **values: Any) -> None:
         page = render_page(
-            f"leaderboard_{template}", site=self, root="../" if "/" in file else "", **values
+            f"leaderboard/{template}", site=self, root="../" if "/" in file else "", **values
         )
         (self.folder / file).write_text(page + "\n", encoding="utf-8", newline="\n")
 

@@ -30,20 +30,20 @@ def submit(folders: Iterable[Path], to: Path) -> list[Path]:
         CheckpointError: If a run is damaged, or its images are not those that its manifest lists.
         ConfigError: If a run is not plausible, or an entry that is there is not.
     """
-    entries = {entry.key: entry for entry in read_entries(to)}
+    entries = read_entries(to)
+    places = {entry.key: path for path, entry in entries.items()}
     changed = {}
     for folder in (run for given in folders for run in _runs_of(given)):
         entry = Entry(runs=(entry_run(folder),))
-        if (known := entries.get(entry.key)) is not None:
-            by_seed = {run.record.seed: run for run in (*known.runs, *entry.runs)}
-            entry = Entry(runs=tuple(by_seed[seed] for seed in sorted(by_seed)))
-        entries[entry.key] = changed[entry.key] = entry
-    to.mkdir(parents=True, exist_ok=True)
-    written = []
-    for entry in changed.values():
-        written.append(to / file_name(entry))
-        write_text_atomic(written[-1], entry.model_dump_json(indent=1) + "\n")
-    return written
+        path = places.setdefault(entry.key, to / file_name(entry))
+        known = entries.get(path, entry)
+        by_seed = {run.record.seed: run for run in (*known.runs, *entry.runs)}
+        entries[path] = Entry(runs=tuple(by_seed[seed] for seed in sorted(by_seed)))
+        changed[path] = entries[path]
+    for path, entry in changed.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(path, entry.model_dump_json(indent=1) + "\n")
+    return [*changed]
 
 
 def _runs_of(folder: Path) -> list[Path]:
@@ -83,8 +83,8 @@ def entry_run(folder: Path) -> EntryRun:
 
 
 def file_name(entry: Entry) -> str:
-    """Name of the file of an entry: readable, and of its own."""
+    """Return a readable and unique name for the file of an entry, below a folder per scene."""
     run = entry.runs[0].record
-    words = "-".join((run.scene, run.method, run.strategy, run.preset))
-    plain = re.sub(r"[^\w.-]+", "_", words)[:100]
-    return f"{plain}-{hashlib.sha256(repr(entry.key).encode()).hexdigest()[:8]}.json"
+    words = run.scene, "-".join((run.method, run.strategy, run.preset))
+    scene, plain = (re.sub(r"[^\w.-]+", "_", text)[:100] for text in words)
+    return f"{scene}/{plain}-{hashlib.sha256(repr(entry.key).encode()).hexdigest()[:8]}.json"

@@ -39,7 +39,7 @@ def page_of(cloud: Cloud, rgb: NDArray[np.uint8], *, max_points: int = MAX_POINT
     """The text of the page; see `write_page`. ``rgb``: colours of the points. [P, 3]"""
     data = json.dumps(_page_data(cloud, rgb, max_points), ensure_ascii=False)
     # No text can end the script: JSON has "<" inside of strings only.
-    page = render_page("viewer", title=cloud.name, data=Markup(data.replace("<", "\\u003c")))
+    page = render_page("viewer/page", title=cloud.name, data=Markup(data.replace("<", "\\u003c")))
     return page + "\n"
 
 

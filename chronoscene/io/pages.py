@@ -1,4 +1,4 @@
-"""HTML pages that need no other file: templates of this package with style and script inside."""
+"""Self-contained HTML pages, made from the templates of this package."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ TEMPLATES = Path(__file__).parent / "templates"
 def render_page(name: str, **values: Any) -> str:
     """Fill in ``templates/<name>.html.j2``; all values are escaped.
 
-    In a template, ``{{ asset("page.css") }}`` is the text of a file beside it, as it is.
+    In a template, ``{{ asset("shared/page.css") }}`` inserts a file of ``templates/`` unchanged.
 
     Args:
-        name: Of the template.
-        values: What the template calls by name.
+        name: Template, such as ``viewer/page``.
+        values: Variables of the template.
     """
     from jinja2 import Environment, FileSystemLoader
     from markupsafe import Markup
@@ -36,12 +36,12 @@ def render_page(name: str, **values: Any) -> str:
 
 
 def data_uri(picture: Image.Image, *, form: str = "jpeg", quality: int = 82) -> str:
-    """A picture in a data URI.
+    """Encode a picture as a data URI.
 
     Args:
-        picture: Of any mode; it becomes RGB.
+        picture: Picture of any mode; converted to RGB.
         form: ``jpeg`` or ``webp``.
-        quality: As Pillow counts it, up to 100.
+        quality: Pillow's quality, up to 100.
     """
     file = io.BytesIO()
     picture.convert("RGB").save(file, form, quality=quality)

@@ -30,7 +30,7 @@ def test_tables_have_their_marks_and_names_are_only_text():
         breaks={0},
     )
     environment = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
-    page = environment.get_template("tables.html.j2").module.boxed(table)
+    page = environment.get_template("shared/tables.html.j2").module.boxed(table)
     assert "<b>" not in page and "&lt;b&gt;A&lt;/b&gt;" in page and "a &amp; b" in page
     assert '<td class="rank1">21.0</td>' in page and '<td class="rank1">0.6</td>' in page
     assert '<td class="rank0">20.0 †</td>' in page

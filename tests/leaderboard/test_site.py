@@ -60,7 +60,7 @@ def runs(tmp_path_factory):
 @pytest.fixture(scope="module")
 def entries(runs):
     submit([runs], runs.parent / "entries")
-    return read_entries(runs.parent / "entries")
+    return [*read_entries(runs.parent / "entries").values()]
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_the_names_of_an_entry_import_nothing(make_run, tmp_path, monkeypatch):
     submit([tmp_path / "runs"], tmp_path / "e")
     monkeypatch.setattr("leaderboard.site.load_spec", lambda name: pytest.fail(name))
     monkeypatch.setattr("leaderboard.site.installed_methods", dict)
-    write_site(read_entries(tmp_path / "e"), load_published(), tmp_path / "site")
+    write_site(read_entries(tmp_path / "e").values(), load_published(), tmp_path / "site")
 
 
 def test_all_numbers_of_the_paper_are_on_a_page(site):
@@ -135,7 +135,7 @@ def test_all_numbers_of_the_paper_are_on_a_page(site):
 def test_scenes_of_one_name_have_rows_of_their_own(make_run, tmp_path):
     submit([make_run()], tmp_path / "e")
     submit([make_run(split_hash="f" * 64, psnr=((11.0, 12.0), (13.0, 14.0)))], tmp_path / "e")
-    write_site(read_entries(tmp_path / "e"), load_published(), tmp_path / "site")
+    write_site(read_entries(tmp_path / "e").values(), load_published(), tmp_path / "site")
     for page in ("index.html", "scene/plaza.html", "method/3dgs.html"):
         text = (tmp_path / "site" / page).read_text(encoding="utf-8")
         assert "23.00" in text and "12.50" in text
@@ -143,7 +143,7 @@ def test_scenes_of_one_name_have_rows_of_their_own(make_run, tmp_path):
 
 def test_commands_make_the_run_again(make_run, tmp_path):
     submit([make_run(variant="sh_degree=2,budget=90s", max_width=800)], tmp_path / "e")
-    write_site(read_entries(tmp_path / "e"), load_published(), tmp_path / "site")
+    write_site(read_entries(tmp_path / "e").values(), load_published(), tmp_path / "site")
     page = (tmp_path / "site/method/3dgs.html").read_text(encoding="utf-8")
     assert "--seed 0 --set sh_degree=2 --budget 90s --max-width 800<" in page
 

@@ -15,7 +15,7 @@ def test_seeds_extend_an_entry_and_replace_themselves(make_run, tmp_path):
     first = submit([make_run()], to)
     assert submit([make_run(seed=1)], to) == first
     assert submit([make_run(psnr=((30.0, 31.0), (32.0, 33.0)))], to) == first
-    (entry,) = read_entries(to)
+    (entry,) = read_entries(to).values()
     assert [(r.seed, r.periods["0"]["psnr"]) for r in entry.records] == [(0, 30.5), (1, 21.0)]
 
 
@@ -24,7 +24,7 @@ def test_a_folder_of_runs_gives_an_entry_per_setting(make_run, tmp_path):
     make_run("4dgs", device="cuda (Test)")
     written = submit([tmp_path / "runs"], tmp_path / "entries")
     assert len({*written}) == 3
-    assert [len(entry.runs) for entry in read_entries(tmp_path / "entries")] == [1, 1, 2]
+    assert [len(entry.runs) for entry in read_entries(tmp_path / "entries").values()] == [1, 1, 2]
 
 
 def test_devices_have_entries_of_their_own(make_run, tmp_path):

@@ -81,7 +81,7 @@ def comparison_page(
         for scene, of_scene in found.items()
     ]
     return render_page(
-        "comparison",
+        "comparison/page",
         title=runs.resolve().name,
         tables=readable_tables(entries, records),
         notes=footnotes(entries, records, failures),

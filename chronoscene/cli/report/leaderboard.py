@@ -55,7 +55,7 @@ def leaderboard_command(entries: Path, out: Path, runs: tuple[Path, ...]) -> Non
     It needs no server: open its index.html.
     """
     check_place("--out", out)
-    found = read_entries(entries)
+    found = [*read_entries(entries).values()]
     pictured = write_site(found, load_published(), out, runs)
     click.echo(f"{len(found)} measured entries, {pictured} of them with pictures")
     tell_written(out / "index.html")

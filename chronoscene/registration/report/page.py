@@ -48,7 +48,7 @@ def render_report(
     """
     photos = Photos(model)
     return render_page(
-        "registration",
+        "registration/page",
         title=title,
         version=__version__,
         certificate=certificate,

@@ -31,7 +31,7 @@ TITLES: dict[Severity, str] = {"error": "Errors", "warning": "Warnings", "info":
 def write_html(reports: Sequence[SceneReport], *, strict: bool = False) -> str:
     """All findings of some scenes as an HTML page."""
     return render_page(
-        "validation",
+        "validation/page",
         scenes=[(report, _sections(report), _skipped(report)) for report in reports],
         total=rule.counts(reports),
         valid=is_valid(reports, strict=strict),
