@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from chronoscene.errors import ChronoSceneError
 from chronoscene.geodesy import Georeference, median_longitude
-from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.similarity import SIGMA, Similarity, fit_robustly
 from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.scene_folder import RawScene, derived
@@ -24,7 +23,6 @@ MUCH_NEARER = 0.25
 
 MIN_PHOTOS = 6  # Photos with a position from which a similarity is meaningful
 MIN_SPREAD = 10.0  # Metres; smaller spreads of positions are the noise of the receiver
-MAX_UP = 0.9  # Share of the cameras that look up if the model was turned over
 
 
 @derived
@@ -110,16 +108,3 @@ def fit_gps(scene: RawScene) -> GpsFit | None:
         return None
     sigma = SIGMA * float(np.median(found[1]))
     return GpsFit(np.array(rows, np.int64), found[0], found[1], sigma, spread)
-
-
-def is_upside_down(scene: RawScene, fit: GpsFit) -> bool:
-    """Whether the fit turned the model over, as it does if model or positions are mirrored.
-
-    Cameras look down, or to the horizon with their lower side down. A mirrored plan fits only with
-    the model upside down.
-    """
-    assert scene.images is not None
-    rotations = rotation_from_quaternion(scene.images.quaternions[fit.images])
-    middle = rotations[:, 1] + rotations[:, 2]  # between down and forwards, in the world
-    up = middle @ fit.metres_from_world.matrix[2]
-    return bool(np.mean(up > 0) > MAX_UP)

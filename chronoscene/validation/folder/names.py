@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import unicodedata
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
@@ -12,15 +11,6 @@ from chronoscene.formats.chronoscene import check_name
 
 PUNCTUATION = "\"'`,;"  # What tables put around and after a name
 
-FORBIDDEN = re.compile(r'[<>:"|?*\\]|[ .]$')
-"""What a file or folder name cannot contain, or end in, on Windows (Microsoft, *Naming Files,
-Paths, and Namespaces*)."""
-
-DEVICES = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?", re.IGNORECASE)
-"""Names that Windows reserves for devices, with any extension."""
-
-MAX_NAME_BYTES = 255  # Longest name on most file systems
-
 
 def is_safe(name: str) -> bool:
     """Whether an image name stays below ``images/``."""
@@ -29,16 +19,6 @@ def is_safe(name: str) -> bool:
     except SceneError:
         return False
     return True
-
-
-def is_portable(name: str) -> bool:
-    """Whether the common systems can store a file of this name, folders included."""
-    return not any(
-        FORBIDDEN.search(part)
-        or DEVICES.fullmatch(part)
-        or len(part.encode("utf-8", "surrogateescape")) > MAX_NAME_BYTES
-        for part in PurePosixPath(name).parts
-    )
 
 
 def spelling(name: str) -> str:

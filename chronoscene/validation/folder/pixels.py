@@ -36,9 +36,6 @@ END_MARKS = {"JPEG": b"\xff\xd9", "MPO": b"\xff\xd9", "PNG": b"IEND"}
 JPEG = ("JPEG", "MPO")  # Pillow's names of JPEG files
 TAIL = 4096  # Bytes at the end of a file in which its end marker is looked for
 
-_SUBFILE, _REDUCED, _MASK = 254, 1, 4
-"""TIFF tag for the kind of an image in the file, and two of its bits (TIFF 6.0, page 36)."""
-
 _HEADER_THREADS = 4
 _MIN_THREADED = 32  # Fewer headers than this are read before threads have started
 
@@ -69,8 +66,6 @@ class Header:
     """Whether it has more than 8 bits per channel."""
     transparent: bool = False
     """Whether it may have transparent pixels."""
-    animated: bool = False
-    """Whether it has several frames."""
     truncated: bool = False
     """Whether the file ends before its image does."""
     exif: ExifData = field(default_factory=ExifData)
@@ -112,15 +107,6 @@ def read_header(path: Path) -> Header:
         return Header(_problem(error))
 
 
-def peak(path: Path) -> int | None:
-    """Largest value in an image of one channel; None if it cannot be decoded."""
-    try:
-        with Image.open(path) as image:
-            return int(np.asarray(image).max())
-    except Exception:  # as above
-        return None
-
-
 def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
     exif, kind = exif_of(image), image.format or ""
     turned = kind == "TIFF" and exif.orientation >= 5  # Pillow gives the size after rotation
@@ -133,7 +119,6 @@ def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
         deep=_is_deep(image),
         transparent=is_transparent(image),
         truncated=_is_truncated(path, file, image),
-        animated=_has_frames(image),
         exif=exif,
     )
 
@@ -144,21 +129,6 @@ def _is_deep(image: Image.Image) -> bool:
         return True
     tiles = getattr(image, "tile", None) or ((),)
     return any(";16" in str(argument) for argument in tiles[0][3:])
-
-
-def _has_frames(image: Image.Image) -> bool:
-    """Whether there are several images that are not previews or masks."""
-    if image.format == "MPO" or not getattr(image, "is_animated", False):
-        return False
-    if image.format != "TIFF":
-        return True
-    size = image.size
-    try:
-        image.seek(1)
-    except (EOFError, OSError, SyntaxError):
-        return False
-    kind = getattr(image, "tag_v2", {}).get(_SUBFILE, 0)
-    return image.size == size and not kind & (_REDUCED | _MASK)
 
 
 def _is_truncated(path: Path, file: BinaryIO, image: Image.Image) -> bool:

@@ -22,7 +22,7 @@ from chronoscene.colmap.raw_model import RawImages, RawModel, RawPoints
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, read_periods
 from chronoscene.formats.shared.colmap_layout import Assigned
-from chronoscene.images.masks import MASKS, mask_name, mask_place
+from chronoscene.images.masks import MASKS, mask_name
 from chronoscene.io.documents import decode_text
 from chronoscene.scene import Camera, Period, Scene, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
@@ -53,7 +53,6 @@ _REASONS = {
     "tests": f"{SPLIT}, test.txt or the images of the model cannot be read",
     "point_periods": "points or periods cannot be read, or there are too many periods",
     "pixels": "images are decoded only with --decode",
-    "mask_peaks": "masks are decoded only with --decode",
 }
 
 
@@ -368,14 +367,6 @@ class RawScene:
         masked = {n: mask_name(n) for n in self.present if mask_name(n) in masks}
         headers = pixels.read_headers(self.root / MASKS, list(masked.values()))
         return {name: headers[mask] for name, mask in masked.items()}
-
-    @cached_property
-    def mask_peaks(self) -> dict[str, int | None] | None:
-        """Largest value of each readable mask, None where it is damaged, if they may be decoded."""
-        if not self.decode:
-            return None
-        readable = [name for name, header in self.mask_headers.items() if header.problem is None]
-        return {n: pixels.peak(self.root / mask_place(n)) for n in readable}
 
     @cached_property
     def pixels(self) -> dict[str, Pixels] | None:

@@ -231,7 +231,7 @@ def repair_test(
     repairs: list[Repair] = []
     _note(repairs, "CS324", renamed, "name", "corrected as in the model")
     _note(repairs, "CS324", unknown, "line", "on images that are not in the model removed")
-    _note(repairs, "CS326", len(entries) - unknown - len(lines), "repeated line", "removed")
+    _note(repairs, "", len(entries) - unknown - len(lines), "repeated line", "removed")
     return list(lines), repairs
 
 

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import click
 
-from chronoscene.validation.rule import GROUPS, Rule, Severity
+from chronoscene.validation.rule import GROUPS, RETIRED, Rule, Severity
 from chronoscene.validation.rules import all_rules
 
 COLOURS: dict[Severity, str] = {"error": "red", "warning": "yellow", "info": "cyan"}
 
-INTRODUCTION = """\
+INTRODUCTION = f"""\
 # Validation rules
 
 `chronoscene validate` checks a scene with the rules below; [DATASET.md](../DATASET.md#validation)
 describes the command. `chronoscene validate --explain CS201` prints a rule in the terminal. Codes
-are stable: a code is never reused.
+are stable: a code is never reused, not even that of a rule that is gone
+({", ".join(RETIRED)}).
 
 This page is generated: `python -m chronoscene.validation.report.rule_list >
 docs/validation-rules.md`. The rules of group CS1 are in the files

@@ -9,15 +9,13 @@ import numpy as np
 
 from chronoscene.colmap.raw_model import MODEL_FILES, RawImages, RawModel, find_stray_model
 from chronoscene.formats.chronoscene import MODEL
-from chronoscene.io.wording import counted, quote, shown
+from chronoscene.io.wording import quote, shown
 from chronoscene.scene import Camera
 from chronoscene.validation import rule
 from chronoscene.validation.folder.grouping import grouped
-from chronoscene.validation.folder.names import is_portable, is_safe, spelling
+from chronoscene.validation.folder.names import is_safe, spelling
 from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
-
-MAX_ID = 2**31 - 2  # Largest id in COLMAP's databases
 
 
 @rule.error(
@@ -123,19 +121,6 @@ def unknown_camera(scene: RawScene, cameras: Sequence[Camera], images: RawImages
         yield Hit(place, "a camera of the model", f"camera {images.camera_ids[i]}")
 
 
-@rule.error(
-    "CS109",
-    bad="image id -1; camera id 4294967295",
-    remedy="number from 1, and update the references",
-    needs=("model",),
-)
-def id_out_of_range(scene: RawScene) -> Iterator[Hit]:
-    """The id of a camera or image is outside the range that COLMAP supports."""
-    for stem, ids in _ids(scene):
-        for wrong in sorted({i for i in ids if not 0 <= i <= MAX_ID}):
-            yield Hit(scene.model_file(stem), f"ids from 0 to {MAX_ID}", f"id {wrong}")
-
-
 def _ids(scene: RawScene) -> Iterator[tuple[str, list[int]]]:
     yield "cameras", [camera.camera_id for camera in scene.cameras or ()]
     yield "images", scene.images.ids.tolist() if scene.images else []
@@ -178,16 +163,3 @@ def name_case_collision(scene: RawScene, names: list[str]) -> Iterator[Hit]:
         if len(group) > 1:
             place = scene.model_file("images")
             yield Hit(place, "names that differ by more than case", shown(sorted(group)))
-
-
-@rule.info(
-    "CS114",
-    bad="`2016-05-03T12:00:00.jpg`; `aux.png`",
-    remedy="nothing to do here; to share the scene, rename the files in images/ and in the model",
-)
-def name_not_portable(names: list[str]) -> Iterator[Hit]:
-    """Other systems cannot store some image names: they have characters that Windows rejects, end
-    in a space or a dot, are names of devices, or are longer than 255 bytes."""
-    if odd := [name for name in names if not is_portable(name)]:
-        found = f"{counted(len(odd), 'name')} that some cannot store: {shown(odd)}"
-        yield Hit("images", "names that all systems can store", found, count=len(odd))

@@ -1,4 +1,4 @@
-"""CS20, CS21: image files: whether they are there, their sizes, and what kind of files they are."""
+"""CS20, CS21: presence, size and kind of the image files; CS24: their masks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from chronoscene.colmap.raw_model import RawImages
-from chronoscene.io.wording import quote
+from chronoscene.images.masks import MASKS, MODES, mask_name, mask_place
+from chronoscene.io.wording import counted, quote, shown
 from chronoscene.scene import Camera
 from chronoscene.validation import rule
 from chronoscene.validation.folder.names import Spellings
@@ -223,16 +224,6 @@ def image_transparent(readable: dict[str, Header]) -> Iterator[Hit]:
 
 
 @rule.warning(
-    "CS214", bad="an animated WebP", remedy="save the frame that is meant as a file of its own"
-)
-def image_animated(readable: dict[str, Header]) -> Iterator[Hit]:
-    """An image has several frames, of which only the first is used."""
-    for name, header in readable.items():
-        if header.animated:
-            yield Hit(f"images/{name}", "a single frame", f"several frames ({header.kind})")
-
-
-@rule.warning(
     "CS215",
     bad="a PNG named `a.jpg`",
     remedy="rename the file, in images/ and in the model, or convert it",
@@ -259,3 +250,66 @@ def image_blank(pixels: dict[str, Pixels]) -> Iterator[Hit]:
             red, green, blue = (round(float(c)) for c in thumbnail.mean(axis=(0, 1)))
             found = f"a single colour, #{red:02x}{green:02x}{blue:02x}"
             yield Hit(f"images/{name}", "an image with content", found)
+
+
+@rule.error(
+    "CS241",
+    bad="a mask in RGB; a mask of zero bytes",
+    remedy="save the mask as a grey PNG: 0 where the image is ignored, anything else elsewhere",
+)
+def mask_unreadable(scene: RawScene, mask_headers: dict[str, Header]) -> Iterator[Hit]:
+    """A mask cannot be read, or is no image of one channel with 8 bits."""
+    for name, header in mask_headers.items():
+        if header.problem is not None:
+            yield Hit(mask_place(name), "an image", header.problem)
+        elif header.mode not in MODES:
+            yield Hit(mask_place(name), "one channel of 8 bits", f"pixels of mode {header.mode}")
+        elif header.truncated:
+            yield Hit(mask_place(name), "an image that can be decoded", "a damaged one")
+
+
+@rule.error(
+    "CS242",
+    bad="a photo of 4000 x 3000 and its mask of 1000 x 750",
+    remedy="make the mask from the image file that is in images/",
+)
+def mask_size(readable: dict[str, Header], mask_headers: dict[str, Header]) -> Iterator[Hit]:
+    """A mask has another size than its image."""
+    for name, header in mask_headers.items():
+        if header.problem is None and name in readable and header.size != readable[name].size:
+            width, height = readable[name].size
+            found = f"{header.size[0]} x {header.size[1]}"
+            yield Hit(mask_place(name), f"{width} x {height} as images/{name}", found)
+
+
+@rule.warning(
+    "CS243",
+    bad="`masks/x.png` for `images/x.jpg`, whose mask is `masks/x.jpg.png`",
+    remedy="name the mask after its image, with the extension of the image and then .png",
+)
+def mask_without_image(scene: RawScene, names: list[str]) -> Iterator[Hit]:
+    """A file in `masks/` is not the mask of an image, so it is not used."""
+    images = {*names, *scene.files}
+    others = Spellings(images - scene.mask_headers.keys())
+    for file in scene.mask_files:
+        if file.removesuffix(".png") in images and file.endswith(".png"):
+            continue
+        near = others.find(file) or others.find(file.removesuffix(".png"))
+        hint = f"; the mask of {quote(near)} would be {quote(mask_name(near))}" if near else ""
+        yield Hit(f"{MASKS}/{file}", "the mask of an image", f"no image of this name{hint}")
+
+
+@rule.warning(
+    "CS245",
+    bad="masks of 40 out of 50 photos of a period, for example where the masking stopped",
+    remedy="add the masks that are missing, if something is to be ignored in these images",
+)
+def masks_missing(periods: dict[str, int], mask_headers: dict[str, Header]) -> Iterator[Hit]:
+    """Some images of a period have a mask, and others have none, so all of them counts."""
+    for period in sorted({periods[name] for name in mask_headers if name in periods}):
+        images = [name for name, of in periods.items() if of == period]
+        without = [name for name in images if name not in mask_headers]
+        if without:
+            expected = f"a mask of each of the {len(images)} images of period {period}"
+            found = f"none of {counted(len(without), 'image')}: {shown(without)}"
+            yield Hit(MASKS, expected, found, count=len(without))

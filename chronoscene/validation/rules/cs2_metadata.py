@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
-from datetime import date, time, timedelta
+from datetime import date, timedelta
 from itertools import pairwise
 
 import numpy as np
 
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.formats.chronoscene import PERIODS
-from chronoscene.io.wording import counted, shown
 from chronoscene.validation import rule
 from chronoscene.validation.checks import photo_metadata
 from chronoscene.validation.checks.photo_metadata import GpsFit, dates_of, of_other_period
@@ -39,9 +38,6 @@ MIN_APART = timedelta(days=183)  # Visits to a place that form one period may be
 APART_RATIO = 10.0
 """An outlier is also this many times as far from the median date as three quarters of the
 photos."""
-
-ONE_VISIT = timedelta(minutes=5)
-"""Photos that follow each other this closely were taken on one visit."""
 
 PURE = 0.9  # Share of the images whose period must be that of most images in their group
 MIN_GROUP = 3  # Images of a group from which a majority is meaningful
@@ -113,10 +109,6 @@ def exif_position(scene: RawScene, images: RawImages) -> Iterator[Hit]:
         found = f"a distance of {np.median(fit.distance):.3g} m (median)"
         yield Hit(scene.model_file("images"), "cameras at the GPS positions of the photos", found)
         return
-    if photo_metadata.is_upside_down(scene, fit):
-        found = "positions that fit only a mirrored or overturned model, whose cameras look up"
-        todo = "check the signs of longitudes (east, west), and whether the model is mirrored"
-        yield Hit(scene.model_file("images"), "cameras the right way up over GPS", found, todo)
     far = fit.distance > max(GPS_FAR, GPS_SIGMAS * fit.sigma)
     whole = _mostly_far(scene, fit, far)
     yield from whole.values()
@@ -187,31 +179,6 @@ def exif_date_alone(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
             if abs(taken - middle) > limit and name not in elsewhere:
                 expected = f"a date around {middle:%Y-%m-%d}"
                 yield Hit(f"images/{name}", expected, f"{taken:%Y-%m-%d}")
-
-
-@rule.warning(
-    "CS226",
-    bad="every second photo of a flight in period 0, the others in period 1",
-    remedy="put the photos of one visit into one period; if dates were copied from one photo to "
-    "others, ignore this rule",
-)
-def one_visit_in_two_periods(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit]:
-    """Photos taken within five minutes of each other are in different periods."""
-    misfiled = of_other_period(scene)  # has its own rule
-    taken = sorted(
-        (moment, name)
-        for name, moment in dates_of(scene).items()
-        if moment.time() != time() and name not in misfiled  # midnight: the time is unknown
-    )
-    found = grouped(
-        (tuple(sorted((periods[a], periods[b]))), (a, b))
-        for (early, a), (late, b) in pairwise(taken)
-        if periods[a] != periods[b] and late - early <= ONE_VISIT
-    )
-    for (one, other), pairs in found.items():
-        text = f"{counted(len(pairs), 'pair')} within five minutes: {shown(pairs[0])}"
-        expected = f"photos of periods {one} and {other} at different times"
-        yield Hit(scene.period_place, expected, text, count=len(pairs))
 
 
 @rule.warning(

@@ -247,20 +247,6 @@ def test_ambiguous(scene: RawScene) -> Iterator[Hit]:
     return _problems(TEST, scene.test_problems, "ambiguous")
 
 
-@rule.info("CS326", bad="`a.jpg` twice; `a.jpg` and `a`", remedy="delete one of the lines")
-def test_duplicate(scene: RawScene, test: list[NameEntry]) -> Iterator[Hit]:
-    """`test.txt` lists an image twice."""
-    index = NameIndex(scene.names)
-    written: dict[str, list[str]] = {}
-    for entry in test:
-        images = index.find(entry.name)
-        written.setdefault(images[0] if len(images) == 1 else entry.name, []).append(entry.name)
-    for name, forms in written.items():
-        if len(forms) > 1:
-            as_forms = f", as {shown(sorted(set(forms)))}" if len(set(forms)) > 1 else ""
-            yield Hit(TEST, "each name once", f"{quote(name)} {len(forms)} times{as_forms}")
-
-
 def _meant(scene: RawScene, problems: Iterable[Problem], lines: dict[int, str]) -> dict[int, str]:
     """By line, the image that an unknown name in ``lines`` of a file probably means."""
     unknown = [p.line for p in problems if p.kind == "unknown" and p.line]

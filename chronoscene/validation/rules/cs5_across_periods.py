@@ -1,4 +1,4 @@
-"""CS506 to CS508, CS519 to CS521: how the periods relate to each other, and the scene to metres."""
+"""CS506 to CS508, CS519, CS520: how the periods relate to each other, and the scene to metres."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chronoscene.arrays import Array, Ints, Mask
+from chronoscene.arrays import Ints, Mask
 from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import WORLD, read_world
-from chronoscene.scene.tracks import common_view
 from chronoscene.validation import rule
 from chronoscene.validation.checks.photo_metadata import fit_gps
-from chronoscene.validation.checks.reprojection import depth_percentiles, own_frames
+from chronoscene.validation.checks.reprojection import depth_percentiles
 from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import NOTHING, Hit
-from chronoscene.validation.rules.cs1_cameras import pose_matrices
 
 MIN_SHARED = 10  # Shared points from which a similarity between two periods can be told from chance
 MAX_BLOCK = 10_000_000  # Points times periods that are counted at a time
@@ -27,11 +25,6 @@ UNIT_TOLERANCE = 0.1
 """Relative difference between the unit and the metre by GPS that its noise can explain."""
 
 NEAREST, FARTHEST = 0.01, 50_000.0  # Plausible range of metres between cameras and points
-APART = 0.05  # Share of a period's points that cameras of another period should at least see
-OWN = 0.5  # Share of a period's points that its own cameras must see
-MAX_PERIODS = 100  # All pairs are compared
-MAX_POINTS, MAX_IMAGES = 3000, 300  # Points and images of all periods together that are compared
-REACH = 3.0  # How far a camera sees, in units of the 95th percentile of the depths in its period
 
 
 @rule.warning(
@@ -110,10 +103,7 @@ def connected(common: Ints, minimum: int) -> list[Ints]:
     needs=("reprojections", "point_periods"),
 )
 def period_frame(scene: RawScene) -> Iterator[Hit]:
-    """A period is in a frame of its own: mirrored, scaled, rotated or moved against the others."""
-    for index, explained in own_frames(scene).items():
-        place = f"period {scene.period_ids[index]}"
-        yield Hit(place, "the frame of the other periods", explained)
+    """A period without points in common with the others is in a frame of another scale."""
     for index, ratio in _other_depths(scene).items():
         found = f"points {ratio:.3g} times as far from the cameras, and none shared"
         place = f"period {scene.period_ids[index]}"
@@ -164,56 +154,3 @@ def frame_scale(scene: RawScene) -> Iterator[Hit]:
         if index >= 0 and not NEAREST <= depth <= FARTHEST:
             place = f"period {scene.period_ids[index]}"
             yield Hit(place, "a world in metres", f"points {depth:.3g} m from the cameras (median)")
-
-
-@rule.warning(
-    "CS521",
-    bad="the photos of 2016 show the north side, those of 2023 the south side",
-    remedy="leave the period out, or make it a scene of its own; if the places are the same, its "
-    "frame is a different one: register the periods together",
-    needs=("reprojections", "point_periods"),
-)
-def period_apart(scene: RawScene) -> Iterator[Hit]:
-    """A period shows a different place than the others: its cameras see hardly any of their points,
-    and their cameras hardly any of its points."""
-    if len(scene.period_ids) > MAX_PERIODS:
-        return
-    share = _views(scene)
-    share[~(np.diag(share) >= OWN)] = np.nan  # cameras that miss their own points tell nothing
-    for index in own_frames(scene).keys() | _other_depths(scene).keys():
-        share[index], share[:, index] = np.nan, np.nan  # a wrong frame tells nothing of places
-    for index, period in enumerate(scene.period_ids):
-        both = np.fmax(np.delete(share[index], index), np.delete(share[:, index], index))
-        if np.isfinite(both).any() and np.nanmax(both) < APART:
-            found = f"at most {100 * np.nanmax(both):.1f} % of the points in common view"
-            yield Hit(f"period {period}", "views of the place that the others show", found)
-
-
-def _views(scene: RawScene) -> Array:
-    """Share of the points of a period (columns) in the view of a camera of another (rows). [T, T]
-
-    Points and images are sampled. NaN for periods without points or without cameras.
-    """
-    images, points, seen = scene.images, scene.points, scene.point_periods
-    assert images is not None and points is not None and seen is not None
-    count = len(scene.period_ids)
-    depths = depth_percentiles(scene, 95)
-    reach = np.array([REACH * depths.get(i, np.nan) for i in range(count)])
-    finite = np.isfinite(points.xyz).all(axis=1)
-    owners = [_sample(finite & seen[:, i], MAX_POINTS // count) for i in range(count)]
-    xyz = points.xyz[np.concatenate([np.zeros(0, np.int64), *owners])]
-    owner = np.repeat(np.arange(count), list(map(len, owners)))
-    known = np.isin(images.camera_ids, list(scene.usable_cameras)) & scene.is_posed
-    poses = pose_matrices(np.column_stack([images.quaternions, images.translations]))
-    views = []
-    for period in range(count):
-        mine = _sample(known & (scene.image_periods == period), MAX_IMAGES // count)
-        cameras = [scene.usable_cameras[i] for i in images.camera_ids[mine].tolist()]
-        views.append(list(zip(cameras, poses[mine], strict=True)))
-    return common_view(xyz, owner, views, reach).T
-
-
-def _sample(mask: Mask, count: int) -> Ints:
-    """Indices where a mask is true, about ``count`` of them, evenly spread."""
-    index = np.flatnonzero(mask)
-    return index[:: len(index) // max(1, count) + 1]

@@ -20,15 +20,6 @@ MIN_COLOURED = 100  # Points from which their colours are judged
 SAME_COLOUR = 0.95  # Share of points of one colour; snow and night skies have many shades
 COLOURED_SAMPLE = 50_000  # Points whose colours are looked at
 
-MAX_DUPLICATES = 0.05
-"""Share of points on top of another one. Up to one percent was seen in COLMAP's models."""
-
-SAME_POINT = 1e-6
-"""Edge of the cells in which points are one, in median distances of the points from their centre:
-copies that went through single precision differ by a tenth of that."""
-
-SAMPLE = 10_000  # Points from which that distance is taken
-
 FAR = 100.0
 """Distance of a point from the centre, in units of the median distance of points and cameras."""
 
@@ -168,45 +159,6 @@ def no_training_points(
     total = len(scene.points or ())
     if total and not train[observations.image[observations.valid]].any():
         yield Hit(scene.model_file("points3D"), "points seen in training images", f"0 of {total}")
-
-
-@rule.warning(
-    "CS517",
-    what=f"More than {MAX_DUPLICATES:.0%} of the points coincide with another point, to within a "
-    "millionth of the scene.",
-    bad="the points of two runs in one file",
-    remedy="merge the duplicates, or triangulate the points again (colmap point_triangulator "
-    "--clear_points 1)",
-)
-def duplicate_points(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
-    finite = np.isfinite(points.xyz).all(axis=1)
-    xyz = _cells(points.xyz[finite])
-    ordered = np.sort(_hash(xyz))  # much faster than sorting points
-    if np.count_nonzero(ordered[1:] == ordered[:-1]) <= MAX_DUPLICATES * len(xyz):
-        return
-    twice = len(xyz) - len(np.unique(xyz, axis=0))
-    if twice > MAX_DUPLICATES * len(xyz):
-        found = f"{twice} of {len(xyz)} that coincide with another one"
-        yield Hit(scene.model_file("points3D"), "distinct points", found, count=twice)
-
-
-def _cells(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The small cubes that points are in, as whole numbers; the points if they are all one."""
-    sample = xyz[:: len(xyz) // SAMPLE + 1]
-    if not len(sample):
-        return xyz
-    edge = SAME_POINT * float(np.median(np.abs(sample - np.median(sample, axis=0)).max(axis=1)))
-    cells = np.floor(xyz / edge) if 0 < edge < np.inf else xyz
-    return np.asarray(cells + 0.0)  # makes -0.0 positive, so that equal numbers have equal bits
-
-
-def _hash(xyz: NDArray[np.float64]) -> NDArray[np.uint64]:
-    """A number per point: the same for equal points, almost never for different ones."""
-    mixed = np.zeros(len(xyz), np.uint64)
-    for bits in np.ascontiguousarray(xyz.T).view(np.uint64):
-        mixed = (mixed ^ bits ^ (bits >> np.uint64(32))) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= mixed >> np.uint64(29)
-    return mixed
 
 
 @rule.warning(

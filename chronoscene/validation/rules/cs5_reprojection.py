@@ -1,4 +1,4 @@
-"""CS511 to CS513, CS515, CS516, CS524: whether points, poses and cameras fit each other."""
+"""CS511 to CS513, CS515, CS516: whether points, poses and cameras fit each other."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chronoscene.colmap.raw_model import RawImages, RawPoints
+from chronoscene.colmap.raw_model import RawImages
 from chronoscene.io.wording import shown
 from chronoscene.validation import rule
 from chronoscene.validation.checks import reprojection
-from chronoscene.validation.checks.reprojection import image_errors, own_frames, pose_limit
+from chronoscene.validation.checks.reprojection import image_errors, pose_limit
 from chronoscene.validation.folder.observations import Reprojection
 from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import Hit
@@ -20,7 +20,6 @@ from chronoscene.validation.rules.cs1_poses import other_convention
 MAX_OUTSIDE = 0.05  # Share of observations outside the image; undistortion leaves a few there
 MAX_BEHIND = 0.5  # Share of observations behind their camera. A consistent model has none.
 MAX_WRONG = 0.5  # Share of the images of a period beyond which one finding reports all of them
-MIN_STORED = 0.9  # Share of the points that must have an error stored with them
 
 
 @rule.warning(
@@ -75,8 +74,6 @@ def pose_disagrees(scene: RawScene, images: RawImages) -> Iterator[Hit]:
     if wrong and other_convention(scene):
         return  # CS125 gives the reason for all of them
     for index in sorted({int(scene.image_periods[image]) for image in wrong}):
-        if index in own_frames(scene):
-            continue  # CS519 gives the reason
         mine = [image for image in wrong if scene.image_periods[image] == index]
         total = sum(int(scene.image_periods[image]) == index for image in judged)
         if index >= 0 and len(mine) > max(1, MAX_WRONG * total):
@@ -108,7 +105,6 @@ def period_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
         worst = known[np.argsort(-errors[known])]
         named = shown([images.names[i] for i in worst])
         found = f"{reprojection.period_errors(scene)[period]:.3g} px; the worst are {named}"
-        found += _other_focal(scene, index, limit)
         yield Hit(f"period {period}", f"a median error below {limit:.3g} px", found)
 
 
@@ -118,17 +114,8 @@ def _worse_periods(scene: RawScene) -> dict[int, float]:
     limit, judged = reprojection.period_limit(scene), reprojection.judged_images(scene)
     if not judged or limit > reprojection.WORSE * np.median([pose_limit(scene, i) for i in judged]):
         return {}  # no period fits: nothing to compare with
-    explained = {scene.period_ids[index] for index in own_frames(scene)}
     errors = reprojection.period_errors(scene).items()
-    return {p: limit for p, median in errors if median > limit and p not in explained}
-
-
-def _other_focal(scene: RawScene, index: int, limit: float) -> str:
-    """A hint that other focal lengths explain the errors of a period, if they do."""
-    if scene.point_periods is None:
-        return ""
-    factor = reprojection.focal_factor(reprojection.Rays(scene, index), limit)
-    return "" if factor is None else f"; it fits with focal lengths multiplied by {factor:.4g}"
+    return {p: limit for p, median in errors if median > limit}
 
 
 @rule.warning(
@@ -147,26 +134,3 @@ def image_error(scene: RawScene, images: RawImages) -> Iterator[Hit]:
         if limit < error <= pose_limit(scene, image):  # CS513 reports larger ones
             place = scene.image_place(images.names[image])
             yield Hit(place, f"a median error below {limit:.3g} px", f"{error:.3g} px")
-
-
-@rule.warning(
-    "CS524",
-    bad="a focal length replaced by that of the data sheet; stored 0.5 px, measured 3.2 px",
-    remedy="use cameras, images and points of one model, or refine them together (colmap "
-    "bundle_adjuster)",
-    needs=("reprojections",),
-)
-def error_outdated(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
-    """The reprojection errors are far larger than the errors stored with the points: cameras, poses
-    or points were changed after the model was made."""
-    stored = points.error[(points.error > 0) & np.isfinite(points.error)]
-    if len(stored) < MIN_STORED * len(points) or not len(stored):
-        return  # not every program stores them
-    errors, judged = image_errors(scene), reprojection.judged_images(scene)
-    if not judged:
-        return
-    found, expected = float(np.median(errors[judged])), float(np.median(stored))
-    fits = all(errors[i] <= pose_limit(scene, i) for i in judged)
-    if fits and found > reprojection.outlier_limit(expected) and not _worse_periods(scene):
-        text = f"{found:.3g} px (median)"
-        yield Hit(scene.model_file("points3D"), f"errors around {expected:.3g} px", text)

@@ -181,13 +181,6 @@ def test_image_transparent(scene):
     scene.expect("CS213", place="images/a000.png", found="RGBA")
 
 
-@pytest.mark.parametrize("suffix", [".png", ".webp"])
-def test_image_animated(scene, suffix):
-    frames = {"save_all": True, "append_images": [noise(seed=5)]}
-    scene.save("a000.png", noise(), as_name=f"a000{suffix}", **frames)
-    scene.expect("CS214", place=f"images/a000{suffix}", found="several")
-
-
 def test_image_misnamed(scene):
     scene.save("a000.png", noise(), format="JPEG")
     scene.expect("CS215", place="images/a000.png", found="a JPEG file")
@@ -230,18 +223,3 @@ def test_one_transparent_colour(scene):
     image = noise().quantize(32)
     scene.save("a000.png", image, transparency=0)
     scene.expect("CS213", place="images/a000.png", found="pixels of mode P")
-
-
-@pytest.mark.parametrize(
-    ("size", "kind", "codes"),
-    [((64, 48), 0, {"CS214", "CS507"}), ((64, 48), 4, {"CS507"}), ((16, 12), 1, {"CS507"})],
-)
-def test_pages_of_a_tiff(scene, size, kind, codes):
-    """A second page is a second image, unless it is a mask or a preview."""
-    from PIL.TiffImagePlugin import ImageFileDirectory_v2
-
-    page, tags = noise(size=size, seed=5), ImageFileDirectory_v2()
-    tags[254] = kind
-    page.encoderinfo = {"tiffinfo": tags}
-    scene.save("a000.png", noise(), as_name="a000.tif", save_all=True, append_images=[page])
-    assert {f.code for f in scene.validate(decode=True).findings} == codes

@@ -73,7 +73,7 @@ def test_period_order(scene):
 
 def test_two_periods_of_one_day_have_no_order(scene):
     tag_dates(scene, "2023-05-03", "2023-05-03")
-    assert {f.code for f in scene.validate().findings} == {"CS226", "CS507"}
+    assert {f.code for f in scene.validate().findings} == {"CS507"}
 
 
 @pytest.mark.parametrize("date", ["2020", "2023-07", "2023-09-01", "9999", "0001-01-01"])
@@ -145,19 +145,6 @@ def test_scale_by_positions(scene):
     assert {f.code for f in scene.validate().findings} == {"CS507"}
 
 
-def test_longitudes_without_their_sign(scene):
-    """West read as east: the plan is mirrored, and heights do not count."""
-    tag_places(scene)
-    for name in NAMES:
-        path = scene.path(f"images/{name}")
-        with Image.open(path) as image:
-            image.load()
-            exif = image.getexif()
-        exif.get_ifd(0x8825)[3] = "W"
-        image.save(path, exif=exif)
-    scene.expect("CS223", place=IMAGES, found="a mirrored or overturned model")
-
-
 IMAGES, SPLIT, TEST = "sparse/0/images.txt", "sparse/split.txt", "sparse/0/test.txt"
 
 
@@ -206,18 +193,6 @@ def test_a_date_of_another_period_is_one_finding(scene):
 def test_visits_of_one_year_are_one_period(scene):
     tag_all(scene, "2016:03:01 10:{}:00", "2023:05:01 10:{}:00")
     tag_date(scene, "a002.png", "2016:08:01 10:00:00")
-    assert {f.code for f in scene.validate().findings} == {"CS507"}
-
-
-def test_one_flight_in_two_periods(scene):
-    for i in range(7):
-        tag_date(scene, f"a{i:03d}.png", f"2016:05:01 10:{2 * i:02d}:00")
-        tag_date(scene, f"b{i:03d}.png", f"2016:05:01 10:{2 * i + 1:02d}:00")
-    scene.expect("CS226", place=SPLIT, found="13 pairs within five minutes: 'a000.png', 'b000.png'")
-
-
-def test_days_without_a_time_are_not_one_flight(scene):
-    tag_all(scene, "2016:05:01", "2016:05:01")
     assert {f.code for f in scene.validate().findings} == {"CS507"}
 
 

@@ -175,16 +175,6 @@ def test_ambiguous(scene):
     scene.expect("CS325", place=f"{TEST}:1", found=found, also={"CS404", "CS702"})
 
 
-def test_duplicate(scene):
-    scene.write(TEST, [*scene.lines(TEST), "a003.png"])
-    scene.expect("CS326", place=TEST, found="'a003.png' 2 times")
-
-
-def test_duplicate_in_another_form(scene):
-    scene.write(TEST, [*scene.lines(TEST), "a003"])
-    scene.expect("CS326", place=TEST, found="'a003.png' 2 times, as 'a003', 'a003.png'")
-
-
 @pytest.mark.parametrize("line", ["A001.PNG", "a001.png 0"])
 def test_what_a_misspelt_test_name_means_is_said(scene, line):
     scene.write(TEST, [*scene.lines(TEST), line])

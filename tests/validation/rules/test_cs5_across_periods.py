@@ -49,57 +49,36 @@ def separate(scene, shift=(0.0, 0.0, 0.0), scale=1.0):
 
 
 @pytest.mark.parametrize(
-    ("similarity", "found"),
+    "similarity",
     [
-        (Sim3(4.0, np.eye(3), np.zeros(3)), "scaled by 0.25, rotated by 0 degrees"),
-        (Sim3(1.0, turn("y", 40), np.array([3.0, 0, 1])), "scaled by 1, rotated by 40 degrees"),
+        Sim3(4.0, np.eye(3), np.zeros(3)),
+        Sim3(1.0, turn("y", 40), np.array([3.0, 0, 1])),
+        Sim3(1.25, np.eye(3), np.zeros(3)),
+        Sim3(1.0, turn("x", 12), np.zeros(3)),
+        Sim3(1.0, np.eye(3), np.array([0.2, 0, 0])),
     ],
 )
-def test_period_in_a_frame_of_its_own(scene, similarity, found):
+def test_period_whose_poses_were_moved(scene, similarity):
+    """Also by far less than what makes a single pose wrong."""
     in_frame_of_its_own(scene, similarity)
-    # What its cameras see in the wrong frame depends on the frame.
-    seen = {f.code for f in scene.validate().findings}
-    also = seen & {"CS512", "CS521"}
-    scene.expect("CS519", place="period 1", found=found, also=also)
+    found = {f.code: f.place for f in scene.validate().findings}
+    assert "period 1" in (found.get("CS513"), found.get("CS515"))
 
 
 def test_mirrored_period(scene):
     mirror = np.diag([1.0, 1.0, -1.0])
     flip = np.diag([-1.0, 1.0, 1.0])
     scene.change_poses(lambda r, t: (flip @ r @ mirror, flip @ t), PERIOD_1)
-    seen = {f.code for f in scene.validate().findings}
-    found = "a period that fits mirrored, with z of the world negated, x of the camera negated"
-    scene.expect("CS519", place="period 1", found=found, also=seen & {"CS512"})
-
-
-@pytest.mark.parametrize(
-    ("similarity", "found"),
-    [
-        (Sim3(1.25, np.eye(3), np.zeros(3)), "scaled by 0.8, rotated by 0 degrees"),
-        (Sim3(1.0, turn("x", 12), np.zeros(3)), "scaled by 1, rotated by 12 degrees"),
-        (Sim3(1.0, np.eye(3), np.array([0.2, 0, 0])), "rotated by 0 degrees and moved by 0.2"),
-    ],
-)
-def test_period_that_is_a_little_off(scene, similarity, found):
-    """Far less than what makes a single pose wrong, and still not the frame of the others."""
-    in_frame_of_its_own(scene, similarity)
-    scene.expect("CS519", place="period 1", found=found)
+    scene.expect("CS513", place="period 1", also={"CS515"})
 
 
 def test_focal_length_of_one_period(scene):
-    """Not the frame is wrong, although nearly every error can be explained by one."""
     scene.write(
         "sparse/0/cameras.txt", ["1 PINHOLE 64 48 50 50 32 24", "2 PINHOLE 64 48 62.5 62.5 32 24"]
     )
     for row in range(14, 28, 2):
         scene.edit_fields(IMAGES, row, {8: "2"})
-    scene.expect("CS515", place="period 1", found="it fits with focal lengths multiplied by 0.8")
-
-
-def test_opengl_axes_in_one_period(scene):
-    flip = np.diag([1.0, -1.0, -1.0])
-    scene.change_poses(lambda r, t: (flip @ r, flip @ t), PERIOD_1)
-    scene.expect("CS519", place="period 1", found="y and z of the camera negated")
+    scene.expect("CS515", place="period 1", found="px; the worst are")
 
 
 @pytest.mark.parametrize("number", ["1e308", "-1e200", "5e-324"])
@@ -113,7 +92,7 @@ def test_absurd_numbers_in_a_period_of_another_frame(scene, what, number):
     else:
         scene.edit_fields(IMAGES, 20, {6: number})
     codes = {f.code for f in scene.validate().findings}
-    assert "CS519" in codes and "CS000" not in codes
+    assert "CS513" in codes and "CS000" not in codes
 
 
 def test_scale_of_a_period_without_shared_points(scene):
@@ -125,12 +104,6 @@ def test_scale_of_a_period_without_shared_points(scene):
 def test_separate_points_in_one_frame_need_a_match_only(scene):
     separate(scene)
     scene.expect("CS508")
-
-
-def test_period_at_another_place(scene):
-    separate(scene, shift=(500.0, 0.0, 0.0))
-    found = "at most 0.0 % of the points in common view"
-    scene.expect("CS521", place="period 0", found=found, also={"CS508"}, times=2)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e6])

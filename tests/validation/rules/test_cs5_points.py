@@ -120,35 +120,6 @@ def test_points_without_any_track_are_one_finding(scene):
     assert "CS514" in found and not found & {"CS503", "CS506", "CS525"}
 
 
-def test_duplicate_points(scene):
-    lines = scene.lines(POINTS)
-    shared = lines[0].split()[1:4]
-    for row in range(1, 4):
-        scene.edit_fields(POINTS, row, {1: shared[0], 2: shared[1], 3: shared[2]})
-    scene.expect("CS517", place=POINTS, found="3 of 40")
-
-
-def test_points_that_were_rounded_are_the_same_points(scene):
-    """Copies that went through single precision."""
-    shared = [f"{np.float32(x):.9g}" for x in scene.lines(POINTS)[0].split()[1:4]]
-    for row in range(1, 4):
-        scene.edit_fields(POINTS, row, dict(enumerate(shared, start=1)))
-    found = [f.found for f in scene.validate().findings if f.code == "CS517"]
-    assert found in ([f"{n} of 40 that coincide with another one"] for n in (2, 3))
-
-
-def test_two_points_in_one_place_are_silent(scene):
-    x, y, z = scene.lines(POINTS)[0].split()[1:4]
-    scene.edit_fields(POINTS, 1, {1: x, 2: y, 3: z})
-    assert {f.code for f in scene.validate().findings} == {"CS507"}
-
-
-def test_points_with_one_equal_coordinate_are_silent(scene):
-    for row in range(20):
-        scene.edit_fields(POINTS, row, {1: "0.25"})
-    assert "CS517" not in {f.code for f in scene.validate().findings}
-
-
 def test_far_points(scene):
     scene.edit_fields(POINTS, 5, {2: "4e4"})
     scene.expect("CS518", place=POINTS, found="1 point up to 4e+04 away (ids 6)")
