@@ -1,0 +1,199 @@
+"""Docstrings open with a verb or a noun phrase, and nothing speaks a private vocabulary."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("chronoscene", "chronogs", "baselines", "leaderboard")
+
+OPENING = re.compile(r"\s*(What|Whether|Where|How|Of|Those|Which|When|Who|Why|That|As|If)\b")
+"""Words that open a subordinate clause, not a sentence or a noun phrase."""
+
+PRIVATE_WORDS = re.compile(r"\bSay\b|\btold\b|\btells\b|\bthis room\b|\brooms\b")
+"""Names and words that the code does without: `Log`; reported, warned; package."""
+
+OPENING_NOT_YET: tuple[str, ...] = (
+    "baselines/cl_splats/",
+    "baselines/deformation_4dgs/",
+    "baselines/external/",
+    "baselines/gaussian_in_the_wild/",
+    "baselines/realtime_4dgs/",
+    "baselines/scaffold_gs/",
+    "chronogs/",
+    "chronoscene/anchors/",
+    "chronoscene/bench/contract/",
+    "chronoscene/bench/files/",
+    "chronoscene/bench/plan/",
+    "chronoscene/bench/report/",
+    "chronoscene/bench/run/",
+    "chronoscene/bench/score/",
+    "chronoscene/bench/study/",
+    "chronoscene/bench/train/",
+    "chronoscene/bench/use/",
+    "chronoscene/cli/",
+    "chronoscene/cli/methods/",
+    "chronoscene/cli/report/",
+    "chronoscene/cli/scenes/",
+    "chronoscene/colmap/",
+    "chronoscene/compression/",
+    "chronoscene/convert.py",
+    "chronoscene/download/",
+    "chronoscene/figures/",
+    "chronoscene/formats/",
+    "chronoscene/gaussians/",
+    "chronoscene/images/",
+    "chronoscene/io/",
+    "chronoscene/kernels/",
+    "chronoscene/methods.py",
+    "chronoscene/metrics/",
+    "chronoscene/rasterizer/",
+    "chronoscene/registration/",
+    "chronoscene/registration/features/",
+    "chronoscene/registration/photos/",
+    "chronoscene/registration/quality/",
+    "chronoscene/registration/reconstruct/",
+    "chronoscene/registration/report/",
+    "chronoscene/registration/ties/",
+    "chronoscene/scene/",
+    "chronoscene/stats/",
+    "chronoscene/synth/",
+    "chronoscene/training/",
+    "chronoscene/undistort.py",
+    "chronoscene/validation/",
+    "chronoscene/validation/checks/",
+    "chronoscene/validation/folder/",
+    "chronoscene/validation/report/",
+    "chronoscene/validation/rules/",
+    "leaderboard/",
+)
+"""Paths, or their beginnings, with docstrings that open with one of `OPENING`."""
+
+WORDS_NOT_YET: tuple[str, ...] = (
+    "baselines/external/",
+    "baselines/gaussian_splatting/",
+    "chronoscene/bench/contract/",
+    "chronoscene/bench/files/",
+    "chronoscene/bench/plan/",
+    "chronoscene/bench/report/",
+    "chronoscene/bench/run/",
+    "chronoscene/bench/score/",
+    "chronoscene/bench/study/",
+    "chronoscene/bench/train/",
+    "chronoscene/bench/use/",
+    "chronoscene/cli/",
+    "chronoscene/cli/report/",
+    "chronoscene/download/",
+    "chronoscene/formats/",
+    "chronoscene/images/",
+    "chronoscene/io/",
+    "chronoscene/methods.py",
+    "chronoscene/metrics/",
+    "chronoscene/registration/",
+    "chronoscene/registration/features/",
+    "chronoscene/registration/photos/",
+    "chronoscene/registration/quality/",
+    "chronoscene/registration/reconstruct/",
+    "chronoscene/registration/ties/",
+    "chronoscene/training/",
+    "chronoscene/validation/rules/",
+    "leaderboard/",
+)
+"""Paths, or their beginnings, with one of `PRIVATE_WORDS`."""
+
+
+def sources() -> Iterator[tuple[str, str]]:
+    """Path within the repository and text of each module."""
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            yield path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+
+
+def docstrings(text: str) -> Iterator[tuple[int, str]]:
+    """Line and text of docstrings, and of the strings under fields and constants."""
+    for node in ast.walk(ast.parse(text)):
+        body = getattr(node, "body", None)
+        if not isinstance(body, list):
+            continue
+        owner = isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
+        for before, statement in zip([None, *body], body, strict=False):
+            documents = isinstance(before, (ast.Assign, ast.AnnAssign)) or (owner and not before)
+            if (
+                documents
+                and isinstance(statement, ast.Expr)
+                and isinstance(statement.value, ast.Constant)
+                and isinstance(statement.value.value, str)
+            ):
+                yield statement.lineno, statement.value.value
+
+
+@cache
+def bad_openings() -> dict[str, list[str]]:
+    """Places with a docstring that opens with a wrong word, per file."""
+    found = {
+        path: [f"{path}:{n}: {doc[:60]!r}" for n, doc in docstrings(text) if OPENING.match(doc)]
+        for path, text in sources()
+    }
+    return {path: places for path, places in found.items() if places}
+
+
+@cache
+def private_words() -> dict[str, list[str]]:
+    """Places with a private word, per file."""
+    found = {
+        path: [
+            f"{path}:{n}: {line.strip()[:80]}"
+            for n, line in enumerate(text.splitlines(), 1)
+            if PRIVATE_WORDS.search(line)
+        ]
+        for path, text in sources()
+    }
+    return {path: places for path, places in found.items() if places}
+
+
+def test_docstrings_open_with_a_verb_or_a_noun() -> None:
+    assert not [
+        p
+        for path, places in bad_openings().items()
+        if not path.startswith(OPENING_NOT_YET)
+        for p in places
+    ]
+
+
+def test_no_private_vocabulary() -> None:
+    assert not [
+        p
+        for path, places in private_words().items()
+        if not path.startswith(WORDS_NOT_YET)
+        for p in places
+    ]
+
+
+@pytest.mark.parametrize("prefix", OPENING_NOT_YET)
+def test_opening_exceptions_are_needed(prefix: str) -> None:
+    assert any(path.startswith(prefix) for path in bad_openings()), f"{prefix} is clean: remove it"
+
+
+@pytest.mark.parametrize("prefix", WORDS_NOT_YET)
+def test_word_exceptions_are_needed(prefix: str) -> None:
+    assert any(path.startswith(prefix) for path in private_words()), f"{prefix} is clean: remove it"
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ('"""Whether it is."""', 1),
+        ('def f():\n    """\n    How it goes."""', 1),
+        ('class C:\n    """A class."""\n\n    x: int = 0\n    """Of which."""', 1),
+        ('"""Whereabouts of a thing."""', 0),
+        ('def f():\n    print("x")\n    "What else"', 0),
+    ],
+)
+def test_lint_itself(text: str, found: int) -> None:
+    assert sum(bool(OPENING.match(doc)) for _, doc in docstrings(text)) == found
