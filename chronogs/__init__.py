@@ -31,8 +31,8 @@ _SHORT: dict[str, Any] = _FULL | {
     "antialiased": True,
     "cooldown": 0.2,
 }
-"""Better with two fifths of the numbers: docs/what-a-scene-requires.md and docs/generalisation.md
-have the trials."""
+"""Better with two fifths of the numbers: what-a-scene-requires.md and generalisation.md in
+docs/experiments have the trials."""
 
 _TEXT: dict[str, Any] = {
     "fusion": "sum",

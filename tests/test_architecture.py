@@ -1,4 +1,4 @@
-"""Imports point one way; docs/architecture.md shows which."""
+"""Imports point one way; docs/reference/architecture.md shows which."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def chronogs(data: Path, output: Path, config: ProgramConfig) -> list[str]:
             file,
             expected=f"a config with {PUBLISHED_ITERATIONS} iterations",
             found="another one",
-            todo="use the version of the program that docs/other-programs.md names",
+            todo="use the version of the program that docs/guides/other-programs.md names",
         )
     text = text.replace(PUBLISHED_ITERATIONS, str(config.iterations))
     text = text.replace("update_until: 20000", f"update_until: {config.iterations // 2}")

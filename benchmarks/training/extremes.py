@@ -3,7 +3,8 @@
     python -m benchmarks.training.extremes [--write] [--extreme WORD ...] [--method NAME ...]
 
 Trains every installed method on every extreme of tests/methods/support/extreme_trainings.py, and
-prints a table in Markdown. With --write it replaces the one of docs/training-extremes.md.
+prints a table in Markdown. With --write it replaces the one in
+docs/experiments/training-extremes.md.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ sys.path.insert(0, str(ROOT / "tests" / "methods" / "support"))
 
 extremes: Any = import_module("extreme_trainings")
 
-PAGE = ROOT / "docs" / "training-extremes.md"
+PAGE = ROOT / "docs" / "experiments" / "training-extremes.md"
 BEGIN, END = "<!-- table: begin -->", "<!-- table: end -->"
 HEAD = ("extreme", "method", "steps", "outcome", "PSNR before, dB", "after, dB", "primitives")
 

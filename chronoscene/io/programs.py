@@ -61,7 +61,7 @@ def run_program(command: Sequence[str], *, folder: Path, log: Path) -> Usage:
                 expected="a program that can be started",
                 found=error.strerror or str(error),
                 todo="install it, or name its environment with --set prefix=...; "
-                "docs/other-programs.md says how",
+                "docs/guides/other-programs.md says how",
             ) from error
         try:
             pause = FIRST_PAUSE

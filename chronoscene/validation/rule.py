@@ -10,7 +10,8 @@ skipped if one of them is None, or what it is read from, and yields a `Hit` for 
         ...
 
 The docstring says what is wrong; the name is that of the function, here ``quaternion-not-unit``.
-Codes are stable and never reused (`RETIRED`). ``docs/validation-rules.md`` lists all rules.
+Codes are stable and never reused (`RETIRED`). ``docs/reference/validation-rules.md``
+lists all rules.
 """
 
 from __future__ import annotations

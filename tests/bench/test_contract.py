@@ -40,8 +40,8 @@ def test_a_method_that_looks_at_test_photos_is_found(problems, monkeypatch, tmp_
     monkeypatch.setenv("TOY_PEEK", str(tmp_path))
     assert problems("PEEKING", rule) == [
         "training: expected a model that does not depend on test photos, found a difference in "
-        "model.json; correct the method, or tell its author; docs/adding-a-method.md says what it "
-        "returns"
+        "model.json; correct the method, or report it to its author; see "
+        "docs/guides/adding-a-method.md"
     ]
     monkeypatch.delenv("TOY_PEEK")
     assert problems("PEEKING", rule) == [None]

@@ -120,7 +120,7 @@ else:
 
 def test_the_recipe_of_the_page_runs(bench_here, tmp_path, monkeypatch):
     """As it is printed, with a program in an environment without packages."""
-    page = ROOT / "docs/other-programs.md"
+    page = ROOT / "docs/guides/other-programs.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     (tmp_path / "recipe.py").write_text(code)
     (tmp_path / "mine.py").write_text(MINE)

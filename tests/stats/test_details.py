@@ -59,7 +59,7 @@ def test_json_has_counts_measures_and_totals(statistics):
 
 
 def test_all_keys_are_in_the_documentation(statistics):
-    text = (Path(__file__).parents[2] / "docs/statistics.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs/guides/statistics.md").read_text(encoding="utf-8")
     data = json.loads(format_details([statistics], "json"))
     scene = data["scenes"][0]
     for key in {*data, *scene, *scene["periods"][0]}:

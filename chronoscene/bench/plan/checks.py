@@ -57,7 +57,7 @@ def check_runner(job: Job, spec: MethodSpec, runner: Runner) -> None:
                 f"{spec.name} --set {name}",
                 expected="a value, which its commands need",
                 found="none",
-                todo=f"pass --set {name}=..., as docs/other-programs.md says",
+                todo=f"pass --set {name}=..., as docs/guides/other-programs.md says",
             )
     if job.budget_seconds is not None and "seconds" not in used:
         raise ConfigError(
@@ -80,7 +80,7 @@ def check_stages(job: Job, spec: MethodSpec) -> None:
             f"{spec.name} --strategy {job.strategy}",
             expected="a method that can be trained on one period after the other",
             found="one without extend",
-            todo="use another strategy, or write the function: docs/adding-a-method.md",
+            todo="use another strategy, or write the function: docs/guides/adding-a-method.md",
         )
     if job.keep_training:
         raise ConfigError(

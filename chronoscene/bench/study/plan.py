@@ -119,7 +119,7 @@ def _wrong(path: Path, found: str) -> ConfigError:
         path,
         expected="a study file",
         found=found,
-        todo="correct it; docs/studies.md describes the form",
+        todo="correct it; docs/guides/studies.md describes the form",
     )
 
 

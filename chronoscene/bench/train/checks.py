@@ -21,7 +21,7 @@ def refuse(place: str, expected: str, found: object) -> MethodError:
         place,
         expected=expected,
         found=str(found),
-        todo="correct the method, or tell its author; docs/adding-a-method.md says what it returns",
+        todo="correct the method, or report it to its author; see docs/guides/adding-a-method.md",
     )
 
 

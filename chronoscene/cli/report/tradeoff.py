@@ -69,7 +69,7 @@ def command(
     memory, and prints them; then the PSNR of the probe views after given times of training, and the
     times until they have a given PSNR. CSV has the points of the fronts and all others. With
     --budget, --max-bytes or --target-psnr it says in a sentence which configuration to use, and
-    nothing else. docs/benchmark.md, "Trade-off".
+    nothing else. docs/guides/tables-and-figures.md, "Trade-off".
     """
     records, failures = read_runs(folders)
     records = as_configurations(records)

@@ -126,7 +126,7 @@ def command(
 
     Each run (one method, strategy, scene and seed) gets a folder below --out with its checkpoint,
     predictions and scores. Finished runs are kept, so the same command resumes after an
-    interruption. docs/benchmark.md describes strategies, budget, seeds and files.
+    interruption. docs/guides/benchmark.md describes strategies, budget and seeds.
     """
     check_outside(out, options["scenes"], option="--out")
     check_place("--out", out)

@@ -50,8 +50,8 @@ def command(
 
     OUT gets a point cloud in PLY format for each pair of periods, with scores and colours, a
     picture of the pairs from above, and a table as CSV. Where gt/ of the scene has change masks,
-    the map is scored by them, beside differences of images. docs/changes.md says what the scores
-    mean.
+    the map is scored by them, beside differences of images. docs/guides/changes.md explains the
+    scores.
     """
     run = open_run(folder, device=device)
     pairs = [_pair(run, *names) for names in between]

@@ -42,7 +42,7 @@ def command(
 
     Each test camera is rendered at every period and compared with the truth of a generated scene,
     or with that in a folder: quality, changes that are missed, ghosts of other periods, depth.
-    docs/benchmark.md defines the columns.
+    docs/reference/scores.md defines the columns.
     """
     check_file("--out", out)
     run = open_run(folder, device=device)

@@ -61,7 +61,7 @@ def command(
 
     FOLDER has a PNG file for each test view of SCENE, named like it: b/0007.png or b/0007.jpg.png
     for b/0007.jpg. Images have the size of the evaluation, or that of the photos. The result
-    becomes a run beside those of bench; docs/other-programs.md says more.
+    becomes a run beside those of bench; docs/guides/other-programs.md says more.
     """
     check_outside(out, [scene], option="--out")
     check_place("--out", out)

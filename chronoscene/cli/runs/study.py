@@ -38,8 +38,8 @@ def command(name: str, seeds: int, assignments: tuple[str, ...], out: Path, **op
     """Run variants of a method on scenes, for one table.
 
     NAME is a study that comes with a method, such as components of ChronoGS, or FILE.toml one of
-    your own; docs/studies.md describes both. The runs are those of bench, of which finished ones
-    are kept; --set is for the rows that do not set the option themselves. The table says what was
+    your own; docs/guides/studies.md describes both. The runs are those of bench; finished ones are
+    kept; --set is for the rows that do not set the option themselves. The table says what was
     published beside what was measured, and is written to --out as Markdown, CSV and JSON, too.
     """
     check_outside(out, options["scenes"], option="--out")

@@ -1,6 +1,7 @@
-"""The rules for people: ``--explain``, and the page ``docs/validation-rules.md``.
+"""The rules for people: ``--explain``, and the page ``docs/reference/validation-rules.md``.
 
-``python -m chronoscene.validation.report.rule_list > docs/validation-rules.md`` renews the page.
+``python -m chronoscene.validation.report.rule_list > docs/reference/validation-rules.md`` writes
+the page anew.
 """
 
 from __future__ import annotations
@@ -15,13 +16,13 @@ COLOURS: dict[Severity, str] = {"error": "red", "warning": "yellow", "info": "cy
 INTRODUCTION = f"""\
 # Validation rules
 
-`chronoscene validate` checks a scene with the rules below; [DATASET.md](../DATASET.md#validation)
-describes the command. `chronoscene validate --explain CS201` prints a rule in the terminal. Codes
-are stable: a code is never reused, not even that of a rule that is gone
+`chronoscene validate` checks a scene with the rules below, as described in
+[DATASET.md](../../DATASET.md#validation). `chronoscene validate --explain CS201` prints a rule
+in the terminal. Codes are stable: the code of a retired rule is never used again
 ({", ".join(RETIRED)}).
 
 This page is generated: `python -m chronoscene.validation.report.rule_list >
-docs/validation-rules.md`. The rules of group CS1 are in the files
+docs/reference/validation-rules.md`. The rules of group CS1 are in the files
 `chronoscene/validation/rules/cs1_*.py`, and so on; `chronoscene/validation/rule.py` explains how to
 add one.
 """

@@ -81,7 +81,7 @@ def test_missing_runs_are_named(tmp_path):
 
 def test_all_keys_and_columns_are_in_the_documentation(finished_bench):
     runs = finished_bench[0]
-    text = (Path(__file__).parents[3] / "docs/benchmark.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs/reference/results.md").read_text(encoding="utf-8")
     documents = json.loads((runs / "results.json").read_text())
     keys = {key for document in documents for key in (*document, *document["aggregates"])}
     with (runs / "rows.csv").open(newline="") as file:

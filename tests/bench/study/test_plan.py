@@ -67,7 +67,7 @@ def test_mistakes_in_a_file_are_named(study_file, old, new, message):
 
 
 def test_the_example_of_the_documentation_is_a_study(study_file):
-    text = (Path(__file__).parents[3] / "docs/studies.md").read_text()
+    text = (Path(__file__).parents[3] / "docs/guides/studies.md").read_text()
     study = read_study(study_file(text.split("```toml")[1].split("```")[0]))
     assert [row.separate_iterations for row in study.rows] == ["total", "total", "each"]
 
@@ -127,7 +127,7 @@ def test_shipped_rows_have_options_that_exist(name):
 
 
 def test_features_that_are_added_have_one_length():
-    """Features may be left out then, but not have lengths of their own (docs/studies.md)."""
+    """Features may be left out then, but not have lengths of their own (docs/guides/studies.md)."""
     spec = load_spec("chronogs")
     for row in SHIPPED["components"].rows:
         build_config(spec, preset="paper-text", overrides=row.options)

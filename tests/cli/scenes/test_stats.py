@@ -273,7 +273,7 @@ def test_a_place_for_figures_that_is_a_file(make_scene_folder, tmp_path):
 
 
 def test_options_in_the_documentation_exist():
-    text = (Path(__file__).parents[3] / "docs/statistics.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs/guides/statistics.md").read_text(encoding="utf-8")
     lines = re.findall(r"^chronoscene (\w+) (.*?)(?:#.*)?$", text, re.M)
     assert {command for command, _ in lines} == {"stats"}
     for command, arguments in lines:

@@ -368,7 +368,7 @@ def test_extent_of_cameras_that_stand_still(good: Registered) -> None:
 
 
 def test_the_documented_thresholds_are_those_of_the_code() -> None:
-    text = (Path(__file__).parents[3] / "docs" / "registration.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs/reference/certificate.md").read_text(encoding="utf-8")
     for t in THRESHOLDS.values():
         sign = "below" if t.larger_is_better else "above"
         unit = f" {t.unit}" if t.unit else ""

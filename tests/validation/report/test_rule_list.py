@@ -1,11 +1,11 @@
-"""docs/validation-rules.md lists the rules as the code has them."""
+"""docs/reference/validation-rules.md lists the rules as the code has them."""
 
 from pathlib import Path
 
 from chronoscene.validation.report.rule_list import rules_page
 from chronoscene.validation.rules import all_rules
 
-PAGE = Path(__file__).parents[3] / "docs/validation-rules.md"
+PAGE = Path(__file__).parents[3] / "docs/reference/validation-rules.md"
 
 
 def test_the_page_is_current():

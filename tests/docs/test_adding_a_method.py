@@ -1,4 +1,4 @@
-"""docs/adding-a-method.md: its package works, its dataclasses and rules are those of the code."""
+"""The guide to methods: its package works, its dataclasses and rules are those of the code."""
 
 import ast
 import dataclasses
@@ -12,8 +12,8 @@ from chronoscene import methods
 from chronoscene.bench.contract import CHECKS
 from chronoscene.scene.similarity import Sim3
 
-ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs/adding-a-method.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/guides/adding-a-method.md").read_text(encoding="utf-8")
 EXAMPLE = ROOT / "chronoscene/cli/methods/skeleton"
 
 
