@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 from chronoscene.io.processes import Report
 from chronoscene.kernels.runtime import available_threads
 from chronoscene.registration.result import Route
-from chronoscene.registration.stages import Stages, run_step
+from chronoscene.registration.work_folder import Stages, run_step
 
 Calibration = Literal["auto", "per-period", "shared"]
 

@@ -11,15 +11,16 @@ from chronoscene.errors import ConfigError
 from chronoscene.io.processes import Report
 from chronoscene.registration import output
 from chronoscene.registration.context import Context, Options
-from chronoscene.registration.features.matching import find_matches
+from chronoscene.registration.features.correspondences import find_matches
 from chronoscene.registration.output import Inspection, inspect_registration
 from chronoscene.registration.photos.captures import Captures
 from chronoscene.registration.photos.inputs import Inputs, gather
 from chronoscene.registration.reconstruct.estimation import estimate, refined
+from chronoscene.registration.reconstruct.extension import add_period
 from chronoscene.registration.result import Registered
-from chronoscene.registration.stages import Stages, work_folder
 from chronoscene.registration.ties.tie_alignment import TieAlignment, tie
 from chronoscene.registration.ties.tie_points import TiePoints, read_tie_points
+from chronoscene.registration.work_folder import Stages, work_folder
 from chronoscene.scene import Scene
 
 SCHEMA_VERSION = 1  # Version of the log
@@ -110,10 +111,9 @@ def _stage_scene(registered: Registered, inputs: Inputs, name: str, context: Con
     """Write the scene into the work folder."""
     staged = context.work / "scene"
     old = inputs.scene
-    if old is None:
-        scene = output.as_scene(registered, name)
-    else:
-        scene = output.add_period(old, registered, name)
+    scene = output.as_scene(registered, name)
+    if old is not None:
+        scene = add_period(old, scene, registered)
 
     def progress(done: int, total: int) -> None:
         if context.report is not None:

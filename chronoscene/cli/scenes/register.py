@@ -12,7 +12,7 @@ from chronoscene.cli.progress import progress_bar
 from chronoscene.formats import read_scene
 from chronoscene.io.staging import check_outside
 from chronoscene.registration.context import CALIBRATIONS, Options
-from chronoscene.registration.features.matching import MIN_PHOTOS
+from chronoscene.registration.features.camera_groups import MIN_PHOTOS
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import find_captures, read_captures
 from chronoscene.registration.pipeline import run

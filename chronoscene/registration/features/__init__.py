@@ -1,6 +1,6 @@
 """Features, verified matches and held-out tracks of the photos, in COLMAP databases.
 
-`matching` runs the steps; the others are what the worker process does in them.
+`correspondences` runs the steps `extraction` and `matching`, each in a process of its own.
 """
 
 METHOD = "OpenCV RootSIFT 2"

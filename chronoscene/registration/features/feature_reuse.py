@@ -20,7 +20,7 @@ from chronoscene.images.masks import find_masks
 from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import sha256_of, write_text_atomic
 from chronoscene.registration.features import METHOD
-from chronoscene.registration.stages import read_record
+from chronoscene.registration.work_folder import read_record
 
 Record = dict[str, Any]
 """``settings`` that all features depend on, ``groups`` of photos with one camera, and ``photos``:

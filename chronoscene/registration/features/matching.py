@@ -1,203 +1,131 @@
-"""Second stage: features, matches, and what of them is held out."""
+"""Second step: pairs of photos, their verified matches, and what of them is held out. Worker only.
+
+Matches are ours (`nearest`); COLMAP verifies them by geometry. What is stored is not done again.
+Matches of the same photos in an earlier database are copied; see `feature_reuse`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import datetime, timedelta
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
-from chronoscene.registration.context import Calibration, Context
-from chronoscene.registration.features import METHOD
-from chronoscene.registration.photos.inputs import Inputs
-from chronoscene.registration.photos.photo import Capture
-from chronoscene.scene import Frame, Scene
+import numpy as np
+from numpy.typing import NDArray
 
-MIN_PHOTOS = 20
-"""Photos with which a camera is calibrated for each date alone. Lenses are refocused and dropped
-between dates; but few photos, of flat ground from one height above all, leave the focal length
-open, and calibrate worse than last year's lens fits."""
+from chronoscene.io.processes import Report
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.features import feature_reuse
+from chronoscene.registration.features.database import SEED, quiet, read_pairs, write_pairs
+from chronoscene.registration.features.holdout import hold_out
+from chronoscene.registration.features.nearest import Descriptors, mutual_matches
+from chronoscene.registration.features.pairs import choose_pairs
 
-SAME_VISIT = timedelta(days=1)
-"""Periods that follow each other within this time share what was not touched in between."""
+BATCH = 64  # Pairs
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Matched:
-    """What is known of the photos before any pose."""
-
-    keypoints: Mapping[str, int]
-    """Number of features by name."""
-    partners: Mapping[str, int]
-    """Number of photos with verified matches by name."""
-    pairs_across: Mapping[str, int]
-    """Verified pairs of photos between two periods, by ``"0-1"``."""
-    matches_across: Mapping[str, int]
+INLIER_SHARES = ((45, 1 / 4), (30, 1 / 3), (20, 1 / 2), (0, 3 / 4))
+"""From so many matches on, the share that must be inliers for COLMAP to draw enough samples. A pair
+needs 15 inliers, which of fewer matches are a larger share: most pairs of photos without overlap
+are done ten times as soon."""
 
 
-def find_matches(inputs: Inputs, context: Context) -> Matched:
-    """Extract, match and hold out; each is done once."""
-    features = _features(inputs, context)
-    found = _matches(inputs, context)
-    return Matched(
-        keypoints=features["keypoints"],
-        partners=found["partners"],
-        pairs_across=found["verified_pairs_across"],
-        matches_across=found["matches_across"],
-    )
+def match_photos(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Choose pairs, match them, and hold out tracks: one process, because starting three takes
+    longer than what two of them do.
 
-
-def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
-    options = context.options
-    groups = camera_groups(inputs.images, options.camera_model, options.calibration)
-    if inputs.scene is not None:
-        groups = scene_groups(inputs.scene) + groups
-    settings = {
-        "method": METHOD,
-        "groups": groups,
-        "max_image_size": options.max_image_size,
-        "max_features": options.max_features,
-    }
-    places = {
-        "database": str(context.database),
-        "photos": str(context.photos),
-        "threads": context.threads,
-    }
-
-    def extract() -> tuple[Any, list[str]]:
-        # The database may be replaced: pairs that an earlier one had may be missing in it.
-        (context.work / "stage-matches.json").unlink(missing_ok=True)
-        found = context.step("features", settings | places)
-        count = len(found["keypoints"])
-        remark = (
-            f"{sum(found['keypoints'].values())} features in {count} photos, {len(groups)} "
-            f"cameras, {sum(found['focal_known'].values())} with a focal length from EXIF or the "
-            "scene"
-        )
-        return found, [remark, *_reused(found["carried"], count, "photos: features")]
-
-    return dict(context.stages.run("features", settings, extract))
-
-
-def _reused(count: int, total: int, what: str) -> list[str]:
-    return [f"{count} of {total} {what} reused from the previous run"] if count else []
-
-
-def _matches(inputs: Inputs, context: Context) -> dict[str, Any]:
-    options = context.options
-    centres = inputs.centres()
-    taken = {c.name: c.taken.isoformat() for c in inputs.images if c.taken is not None}
-    images = [
-        {"name": name, "period": period, "enu": centres.get(name), "taken": taken.get(name)}
-        for name, period in sorted(inputs.periods.items())
-    ]
-    settings = {
-        "images": images,
-        "exhaustive_limit": options.exhaustive_limit,
-        "periods": inputs.periods,
-        "share": options.held_out,
-        "seed": options.seed,
-    }
-    places = {
-        "database": str(context.database),
-        "pairs": str(context.work / "pairs.txt"),
-        "scratch": str(context.work),
-        "out": str(context.mapping_database),
-        "held_out": str(context.held_out),
-        "threads": context.threads,
-    }
-
-    def match() -> tuple[Any, list[str]]:
-        found = context.step("matches", settings | places)
-        kinds = ", ".join(f"{n} {kind}" for kind, n in found["kinds"].items())
-        pairs, verified, inliers = (found[k] for k in ("pairs", "verified", "inliers"))
-        told = [
-            f"{pairs} pairs ({kinds}), {found['across_periods']} across periods",
-            f"{verified} of {pairs} pairs verified, {inliers} matches",
-            *_reused(found["carried"], pairs, "pairs: matches"),
-            f"{found['held_out']} of {found['tracks_of_several_periods']} tracks of several "
-            "periods held out",
-        ]
-        told += [
-            f"periods {key}: {count} verified pairs, {found['matches_across'][key]} matches"
-            for key, count in found["verified_pairs_across"].items()
-        ]
-        return found, told
-
-    return dict(context.stages.run("matches", settings, match))
-
-
-def scene_groups(scene: Scene) -> list[dict[str, Any]]:
-    """The cameras of a scene with their images, as they are."""
-    by_camera: dict[int, list[Frame]] = {}
-    for frame in scene.frames:
-        by_camera.setdefault(frame.camera.camera_id, []).append(frame)
-    return [
-        {
-            "names": sorted(f.name for f in frames),
-            "model": frames[0].camera.model,
-            "params": list(frames[0].camera.params),
-        }
-        for frames in by_camera.values()
-    ]
-
-
-def camera_groups(
-    captures: Sequence[Capture], model: str, calibration: Calibration = "auto"
-) -> list[dict[str, Any]]:
-    """Lists of names that share a camera, for `features.extraction.extract`.
-
-    Photos share one if make, model, size and focal length agree. With ``auto``, photos of different
-    visits do not, where each has enough of them (`MIN_PHOTOS`). Initial focal lengths are
-    left to COLMAP, which knows the sensors of many cameras.
+    Arguments and results: those of `choose_pairs`, `match` and `hold_out`.
     """
-    by_lens: dict[tuple[Any, ...], list[Capture]] = {}
-    for capture in captures:
-        by_lens.setdefault(_lens(capture), []).append(capture)
-    groups = [g for members in by_lens.values() for g in _SPLITTERS[calibration](members)]
-    return [
-        {"names": sorted(names), "model": model, "params": None}
-        for names in sorted(([c.name for c in group] for group in groups), key=min)
-    ]
+    chosen = choose_pairs(arguments, report)
+    return chosen | match(arguments, report) | hold_out(arguments, report)
 
 
-def _lens(capture: Capture) -> tuple[Any, ...]:
-    exif = capture.exif
-    return (exif.make, exif.model, capture.width, capture.height, exif.focal_mm, exif.focal_35mm)
+def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
+    """Match and verify pairs of images that are not in the database yet.
+
+    Arguments: ``database``, ``pairs`` (text file with two names a line), ``threads``,
+    ``scratch`` (folder).
+
+    Returns:
+        Number of ``pairs``, of those ``verified``, of their ``inliers``, and of the pairs
+        ``carried`` over from an earlier database.
+    """
+    quiet()
+    database = arguments["database"]
+    pairs = read_pairs(Path(arguments["pairs"]))
+    _drop_others(database, pairs)
+    reused = feature_reuse.reuse_matches(Path(database), pairs)
+    left = _unmatched(database, pairs)
+    options = pycolmap.FeatureMatchingOptions()
+    options.use_gpu = False
+    options.num_threads = threads = arguments["threads"]
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    listed = Path(arguments["scratch"]) / "batch.txt"
+    for first in range(0, len(left), BATCH):
+        report("pairs", len(pairs) - len(left) + first, len(pairs))
+        found = _match_descriptors(database, left[first : first + BATCH], threads)
+        for least, share in INLIER_SHARES:
+            write_pairs(listed, [pair for pair, count in found.items() if count >= least])
+            found = {pair: count for pair, count in found.items() if count < least}
+            verification.ransac.min_inlier_ratio = share
+            pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
+            # COLMAP takes the matches that are in the database, and verifies them.
+            pycolmap.match_image_pairs(database, options, pairing, verification)
+    listed.unlink(missing_ok=True)
+    report("pairs", len(pairs), len(pairs))
+    with pycolmap.Database.open(database) as opened:
+        counts = [int(n) for n in opened.read_two_view_geometry_num_inliers()[1]]
+    feature_reuse.forget(Path(database))
+    return {
+        "pairs": len(pairs),
+        "verified": sum(n > 0 for n in counts),
+        "inliers": sum(counts),
+        "carried": reused,
+    }
 
 
-def _periods(captures: Sequence[Capture]) -> list[list[Capture]]:
-    by_period: dict[int, list[Capture]] = {}
-    for capture in captures:
-        by_period.setdefault(capture.period, []).append(capture)
-    return [by_period[p] for p in sorted(by_period)]
+def _match_descriptors(
+    database: str, pairs: Sequence[tuple[str, str]], threads: int
+) -> dict[tuple[str, str], int]:
+    """Store matches of pairs of images, in the order of their ids; the number of each pair."""
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): int(image.image_id) for image in opened.read_all_images()}
+        wanted = [(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in pairs]
+        used = sorted({i for pair in wanted for i in pair})
+        descriptors = {i: Descriptors.of(opened.read_descriptors(i).data) for i in used}
+
+        def matches_of(pair: tuple[int, int]) -> NDArray[np.uint32]:
+            return mutual_matches(descriptors[pair[0]], descriptors[pair[1]])
+
+        counts = []
+        with ThreadPoolExecutor(threads) as pool:
+            for pair, found in zip(wanted, pool.map(matches_of, wanted), strict=True):
+                opened.write_matches(*pair, found)
+                counts.append(len(found))
+    return dict(zip(pairs, counts, strict=True))
 
 
-def _visits(captures: Sequence[Capture]) -> list[list[Capture]]:
-    """The photos of each visit that has enough of them, and those of all others together."""
-    visits: list[list[Capture]] = []
-    undated = []
-    dated: list[tuple[datetime, datetime, list[Capture]]] = []
-    for members in _periods(captures):
-        times = [c.taken for c in members if c.taken is not None]
-        if times:
-            dated.append((min(times), max(times), members))
-        else:
-            undated.append(members)
-    end: datetime | None = None
-    for first, last, members in sorted(dated, key=lambda d: d[0]):
-        if end is not None and first - end <= SAME_VISIT:
-            visits[-1] += members
-        else:
-            visits.append(list(members))
-        end = last if end is None else max(end, last)
-    visits += undated
-    few = [c for members in visits if len(members) < MIN_PHOTOS for c in members]
-    return [m for m in visits if len(m) >= MIN_PHOTOS] + ([few] if few else [])
+def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:
+    """Drop pairs that are not listed: an earlier list may have had others."""
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): image.image_id for image in opened.read_all_images()}
+        listed = {pycolmap.image_pair_to_pair_id(ids[a], ids[b]) for a, b in pairs}
+        for pair_id in set(opened.read_num_matches()[0]) - listed:
+            a, b = pycolmap.pair_id_to_image_pair(pair_id)
+            opened.delete_matches(a, b)
+            opened.delete_two_view_geometry(a, b)
 
 
-_SPLITTERS: dict[Calibration, Callable[[Sequence[Capture]], list[list[Capture]]]] = {
-    "auto": _visits,
-    "per-period": _periods,
-    "shared": lambda captures: [list(captures)],
-}
+def _unmatched(database: str, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Pairs without a geometry. If such a pair has matches, a killed run left them: COLMAP would
+    verify them and then fail to store them a second time, so they are dropped."""
+    left = []
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): image.image_id for image in opened.read_all_images()}
+        for a, b in pairs:
+            if not opened.exists_two_view_geometry(ids[a], ids[b]):
+                if opened.exists_matches(ids[a], ids[b]):
+                    opened.delete_matches(ids[a], ids[b])
+                left.append((a, b))
+    return left

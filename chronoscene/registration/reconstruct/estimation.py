@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from chronoscene.colmap.model import read_model
 from chronoscene.errors import RegistrationError
 from chronoscene.registration.context import Context
-from chronoscene.registration.features.matching import Matched
+from chronoscene.registration.features.correspondences import Matched
 from chronoscene.registration.photos.inputs import Inputs
 from chronoscene.registration.result import CrossMatches, HeldOutTracks, Registered, Route
 from chronoscene.scene import Camera, Points

@@ -12,8 +12,8 @@ from chronoscene import __version__
 from chronoscene.arrays import Array
 from chronoscene.io.pages import render_page
 from chronoscene.registration.quality.certificate import Certificate, PairFigures
-from chronoscene.registration.quality.certificate_json import pair_figures, period_figures
 from chronoscene.registration.quality.verdict import THRESHOLDS, Level, Verdict
+from chronoscene.registration.report.certificate_json import pair_figures, period_figures
 from chronoscene.registration.report.pictures import PHOTO_WIDTH, Photos, camera_map
 from chronoscene.registration.report.spots import DrawnPair, Spot, drawn_pairs, spots
 from chronoscene.registration.result import Registered

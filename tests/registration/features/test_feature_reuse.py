@@ -20,16 +20,15 @@ from PIL import Image
 from chronoscene.errors import RegistrationError
 from chronoscene.formats import read_scene
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration import stages
 from chronoscene.registration.context import Context, Options
 from chronoscene.registration.features import feature_reuse, matching
+from chronoscene.registration.features.correspondences import Matched, find_matches
 from chronoscene.registration.features.database import write_pairs
 from chronoscene.registration.features.extraction import extract
-from chronoscene.registration.features.matching import Matched, find_matches
-from chronoscene.registration.features.verification import match
+from chronoscene.registration.features.matching import match
 from chronoscene.registration.photos.captures import read_captures
 from chronoscene.registration.photos.inputs import gather
-from chronoscene.registration.stages import Stages, work_folder
+from chronoscene.registration.work_folder import STEPS, Stages, work_folder
 from chronoscene.synth import SynthSettings, generate
 
 SETTINGS = SynthSettings(
@@ -489,7 +488,6 @@ def test_a_kill_within_a_copy_loses_nothing(
 KILLED = """
 import os, signal, sys
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration import stages
 from chronoscene.registration.features import feature_reuse
 from chronoscene.registration.features.database import read_pairs
 
@@ -600,7 +598,7 @@ def test_the_command_goes_on_from_the_run_before(
     # that the database has no more.
     write_table(captures, "2016", "2023", "2023", "2023")
     with monkeypatch.context() as patch:
-        patch.setitem(stages.STEPS, "matches", "no_such_module:killed")
+        patch.setitem(STEPS, "matches", "no_such_module:killed")
         with pytest.raises(RegistrationError, match="no_such_module"):
             matched(captures)
     write_table(captures, "2016", "2023", "2023", "2023", "2016")

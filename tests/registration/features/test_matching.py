@@ -1,63 +1,39 @@
-"""Which photos share a camera."""
+"""Pairs that are matched and verified."""
 
-from datetime import datetime, timedelta
+from __future__ import annotations
+
+from itertools import combinations, pairwise
 from pathlib import Path
 
-from chronoscene.images.exif import ExifData
-from chronoscene.registration.context import Calibration
-from chronoscene.registration.features.matching import MIN_PHOTOS, camera_groups
-from chronoscene.registration.photos.photo import Capture
+import chronoscene.colmap.model  # noqa: F401  # loads pycolmap safely
+from chronoscene.io.pycolmap import pycolmap
+from chronoscene.registration.features.matching import INLIER_SHARES, _unmatched
 
 
-def capture(
-    name: str, period: int, *, model: str = "A", focal: float = 24.0, taken: datetime | None = None
-) -> Capture:
-    exif = ExifData(make="maker", model=model, focal_mm=focal)
-    return Capture(name, Path(name), period, 640, 480, exif, taken, None)
+def test_matches_that_a_killed_run_left_are_dropped(tmp_path: Path) -> None:
+    """COLMAP aborts when it stores the matches of a pair a second time."""
+    path = str(tmp_path / "features.db")
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 3
+    with pycolmap.Database.open(path) as database:
+        pycolmap.synthesize_dataset(options, database)
+        ids = {str(image.name): image.image_id for image in database.read_all_images()}
+        pairs = list(combinations(sorted(ids), 2))
+        assert all(database.exists_matches(ids[a], ids[b]) for a, b in pairs)
+        broken = pairs[1]
+        database.delete_two_view_geometry(*(ids[name] for name in broken))
+    assert _unmatched(path, pairs) == [broken]
+    with pycolmap.Database.open(path) as database:
+        left = [pair for pair in pairs if database.exists_matches(*(ids[n] for n in pair))]
+    assert left == [pair for pair in pairs if pair != broken]
 
 
-def names(captures: list[Capture], calibration: Calibration = "auto") -> list[list[str]]:
-    return [group["names"] for group in camera_groups(captures, "SIMPLE_RADIAL", calibration)]
-
-
-def test_lens_and_zoom_make_the_camera() -> None:
-    mixed = [
-        capture("a", 0),
-        capture("b", 0, model="B"),
-        capture("c", 0, focal=70.0),
-        capture("d", 0),
-    ]
-    assert names(mixed) == [["a", "d"], ["b"], ["c"]]
-
-
-def test_a_period_with_many_photos_has_its_own_calibration() -> None:
-    many = [capture(f"0/{i}", 0) for i in range(MIN_PHOTOS)]
-    more = [capture(f"1/{i}", 1) for i in range(MIN_PHOTOS)]
-    assert names(many + more) == [sorted(c.name for c in many), sorted(c.name for c in more)]
-
-
-def test_periods_with_few_photos_share_one() -> None:
-    few = [capture("0/a", 0), capture("1/a", 1)]
-    assert names(few) == [["0/a", "1/a"]]
-    assert names(few, "per-period") == [["0/a"], ["1/a"]]
-
-
-def test_periods_share_one_where_that_is_asked_for() -> None:
-    many = [capture(f"{p}/{i}", p) for p in (0, 1) for i in range(MIN_PHOTOS)]
-    assert names(many, "shared") == [sorted(c.name for c in many)]
-    assert len(names([*many, capture("1/b", 1, model="B")], "shared")) == 2
-
-
-def test_periods_of_one_visit_share_a_calibration() -> None:
-    noon = datetime(2020, 5, 1, 12)
-    minute, year = timedelta(minutes=1), timedelta(days=365)
-
-    def photos(period: int, start: datetime) -> list[Capture]:
-        return [
-            capture(f"{period}/{i:02}", period, taken=start + i * minute) for i in range(MIN_PHOTOS)
-        ]
-
-    legs = photos(0, noon) + photos(1, noon + 40 * minute)
-    later = photos(2, noon + year)
-    assert names(legs + later) == [[c.name for c in legs], [c.name for c in later]]
-    assert len(names(legs + later, "per-period")) == 3
+def test_no_pair_that_could_be_verified_gets_too_few_samples() -> None:
+    """COLMAP draws samples for a share of inliers, and accepts pairs with 15 of them."""
+    needed = pycolmap.TwoViewGeometryOptions()
+    bounds = [least for least, _ in INLIER_SHARES]
+    assert bounds == sorted(bounds, reverse=True)
+    assert bounds[-1] == 0
+    assert INLIER_SHARES[0][1] == needed.ransac.min_inlier_ratio
+    for (above, _), (_, share) in pairwise(INLIER_SHARES):
+        assert share <= needed.min_num_inliers / (above - 1)

@@ -14,7 +14,6 @@ import pytest
 from benchmarks.registration.generated import CaseSettings, generate_case, pose_errors
 from chronoscene.registration.quality import certificate as certificate_module
 from chronoscene.registration.quality.certificate import Certificate, HeldOut, certify, scene_extent
-from chronoscene.registration.quality.certificate_json import pair_figures, period_figures, to_json
 from chronoscene.registration.quality.gps_fit import GpsFit, fit_gps
 from chronoscene.registration.quality.localisation import Localisation
 from chronoscene.registration.quality.misalignment import Misalignment, Transfers
@@ -22,6 +21,7 @@ from chronoscene.registration.quality.overlap import tie_spread
 from chronoscene.registration.quality.rays import Placed, gather
 from chronoscene.registration.quality.surface_distance import SurfaceDistance, surface_distance
 from chronoscene.registration.quality.verdict import THRESHOLDS, judge
+from chronoscene.registration.report.certificate_json import pair_figures, period_figures, to_json
 from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3

@@ -11,7 +11,7 @@ from PIL import Image, ImageOps
 from benchmarks.registration.generated import pose_errors
 from chronoscene.formats import read_scene
 from chronoscene.registration.context import Context, Options
-from chronoscene.registration.features.matching import Matched
+from chronoscene.registration.features.correspondences import Matched
 from chronoscene.registration.output import Inspection
 from chronoscene.registration.photos.captures import Captures, read_captures
 from chronoscene.registration.photos.gps_priors import locate
@@ -20,9 +20,9 @@ from chronoscene.registration.pipeline import run
 from chronoscene.registration.reconstruct.estimation import estimate, refined
 from chronoscene.registration.reconstruct.models import known_images
 from chronoscene.registration.result import Registered
-from chronoscene.registration.stages import Stages, work_folder
 from chronoscene.registration.ties.tie_alignment import tie
 from chronoscene.registration.ties.tie_points import read_tie_points
+from chronoscene.registration.work_folder import Stages, work_folder
 from chronoscene.scene import Scene
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.synth import SynthSettings, generate

@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 
 from chronoscene.errors import DiskFullError, RegistrationError
-from chronoscene.registration import stages
-from chronoscene.registration.stages import Stages, work_folder
+from chronoscene.registration.work_folder import STEPS, Stages, run_step, work_folder
 
 
 class Counter:
@@ -76,14 +75,14 @@ def test_two_runs_do_not_share_a_work_folder(tmp_path: Path) -> None:
 
 
 def test_a_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stages, "fcntl", None)
+    monkeypatch.setattr("chronoscene.registration.work_folder.fcntl", None)
     message = "register: expected Linux or macOS, .* found .*; run it in the Windows Subsystem"
     with pytest.raises(RegistrationError, match=message), work_folder(tmp_path / "work"):
         pass
     assert not (tmp_path / "work").exists()
 
 
-STEPS = """
+ODD_STEPS = """
 import os, sys, time
 from chronoscene.errors import RegistrationError
 
@@ -116,24 +115,22 @@ def sleeps(arguments, report):
 @pytest.fixture(autouse=True)
 def odd_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps that only this test has, in a module that the child process finds."""
-    (tmp_path / "odd_steps.py").write_text(STEPS)
+    (tmp_path / "odd_steps.py").write_text(ODD_STEPS)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     for name in ("good", "aborts", "refuses", "breaks", "threads", "sleeps"):
-        monkeypatch.setitem(stages.STEPS, name, f"odd_steps:{name}")
+        monkeypatch.setitem(STEPS, name, f"odd_steps:{name}")
 
 
 def test_a_step_gives_its_result_and_tells_its_progress(tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
-    result = stages.run_step(
-        "good", {"x": 21}, log=tmp_path / "log", report=lambda *p: told.append(p)
-    )
+    result = run_step("good", {"x": 21}, log=tmp_path / "log", report=lambda *p: told.append(p))
     assert result == {"twice": 42}
     assert told == [("counting", 1, 2)]
     assert "noise of a library" in (tmp_path / "log").read_text()
 
 
 def test_the_matrix_library_of_a_step_starts_no_threads(tmp_path: Path) -> None:
-    assert stages.run_step("threads", {}, log=tmp_path / "log") == "1"
+    assert run_step("threads", {}, log=tmp_path / "log") == "1"
 
 
 @pytest.mark.parametrize(
@@ -142,7 +139,7 @@ def test_the_matrix_library_of_a_step_starts_no_threads(tmp_path: Path) -> None:
 )
 def test_the_death_of_a_step_is_a_message(tmp_path: Path, step: str, found: str) -> None:
     with pytest.raises(RegistrationError, match=found) as caught:
-        stages.run_step(step, {}, log=tmp_path / "log")
+        run_step(step, {}, log=tmp_path / "log")
     assert "--threads 1" in caught.value.todo and str(tmp_path / "log") in caught.value.todo
 
 
@@ -151,20 +148,20 @@ def test_the_death_of_a_step_on_a_full_disk_says_so(
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=250_000))
     with pytest.raises(DiskFullError, match=r"expected space .*, found 0\.2 MB left.*--work"):
-        stages.run_step("aborts", {}, log=tmp_path / "log")
+        run_step("aborts", {}, log=tmp_path / "log")
 
 
 def test_a_refusal_of_a_step_is_the_same_refusal(tmp_path: Path) -> None:
     with pytest.raises(RegistrationError, match=r"^here: expected this, found that; do it$"):
-        stages.run_step("refuses", {}, log=tmp_path / "log")
+        run_step("refuses", {}, log=tmp_path / "log")
 
 
 def test_a_step_dies_with_the_process_that_asked_for_it(tmp_path: Path) -> None:
     code = (
-        "from chronoscene.registration import stages\n"
+        "from chronoscene.registration import work_folder\n"
         "from pathlib import Path\n"
-        "stages.STEPS['sleeps'] = 'odd_steps:sleeps'\n"
-        f"stages.run_step('sleeps', {{'mark': {str(tmp_path / 'mark')!r}}}, log=Path('log'))\n"
+        "work_folder.STEPS['sleeps'] = 'odd_steps:sleeps'\n"
+        f"work_folder.run_step('sleeps', {{'mark': {str(tmp_path / 'mark')!r}}}, log=Path('log'))\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path)
     mark = tmp_path / "mark"

@@ -164,7 +164,7 @@ def _locked(descriptor: int) -> bool:
 
 STEPS = {
     "features": "chronoscene.registration.features.extraction:extract",
-    "matches": "chronoscene.registration.features.verification:match_photos",
+    "matches": "chronoscene.registration.features.matching:match_photos",
     "joint": "chronoscene.registration.reconstruct.routes:joint",
     "separate": "chronoscene.registration.reconstruct.routes:separate",
     "frozen": "chronoscene.registration.reconstruct.routes:add_period",

@@ -1,0 +1,95 @@
+"""Photos that share a camera, and so its calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from datetime import datetime, timedelta
+from typing import Any
+
+from chronoscene.registration.context import Calibration
+from chronoscene.registration.photos.photo import Capture
+from chronoscene.scene import Frame, Scene
+
+MIN_PHOTOS = 20
+"""Photos with which a camera is calibrated for each date alone. Lenses are refocused and dropped
+between dates; but few photos, of flat ground from one height above all, leave the focal length
+open, and calibrate worse than last year's lens fits."""
+
+SAME_VISIT = timedelta(days=1)
+"""Periods that follow each other within this time share what was not touched in between."""
+
+
+def scene_groups(scene: Scene) -> list[dict[str, Any]]:
+    """The cameras of a scene with their images, as they are."""
+    by_camera: dict[int, list[Frame]] = {}
+    for frame in scene.frames:
+        by_camera.setdefault(frame.camera.camera_id, []).append(frame)
+    return [
+        {
+            "names": sorted(f.name for f in frames),
+            "model": frames[0].camera.model,
+            "params": list(frames[0].camera.params),
+        }
+        for frames in by_camera.values()
+    ]
+
+
+def camera_groups(
+    captures: Sequence[Capture], model: str, calibration: Calibration = "auto"
+) -> list[dict[str, Any]]:
+    """Lists of names that share a camera, for `features.extraction.extract`.
+
+    Photos share one if make, model, size and focal length agree. With ``auto``, photos of different
+    visits do not, where each has enough of them (`MIN_PHOTOS`). Initial focal lengths are
+    left to COLMAP, which knows the sensors of many cameras.
+    """
+    by_lens: dict[tuple[Any, ...], list[Capture]] = {}
+    for capture in captures:
+        by_lens.setdefault(_lens(capture), []).append(capture)
+    groups = [g for members in by_lens.values() for g in _SPLITTERS[calibration](members)]
+    return [
+        {"names": sorted(names), "model": model, "params": None}
+        for names in sorted(([c.name for c in group] for group in groups), key=min)
+    ]
+
+
+def _lens(capture: Capture) -> tuple[Any, ...]:
+    exif = capture.exif
+    return (exif.make, exif.model, capture.width, capture.height, exif.focal_mm, exif.focal_35mm)
+
+
+def _periods(captures: Sequence[Capture]) -> list[list[Capture]]:
+    by_period: dict[int, list[Capture]] = {}
+    for capture in captures:
+        by_period.setdefault(capture.period, []).append(capture)
+    return [by_period[p] for p in sorted(by_period)]
+
+
+def _visits(captures: Sequence[Capture]) -> list[list[Capture]]:
+    """The photos of each visit that has enough of them, and those of all others together."""
+    visits: list[list[Capture]] = []
+    undated = []
+    dated: list[tuple[datetime, datetime, list[Capture]]] = []
+    for members in _periods(captures):
+        times = [c.taken for c in members if c.taken is not None]
+        if times:
+            dated.append((min(times), max(times), members))
+        else:
+            undated.append(members)
+    end: datetime | None = None
+    for first, last, members in sorted(dated, key=lambda d: d[0]):
+        if end is not None and first - end <= SAME_VISIT:
+            visits[-1] += members
+        else:
+            visits.append(list(members))
+        end = last if end is None else max(end, last)
+    visits += undated
+    few = [c for members in visits if len(members) < MIN_PHOTOS for c in members]
+    return [m for m in visits if len(m) >= MIN_PHOTOS] + ([few] if few else [])
+
+
+_SPLITTERS: dict[Calibration, Callable[[Sequence[Capture]], list[list[Capture]]]] = {
+    "auto": _visits,
+    "per-period": _periods,
+    "shared": lambda captures: [list(captures)],
+}

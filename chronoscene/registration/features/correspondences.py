@@ -1,0 +1,117 @@
+"""Second stage: features, matches, and what of them is held out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from chronoscene.registration.context import Context
+from chronoscene.registration.features import METHOD
+from chronoscene.registration.features.camera_groups import camera_groups, scene_groups
+from chronoscene.registration.photos.inputs import Inputs
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """What is known of the photos before any pose."""
+
+    keypoints: Mapping[str, int]
+    """Number of features by name."""
+    partners: Mapping[str, int]
+    """Number of photos with verified matches by name."""
+    pairs_across: Mapping[str, int]
+    """Verified pairs of photos between two periods, by ``"0-1"``."""
+    matches_across: Mapping[str, int]
+
+
+def find_matches(inputs: Inputs, context: Context) -> Matched:
+    """Extract, match and hold out; each is done once."""
+    features = _features(inputs, context)
+    found = _matches(inputs, context)
+    return Matched(
+        keypoints=features["keypoints"],
+        partners=found["partners"],
+        pairs_across=found["verified_pairs_across"],
+        matches_across=found["matches_across"],
+    )
+
+
+def _features(inputs: Inputs, context: Context) -> dict[str, Any]:
+    options = context.options
+    groups = camera_groups(inputs.images, options.camera_model, options.calibration)
+    if inputs.scene is not None:
+        groups = scene_groups(inputs.scene) + groups
+    settings = {
+        "method": METHOD,
+        "groups": groups,
+        "max_image_size": options.max_image_size,
+        "max_features": options.max_features,
+    }
+    places = {
+        "database": str(context.database),
+        "photos": str(context.photos),
+        "threads": context.threads,
+    }
+
+    def extract() -> tuple[Any, list[str]]:
+        # The database may be replaced: pairs that an earlier one had may be missing in it.
+        (context.work / "stage-matches.json").unlink(missing_ok=True)
+        found = context.step("features", settings | places)
+        count = len(found["keypoints"])
+        remark = (
+            f"{sum(found['keypoints'].values())} features in {count} photos, {len(groups)} "
+            f"cameras, {sum(found['focal_known'].values())} with a focal length from EXIF or the "
+            "scene"
+        )
+        return found, [remark, *_reused(found["carried"], count, "photos: features")]
+
+    return dict(context.stages.run("features", settings, extract))
+
+
+def _reused(count: int, total: int, what: str) -> list[str]:
+    return [f"{count} of {total} {what} reused from the previous run"] if count else []
+
+
+def _matches(inputs: Inputs, context: Context) -> dict[str, Any]:
+    options = context.options
+    centres = inputs.centres()
+    taken = {c.name: c.taken.isoformat() for c in inputs.images if c.taken is not None}
+    images = [
+        {"name": name, "period": period, "enu": centres.get(name), "taken": taken.get(name)}
+        for name, period in sorted(inputs.periods.items())
+    ]
+    settings = {
+        "images": images,
+        "exhaustive_limit": options.exhaustive_limit,
+        "periods": inputs.periods,
+        "share": options.held_out,
+        "seed": options.seed,
+    }
+    places = {
+        "database": str(context.database),
+        "pairs": str(context.work / "pairs.txt"),
+        "scratch": str(context.work),
+        "out": str(context.mapping_database),
+        "held_out": str(context.held_out),
+        "threads": context.threads,
+    }
+
+    def match() -> tuple[Any, list[str]]:
+        found = context.step("matches", settings | places)
+        kinds = ", ".join(f"{n} {kind}" for kind, n in found["kinds"].items())
+        pairs, verified, inliers = (found[k] for k in ("pairs", "verified", "inliers"))
+        told = [
+            f"{pairs} pairs ({kinds}), {found['across_periods']} across periods",
+            f"{verified} of {pairs} pairs verified, {inliers} matches",
+            *_reused(found["carried"], pairs, "pairs: matches"),
+            f"{found['held_out']} of {found['tracks_of_several_periods']} tracks of several "
+            "periods held out",
+        ]
+        told += [
+            f"periods {key}: {count} verified pairs, {found['matches_across'][key]} matches"
+            for key, count in found["verified_pairs_across"].items()
+        ]
+        return found, told
+
+    return dict(context.stages.run("matches", settings, match))
