@@ -19,7 +19,7 @@ from baselines.cl_splats.model import PeriodModel
 from chronoscene.gaussians.model import initialise
 from chronoscene.methods import Prediction, TrainingSet, TrainingView, View
 from chronoscene.training.devices import to_device
-from chronoscene.training.splatting import Splats, weights_in
+from chronoscene.training.drawing import Splats, weights_in
 
 _STREAM = 9  # Keeps the points apart from other draws of the same seed
 _SEEN = 0.5

@@ -14,7 +14,7 @@ from chronoscene.gaussians.trainer import Due, GaussianTrainer
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.exposure import Exposure
-from chronoscene.training.schedule import ViewSampler
+from chronoscene.training.views import ViewSampler
 
 _EXPOSURES = "exposures"  # Name of the stored transforms of all periods
 

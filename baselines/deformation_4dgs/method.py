@@ -19,8 +19,8 @@ from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.gaussians.model import SHAPES
 from chronoscene.gaussians.trainer import Due
 from chronoscene.methods import TrainingSet
-from chronoscene.training.schedule import log_linear
-from chronoscene.training.splatting import finite_rows
+from chronoscene.training.points import finite_rows
+from chronoscene.training.schedules import log_linear
 
 
 class Deformation4DGS(GaussianMethod):

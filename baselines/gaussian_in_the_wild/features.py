@@ -10,8 +10,8 @@ from torch.nn.functional import grid_sample
 
 from baselines.gaussian_in_the_wild.networks import MAPS
 from chronoscene.methods import View
-from chronoscene.training.schedule import downscale_image
-from chronoscene.training.splatting import camera_tensors
+from chronoscene.training.drawing import camera_tensors
+from chronoscene.training.views import downscale_image
 
 _STREAM = 7  # Keeps the coordinates apart from other draws of the same seed
 _UNKNOWN = 128

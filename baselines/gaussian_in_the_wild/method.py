@@ -20,9 +20,9 @@ from chronoscene.gaussians.model import SHAPES, opacities_of, scales_of
 from chronoscene.gaussians.trainer import Due
 from chronoscene.methods import TrainingSet, View
 from chronoscene.scene.gaussian_cloud import GaussianCloud
-from chronoscene.training.schedule import log_linear
+from chronoscene.training.drawing import Splats, camera_centre_tensor
+from chronoscene.training.schedules import log_linear
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, NUM_BASES, basis
-from chronoscene.training.splatting import Splats, camera_centre_tensor
 
 _PHOTO = "photo."
 """First letters of the tensors that a finished model does without."""

@@ -12,7 +12,7 @@ from baselines.gaussian_in_the_wild.networks import Networks, colors_of
 from chronoscene.anchors.visibility import visible_anchors
 from chronoscene.gaussians.model import GaussianModel, opacities_of, scales_of
 from chronoscene.methods import View
-from chronoscene.training.splatting import Splats, camera_centre_tensor
+from chronoscene.training.drawing import Splats, camera_centre_tensor
 
 COORDINATES = "coordinates"
 """Group of parameters: where Gaussians read in feature maps. [N, 3, 2]"""

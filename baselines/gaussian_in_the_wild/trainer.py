@@ -19,7 +19,7 @@ from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.checkpoint import TrainingState
 from chronoscene.training.devices import to_device, uniform
-from chronoscene.training.splatting import Splats
+from chronoscene.training.drawing import Splats
 
 _STREAM = 8  # Keeps the dropout apart from other draws of the same seed
 PAUSE = 300

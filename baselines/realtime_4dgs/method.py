@@ -15,7 +15,7 @@ from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.gaussians.trainer import Due
 from chronoscene.methods import TrainingSet, View
 from chronoscene.scene.gaussian_cloud import GaussianCloud
-from chronoscene.training.splatting import finite_rows
+from chronoscene.training.points import finite_rows
 
 
 class Realtime4DGS(GaussianMethod):

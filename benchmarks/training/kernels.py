@@ -37,9 +37,9 @@ from chronoscene.anchors.decode import (
     decode_reference,
 )
 from chronoscene.kernels.runtime import available_threads, set_threads
-from chronoscene.training.adam import Adam, DenseTable
-from chronoscene.training.losses import photometric_loss, photometric_loss_reference
-from chronoscene.training.row_adam import RowAdam
+from chronoscene.training.optimizers.adam import Adam, DenseTable
+from chronoscene.training.optimizers.row_adam import RowAdam
+from chronoscene.training.photometric import photometric_loss, photometric_loss_reference
 
 OFFSETS, BASE, PERIOD, PERIODS, SHARED, HIDDEN = 10, 16, 16, 3, 32, 32
 HEIGHT, WIDTH = 240, 320

@@ -54,7 +54,7 @@ from chronoscene.methods import (
     nothing_ahead,
 )
 from chronoscene.scene import Camera, Frame, Period, Points, Scene
-from chronoscene.training.schedule import ViewSampler
+from chronoscene.training.views import ViewSampler
 
 TESTS = 4  # Photos that are not trained on
 POINTS = 3_000

@@ -66,22 +66,22 @@ from chronoscene.kernels.runtime import (
 )
 from chronoscene.methods import method_names
 from chronoscene.rasterizer.cpu import Render
-from chronoscene.training import losses, splatting
-from chronoscene.training.adam import Adam, DenseTable
-from chronoscene.training.row_adam import RowAdam
+from chronoscene.training import drawing, gradients, losses, photometric
+from chronoscene.training.optimizers.adam import Adam, DenseTable
+from chronoscene.training.optimizers.row_adam import RowAdam
 
 Timed = tuple[str, Any, str]
 PARTS: tuple[Timed, ...] = (
     ("frustum culling", AnchorModel, "visible"),
     ("decode", Decode, "forward"),
     ("rasterize", Render, "forward"),
-    ("loss", losses._PhotometricLoss, "forward"),
+    ("loss", photometric._PhotometricLoss, "forward"),
     ("volume term", losses._MeanVolume, "forward"),
     ("volume term, backward", losses._MeanVolume, "backward"),
-    ("loss, backward", losses._PhotometricLoss, "backward"),
+    ("loss, backward", photometric._PhotometricLoss, "backward"),
     ("rasterize, backward", Render, "backward"),
     ("decode, backward", Decode, "backward"),
-    ("check of gradients", splatting, "all_finite"),
+    ("check of gradients", gradients, "all_finite"),
     ("density statistics", DensityStatistics, "update"),
     ("fetch anchors", RowAdam, "fetch"),
     ("Adam, seen anchors", RowAdam, "step"),
@@ -94,11 +94,11 @@ GPU_PARTS: tuple[Timed, ...] = (
     ("decode", AnchorModel, "decode_active"),
     ("deformation", deformed_model, "deform"),
     ("spherical harmonics", gaussian_model, "evaluate"),
-    ("rasterize", splatting, "rasterize"),
+    ("rasterize", drawing, "rasterize"),
     ("loss", anchor_trainer, "photometric_loss"),
     ("loss", gaussian_trainer, "photometric_loss"),
     ("backward", torch.Tensor, "backward"),
-    ("check of gradients", splatting, "all_finite"),
+    ("check of gradients", gradients, "all_finite"),
     ("density statistics", DensityStatistics, "update"),
     ("density statistics", GradientStatistics, "add"),
     ("Adam", DenseTable, "step"),

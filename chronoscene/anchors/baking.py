@@ -24,8 +24,8 @@ from chronoscene.anchors.model import AnchorModel
 from chronoscene.kernels.compilation import kernel
 from chronoscene.methods import View
 from chronoscene.scene.gaussian_cloud import GaussianCloud
+from chronoscene.training.drawing import Splats, camera_centre_tensor
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, NUM_BASES, basis
-from chronoscene.training.splatting import Splats, camera_centre_tensor
 
 RIDGE = 0.01
 """Penalty on the squares of all coefficients but the constant one, as a share of all weights."""

@@ -15,8 +15,8 @@ from torch import Tensor
 from chronoscene.anchors.decode import unpack_bits
 from chronoscene.anchors.model import AnchorLayout, AnchorModel
 from chronoscene.methods import TrainingView, View
-from chronoscene.training.schedule import downscale_view
-from chronoscene.training.splatting import Splats, weights_in
+from chronoscene.training.drawing import Splats, weights_in
+from chronoscene.training.views import downscale_view
 
 
 def blending_weights(splats: Splats, view: View, layout: AnchorLayout) -> Tensor:

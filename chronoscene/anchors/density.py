@@ -21,7 +21,7 @@ from torch import Tensor
 from chronoscene.anchors.config import AnchorConfig
 from chronoscene.kernels.compilation import kernel
 from chronoscene.training import devices
-from chronoscene.training.splatting import rms_spacing
+from chronoscene.training.points import rms_spacing
 
 MIN_DISTANCE = 1e-7
 """Lower bound of a neighbour distance: keeps the log-scales of coinciding points finite."""

@@ -24,14 +24,10 @@ from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import META_FILE, TENSOR_FILE
-from chronoscene.training.periods import period_weights
-from chronoscene.training.splatting import (
-    Splats,
-    SplattingMethod,
-    draw,
-    finite_rows,
-    with_new_periods,
-)
+from chronoscene.training.drawing import Splats, draw
+from chronoscene.training.method import SplattingMethod
+from chronoscene.training.periods import period_weights, with_new_periods
+from chronoscene.training.points import finite_rows
 
 
 class AnchorMethod(SplattingMethod):

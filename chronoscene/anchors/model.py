@@ -28,7 +28,7 @@ from chronoscene.errors import CheckpointError
 from chronoscene.methods import View
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.training.devices import to_device
-from chronoscene.training.splatting import Splats, camera_centre_tensor
+from chronoscene.training.drawing import Splats, camera_centre_tensor
 
 PER_ANCHOR = ("offsets", "features", "log_scales")  # Trained tensors with one row per anchor
 TABLES = (*PER_ANCHOR, "blocks")  # Trained tensors of which a view needs some rows

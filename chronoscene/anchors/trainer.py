@@ -25,27 +25,18 @@ from chronoscene.anchors.visibility import projected_centres
 from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.scene.geometry import camera_centre
-from chronoscene.training.adam import Adam, DenseTable
 from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.devices import to_device
+from chronoscene.training.drawing import draw, step_background
 from chronoscene.training.exposure import Exposure
-from chronoscene.training.losses import mean_volume, photometric_loss
-from chronoscene.training.row_adam import make_table
-from chronoscene.training.schedule import (
-    ViewSampler,
-    downscale_image,
-    downscale_mask,
-    downscale_view,
-    log_linear,
-)
-from chronoscene.training.splatting import (
-    centre_gradients,
-    centres_count,
-    collect_gradients,
-    draw,
-    finite_rows,
-    step_background,
-)
+from chronoscene.training.gradients import centre_gradients, centres_count, collect_gradients
+from chronoscene.training.losses import mean_volume
+from chronoscene.training.optimizers.adam import Adam, DenseTable
+from chronoscene.training.optimizers.row_adam import make_table
+from chronoscene.training.photometric import photometric_loss
+from chronoscene.training.points import finite_rows
+from chronoscene.training.schedules import log_linear
+from chronoscene.training.views import ViewSampler, downscale_image, downscale_mask, downscale_view
 
 _COOLED = 0.1  # Factor of the learning rates at the end of a cooldown
 _MARGIN = 1e-9

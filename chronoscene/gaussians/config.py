@@ -11,7 +11,7 @@ from typing import ClassVar, Self
 
 from chronoscene.checks import check_at_least, check_choice
 from chronoscene.errors import ConfigError
-from chronoscene.training.splatting import SplattingConfig
+from chronoscene.training.config import SplattingConfig
 
 
 @dataclass(frozen=True)

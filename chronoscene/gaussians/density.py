@@ -19,7 +19,7 @@ from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.model import axes_of, dot, logit, opacities_of, scales_of
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.devices import exp, normal
-from chronoscene.training.splatting import centre_gradients, centres_count
+from chronoscene.training.gradients import centre_gradients, centres_count
 
 PARTS = 2  # Gaussians that a split one becomes
 

@@ -19,7 +19,8 @@ from chronoscene.methods import TrainingSet, View
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import META_FILE
-from chronoscene.training.splatting import Splats, SplattingMethod, draw
+from chronoscene.training.drawing import Splats, draw
+from chronoscene.training.method import SplattingMethod
 
 
 class GaussianMethod(SplattingMethod):

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from chronoscene.methods import TrainingSet, View
 from chronoscene.training.devices import exp
+from chronoscene.training.drawing import Splats, camera_centre_tensor
+from chronoscene.training.points import finite_rows, rms_spacing
 from chronoscene.training.spherical_harmonics import NUM_BASES, dc_from_rgb, evaluate
-from chronoscene.training.splatting import Splats, camera_centre_tensor, finite_rows, rms_spacing
 
 SHAPES: dict[str, tuple[int, ...]] = {
     "means": (3,),

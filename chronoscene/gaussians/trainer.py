@@ -24,19 +24,15 @@ from chronoscene.gaussians.mcmc import make_generator, noise, relocate
 from chronoscene.gaussians.model import GaussianModel
 from chronoscene.methods import StepReport, TrainingSet
 from chronoscene.rasterizer import Rasterization
-from chronoscene.training.adam import Adam
 from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.devices import to_device
+from chronoscene.training.drawing import Splats, draw, step_background
 from chronoscene.training.exposure import Exposure
-from chronoscene.training.losses import photometric_loss
-from chronoscene.training.schedule import ViewSampler, log_linear
-from chronoscene.training.splatting import (
-    Splats,
-    collect_gradients,
-    draw,
-    mask_tensor,
-    step_background,
-)
+from chronoscene.training.gradients import collect_gradients, mask_tensor
+from chronoscene.training.optimizers.adam import Adam
+from chronoscene.training.photometric import photometric_loss
+from chronoscene.training.schedules import log_linear
+from chronoscene.training.views import ViewSampler
 
 # Keep random choices of a kind apart from those of others with the same seed
 _SPLIT_STREAM = 1

@@ -1,5 +1,6 @@
-"""What methods share that train tensors and splat them, whatever the tensors are.
+"""Everything that methods share which train tensors and splat them, whatever the tensors are.
 
-`splatting` has the base class of the plug-ins; it and the trainers stand on the rest: views and
-learning rates, exposures, losses, Adam (also of some rows only), and checkpoints.
+`method` has the base class of the plug-ins and `config` their common options. `drawing` renders,
+`losses` compares, `gradients` is the backward pass, `schedules` gives learning rates, and
+`optimizers` step.
 """

@@ -23,9 +23,9 @@ from torch import Tensor
 from chronoscene.kernels.compilation import kernel
 from chronoscene.methods import TrainingSet
 from chronoscene.training import devices
-from chronoscene.training.adam import DenseTable
+from chronoscene.training.optimizers.adam import DenseTable
 from chronoscene.training.periods import period_weights
-from chronoscene.training.schedule import log_linear
+from chronoscene.training.schedules import log_linear
 from chronoscene.training.spherical_harmonics import C0
 
 KINDS = ("none", "image", "period")

@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from chronoscene.errors import ConfigError
 
@@ -42,3 +43,8 @@ def period_weights(period: float, num_periods: int) -> NDArray[np.float32]:
     if share > 0.0:
         weights[lower + 1] = share
     return weights
+
+
+def with_new_periods(rows: Tensor, count: int) -> Tensor:
+    """A row for each period: new ones start as copies of the last. [S, ...] -> [count, ...]"""
+    return rows.detach()[[min(period, len(rows) - 1) for period in range(count)]]

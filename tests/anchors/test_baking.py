@@ -10,8 +10,8 @@ from chronoscene.anchors.model import AnchorLayout, AnchorModel
 from chronoscene.methods import View
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene.geometry import look_at
+from chronoscene.training.drawing import Splats, camera_centre_tensor, draw
 from chronoscene.training.spherical_harmonics import evaluate
-from chronoscene.training.splatting import Splats, camera_centre_tensor, draw
 
 BACKGROUND = torch.tensor([0.1, 0.2, 0.3])
 WEIGHTS = torch.ones(1)

@@ -16,7 +16,7 @@ from chronoscene.anchors.decode import pack_bits
 from chronoscene.anchors.model import AnchorLayout, AnchorModel
 from chronoscene.methods import TrainingView, View
 from chronoscene.scene.geometry import look_at
-from chronoscene.training.splatting import Splats, draw
+from chronoscene.training.drawing import Splats, draw
 
 K = np.array([[60.0, 0.0, 24.0], [0.0, 60.0, 18.0], [0.0, 0.0, 1.0]])
 ABOVE = look_at(np.array([0.0, 0.0, 2.0]), np.zeros(3), up=np.array([0.0, 1.0, 0.0]))

@@ -24,7 +24,7 @@ from chronoscene.anchors.decode import (
 )
 from chronoscene.anchors.decode.layout import BLOCK, CHUNK
 from chronoscene.errors import ShapeError
-from chronoscene.training.splatting import Splats
+from chronoscene.training.drawing import Splats
 
 # Worst of 400 random problems against float64, relative to the largest number of a tensor (or to
 # `SMALL`, where sums cancel): values 1.6e-6, gradients 5e-6, from quaternions near zero.

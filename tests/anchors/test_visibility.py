@@ -12,7 +12,7 @@ from chronoscene.anchors.visibility import projected_centres, visible_anchors
 from chronoscene.methods import View
 from chronoscene.rasterizer import NEAR_PLANE, rasterize
 from chronoscene.training import devices
-from chronoscene.training.splatting import camera_tensors
+from chronoscene.training.drawing import camera_tensors
 
 
 @settings(max_examples=20, deadline=None)

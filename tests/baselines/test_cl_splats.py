@@ -27,7 +27,7 @@ from chronoscene.methods import TrainingSet, build_config
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.checkpoint import load_tensors
-from chronoscene.training.splatting import Splats, draw
+from chronoscene.training.drawing import Splats, draw
 
 STEPS = 100
 

@@ -28,7 +28,7 @@ from chronoscene.bench.contract import tiny_training
 from chronoscene.errors import ConfigError
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, View, build_config
-from chronoscene.training.losses import photometric_loss_reference
+from chronoscene.training.photometric import photometric_loss_reference
 
 
 @pytest.fixture(autouse=True)

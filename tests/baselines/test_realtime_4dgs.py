@@ -32,7 +32,7 @@ from chronoscene.gaussians.model import GaussianModel
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, build_config
 from chronoscene.training.checkpoint import load_tensors, save_tensors
-from chronoscene.training.splatting import draw
+from chronoscene.training.drawing import draw
 
 
 @pytest.fixture(autouse=True)

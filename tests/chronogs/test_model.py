@@ -13,8 +13,8 @@ from chronoscene.anchors.config import HEADS
 from chronoscene.anchors.model import TABLES, AnchorModel
 from chronoscene.errors import ConfigError
 from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.training.drawing import Splats, draw
 from chronoscene.training.losses import mean_volume
-from chronoscene.training.splatting import Splats, draw
 
 Make = Callable[..., ChronoGS]
 CENTRE = torch.tensor([0.3, -0.2, 2.0])

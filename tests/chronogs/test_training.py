@@ -22,7 +22,7 @@ from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.scene.similarity import Sim3
-from chronoscene.training.schedule import log_linear
+from chronoscene.training.schedules import log_linear
 
 Make = Callable[..., ChronoGS]
 GROWING = {

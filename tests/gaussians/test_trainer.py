@@ -11,8 +11,8 @@ from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.gaussians.config import GaussianConfig
 from chronoscene.gaussians.model import SHAPES, logit, opacities_of
 from chronoscene.gaussians.trainer import Timeline
-from chronoscene.training.schedule import ViewSampler
-from chronoscene.training.splatting import draw
+from chronoscene.training.drawing import draw
+from chronoscene.training.views import ViewSampler
 
 
 def test_the_published_schedule():

@@ -15,8 +15,8 @@ from chronoscene.synth.render import shade
 
 SCRIPT = """
 import torch
-from chronoscene.training.adam import adam_block
-from chronoscene.training.adam import Adam
+from chronoscene.training.optimizers.adam import adam_block
+from chronoscene.training.optimizers.adam import Adam
 value = torch.ones(40, requires_grad=True)
 value.grad = torch.ones(40)
 Adam({"x": value}).step({"x": 0.5})

@@ -25,7 +25,8 @@ LARGE_TESTS = (
     "rasterizer/test_extremes.py",
     "anchors/test_decode.py",
     "training/test_losses.py",
-    "training/test_row_adam.py",
+    "training/test_photometric.py",
+    "training/optimizers/test_row_adam.py",
 )
 
 

@@ -12,7 +12,7 @@ from chronoscene.bench.contract import CHECKS
 from chronoscene.bench.contract.subject import PAUSE, NotApplicableError, Subject
 from chronoscene.bench.contract.tiny_training import STEPS
 from chronoscene.methods import method_names
-from chronoscene.training.losses import _PhotometricLoss
+from chronoscene.training.photometric import _PhotometricLoss
 
 
 @pytest.fixture(scope="module", params=method_names())

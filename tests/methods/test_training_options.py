@@ -8,7 +8,7 @@ import pytest
 from chronoscene.bench.contract import tiny_training
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object, load_spec
-from chronoscene.training.schedule import downscale_view
+from chronoscene.training.views import downscale_view
 
 STEPS = 30
 

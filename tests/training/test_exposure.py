@@ -12,9 +12,9 @@ from chronoscene.errors import ConfigError
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, TrainingView
 from chronoscene.scene.similarity import Sim3
+from chronoscene.training.config import SplattingConfig
 from chronoscene.training.exposure import LEARNING_RATE, Exposure, exposed, of_period, transformed
 from chronoscene.training.spherical_harmonics import basis
-from chronoscene.training.splatting import SplattingConfig
 
 SIZE = 32
 

@@ -20,7 +20,7 @@ from chronoscene.anchors.decode.layout import MIN_DISTANCE, MIN_QUAT_NORM
 from chronoscene.checks import check_shape
 from chronoscene.errors import ShapeError
 from chronoscene.training import devices
-from chronoscene.training.splatting import Splats
+from chronoscene.training.drawing import Splats
 
 _ALL = np.float32(-np.inf)  # Opacity above which Gaussians are active, if all are to be
 

@@ -12,7 +12,7 @@ from chronoscene.bench.report.summary import read_runs
 from chronoscene.bench.report.tables import format_runs
 from chronoscene.formats import chronoscene as scene_format
 from chronoscene.methods import load_spec, method_names
-from chronoscene.training import losses
+from chronoscene.training import photometric
 from chronoscene.training.checkpoint import load_tensors
 
 
@@ -98,14 +98,14 @@ def test_a_scene_with_masks_is_trained_and_scored_by_what_counts(
 
 def poison(monkeypatch, numbers):
     """The gradients of the loss are not finite in these calls."""
-    backward, calls = losses._PhotometricLoss.backward, []
+    backward, calls = photometric._PhotometricLoss.backward, []
 
     def poisoned(ctx, *grads):
         gradient, *others = backward(ctx, *grads)
         calls.append(1)
         return (gradient * np.nan if len(calls) in numbers else gradient, *others)
 
-    monkeypatch.setattr(losses._PhotometricLoss, "backward", staticmethod(poisoned))
+    monkeypatch.setattr(photometric._PhotometricLoss, "backward", staticmethod(poisoned))
 
 
 @pytest.mark.parametrize("method", method_names())

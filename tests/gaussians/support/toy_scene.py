@@ -8,7 +8,7 @@ from baselines.gaussian_splatting.method import GaussianSplatting
 from chronoscene.methods import TrainingSet, TrainingView
 from chronoscene.rasterizer import NEAR_PLANE
 from chronoscene.scene.similarity import Sim3
-from chronoscene.training.splatting import Splats, draw
+from chronoscene.training.drawing import Splats, draw
 
 WIDTH, HEIGHT = 48, 36
 EXTENT = 1.1

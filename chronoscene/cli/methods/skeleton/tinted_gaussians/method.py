@@ -13,7 +13,7 @@ from chronoscene.gaussians.method import GaussianMethod
 from chronoscene.gaussians.model import GaussianModel
 from chronoscene.gaussians.trainer import Due
 from chronoscene.methods import TrainingSet
-from chronoscene.training.splatting import with_new_periods
+from chronoscene.training.periods import with_new_periods
 
 
 @dataclass(frozen=True)

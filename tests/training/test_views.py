@@ -1,4 +1,4 @@
-"""Which view comes next, how large its photo is, and how a learning rate falls."""
+"""Which view comes next, and how large its photo is."""
 
 import numpy as np
 import pytest
@@ -6,16 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.methods import TrainingView
-from chronoscene.training.schedule import (
+from chronoscene.training.views import (
     AHEAD,
     ViewSampler,
     downscale_image,
     downscale_mask,
     downscale_view,
-    log_linear,
 )
-
-POSITIVE = st.floats(1e-8, 1e3)
 
 
 @given(st.integers(1, 40), st.integers(0, 2**32), st.integers(1, 4))
@@ -86,34 +83,6 @@ def test_a_point_lands_at_the_same_place() -> None:
     point = np.linalg.inv(original.K) @ [5.0, 3.0, 1.0]  # corner of pixels (4, 2) and (5, 3)
     np.testing.assert_allclose(small.K @ point, [2.5, 1.5, 1.0])
     np.testing.assert_array_equal(original.K[0], [50.0, 0.0, 4.0])
-
-
-@given(POSITIVE, POSITIVE)
-def test_ends_are_exact_and_the_middle_is_the_geometric_mean(start, end):
-    assert log_linear(0.0, start, end) == start
-    assert log_linear(1.0, start, end) == end
-    assert log_linear(0.5, start, end) == pytest.approx(np.sqrt(start * end), rel=1e-12)
-
-
-@given(POSITIVE, POSITIVE, st.floats(-1, 2), st.floats(-1, 2))
-def test_monotone_and_within_the_ends(start, end, first, second):
-    low, high = sorted((start, end))
-    values = [log_linear(p, start, end) for p in sorted((first, second))]
-    for value in values:
-        assert low * (1 - 1e-12) <= value <= high * (1 + 1e-12)
-    sign = 1 if end >= start else -1
-    assert sign * (values[1] - values[0]) >= -1e-12 * high
-
-
-def test_the_published_position_rate_half_way():
-    # 1.6e-4 -> 1.6e-6: a factor of ten down in the middle.
-    assert log_linear(0.5, 1.6e-4, 1.6e-6) == pytest.approx(1.6e-5)
-
-
-def test_off_stays_off_and_a_zero_end_is_refused():
-    assert log_linear(0.3, 0.0, 0.0) == 0.0
-    with pytest.raises(ValueError, match="positive"):
-        log_linear(0.3, 1.0, 0.0)
 
 
 def test_a_square_of_pixels_counts_if_all_of_it_does():

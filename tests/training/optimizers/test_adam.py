@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chronoscene.errors import ShapeError
-from chronoscene.training.adam import BLOCK, Adam, all_finite
+from chronoscene.training.optimizers.adam import BLOCK, Adam, all_finite
 
 # Worst of 1200 runs of 20 steps with rates up to 0.1: 1.7e-6, from rounding in another order.
 TOLERANCE = 5e-6

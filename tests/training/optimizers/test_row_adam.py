@@ -9,9 +9,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chronoscene.training import row_adam
-from chronoscene.training.adam import Adam
-from chronoscene.training.row_adam import RowAdam
+from chronoscene.training.optimizers import row_adam
+from chronoscene.training.optimizers.adam import Adam
+from chronoscene.training.optimizers.row_adam import RowAdam
 
 # Worst of 400 runs: 3e-6 of the rates' sum, by which everything may move.
 TOLERANCE = 1e-5

@@ -22,7 +22,7 @@ from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.kernels.memory import load_first, read, read_index, store_first, write_index
 from chronoscene.kernels.vectors import LANES, select, splat, sqrt
 from chronoscene.training import devices
-from chronoscene.training.adam import (
+from chronoscene.training.optimizers.adam import (
     BETA1,
     BETA2,
     EPS,

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from chronoscene.training.devices import to_device
-from chronoscene.training.ssim_kernel import C1, C2, RADIUS, TAPS
+from chronoscene.training.photometric.ssim_kernel import C1, C2, RADIUS, TAPS
 
 _TAPS = np.array(TAPS, np.float32)
 

@@ -1,8 +1,7 @@
-"""What a training step works with: the next view, the size of its photo, its learning rates."""
+"""Views of training steps: which one comes next, and how large its photo is."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -90,22 +89,3 @@ def downscale_mask(mask: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
     height, width = mask.shape[0] // tall, mask.shape[1] // wide
     squares = mask[: height * tall, : width * wide].reshape(height, tall, width, wide)
     return np.asarray(squares.all(axis=(1, 3)))
-
-
-def log_linear(progress: float, start: float, end: float) -> float:
-    """A learning rate that falls log-linearly: ``start^(1 - p) * end^p``.
-
-    Args:
-        progress: Share of the training that is over; clamped to 0..1.
-        start: Value at progress 0, above 0; or 0 together with `end` to switch it off.
-        end: Value at progress 1.
-    """
-    p = min(max(progress, 0.0), 1.0)
-    if start == 0.0 and end == 0.0:
-        return 0.0
-    if start <= 0.0 or end <= 0.0:
-        raise ValueError(f"start and end must be positive, or both 0, not {start} and {end}")
-    # The ends are exact: exp(log(x)) would miss them by a rounding.
-    if p in (0.0, 1.0):
-        return end if p else start
-    return math.exp((1.0 - p) * math.log(start) + p * math.log(end))

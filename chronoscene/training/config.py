@@ -1,0 +1,60 @@
+"""Options of all methods that splat Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+from chronoscene.checks import check_at_least, check_choice
+from chronoscene.rasterizer import NEAR_PLANE
+from chronoscene.training.exposure import KINDS
+
+
+@dataclass(frozen=True)
+class SplattingConfig:
+    """Options of all methods that splat Gaussians."""
+
+    length_unit: str = "world"
+    """Unit of the options that are lengths. ``world``: that of the scene, as in released code;
+    ``training``: that of the training frame, in which the farthest camera is at distance 1, so
+    that the unit of the scene does not matter."""
+    near_plane: float = NEAR_PLANE
+    """Nearest depth that is drawn, in `length_unit`. The default is common to all methods here; the
+    official rasterizer of 3DGS has 0.2."""
+    antialiased: bool = False
+    """Lower the opacity of Gaussians that are small on the screen, so that the rasterizer's blur
+    adds no light to them: what is thin keeps its brightness at other image sizes than those
+    trained on (Yu et al. 2024, Mip-Splatting)."""
+    ssim_weight: float = 0.2
+    """Weight of 1 - SSIM in the loss; L1 gets the rest."""
+    absgrad: bool = False
+    """Add Gaussians where the sum over the pixels of a centre's absolute gradients is large, which
+    does not cancel where a Gaussian is too large for what it shows (Ye et al. 2024, AbsGS). It is
+    larger, and so must be the threshold: gsplat advises 0.0008 for 3DGS."""
+    random_background: bool = False
+    """Train with another colour behind everything in each step, so that no Gaussian is missing
+    where a photo shows that colour. Images are rendered with the usual background."""
+    exposure: str = "none"
+    """``image`` | ``period``: learn an affine transform of the colours for each training image, or
+    for each period. A rendered view has that of its period: `chronoscene.training.exposure`."""
+    teachers: int = 0
+    """How many models are trained first, in the first half of the training; the one that stays
+    learns from the photos and from what these show, on average, between the photos. Worth it in
+    long trainings: `chronoscene.training.teachers`. Not in any of the papers."""
+
+    def __post_init__(self) -> None:
+        check_at_least("teachers", self.teachers, 0)
+        check_choice("exposure", self.exposure, KINDS)
+        check_choice("length_unit", self.length_unit, ("world", "training"))
+        check_at_least("near_plane", self.near_plane, 0.0)
+
+    def in_training_frame(self, training_from_world: float) -> Self:
+        """The same options with all lengths in units of the training frame.
+
+        Args:
+            training_from_world: Scale of the training frame: its units per unit of the world.
+        """
+        if self.length_unit == "training":
+            return self
+        near_plane = self.near_plane * training_from_world
+        return replace(self, length_unit="training", near_plane=near_plane)

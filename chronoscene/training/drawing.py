@@ -1,0 +1,136 @@
+"""Drawing: from Gaussians, a view and a background to an image."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chronoscene.methods import Prediction, View
+from chronoscene.rasterizer import Rasterization, rasterize
+from chronoscene.scene.geometry import camera_centre
+from chronoscene.training.config import SplattingConfig
+from chronoscene.training.devices import to_device
+from chronoscene.training.exposure import transformed
+
+_BACKGROUND_STREAM = 3  # Keeps the colours of `step_background` apart from other random choices
+
+
+class Splats(NamedTuple):
+    """Gaussians as the rasterizer draws them, in the training frame."""
+
+    means: Tensor
+    """Centres. [N, 3]"""
+    quats: Tensor
+    """Rotations wxyz. [N, 4]"""
+    scales: Tensor
+    """Standard deviations. [N, 3]"""
+    opacities: Tensor
+    """A Gaussian with an opacity of 0 or less is not drawn. [N]"""
+    colors: Tensor
+    """RGB. [N, 3]"""
+
+
+def draw(
+    splats: Splats,
+    view: View,
+    background: Tensor,
+    *,
+    near_plane: float,
+    antialiased: bool = False,
+    render_depth: bool = False,
+    absgrad: bool = False,
+    check_finite: bool = True,
+) -> Rasterization:
+    """Rasterize Gaussians in one view; arguments as `chronoscene.rasterizer.rasterize`."""
+    return rasterize(
+        *splats,
+        *camera_tensors(view, splats.means.device),
+        view.width,
+        view.height,
+        near_plane=near_plane,
+        antialiased=antialiased,
+        backgrounds=background[None],
+        render_depth=render_depth,
+        absgrad=absgrad,
+        check_finite=check_finite,
+    )
+
+
+def weights_in(
+    splats: Splats, view: View, pixels: Tensor, *, near_plane: float, antialiased: bool = False
+) -> Tensor:
+    """What Gaussians add to a view: sums over the pixels of their weight times ``pixels``. [N, 3]
+
+    The weight is transmittance times falloff times opacity, what a colour is multiplied by.
+
+    Args:
+        splats: The Gaussians; their colours do not matter. [N]
+        view: The camera.
+        pixels: Three numbers for each pixel, such as 1 in a region and 0 elsewhere. [H, W, 3]
+        near_plane: As for `draw`.
+        antialiased: The same.
+    """
+    with torch.enable_grad():
+        colors = torch.zeros_like(splats.means).requires_grad_()
+        raster = draw(
+            splats._replace(colors=colors),
+            view,
+            torch.zeros(3, device=colors.device),
+            near_plane=near_plane,
+            antialiased=antialiased,
+        )
+        (gradient,) = torch.autograd.grad((raster.image[0] * pixels).sum(), colors)
+    return gradient
+
+
+def step_background(
+    background: Tensor, config: SplattingConfig, *, seed: int, number: int
+) -> Tensor:
+    """What is behind everything in one step of a training. [3] -> [3]
+
+    Args:
+        background: The usual colour.
+        config: Says whether it is that, or a random one.
+        seed: Of the run; with the number of the step, all that the colour depends on.
+        number: Of the step.
+    """
+    if not config.random_background:
+        return background
+    generator = np.random.default_rng((seed, _BACKGROUND_STREAM, number))
+    return to_device(generator.random(3, np.float32), background.device)
+
+
+def prediction_of(raster: Rasterization, exposure: Tensor | None = None) -> Prediction:
+    """What a method hands to the harness, from a call with one view and with depth.
+
+    Args:
+        raster: The view.
+        exposure: Transform of its colours. [3, 4]
+    """
+    assert raster.depths is not None
+    image = raster.image[0] if exposure is None else transformed(raster.image[0], exposure)
+    images = (image, raster.alphas[0, ..., 0], raster.depths[0, ..., 0])
+    rgb, alpha, depth = (image.detach().cpu().numpy() for image in images)
+    drawn = int((raster.info.radii[0] > 0).all(dim=-1).sum())
+    return Prediction(rgb=rgb.clip(0.0, 1.0), alpha=alpha, depth=depth, drawn=drawn)
+
+
+def camera_tensors(view: View, device: str | torch.device = "cpu") -> tuple[Tensor, Tensor]:
+    """World-to-camera transform and intrinsics of one view, as a batch of one.
+
+    Returns:
+        viewmats: Pose in the training frame. float32 [1, 4, 4]
+        Ks: Intrinsics in pixels. float32 [1, 3, 3]
+    """
+    viewmats = np.array(view.cam_from_world, dtype=np.float32)[None]
+    Ks = np.array(view.K, dtype=np.float32)[None]
+    return to_device(viewmats, device), to_device(Ks, device)
+
+
+def camera_centre_tensor(view: View, device: str | torch.device = "cpu") -> Tensor:
+    """Camera centre in the training frame, computed in float64. float32 [3]"""
+    centre = camera_centre(np.asarray(view.cam_from_world, dtype=np.float64))
+    return to_device(centre.astype(np.float32), device)

@@ -1,0 +1,213 @@
+"""Base class of the methods that splat Gaussians.
+
+A subclass of `SplattingMethod` brings a model that gives `Splats` for a view and a period, and a
+trainer that changes its tensors.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from chronoscene.errors import CheckpointError, ShapeError
+from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet, View
+from chronoscene.rasterizer import Rasterization
+from chronoscene.scene.gaussian_cloud import GaussianCloud
+from chronoscene.training.checkpoint import TRAINING, TrainingState, load_tensors, save_tensors
+from chronoscene.training.drawing import Splats, camera_centre_tensor, prediction_of
+from chronoscene.training.exposure import exposed, of_period
+from chronoscene.training.periods import with_new_periods
+from chronoscene.training.spherical_harmonics import MAX_DEGREE, evaluate
+from chronoscene.training.teachers import Lessons
+
+_EXPOSURE = "exposure"  # Name of the stored transforms
+
+
+class SplattingMethod(ABC):
+    """Fulfils `chronoscene.methods.Method`; a subclass says how a model starts and is drawn.
+
+    `AnchorMethod` and `GaussianMethod` are the two kinds of models that there are.
+
+    Args:
+        config: Options of the method, a frozen dataclass on `SplattingConfig`. From `setup` on,
+            `config` holds them with lengths in units of the training frame.
+    """
+
+    name: ClassVar[str]
+    """On the command line."""
+    version: ClassVar[str] = "1"
+    """Of the implementation; stored with every model."""
+    primitive: ClassVar[str]
+    """Name of a stored tensor with one row per primitive."""
+
+    def __init__(self, config: Any) -> None:
+        self.config = config
+        self.background = torch.zeros(3)
+        self.meta: dict[str, Any] = {}
+        """Content of ``model.json``; subclasses add what `restore` needs."""
+        self.trainer: Any = None
+        """What `start` gave, which has an `Exposure` as ``exposure``; None after `load`."""
+        self._exposure: Tensor | None = None
+        self._lessons: Lessons | None = None
+
+    @abstractmethod
+    def start(self, train: TrainingSet, *, seed: int, device: str) -> Any:
+        """Build the initial model; returns what trains it by ``step``, arguments as there.
+
+        Where the method can be resumed, it gives a `TrainingState` by ``state`` and takes one by
+        ``load_state``.
+        """
+
+    @abstractmethod
+    def draw_splats(self, splats: Splats, view: View) -> Rasterization:
+        """Render Gaussians by the rules of the model, with depth."""
+
+    @abstractmethod
+    def splats(self, view: View, period: float, appearance_period: float) -> Splats:
+        """What is drawn in a view: the geometry of one period in the colours of another."""
+
+    @abstractmethod
+    def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
+        """`to_gaussians` without the exposure."""
+
+    @abstractmethod
+    def stored_tensors(self) -> dict[str, Tensor]:
+        """The model as it goes to disk, by name."""
+
+    @abstractmethod
+    def restore(self, folder: Path, tensors: dict[str, Tensor], device: str) -> None:
+        """Rebuild the model from `stored_tensors` and `meta`."""
+
+    def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
+        self.config = self.config.in_training_frame(train.training_from_world.scale)
+        background = np.array(train.background, np.float32)
+        self.background = torch.from_numpy(background).to(device)
+        self.meta = {
+            "method": self.name,
+            "version": self.version,
+            "config": asdict(self.config),
+            "training_from_world": train.training_from_world.to_matrix().tolist(),
+            "num_periods": train.num_periods,
+            "background": background.tolist(),
+        }
+        if self.config.teachers:
+            self._lessons = Lessons(self.config.teachers, seed, train, device)
+            self._begin_lesson(self._lessons)
+        else:
+            self.trainer = self.start(train, seed=seed, device=device)
+
+    def _begin_lesson(self, lessons: Lessons) -> None:
+        """Begin the next model: a teacher, or the one that stays."""
+        train = lessons.training_set(lambda: type(self)(self.config))
+        self.trainer = self.start(train, seed=lessons.own_seed(), device=lessons.device)
+
+    def go_on(self, train: TrainingSet, trainer: Any) -> None:
+        """Put another trainer in place of the one before: the last part of `extend`.
+
+        Exposures go on, too; a new period starts with that of the last one.
+        """
+        exposure = self.exposure()
+        self.meta["num_periods"] = train.num_periods
+        self.trainer = trainer
+        if exposure is not None:
+            trainer.exposure.begin(with_new_periods(exposure, train.num_periods))
+
+    def step(self, index: int, progress: float) -> StepReport:
+        assert self.trainer is not None, "setup comes first"
+        if (lessons := self._lessons) is not None:
+            while lessons.is_over(progress):
+                lessons.end(self, index)
+                self._begin_lesson(lessons)
+            index, progress = lessons.own_time(index, progress)
+        return self.trainer.step(index, progress)
+
+    def render(self, view: View, period: float) -> Prediction:
+        return self.render_split(view, geometry_period=period, appearance_period=period)
+
+    @torch.no_grad()
+    def render_split(
+        self, view: View, *, geometry_period: float, appearance_period: float
+    ) -> Prediction:
+        """Opacities and shapes come from the first period, colours from the second."""
+        transforms = self.exposure()
+        exposure = None if transforms is None else of_period(transforms, appearance_period)
+        splats = self.splats(view, geometry_period, appearance_period)
+        return prediction_of(self.draw_splats(splats, view), exposure)
+
+    @torch.no_grad()
+    def to_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
+        gaussians, transforms = self.static_gaussians(period, views), self.exposure()
+        if transforms is None:
+            return gaussians
+        exposure = of_period(transforms, period).cpu().numpy()
+        return replace(gaussians, sh_coeffs=exposed(gaussians.sh_coeffs, exposure))
+
+    @torch.no_grad()
+    def render_gaussians(self, gaussians: GaussianCloud, view: View) -> Prediction:
+        device = self.background.device
+        arrays = (getattr(gaussians, field.name) for field in fields(gaussians))
+        means, quats, scales, opacities, sh = (torch.from_numpy(a).to(device) for a in arrays)
+        centre = camera_centre_tensor(view, device)
+        colors = evaluate(sh[:, 0], sh[:, 1:], means, centre, MAX_DEGREE)
+        splats = Splats(means, quats, scales, opacities, colors)
+        return prediction_of(self.draw_splats(splats, view))
+
+    def exposure(self) -> Tensor | None:
+        """The transform of colours of each period, if the training learns any. [T, 3, 4]"""
+        if self.trainer is None:
+            return self._exposure
+        transforms: Tensor | None = self.trainer.exposure.by_period()
+        return transforms
+
+    def _all_tensors(self) -> dict[str, Tensor]:
+        """All that is stored, by name."""
+        exposure = self.exposure()
+        return self.stored_tensors() | ({} if exposure is None else {_EXPOSURE: exposure})
+
+    def save(self, folder: Path) -> None:
+        """Write the model; the state of the optimiser is not stored."""
+        save_tensors(folder, self._all_tensors(), self.meta)
+
+    def load(self, folder: Path, *, device: str) -> None:
+        """Read a model; what is stored with it takes precedence over the options given here."""
+        tensors, self.meta = load_tensors(folder, device=device, method=self.name)
+        self.background = torch.tensor(self.meta["background"], dtype=torch.float32, device=device)
+        self._exposure = tensors.pop(_EXPOSURE, None)
+        self.restore(folder, tensors, device)
+        self.trainer = None
+
+    def save_training(self, folder: Path) -> None:
+        state = self.trainer.state()
+        meta = {"method": self.name, "version": self.version, "values": state.values}
+        if self._lessons is not None:
+            meta["lessons"] = self._lessons.write(folder)
+        save_tensors(folder, state.tensors, meta, stem=TRAINING)
+
+    def load_training(self, folder: Path) -> None:
+        tensors, meta = load_tensors(folder, method=self.name, stem=TRAINING)
+        try:
+            if self._lessons is not None:
+                self._lessons.read(folder, meta["lessons"])
+                self._begin_lesson(self._lessons)
+            self.trainer.load_state(TrainingState(tensors, meta["values"]))
+        except (KeyError, RuntimeError, ShapeError) as error:
+            raise CheckpointError(
+                folder,
+                expected=f"a training that {self.name} {self.version} can go on with",
+                found=f"{type(error).__name__}: {error}",
+                todo="go on with the version of the software, and on the device, that began it",
+            ) from error
+
+    def size(self) -> MethodSize:
+        """Number of primitives, and of all stored numbers."""
+        tensors = self._all_tensors()
+        count, parameters = len(tensors[self.primitive]), sum(t.numel() for t in tensors.values())
+        unit = "anchors" if self.primitive == "anchors" else "Gaussians"
+        return MethodSize(count, parameters, unit)

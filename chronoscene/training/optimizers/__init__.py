@@ -1,0 +1,1 @@
+"""Optimisers: Adam of whole tensors, and of the rows that a step saw."""
