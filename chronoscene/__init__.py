@@ -1,6 +1,7 @@
 """Dataset toolkit and benchmark harness for multi-period scene reconstruction."""
 
 import os as _os
+import typing as _typing
 
 # Loaded before anything can import pycolmap: pycolmap 4.2.1 exports its own zlib symbols, and a
 # process that loads it before the system's zlib aborts at its first compression.
@@ -15,3 +16,46 @@ _os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
 _os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Camera",
+    "ChronoSceneError",
+    "Frame",
+    "Scene",
+    "SceneReport",
+    "Statistics",
+    "TrainedRun",
+    "open_run",
+    "read_scene",
+    "statistics",
+    "validate",
+]
+"""The public interface, which `chronoscene.api` defines."""
+
+if _typing.TYPE_CHECKING:
+    from chronoscene.api import (
+        Camera,
+        ChronoSceneError,
+        Frame,
+        Scene,
+        SceneReport,
+        Statistics,
+        TrainedRun,
+        open_run,
+        read_scene,
+        statistics,
+        validate,
+    )
+else:
+
+    def __getattr__(name):
+        """Import the public interface at its first use: ``import chronoscene`` itself is quick."""
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from chronoscene import api
+
+        return getattr(api, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -217,7 +217,13 @@ class SceneReport:
     """Errors first, then by code, then in the order of the rule."""
     skipped: tuple[Skipped, ...]
 
+    @property
+    def is_valid(self) -> bool:
+        """True if there are no errors."""
+        return not self.count("error")
+
     def count(self, severity: Severity) -> int:
+        """Return the number of findings of a severity."""
         return sum(f.severity == severity for f in self.findings)
 
 

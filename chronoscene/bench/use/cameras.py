@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.bench.files.predictions import image_file
-from chronoscene.bench.use.trained_run import OpenRun
+from chronoscene.bench.use.trained_run import TrainedRun
 from chronoscene.colmap.model import read_model
 from chronoscene.errors import ConfigError
 from chronoscene.formats.shared import transforms
@@ -53,7 +53,7 @@ class Shots:
     """Whether one camera moves; else each stands for itself."""
 
 
-def find_shots(source: str, run: OpenRun, scene_root: Path | None, frames: int) -> Shots:
+def find_shots(source: str, run: TrainedRun, scene_root: Path | None, frames: int) -> Shots:
     """The cameras that ``--cameras`` names.
 
     Args:
@@ -90,7 +90,7 @@ def find_shots(source: str, run: OpenRun, scene_root: Path | None, frames: int) 
 
 
 def with_periods(
-    shots: Shots, run: OpenRun, periods: tuple[float, ...], frames: int
+    shots: Shots, run: TrainedRun, periods: tuple[float, ...], frames: int
 ) -> tuple[Shot, ...]:
     """The same cameras at the periods asked for.
 
@@ -126,7 +126,7 @@ def with_periods(
     )
 
 
-def _range(run: OpenRun, periods: tuple[float, ...], count: int) -> Iterable[float]:
+def _range(run: TrainedRun, periods: tuple[float, ...], count: int) -> Iterable[float]:
     """Periods from the first to the last; each has an equal share where nothing is between."""
     start, end = periods[0], periods[-1]
     if run.is_continuous:
@@ -136,7 +136,7 @@ def _range(run: OpenRun, periods: tuple[float, ...], count: int) -> Iterable[flo
     return whole[np.arange(count) * len(whole) // count].tolist()
 
 
-def _of_scene(run: OpenRun, scene: Scene, split: str) -> Shots:
+def _of_scene(run: TrainedRun, scene: Scene, split: str) -> Shots:
     store = ImageStore(scene, max_width=run.record.max_width)
     frames = scene.frames if split == "all" else scene.select(split="test")
     shots = (
@@ -145,7 +145,7 @@ def _of_scene(run: OpenRun, scene: Scene, split: str) -> Shots:
     return Shots(tuple(shots), is_path=False)
 
 
-def _around(run: OpenRun, scene: Scene, frames: int) -> Shots:
+def _around(run: TrainedRun, scene: Scene, frames: int) -> Shots:
     poses = np.stack([frame.cam_from_world for frame in scene.frames])
     camera = ImageStore(scene, max_width=run.record.max_width).camera(scene.frames[0])
     path = orbit(poses, scene.points.xyz, frames)
@@ -156,7 +156,7 @@ def _numbered(i: int) -> str:
     return f"{i:04}.png"
 
 
-def _of_model(run: OpenRun, folder: Path) -> Shots:
+def _of_model(run: TrainedRun, folder: Path) -> Shots:
     shots = []
     for image in read_model(folder).images:
         camera = image.camera if image.camera.is_pinhole else undistorted_camera(image.camera)
@@ -166,7 +166,7 @@ def _of_model(run: OpenRun, folder: Path) -> Shots:
     return Shots(tuple(shots), is_path=False)
 
 
-def _of_path(run: OpenRun, path: Path) -> Shots:
+def _of_path(run: TrainedRun, path: Path) -> Shots:
     """A camera path as nerfstudio's viewer exports it."""
     data = read_json_document(path)
     kind = data.get("camera_type", "perspective")

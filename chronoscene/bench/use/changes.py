@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 from chronoscene.arrays import Array
 from chronoscene.bench.files.predictions import to_bytes
 from chronoscene.bench.use.cameras import Shot
-from chronoscene.bench.use.trained_run import OpenRun
+from chronoscene.bench.use.trained_run import TrainedRun
 from chronoscene.errors import ConfigError
 from chronoscene.images.store import ImageStore
 from chronoscene.images.truth import load_changes, truth_place
@@ -40,7 +40,7 @@ from chronoscene.scene.cameras import project_points, unproject_pixels
 
 Mask = NDArray[np.bool_]
 Render = Callable[[Camera, Array, float], Prediction]
-"""As `OpenRun.render`: camera, pose, period."""
+"""As `TrainedRun.render`: camera, pose, period."""
 
 MAX_WIDTH = 640
 """Pixels: places lie farther apart than those of wider images."""
@@ -273,7 +273,7 @@ SCORES = {
 """Keys of `score_map` with their headings, in the order of the table."""
 
 
-def map_run(run: OpenRun, scene: Scene, pairs: Sequence[tuple[int, int]]) -> Iterator[Compared]:
+def map_run(run: TrainedRun, scene: Scene, pairs: Sequence[tuple[int, int]]) -> Iterator[Compared]:
     """The map of each pair of periods, and its scores where a truth is known.
 
     Args:
@@ -285,7 +285,7 @@ def map_run(run: OpenRun, scene: Scene, pairs: Sequence[tuple[int, int]]) -> Ite
         ConfigError: If its models cannot tell periods apart, or give no depth.
         ImageError: If a file of the truth is damaged.
     """
-    if not (run.tells_period or run.strategy.model_per_period):
+    if not (run.uses_period or run.strategy.model_per_period):
         raise _unfit(run, "models that know the periods", "one that is not told the period")
     if "depth" not in run.spec.outputs:
         raise _unfit(run, "a method that renders depth", "one that does not")
@@ -296,7 +296,7 @@ def map_run(run: OpenRun, scene: Scene, pairs: Sequence[tuple[int, int]]) -> Ite
         yield made, score_map(run, scene, store, made)
 
 
-def _unfit(run: OpenRun, expected: str, found: str) -> ConfigError:
+def _unfit(run: TrainedRun, expected: str, found: str) -> ConfigError:
     return ConfigError(
         run.folder,
         expected=expected,
@@ -305,7 +305,7 @@ def _unfit(run: OpenRun, expected: str, found: str) -> ConfigError:
     )
 
 
-def _width(run: OpenRun) -> int:
+def _width(run: TrainedRun) -> int:
     return min(run.record.max_width, MAX_WIDTH)
 
 
@@ -313,7 +313,9 @@ def _shot(store: ImageStore, frame: Frame) -> Shot:
     return Shot(frame.name, store.camera(frame), frame.cam_from_world, frame.period)
 
 
-def score_map(run: OpenRun, scene: Scene, store: ImageStore, made: ChangeMap) -> dict[str, float]:
+def score_map(
+    run: TrainedRun, scene: Scene, store: ImageStore, made: ChangeMap
+) -> dict[str, float]:
     """How well a map tells changed pixels of test views from unchanged ones.
 
     The pixels of all views of the two periods are taken together. The baseline is the difference

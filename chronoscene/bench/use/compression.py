@@ -38,7 +38,7 @@ from chronoscene.bench.files.records import (
 )
 from chronoscene.bench.files.strategies import period_part
 from chronoscene.bench.score.scoring import score_run
-from chronoscene.bench.use.trained_run import OpenRun
+from chronoscene.bench.use.trained_run import TrainedRun
 from chronoscene.compression.columns import Columns
 from chronoscene.compression.file import COMPRESSED_FILE, META_FILE, TENSOR_FILE, encode
 from chronoscene.compression.positions import Grid, morton
@@ -69,7 +69,7 @@ Arrays = dict[str, NDArray[Any]]
 class _Part:
     """A model of a run, sorted along the Morton curve, and the views that it was trained on."""
 
-    run: OpenRun
+    run: TrainedRun
     frames: tuple[Frame, ...]
     store: ImageStore
     scratch: Path
@@ -82,7 +82,7 @@ class _Part:
         _save(self.scratch, tensors)
         model, run = self.run.load(self.scratch), self.run
         views = [run.view(self.store.camera(f), f.cam_from_world) for f in frames]
-        periods = [run.told(f.period) for f in frames]
+        periods = [run.model_period(f.period) for f in frames]
         return [model.render(v, p).rgb for v, p in zip(views, periods, strict=True)]
 
     def rounded(self, rules: Mapping[str, Columns]) -> Arrays:
@@ -108,7 +108,9 @@ class _Part:
         return float(np.mean(values))
 
 
-def compress_run(run: OpenRun, scene: Scene, *, max_loss: float | None, progress: Progress) -> Path:
+def compress_run(
+    run: TrainedRun, scene: Scene, *, max_loss: float | None, progress: Progress
+) -> Path:
     """Write a run beside another: its models compressed, its test views rendered by them, scored.
 
     Args:
@@ -160,7 +162,7 @@ def compress_run(run: OpenRun, scene: Scene, *, max_loss: float | None, progress
 
 @contextmanager
 def _opened(
-    run: OpenRun, period: int, frames: tuple[Frame, ...], store: ImageStore
+    run: TrainedRun, period: int, frames: tuple[Frame, ...], store: ImageStore
 ) -> Iterator[_Part]:
     model: Method = run.model(period)
     if not hasattr(model, "permute"):
@@ -254,7 +256,7 @@ def _sensitivity(
     return found
 
 
-def _score(run: OpenRun, scene: Scene, store: ImageStore, variant: str, runs: Path) -> None:
+def _score(run: TrainedRun, scene: Scene, store: ImageStore, variant: str, runs: Path) -> None:
     """Render the test views of a run whose folder has its models, and write its record."""
     writer, seconds = ImageWriter(run.folder / PREDICTIONS), 0.0
     frames = scene.select(split="test")

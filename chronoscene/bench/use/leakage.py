@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from chronoscene.bench.files.predictions import to_bytes
 from chronoscene.bench.files.records import Row
 from chronoscene.bench.score.regions import ALL, CHANGED, INVARIANT
-from chronoscene.bench.use.trained_run import OpenRun
+from chronoscene.bench.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
 from chronoscene.images.truth import UNCHANGED, load_changes, load_depth, load_other, truth_place
 from chronoscene.io.tables import Table
@@ -48,7 +48,7 @@ COLUMNS: dict[Key, tuple[str, int]] = {
 """Heading and decimals of what is measured, in the order of the table."""
 
 
-def measure_leakage(run: OpenRun, scene: Scene, truth: Path) -> Iterator[list[Row]]:
+def measure_leakage(run: TrainedRun, scene: Scene, truth: Path) -> Iterator[list[Row]]:
     """What one test view after the other shows at each period.
 
     Args:
@@ -68,7 +68,7 @@ def measure_leakage(run: OpenRun, scene: Scene, truth: Path) -> Iterator[list[Ro
 
 
 def _of_view(
-    run: OpenRun, store: ImageStore, frame: Frame, truth: Path, counted: Mask
+    run: TrainedRun, store: ImageStore, frame: Frame, truth: Path, counted: Mask
 ) -> list[Row]:
     camera, own, photo = store.camera(frame), frame.period, store.load(frame)
     rendered = [run.render(camera, frame.cam_from_world, p) for p in range(run.num_periods)]

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from chronoscene.bench.files.predictions import encode_png, to_bytes
 from chronoscene.bench.use.cameras import Shot
-from chronoscene.bench.use.trained_run import OpenRun
+from chronoscene.bench.use.trained_run import TrainedRun
 from chronoscene.errors import ConfigError
 from chronoscene.images.animation import SUFFIXES, write_animation
 from chronoscene.io.staging import staged_folder
 
 
 def check_shots(
-    run: OpenRun, shots: Sequence[Shot], out: Path, appearance_period: float | None
+    run: TrainedRun, shots: Sequence[Shot], out: Path, appearance_period: float | None
 ) -> None:
     """Find out before long work that it cannot be done.
 
@@ -48,7 +48,7 @@ def is_animation(out: Path) -> bool:
 
 
 def render_shots(
-    run: OpenRun, shots: Sequence[Shot], *, appearance_period: float | None = None
+    run: TrainedRun, shots: Sequence[Shot], *, appearance_period: float | None = None
 ) -> Iterator[NDArray[np.uint8]]:
     """One picture after the other. [H, W, 3]"""
     for shot in shots:

@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from chronoscene.bench.use.changes import ChangeMap, changes_csv, changes_table, map_run
-from chronoscene.bench.use.trained_run import OpenRun, open_run
+from chronoscene.bench.use.trained_run import TrainedRun, open_run
 from chronoscene.cli.options import DEVICE, RUN, SCENE
 from chronoscene.cli.output import emit, tell_written, terminal_width
 from chronoscene.cli.progress import tracked
@@ -83,7 +83,7 @@ def usual_pairs(periods: int) -> list[tuple[int, int]]:
     return list(combinations(numbers, 2) if periods <= _ALL_PAIRS else pairwise(numbers))
 
 
-def _pair(run: OpenRun, *names: str) -> tuple[int, int]:
+def _pair(run: TrainedRun, *names: str) -> tuple[int, int]:
     """Two whole periods in their order."""
     first, second = sorted(run.parse_period(name) for name in names)
     if first == second or not (first.is_integer() and second.is_integer()):

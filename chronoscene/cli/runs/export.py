@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.use.export import export_gaussians, measure_loss
+from chronoscene.bench.use.export import measure_loss
 from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli.options import DEVICE, RUN, SCENE, STAGE
 from chronoscene.cli.output import check_file, emit, tell_written
@@ -46,7 +46,7 @@ def command(
     announce("read the scene")
     trained_on = run.scene(scene)
     announce("export")
-    gaussians = export_gaussians(run, trained_on, wanted)
+    gaussians = run.gaussians(wanted, scene=trained_on)
     write_gaussians(out, gaussians)
     announce("measure")
     loss = measure_loss(run, trained_on, wanted, gaussians)

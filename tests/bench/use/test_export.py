@@ -12,7 +12,6 @@ from click.testing import CliRunner
 from plyfile import PlyData
 
 from chronoscene.bench.files.predictions import to_bytes
-from chronoscene.bench.use.export import export_gaussians
 from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli import cli
 from chronoscene.errors import CheckpointError, ConfigError, DiskFullError
@@ -145,17 +144,9 @@ def test_an_earlier_stage_is_exported_from_the_views_that_it_saw(bench_here, tmp
     run = open_run(folder, stage=0)
     scene = run.scene()
     own = [frame for frame in scene.frames if frame.period == 0]
-    alone = export_gaussians(
-        run,
-        scene.with_frames(
-            [
-                frame if frame in own else dataclasses.replace(frame, split="test")
-                for frame in scene.frames
-            ]
-        ),
-        0,
-    )
-    whole = export_gaussians(run, scene, 0)
+    tests = [f if f in own else dataclasses.replace(f, split="test") for f in scene.frames]
+    alone = run.gaussians(0, scene=scene.with_frames(tests))
+    whole = run.gaussians(0, scene=scene)
     np.testing.assert_array_equal(whole.sh_coeffs, alone.sh_coeffs)
     pictures = tmp_path / "pictures"
     arguments = ["render", str(folder), "--period", "0", "--out", str(pictures), "--stage", "0"]

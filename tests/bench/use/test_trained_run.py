@@ -12,7 +12,7 @@ from chronoscene.bench.files.predictions import load_image, read_manifest, to_by
 from chronoscene.bench.files.records import CONFIG_FILE, PREDICTIONS, SOURCE_FILE
 from chronoscene.bench.plan.plan import BenchSettings
 from chronoscene.bench.run.runner import run_bench
-from chronoscene.bench.use.trained_run import OpenRun, open_run
+from chronoscene.bench.use.trained_run import TrainedRun, open_run
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
 
 STRATEGIES = ("joint", "pooled", "separate")
@@ -22,7 +22,7 @@ def folder_of(runs: Path, strategy: str = "joint") -> Path:
     return runs / "ring" / f"mean-{strategy}-balanced" / "seed0"
 
 
-def assert_renders_its_predictions(run: OpenRun) -> None:
+def assert_renders_its_predictions(run: TrainedRun) -> None:
     frames = {frame.name: frame for frame in run.scene().frames}
     entries = read_manifest(run.folder / PREDICTIONS).images
     assert len(entries) == 3
