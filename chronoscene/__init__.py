@@ -18,13 +18,17 @@ _os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 __version__ = "0.1.0"
 
 __all__ = [
+    "BenchmarkResult",
     "Camera",
     "ChronoSceneError",
     "Frame",
+    "GaussianCloud",
     "Scene",
     "SceneReport",
+    "ScoredView",
     "Statistics",
     "TrainedRun",
+    "benchmark",
     "open_run",
     "read_scene",
     "statistics",
@@ -34,13 +38,17 @@ __all__ = [
 
 if _typing.TYPE_CHECKING:
     from chronoscene.api import (
+        BenchmarkResult,
         Camera,
         ChronoSceneError,
         Frame,
+        GaussianCloud,
         Scene,
         SceneReport,
+        ScoredView,
         Statistics,
         TrainedRun,
+        benchmark,
         open_run,
         read_scene,
         statistics,

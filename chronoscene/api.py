@@ -6,16 +6,28 @@ version to the next.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from chronoscene.bench.files.records import ROWS_FILE, Failure
+from chronoscene.bench.files.strategies import STRATEGIES
+from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.stop import parse_duration
+from chronoscene.bench.report.summary import ENTRY_COLUMNS, read_with_rows, summarise
+from chronoscene.bench.run.runner import run_bench
+from chronoscene.bench.score.views import ScoredView
 from chronoscene.bench.use.trained_run import TrainedRun, open_run
 from chronoscene.checks import check_choice
 from chronoscene.errors import ChronoSceneError, SceneError
 from chronoscene.formats import read_scene
+from chronoscene.images.store import MAX_WIDTH
+from chronoscene.io.log import Log
+from chronoscene.kernels.runtime import check_device
+from chronoscene.methods import as_typed
 from chronoscene.scene import Camera, Frame, Scene
+from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.stats.counts import COUNT_RULES, CountRule
 from chronoscene.stats.measures import measure_scene
 from chronoscene.validation.rule import SceneReport
@@ -26,13 +38,17 @@ if TYPE_CHECKING:
     from pandas import DataFrame, Series
 
 __all__ = [
+    "BenchmarkResult",
     "Camera",
     "ChronoSceneError",
     "Frame",
+    "GaussianCloud",
     "Scene",
     "SceneReport",
+    "ScoredView",
     "Statistics",
     "TrainedRun",
+    "benchmark",
     "open_run",
     "read_scene",
     "statistics",
@@ -149,3 +165,113 @@ def _between(periods: DataFrame, shares: Sequence[Sequence[float | None]]) -> Da
     import pandas as pd
 
     return pd.DataFrame(shares, periods.index, periods.index, dtype=float)
+
+
+@dataclass(frozen=True, slots=True)
+class BenchmarkResult:
+    """Finished and failed runs of `benchmark`."""
+
+    runs: tuple[Path, ...]
+    """Folders of the finished runs, which `open_run` takes."""
+    failures: tuple[Failure, ...]
+    """Runs without a result; ``failure.reason`` names the error."""
+
+    def table(self, metrics: Sequence[str] = ()) -> DataFrame:
+        """Return means over seeds with spread and intervals, as ``chronoscene table`` shows them.
+
+        Args:
+            metrics: Names of the metrics wanted; all if empty.
+
+        Returns:
+            One row per scene, method, quantity and column (``period 0``, ``macro``, ...);
+            `chronoscene.bench.report.summary.ENTRY_COLUMNS` describes the columns.
+        """
+        records = [read_with_rows(folder) for folder in self.runs]
+        return summarise(records, metrics)[[*ENTRY_COLUMNS]]
+
+    def rows(self) -> DataFrame:
+        """Return the values of single test views: one row per run, view, region and metric."""
+        import pandas as pd
+
+        tables = [pd.read_csv(folder / ROWS_FILE) for folder in self.runs]
+        return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+
+def benchmark(
+    scenes: str | Path | Sequence[str | Path],
+    methods: str | Sequence[str],
+    *,
+    out: str | Path,
+    preset: str = "balanced",
+    iterations: int | None = None,
+    budget: str | float | None = None,
+    seeds: Sequence[int] = (0,),
+    strategies: str | Sequence[str] = "joint",
+    overrides: Mapping[str, object] | None = None,
+    max_width: int = MAX_WIDTH,
+    device: str = "auto",
+    threads: int | None = None,
+    jobs: int | None = None,
+    overwrite: bool = False,
+    format: str | None = None,
+    period_by: str | None = None,
+    log: Log | None = None,
+) -> BenchmarkResult:
+    """Train methods on scenes, render the test views and score them, as ``chronoscene bench`` does.
+
+    Finished runs in ``out`` are kept, so the same call resumes after an interruption. Each run is
+    trained in a process of its own.
+
+    Args:
+        scenes: Folders of scenes, or one of them.
+        methods: Names, or ``module:SPEC``.
+        out: Folder of runs.
+        preset: Preset of the methods.
+        iterations: Training steps; None for those of the preset.
+        budget: End of the training by the clock: seconds, or a text such as ``5m``. Schedules
+            follow the clock then, and equal seeds do not give equal models.
+        seeds: Each method is trained once per seed.
+        strategies: One or several of ``joint``, ``pooled``, ``separate`` and ``sequential``.
+        overrides: Options of the methods: ``key`` for all methods, ``method.key`` for one.
+        max_width: Wider images are scaled down to this width in pixels.
+        device: ``auto``, ``cpu`` or ``cuda``.
+        threads: Threads per run; None for all cores.
+        jobs: Number of runs at a time; None for one.
+        overwrite: Replace finished runs that were made with other settings.
+        format: Name of the dataset format of the scenes; None to detect it.
+        period_by: Grouping of images into periods, for formats with a choice.
+        log: Function that takes lines about the progress; None for silence.
+
+    Raises:
+        ChronoSceneError: If anything asked for is wrong; nothing is trained then. Failures during
+            a run are in the result instead.
+
+    Example:
+        >>> result = benchmark("data/plaza", ["chronogs", "3dgs"], out="runs", budget="90s")
+        >>> result.table(["psnr"])
+    """
+    check_device(device)
+    settings = BenchSettings(
+        scenes=tuple(map(Path, [scenes] if isinstance(scenes, str | Path) else scenes)),
+        methods=_several(methods),
+        runs=Path(out),
+        preset=preset,
+        iterations=iterations,
+        budget_seconds=parse_duration(budget, "budget") if isinstance(budget, str) else budget,
+        seeds=tuple(seeds),
+        strategies=tuple(check_choice("strategy", s, STRATEGIES) for s in _several(strategies)),
+        overrides={key: as_typed(value) for key, value in (overrides or {}).items()},
+        max_width=max_width,
+        device=device,
+        threads=threads,
+        jobs=jobs,
+        overwrite=overwrite,
+        dataset_format=format,
+        period_by=period_by,
+    )
+    outcome = run_bench(settings, log or (lambda line: None))
+    return BenchmarkResult(outcome.finished, outcome.failures)
+
+
+def _several(names: str | Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
