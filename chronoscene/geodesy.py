@@ -28,8 +28,8 @@ class Georeference:
     height: float
     """Metres, of the origin, in the sense of ``height_kind``."""
     height_kind: HeightKind
-    """``as stated`` (sea level or ellipsoid: cameras do not say), ``relative`` (above take-off, by
-    the barometer) or ``none`` (unknown: all are set to zero)."""
+    """``as stated`` (above sea level or the ellipsoid: photos do not state which), ``relative``
+    (above take-off, by the barometer) or ``none`` (unknown: all are set to zero)."""
 
     @property
     def crs(self) -> str:
@@ -60,7 +60,7 @@ def from_crs(crs: str | None) -> Georeference | None:
     if found is None:
         return None
     latitude, longitude, height = (float(value) for value in found.groups())
-    return Georeference(latitude, longitude, height, "as stated")
+    return Georeference(latitude, longitude, height, height_kind="as stated")
 
 
 def median_longitude(degrees: Array) -> float:

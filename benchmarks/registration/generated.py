@@ -16,7 +16,7 @@ import numpy as np
 from chronoscene.arrays import Array, Ints, Mask
 from chronoscene.geodesy import Georeference
 from chronoscene.registration.quality.misalignment import measure, transfers
-from chronoscene.registration.quality.rays import Rays, place, rays_at
+from chronoscene.registration.quality.rays import TrackRays, place, rays_at
 from chronoscene.registration.reconstruct.estimation import cross_matches
 from chronoscene.registration.result import HeldOutTracks, Registered
 from chronoscene.scene import Camera
@@ -384,7 +384,7 @@ def _by_ties(model: Registered, seen: _Sightings, a: int, b: int) -> Sim3 | None
     return refined.similarity.inverse() @ first
 
 
-def replace_poses(rays: Rays, poses: Array) -> Rays:
+def replace_poses(rays: TrackRays, poses: Array) -> TrackRays:
     """Return the observations with the poses of moved cameras."""
     return replace(rays, pose=poses[rays.image])
 

@@ -66,7 +66,7 @@ def judged(
             continue
         r, c = rotation[mine], 100 * centre[mine] / extent
         rows.append((np.median(r), r.max(), np.median(c), c.max()))
-    reason = verdict.findings[0].check if verdict.findings else ""
+    reason = verdict.objections[0].check if verdict.objections else ""
     return Outcome(family, route, tuple(rows), verdict.level, reason, seconds)
 
 
@@ -108,5 +108,6 @@ def print_outcome(outcome: Outcome, inspection: Inspection) -> None:
             f"  period {p}: rotation {row[0]:.4f} (largest {row[1]:.4f}) degrees, centre "
             f"{row[2]:.4f} (largest {row[3]:.4f}) % of the extent"
         )
-    findings = "; ".join(f"{f.check} {f.place}: {f.found}" for f in inspection.verdict.findings[:2])
-    print(f"  verdict {outcome.verdict} {findings}", flush=True)
+    first = inspection.verdict.objections[:2]
+    reasons = "; ".join(f"{o.check} {o.place}: {o.found}" for o in first)
+    print(f"  verdict {outcome.verdict} {reasons}", flush=True)

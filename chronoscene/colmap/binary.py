@@ -42,7 +42,7 @@ KEYPOINT = np.dtype([("xy", "<f8", 2), ("point_id", "<i8")])  # A keypoint of an
 POINT_HEAD = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
-"""What stands before the track of a point."""
+"""Fields of a point before its track."""
 
 _COUNT = struct.Struct("<Q")
 _CAMERA_HEAD, _IMAGE_HEAD = struct.Struct("<iiQQ"), struct.Struct("<i7di")
@@ -128,7 +128,7 @@ def read_rigs(folder: Path) -> RawRigs | None:
 
 
 class _RecordError(Exception):
-    """What is wrong with a record."""
+    """Problem of a record."""
 
 
 class _Reader:
@@ -139,7 +139,7 @@ class _Reader:
         self.at = 0
         """Bytes read so far."""
         self.index: int | None = None
-        """Of the current record; None before the first."""
+        """Index of the current record; None before the first."""
         self.kind = ""
         self.parts = ""
         """Number of parts that the current record announces, for messages."""

@@ -50,7 +50,7 @@ class PosedImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """What a COLMAP model says, without periods."""
+    """Registered images and points of a COLMAP model, without periods."""
 
     images: tuple[PosedImage, ...]
     """Registered images, sorted by name."""

@@ -83,7 +83,7 @@ CAMERA = 0  # Type of the sensors that are cameras
 
 @dataclass(frozen=True, slots=True)
 class RawFrame:
-    """Where a rig was when its images were taken."""
+    """Pose of a rig when its images were taken."""
 
     frame_id: int
     rig_id: int
@@ -103,7 +103,7 @@ class RawRigs:
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """Why a file of the model, or a line of it, cannot be read."""
+    """A file of the model, or a line of it, that cannot be read."""
 
     file: str
     """Name of the file, with a line number for text (``cameras.txt:3``)."""
@@ -135,7 +135,7 @@ class RawModel:
 
 
 def model_files(folder: Path) -> dict[str, str]:
-    """Which file counts for each stem. A complete binary model wins, then a complete text one."""
+    """File to read for each stem. A complete binary model wins, then a complete text one."""
     forms = [
         {stem: stem + form for stem in MODEL_FILES if (folder / (stem + form)).is_file()}
         for form in FORMS
@@ -154,7 +154,7 @@ def numbered_models(folder: Path) -> list[Path]:
 
 
 def model_kind(folder: Path) -> Literal["binary", "text"] | None:
-    """Which form of a complete model a folder has; binary wins, as in COLMAP."""
+    """Form of the complete model in a folder; binary wins, as in COLMAP."""
     files = model_files(folder)
     forms = {Path(file).suffix for file in files.values()}
     if len(files) < len(MODEL_FILES) or len(forms) > 1:

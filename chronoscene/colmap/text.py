@@ -153,7 +153,7 @@ def read_points(path: Path) -> RawPoints:
 
 
 def read_rigs(folder: Path) -> RawRigs | None:
-    """``rigs.txt`` and ``frames.txt``; None where one is absent or damaged (COLMAP will say so)."""
+    """``rigs.txt`` and ``frames.txt``; None where one is absent or damaged (COLMAP reports it)."""
     rigs, frames = folder / "rigs.txt", folder / "frames.txt"
     if not (rigs.is_file() and frames.is_file()):
         return None

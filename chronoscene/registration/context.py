@@ -1,4 +1,4 @@
-"""What all stages of a run share: options, the work folder, and its state."""
+"""Options of a registration, and the work folder that all of its stages share."""
 
 from __future__ import annotations
 
@@ -21,39 +21,39 @@ EXHAUSTIVE_LIMIT = 60  # Images; at most 1,770 pairs
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to register."""
+    """Options of a registration."""
 
     route: Route | None = None
     """None to choose: joint if matches connect the periods, else separate."""
     work: Path | None = None
     """Folder for intermediate results, kept between runs; None for ``<out>.work``."""
     overwrite: bool = False
-    """Whether an earlier registration at the output path may be replaced."""
+    """True to replace an earlier registration at the output path."""
     max_image_size: int = 1600
     """Pixels; larger photos are downscaled for feature extraction."""
     max_features: int = 5000
-    """Of each photo."""
+    """Features kept of each photo."""
     exhaustive_limit: int = EXHAUSTIVE_LIMIT
-    """Up to so many photos, all pairs are matched."""
+    """Number of photos up to which all pairs are matched."""
     held_out: float = 0.1
     """Share of the tracks across periods that take no part in the estimation."""
     camera_model: str = "SIMPLE_RADIAL"
     """COLMAP's camera model for the photos."""
     calibration: Calibration = "auto"
-    """Whether periods that used the same camera share its calibration."""
+    """Sharing of calibrations between periods that used the same camera."""
     threads: int | None = None
     """None for one per processor. With 1, every run gives bit-identical results."""
     seed: int = 0
-    """Of the draw of held-out tracks."""
+    """Seed of the draw of held-out tracks."""
     tie_points: Path | None = None
     """File of tie points or ground control."""
     tie_scale: float = 1.0
     """Size of these photos divided by that of the photos that were clicked in."""
     page: bool = False
-    """Whether to write ``registration.html``."""
+    """True to write ``registration.html``."""
 
     def work_folder(self, out: Path) -> Path:
-        """Where intermediate results of a scene are."""
+        """Folder of the intermediate results of a scene."""
         return (self.work or Path(f"{out.resolve()}.work")).resolve()
 
     def record(self) -> dict[str, Any]:

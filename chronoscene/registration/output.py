@@ -1,4 +1,4 @@
-"""What a registration writes: a scene in the ChronoScene format, and files about it beside it."""
+"""Output of a registration: a scene in the ChronoScene format, and files about it beside it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PAGE = "registration.html"
 
 
 def as_scene(registered: Registered, name: str) -> Scene:
-    """A scene with the cameras as they are; periods without a registered image are left out."""
+    """Make a scene with distorted cameras; periods without a registered image are left out."""
     present = sorted(set(registered.periods.tolist()))
     number = {period: i for i, period in enumerate(present)}
     periods = {
@@ -195,10 +195,10 @@ def inspect_registration(
     Args:
         model: The registration, after alignment by tie points.
         folder: An existing folder.
-        page: Whether to write the page.
+        page: True to write the page.
         ties: Result of the alignment by tie points.
         tie_points: Clicked points that count as ties.
-        title: Of the page; None for the name of the folder.
+        title: Title of the page; None for the name of the folder.
     """
     model = model if tie_points is None else with_tie_tracks(model, tie_points)
     certificate = certify(model)

@@ -120,11 +120,11 @@ def _stage_scene(registered: Registered, inputs: Inputs, name: str, context: Con
             context.report("images", done, total)
 
     counts = output.write_scene(scene, staged, progress=progress)
-    told = [", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())]
+    remarks = [", ".join(f"{v} {k.replace('_', ' ')}" for k, v in counts.items())]
     if old is not None:
         kept = copy_poses(old.root / "sparse/0", staged / "sparse/0")
-        told.append(f"poses of {kept} images copied unchanged")
-    context.stages.remark("scene", *told)
+        remarks.append(f"poses of {kept} images copied unchanged")
+    context.stages.remark("scene", *remarks)
     return staged
 
 

@@ -89,7 +89,7 @@ class Registered:
     gps_enu: NDArray[np.float64]
     """GPS position of each photo in the frame of the model, plausible or not; else NaN. [N, 3]"""
     gps_used: NDArray[np.bool_]
-    """Whether the position took part in the estimation. [N]"""
+    """True if the position took part in the estimation. [N]"""
     georeference: Georeference | None
     """None if the frame is arbitrary, and with it its scale."""
     num_periods: int

@@ -231,7 +231,7 @@ def run_step(
 
 def _check_space(folder: Path) -> None:
     """Raise an error if there is hardly any space: libraries abort where they cannot write, and the
-    log cannot say why."""
+    log does not give the reason."""
     free = shutil.disk_usage(folder).free
     if free < LEAST_SPACE:
         raise DiskFullError(

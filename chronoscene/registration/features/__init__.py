@@ -4,5 +4,5 @@
 """
 
 METHOD = "OpenCV RootSIFT 2"
-"""How features and matches are computed. Change it when they come out differently: what earlier
-versions computed is then not reused, because features of two kinds match each other less well."""
+"""Name of the algorithms for features and matches. Change it when their results change: results of
+earlier versions are then not reused, because features of two kinds match each other less well."""

@@ -11,16 +11,16 @@ from chronoscene.registration.photos.photo import Capture
 from chronoscene.scene import Frame, Scene
 
 MIN_PHOTOS = 20
-"""Photos with which a camera is calibrated for each date alone. Lenses are refocused and dropped
-between dates; but few photos, of flat ground from one height above all, leave the focal length
-open, and calibrate worse than last year's lens fits."""
+"""Photos from which on a camera is calibrated for each date alone. Lenses are refocused and dropped
+between dates; but few photos, above all of flat ground from one height, do not determine the focal
+length, and a calibration of another date fits better."""
 
 SAME_VISIT = timedelta(days=1)
-"""Periods that follow each other within this time share what was not touched in between."""
+"""Time between periods up to which they count as one visit, with one calibration."""
 
 
 def scene_groups(scene: Scene) -> list[dict[str, Any]]:
-    """The cameras of a scene with their images, as they are."""
+    """Group the images of a scene by camera, for `extraction.extract`."""
     by_camera: dict[int, list[Frame]] = {}
     for frame in scene.frames:
         by_camera.setdefault(frame.camera.camera_id, []).append(frame)
@@ -37,7 +37,7 @@ def scene_groups(scene: Scene) -> list[dict[str, Any]]:
 def camera_groups(
     captures: Sequence[Capture], model: str, calibration: Calibration = "auto"
 ) -> list[dict[str, Any]]:
-    """Lists of names that share a camera, for `features.extraction.extract`.
+    """Group photos that share a camera, for `extraction.extract`.
 
     Photos share one if make, model, size and focal length agree. With ``auto``, photos of different
     visits do not, where each has enough of them (`MIN_PHOTOS`). Initial focal lengths are
@@ -66,7 +66,7 @@ def _periods(captures: Sequence[Capture]) -> list[list[Capture]]:
 
 
 def _visits(captures: Sequence[Capture]) -> list[list[Capture]]:
-    """The photos of each visit that has enough of them, and those of all others together."""
+    """Group photos by visit; visits with too few photos form one group."""
     visits: list[list[Capture]] = []
     undated = []
     dated: list[tuple[datetime, datetime, list[Capture]]] = []

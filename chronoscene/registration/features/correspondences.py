@@ -1,4 +1,4 @@
-"""Second stage: features, matches, and what of them is held out."""
+"""Second stage: features, verified matches and held-out tracks, each step done once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from chronoscene.registration.photos.inputs import Inputs
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matched:
-    """What is known of the photos before any pose."""
+    """Counts of features and matches, by which the route is chosen."""
 
     keypoints: Mapping[str, int]
     """Number of features by name."""
@@ -26,7 +26,7 @@ class Matched:
 
 
 def find_matches(inputs: Inputs, context: Context) -> Matched:
-    """Extract, match and hold out; each is done once."""
+    """Extract features, match photos, and hold out tracks, unless an earlier run did."""
     features = _features(inputs, context)
     found = _matches(inputs, context)
     return Matched(
@@ -101,17 +101,17 @@ def _matches(inputs: Inputs, context: Context) -> dict[str, Any]:
         found = context.step("matches", settings | places)
         kinds = ", ".join(f"{n} {kind}" for kind, n in found["kinds"].items())
         pairs, verified, inliers = (found[k] for k in ("pairs", "verified", "inliers"))
-        told = [
+        remarks = [
             f"{pairs} pairs ({kinds}), {found['across_periods']} across periods",
             f"{verified} of {pairs} pairs verified, {inliers} matches",
             *_reused(found["carried"], pairs, "pairs: matches"),
             f"{found['held_out']} of {found['tracks_of_several_periods']} tracks of several "
             "periods held out",
         ]
-        told += [
+        remarks += [
             f"periods {key}: {count} verified pairs, {found['matches_across'][key]} matches"
             for key, count in found["verified_pairs_across"].items()
         ]
-        return found, told
+        return found, remarks
 
     return dict(context.stages.run("matches", settings, match))

@@ -1,4 +1,4 @@
-"""What the steps read from COLMAP's database, and lists of pairs. Worker process only."""
+"""Reading COLMAP's database, and files of image pairs. Worker process only."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ SEED = 0
 
 
 def quiet() -> None:
-    """Keep COLMAP's progress out of the log, and make its random numbers the same every time."""
+    """Silence COLMAP's progress messages, and seed its random numbers."""
     pycolmap.logging.minloglevel = 2
     pycolmap.set_random_seed(SEED)
 
 
 def read_pairs(path: Path) -> list[tuple[str, str]]:
-    """Pairs of names from a file that `write_pairs` wrote."""
+    """Read pairs of names from a file that `write_pairs` wrote."""
     lines = path.read_text(encoding="utf-8").splitlines()
     return [(a, b) for a, b in (line.split(" ") for line in lines)]
 
 
 def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
-    """Write pairs of names, one a line; COLMAP cuts at blanks, so names must have none."""
+    """Write pairs of names, one per line. COLMAP splits at blanks, so names must have none."""
     write_text_atomic(path, "".join(f"{a} {b}\n" for a, b in pairs))
 
 

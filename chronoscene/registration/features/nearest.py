@@ -23,7 +23,7 @@ MAX_RATIO = 0.8
 MAX_DISTANCE = 0.7
 """COLMAP's, in lengths of a descriptor, which is 512."""
 
-PAIRS = 64  # Of the 128 numbers of a descriptor
+PAIRS = 64  # Pairs of numbers in a descriptor
 COLUMNS = 2 * LANES  # Descriptors that a product reads side by side
 CHUNK = 512  # Descriptors that a cache holds while all queries pass by; a multiple of COLUMNS
 NOWHERE = -(2**30)  # Minus the squared length of what fills up the last columns
@@ -34,7 +34,7 @@ _RATIO = np.float32(1 / MAX_RATIO**2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Descriptors:
-    """Those of an image, and the same arranged to be searched."""
+    """Descriptors of an image, also in the memory layout of the search."""
 
     values: NDArray[np.uint8]
     """[N, 128]"""
@@ -56,14 +56,14 @@ class Descriptors:
 
 
 def mutual_matches(first: Descriptors, second: Descriptors) -> NDArray[np.uint32]:
-    """Pairs of descriptors that are each other's nearest, by far in both directions.
+    """Match descriptors that are mutual nearest neighbours and pass the ratio test both ways.
 
-    One with two nearest at the same distance has no match. Where an image has one descriptor, there
-    is no second nearest, and the ratio is not tested.
+    A descriptor with two nearest neighbours at the same distance has no match. The ratio is not
+    tested where the other image has a single descriptor.
 
     Args:
-        first: Of one image, N of them.
-        second: Of the other.
+        first: Descriptors of one image.
+        second: Descriptors of the other.
 
     Returns:
         Indices, sorted by the first. [M, 2]
@@ -85,7 +85,7 @@ def _squares(values: NDArray[np.uint8]) -> Integers:
 def _nearest(
     queries: NDArray[np.uint8], searched: Descriptors
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Nearest of the searched descriptors, and whether it passes distance and ratio. [Q], [Q]"""
+    """Index of the nearest descriptor, and True where it passes both tests. [Q], [Q]"""
     padded = np.zeros((-(-len(queries) // ROW_TILE) * ROW_TILE, 2 * PAIRS), np.int16)
     padded[: len(queries)] = queries
     found = np.empty((3, len(padded)), np.int32)

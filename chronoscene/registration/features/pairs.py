@@ -1,4 +1,4 @@
-"""Which pairs of images to match. Worker process only.
+"""Choice of the image pairs to match. Worker process only.
 
 Few images are matched exhaustively. Many are matched with their neighbours in space (by GPS), in
 time (by the order in which they were taken) and in appearance (by a global descriptor), within
@@ -25,7 +25,7 @@ from chronoscene.registration.features.database import quiet, write_pairs
 SPATIAL_NEIGHBOURS = 10
 SEQUENTIAL_NEIGHBOURS = 4
 SIMILAR_NEIGHBOURS = 6
-"""Of each image in its period, and again in every other period (but for the sequence)."""
+"""Neighbours of each image in its period and, except in the sequence, in every other period."""
 
 WORDS = 64
 MAX_TRAINING = 20_000
@@ -36,7 +36,7 @@ Pair = tuple[int, int]
 
 
 def choose_pairs(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
-    """Write the list of pairs to match.
+    """Choose the pairs to match, and write their list.
 
     Arguments: ``database``, ``pairs`` (list file), ``images`` (each with ``name``, ``period``,
     ``enu`` or null, ``taken`` or null), ``exhaustive_limit``.

@@ -43,20 +43,20 @@ rows; descriptors [K, 128]."""
 
 
 def photos_at_once(max_image_size: int, threads: int) -> int:
-    """How many photos the memory allows, and the threads."""
+    """Number of photos that threads and memory allow at a time."""
     return max(1, min(threads, MEMORY // (PYRAMID_BYTES * max_image_size**2)))
 
 
 def sift_features(
     path: Path, max_image_size: int, max_features: int, mask_path: Path | None = None
 ) -> Features:
-    """Features of a photo: first those that are not faint, of each kind the largest first.
+    """Detect and describe features: strong ones before faint ones, each by decreasing size.
 
     Args:
-        path: Of the photo. Orientation tags are not applied.
+        path: Photo. Orientation tags are not applied.
         max_image_size: Pixels; a photo with a longer side is scaled down to it.
-        max_features: How many are kept of those found, in this order.
-        mask_path: Of its mask, if it has one: there are no features where it is 0.
+        max_features: Number of features to keep, in this order.
+        mask_path: Mask of the photo, if there is one: no features are found where it is 0.
     """
     with Image.open(path) as image:
         image.draft("L", image.size)  # of a JPEG, colours need not be decoded

@@ -1,4 +1,4 @@
-"""What to register: the photos of each period, with their metadata.
+"""The photos of each period, with their metadata.
 
 Three forms are read: a folder with one folder for each period, one folder of photos (periods are
 proposed from their dates), and a CSV table of image and period.
@@ -187,8 +187,8 @@ def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Capt
     )
     _check_names(root, images)
     shown = ", ".join(f"{i} = {p.label} ({p.date or 'no date'})" for i, p in enumerate(periods))
-    told = (*remarks, f"periods: {shown}")
-    return Captures(root, tuple(images), periods, tuple(refused), told)
+    remarks = [*remarks, f"periods: {shown}"]
+    return Captures(root, tuple(images), periods, tuple(refused), tuple(remarks))
 
 
 def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:

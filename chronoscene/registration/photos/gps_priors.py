@@ -1,4 +1,4 @@
-"""Which GPS positions of photos are plausible, and the local frame around them."""
+"""Plausible GPS positions of photos, in a local frame around them."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _heights(
 def _plausible(
     captures: Sequence[Capture], enu: NDArray[np.float64], has: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Which positions are no gross errors, and remarks on the others."""
+    """Mask of the positions without gross errors, and remarks on the others."""
     distance = np.linalg.norm(enu[:, :2] - np.median(enu[has][:, :2], axis=0), axis=1)
     limit = max(GROSS_METRES, GROSS_FACTOR * float(np.median(distance[has])))
     wild = has & ~(np.nan_to_num(distance, nan=0.0) <= limit)

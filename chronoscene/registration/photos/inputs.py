@@ -54,18 +54,18 @@ class Inputs:
     images: tuple[Capture, ...]
     """New photos under their final names, sorted."""
     periods: dict[str, int]
-    """Of all photos, by name."""
+    """Period of every photo, by name."""
     labels: tuple[str, ...]
     dates: tuple[str | None, ...]
     refused: dict[str, tuple[int, str]]
     """Period and reason of photos that cannot be used, by name."""
     positions: Positions
-    """Of ``images``."""
+    """GPS positions of ``images``."""
     georeference: Georeference | None
 
     @property
     def frames(self) -> tuple[Frame, ...]:
-        """Those of the scene that is extended."""
+        """Frames of the scene that is extended."""
         return self.scene.frames if self.scene else ()
 
     def totals(self) -> list[int]:
@@ -83,7 +83,7 @@ class Inputs:
         }
 
     def centres(self) -> dict[str, list[float]]:
-        """Where images were taken, as far as known, in one frame."""
+        """Known positions of images, in one frame, by name."""
         known = {f.name: camera_centre(f.cam_from_world).tolist() for f in self.frames}
         if self.scene is None or self.georeference is not None:
             known |= self.priors()["enu"]
@@ -98,8 +98,8 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
         SceneError: If the scene has distortion.
     """
     stages = context.stages
-    told = [f"{name}: {reason}" for name, _, reason in captures.refused]
-    stages.remark("captures", *captures.remarks, *told)
+    refused = [f"{name}: {reason}" for name, _, reason in captures.refused]
+    stages.remark("captures", *captures.remarks, *refused)
     digests = content_digests(captures.images)
     unique = drop_copies(captures.images, digests)
     _check_enough(captures, unique.captures, scene, context)
@@ -143,7 +143,7 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
 
 
 def _mask_inputs(mask: Path | None) -> list[str]:
-    """What the first stage depends on: nothing without a mask."""
+    """Path and digest of a mask, on which the first stage depends."""
     return [] if mask is None else [str(mask.resolve()), sha256_of(mask)]
 
 
@@ -192,7 +192,7 @@ def _place(
     """Put photos, those of the scene, and their masks where the steps find them."""
     for folder in (context.photos, context.work / MASKS):
         shutil.rmtree(folder, ignore_errors=True)
-    names, told = place_photos(captures, context.photos)
+    names, notes = place_photos(captures, context.photos)
     masks = dict(zip(names, (c.mask for c in captures), strict=True))
     for frame in scene.frames if scene else ():
         assert scene is not None
@@ -203,8 +203,8 @@ def _place(
     for name, mask in found.items():
         place_image(mask, context.work / mask_place(name), "symlink")
     if found:
-        told.append(f"masks of {len(found)} photos: no features where they are 0")
-    return names, [*remarks, *told]
+        notes.append(f"masks of {len(found)} photos: no features where they are 0")
+    return names, [*remarks, *notes]
 
 
 def _locate(
@@ -317,7 +317,7 @@ def renamed(captures: Sequence[Capture], names: Sequence[str]) -> tuple[Capture,
 
 
 def _is_plain(path: Path) -> bool:
-    """Whether COLMAP reads a file in colour, as it is stored."""
+    """Return True if COLMAP reads a file in colour, as it is stored."""
     with Image.open(path) as image:
         plain = image.mode in _PLAIN_MODES and getattr(image, "n_frames", 1) == 1
         turned_tiff = image.format == "TIFF" and image.getexif().get(_ORIENTATION, 1) != 1

@@ -83,7 +83,7 @@ def open_photo(path: Path, name: str, period: int) -> Capture | str:
 
 
 def is_panorama(path: Path) -> bool:
-    """Whether GPano metadata declare an equirectangular or cylindrical projection."""
+    """Return True if GPano metadata declare an equirectangular or cylindrical projection."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     return re.search(rb"GPano:ProjectionType\W{1,4}(equirectangular|cylindrical)", head) is not None
@@ -101,4 +101,10 @@ def _position(exif: ExifData) -> Gps | None:
             east, north, up = drone.rtk_std
             # Stated deviations are of the antenna at the fix, not at the shutter: at least 2 cm.
             sigma = (max(east, 0.02), max(north, 0.02), max(up, 0.03))
-    return Gps(exif.latitude, exif.longitude, exif.altitude, relative, sigma)
+    return Gps(
+        latitude=exif.latitude,
+        longitude=exif.longitude,
+        altitude=exif.altitude,
+        relative_altitude=relative,
+        sigma=sigma,
+    )

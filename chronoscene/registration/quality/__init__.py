@@ -1,4 +1,4 @@
-"""How well a registration fits: a `Registered` comes in, a certificate and a verdict go out.
+"""Quality of a registration: a `Registered` comes in, a certificate and a verdict go out.
 
 `rays` gathers the observations once; the other modules measure; `certificate` collects their
 figures, `verdict` judges them.

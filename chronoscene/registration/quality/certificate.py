@@ -1,4 +1,4 @@
-"""How good a registration is: every figure with its unit and number, or why there is none.
+"""Measured quality of a registration: every figure, or the reason why it cannot be computed.
 
 `certify` measures; `chronoscene.registration.quality.verdict` judges.
 """
@@ -27,7 +27,7 @@ from chronoscene.registration.quality.rays import (
     MAX_OBSERVATIONS,
     Evidence,
     Placed,
-    Rays,
+    TrackRays,
     gather,
     project,
     sampson_distance,
@@ -36,7 +36,7 @@ from chronoscene.registration.quality.surface_distance import SurfaceDistance, s
 from chronoscene.registration.result import Registered
 from chronoscene.scene.geometry import camera_centre
 
-BADLY_PLACED = 4.0  # Transfers whose point is less certain than this many pixels tell nothing
+BADLY_PLACED = 4.0  # Pixels; transfers whose point is less certain than this are ignored
 AGREES = 3.0  # Pixels within which a held-out observation agrees with the registration
 
 
@@ -50,7 +50,7 @@ class PeriodFigures:
     photos: int
     """Registered or not."""
     reasons: Mapping[str, int]
-    """Why photos are missing, and how many for each reason."""
+    """Number of missing photos by reason."""
     error: float | None
     """Median reprojection error of its observations in the model, pixels."""
     observations: int
@@ -114,7 +114,7 @@ class Certificate:
     pairs: tuple[PairFigures, ...]
     """All pairs of periods, earlier first."""
     evidence: Evidence
-    """What all of this was measured on."""
+    """Observations on which the figures are measured."""
 
 
 def certify(model: Registered) -> Certificate:
@@ -220,7 +220,7 @@ def _all_transfers(
     sampled = np.zeros(len(model.points), bool)
     sampled[tracks[::step]] = True
     shift = held_out.track.max(initial=-1) + 1
-    rays = Rays.join(held_out, replace(ties, track=ties.track + shift))
+    rays = TrackRays.join(held_out, replace(ties, track=ties.track + shift))
 
     def placed(p: int) -> Placed:
         tied = evidence.ties_placed[p].of(sampled)

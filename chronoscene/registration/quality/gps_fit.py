@@ -17,7 +17,7 @@ SPREAD_FACTOR = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpsFit:
-    """Cameras of a period against where their GPS says they were, in metres."""
+    """Differences between the cameras of a period and their GPS positions, in metres."""
 
     positions: int
     median: float
@@ -26,7 +26,7 @@ class GpsFit:
     outliers: int
     """Positions off by more than three robust standard deviations."""
     scale: float | None
-    """Of that similarity: the period's own GPS against the model. None where the path is short."""
+    """Scale of that similarity, GPS relative to model. None where the path is short."""
     scale_error: float | None
     """Standard deviation."""
     turn: float | None
@@ -39,7 +39,7 @@ class GpsFit:
 
 
 def fit_gps(centres: Array, gps: Array) -> GpsFit | str:
-    """Compare cameras with positions, or say why not.
+    """Compare cameras with GPS positions; the reason, where that is not possible.
 
     Args:
         centres: In the frame of the model, which is east, north, up in metres. [N, 3]

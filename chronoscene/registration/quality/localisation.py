@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Ints
 from chronoscene.registration.quality.misalignment import generators, rotation_angle
-from chronoscene.registration.quality.rays import Placed, Rays, project
+from chronoscene.registration.quality.rays import Placed, TrackRays, project
 from chronoscene.scene.geometry import camera_centre, pose_from_rotation_translation
 from chronoscene.scene.similarity import SIGMA
 
@@ -23,7 +23,7 @@ INLIER_PIXELS = 6.0
 
 @dataclass(frozen=True, slots=True)
 class Excess:
-    """What noise does not explain of differences; 0 if it explains them all."""
+    """Difference beyond what noise explains; 0 if noise explains all of it."""
 
     value: float
     low: float
@@ -48,7 +48,7 @@ class Localisation:
     """World units."""
 
 
-def localise(rays: Rays, placed: Placed) -> Localisation | str:
+def localise(rays: TrackRays, placed: Placed) -> Localisation | str:
     """Compare the pose of each image by the points of the other period with its pose in the model.
 
     Args:
@@ -102,7 +102,7 @@ def _excess(size: Array, noise: Array) -> Excess:
     )
 
 
-def _variance(rays: Rays, xyz: Array, pose: Array) -> tuple[float, float]:
+def _variance(rays: TrackRays, xyz: Array, pose: Array) -> tuple[float, float]:
     """Variance of a pose by least squares: rotation in degrees squared, centre in squared units.
 
     It is that of a sandwich estimator, ``N^-1 M N^-1`` with ``N = sum J^T J`` and
@@ -123,12 +123,12 @@ def _variance(rays: Rays, xyz: Array, pose: Array) -> tuple[float, float]:
     return turn, float(np.trace(covariance[:3, :3]))
 
 
-def _project(rays: Rays, xyz: Array, pose: Array) -> tuple[Array, Array, Array]:
-    """As `project`, by a camera at another pose."""
+def _project(rays: TrackRays, xyz: Array, pose: Array) -> tuple[Array, Array, Array]:
+    """Project as `project` does, from another pose."""
     return project(replace(rays, pose=np.broadcast_to(pose, (len(rays), 4, 4))), xyz)
 
 
-def _localise_one(rays: Rays, xyz: Array) -> tuple[Array, Ints] | None:
+def _localise_one(rays: TrackRays, xyz: Array) -> tuple[Array, Ints] | None:
     """Pose by PnP with RANSAC, refined on its inliers, and which they are.
 
     The pose in the model is not used. Inliers are those of the pose that RANSAC returns: those of

@@ -1,4 +1,4 @@
-"""How far two periods are misaligned, by tracks that took no part in the estimation.
+"""Misalignment of two periods, measured on tracks that took no part in the estimation.
 
 A track is placed by its images of one period alone and projected into its images of the other, in
 both directions. The similarity that would bring the periods together, and how surely it is known,
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.arrays import Array, Ints
-from chronoscene.registration.quality.rays import Placed, Rays, place, project
+from chronoscene.registration.quality.rays import Placed, TrackRays, place, project
 from chronoscene.scene.similarity import Sim3, fit_robustly
 
 MIN_TRACKS = 12  # Fewer tracks do not determine seven unknowns and their spread
@@ -32,13 +32,13 @@ NOISE_FLOOR = 0.1  # Pixels: no feature is located better, even if a few residua
 class Transfers:
     """Points placed in one period at the rays of another (O observations)."""
 
-    rays: Rays
+    rays: TrackRays
     xyz: Array
     """[O, 3]"""
     covariance: Array
-    """Of the points, for observations of one pixel. [O, 3, 3]"""
+    """Covariance of the points, for observations of one pixel. [O, 3, 3]"""
     backward: NDArray[np.bool_]
-    """Whether the point was placed by the later of the two periods. [O]"""
+    """True if the point was placed by the later of the two periods. [O]"""
 
     def __len__(self) -> int:
         return len(self.rays)
@@ -70,7 +70,7 @@ class Misalignment:
 
 
 def transfers(
-    rays: Rays, period: Ints, a: int, b: int, placed: tuple[Placed, Placed] | None = None
+    rays: TrackRays, period: Ints, a: int, b: int, placed: tuple[Placed, Placed] | None = None
 ) -> tuple[Transfers, Placed, Placed]:
     """Tracks of two periods in both directions, and the points as each of them places them.
 
@@ -85,7 +85,7 @@ def transfers(
     placed_a, placed_b = placed or (place(of_a), place(of_b))
     forward, backward = _seen(placed_a, of_b), _seen(placed_b, of_a)
     both = Transfers(
-        rays=Rays.join(forward[0], backward[0]),
+        rays=TrackRays.join(forward[0], backward[0]),
         xyz=np.concatenate([forward[1], backward[1]]),
         covariance=np.concatenate([forward[2], backward[2]]),
         backward=np.repeat([False, True], [len(forward[0]), len(backward[0])]),
@@ -93,7 +93,7 @@ def transfers(
     return both, placed_a, placed_b
 
 
-def _seen(placed: Placed, rays: Rays) -> tuple[Rays, Array, Array]:
+def _seen(placed: Placed, rays: TrackRays) -> tuple[TrackRays, Array, Array]:
     found, slot = placed.find(rays.track)
     return rays.where(found), placed.xyz[slot], placed.covariance[slot]
 
@@ -275,7 +275,7 @@ def _interval(
     value = size(estimate)
     high = float(np.percentile([size(m) for m in drawn], 97.5))
     chance = float(np.percentile([size(m) for m in noise], 95))
-    return Interval(value, max(0.0, value - chance), max(value, high))
+    return Interval(value, low=max(0.0, value - chance), high=max(value, high))
 
 
 def _displacement(similarity: Sim3, centres: Array) -> float:

@@ -1,4 +1,4 @@
-"""What two periods have in common: tie points, their distribution, and the images they tie."""
+"""Overlap of two periods: tie points, their distribution, and the images that they tie."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TIES_OF_IMAGE = 8  # Tie points with which an image counts as tied to the other 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TieSpread:
-    """Where the tie points of two periods lie."""
+    """Distribution of the tie points of two periods."""
 
     points: int
     """Points of the model seen in both periods."""
@@ -43,7 +43,7 @@ def tie_spread(
 
     Args:
         model: The registration.
-        seen: Whether an image of the period sees the point. [P, T]
+        seen: True if an image of the period sees the point. [P, T]
         a: Earlier period.
         b: Later period.
         cells: From `ground_plan`, where it is at hand.

@@ -30,7 +30,7 @@ measured, and those whose error is taken: a sample where there are more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rays:
+class TrackRays:
     """Observations grouped by track (O observations)."""
 
     track: Ints
@@ -40,23 +40,23 @@ class Rays:
     pose: Array
     """cam_from_world of the image. [O, 4, 4]"""
     uv: Array
-    """Where the ray meets the plane at depth 1 of its camera. [O, 2]"""
+    """Intersection of the ray with the plane at depth 1 of its camera. [O, 2]"""
     focal: Array
     """Pixels. [O, 2]"""
 
     def __len__(self) -> int:
         return len(self.track)
 
-    def where(self, mask: Mask | Ints) -> Rays:
+    def where(self, mask: Mask | Ints) -> TrackRays:
         """Some of the observations, in their order."""
-        return Rays(*(getattr(self, name)[mask] for name in self.__slots__))
+        return TrackRays(*(getattr(self, name)[mask] for name in self.__slots__))
 
-    def finite(self) -> Rays:
+    def finite(self) -> TrackRays:
         """Without the pixels that COLMAP finds no ray for."""
         return self.where(np.flatnonzero(np.isfinite(self.uv).all(axis=1)))
 
     @classmethod
-    def join(cls, *parts: Rays) -> Rays:
+    def join(cls, *parts: TrackRays) -> TrackRays:
         """Observations of several, one after the other; tracks keep their numbers."""
         names = cls.__slots__
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
@@ -76,7 +76,7 @@ class Placed:
     """Root mean square residual in pixels. [K]"""
 
     def find(self, track: Ints) -> tuple[Mask, Ints]:
-        """Which tracks are placed, and the index of each that is."""
+        """Mask of the given tracks that are placed, and the index of each that is."""
         if not len(self.track):
             return np.zeros(len(track), bool), np.zeros(0, np.int64)
         slot = np.searchsorted(self.track, track).clip(max=len(self.track) - 1)
@@ -99,20 +99,20 @@ class Placed:
         return every.select(np.argsort(every.track, kind="stable"))
 
 
-def rays_at(model: Registered, track: Ints, image: Ints, xy: Array) -> Rays:
-    """Rays of observations; NaN where COLMAP finds none. [O], [O], [O, 2]"""
+def rays_at(model: Registered, track: Ints, image: Ints, xy: Array) -> TrackRays:
+    """TrackRays of observations; NaN where COLMAP finds none. [O], [O], [O, 2]"""
     uv, focal = unproject(model.cameras, image, xy)
-    return Rays(track, image, model.cam_from_world[image], uv, focal)
+    return TrackRays(track, image, model.cam_from_world[image], uv, focal)
 
 
-def model_rays(model: Registered) -> Rays:
-    """Rays of the points of a model; a track is the index of a point."""
+def model_rays(model: Registered) -> TrackRays:
+    """TrackRays of the points of a model; a track is the index of a point."""
     track = track_owners(model.track_start)
     return rays_at(model, track, model.track_image, model.track_xy).finite()
 
 
-def held_out_rays(model: Registered) -> Rays:
-    """Rays of the tracks that took no part in the estimation."""
+def held_out_rays(model: Registered) -> TrackRays:
+    """TrackRays of the tracks that took no part in the estimation."""
     tracks = model.held_out_tracks
     return rays_at(model, track_owners(tracks.start), tracks.image, tracks.xy).finite()
 
@@ -133,7 +133,7 @@ def unproject(cameras: Sequence[Camera], image: Ints, xy: Array) -> tuple[Array,
     return uv, focal
 
 
-def project(rays: Rays, xyz: Array) -> tuple[Array, Array, Array]:
+def project(rays: TrackRays, xyz: Array) -> tuple[Array, Array, Array]:
     """Residuals of points at their rays, in pixels.
 
     Args:
@@ -182,7 +182,7 @@ def sampson_distance(
         return np.asarray(np.abs((b * line_b).sum(axis=1)) / np.sqrt(square))
 
 
-def place(rays: Rays) -> Placed:
+def place(rays: TrackRays) -> Placed:
     """Points of tracks by their rays: those seen by two images or more, with parallax, that fit.
 
     First the point nearest to all rays, then three Gauss-Newton steps on the residuals in pixels.
@@ -224,7 +224,7 @@ def _normal_equations(residual: Array, jacobian: Array, first: Ints) -> tuple[Ar
 
 
 def _first_of_groups(track: Ints) -> Ints:
-    """Where each run of equal values begins."""
+    """Index of the first entry of each run of equal values."""
     if not len(track):
         return np.zeros(0, np.int64)
     return np.flatnonzero(np.concatenate([[True], track[1:] != track[:-1]]))
@@ -238,20 +238,20 @@ class Evidence:
     """
 
     seen: Mask
-    """Whether an image of the period sees the point. [P, T]"""
-    observed: tuple[Rays, ...]
+    """True if an image of the period sees the point. [P, T]"""
+    observed: tuple[TrackRays, ...]
     """A sample of the observations of each period, whatever their points. A track is the index of
     a point here, in `ties` and in `clouds`."""
     clouds: tuple[Placed, ...]
     """A sample of the points of each period, placed by its images."""
-    ties: Rays
+    ties: TrackRays
     """A sample of the points that several periods see."""
     ties_placed: tuple[Placed, ...]
-    """Those of the ties that each period places."""
-    held_out: Rays
+    """The ties that each period places."""
+    held_out: TrackRays
     """Tracks that took no part in the estimation."""
     held_out_placed: tuple[Placed, ...]
-    matches: tuple[tuple[Rays, Rays], ...]
+    matches: tuple[tuple[TrackRays, TrackRays], ...]
     """Both ends of each of the `Registered.held_out`."""
 
 
@@ -299,7 +299,7 @@ def _sample(points: Ints, length: Ints, max_observations: int) -> Ints:
     return points[:: int(length[points].sum()) // max_observations + 1]
 
 
-def _matches(model: Registered) -> tuple[tuple[Rays, Rays], ...]:
+def _matches(model: Registered) -> tuple[tuple[TrackRays, TrackRays], ...]:
     counts = np.array([len(m.xy_a) for m in model.held_out], np.int64)
     ends = np.concatenate([[0], np.cumsum(counts)])
     image = [m.image_a for m in model.held_out] + [m.image_b for m in model.held_out]

@@ -40,9 +40,9 @@ class SurfaceDistance:
     cores: int
     """Core points where both periods have a surface."""
     stable: int
-    """Those that one common shift explains: all of them if nothing changed."""
+    """Core points that one common shift explains: all of them if nothing changed."""
     median: float
-    """Of the absolute distance over stable core points."""
+    """Median absolute distance over stable core points."""
     level: float
     """Median level of detection; smaller distances are not significant."""
     beyond: float
@@ -54,7 +54,7 @@ class SurfaceDistance:
 def surface_distance(
     first: Placed, second: Placed, centre: Array, registration: float
 ) -> SurfaceDistance | str:
-    """Compare the point clouds of two periods, or say why that is not possible.
+    """Compare the point clouds of two periods; the reason, where that is not possible.
 
     Args:
         first: Points placed by the images of one period.
@@ -154,7 +154,7 @@ def _stable(distance: Array, normal: Array, chance: Array) -> Mask:
 def _shift(distance: Array, normal: Array, chance: Array) -> Interval:
     """Translation t with ``n . t = distance``: one step of point-to-plane ICP, reweighted.
 
-    A direction that no surface faces (along a street, say) gets a wide interval.
+    A direction that no surface faces (such as along a street) gets a wide interval.
     """
     weight = 1.0 / np.maximum(chance, np.median(chance) * 0.1) ** 2
     prior = 1e-6 * weight.sum() * np.eye(3)
@@ -170,4 +170,4 @@ def _shift(distance: Array, normal: Array, chance: Array) -> Interval:
     covariance = np.linalg.inv(left) * scale**2 * NEIGHBOURS
     spread = CONFIDENCE * float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
     value = float(np.linalg.norm(t))
-    return Interval(value, max(0.0, value - spread), value + spread)
+    return Interval(value, low=max(0.0, value - spread), high=value + spread)

@@ -25,17 +25,17 @@ Level = Literal["pass", "doubtful", "fail"]
 LEVELS: tuple[Level, ...] = ("pass", "doubtful", "fail")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Threshold:
     """One check: the limits beyond which a figure is doubtful, and beyond which it fails."""
 
     key: str
     what: str
-    unit: str
+    unit: str = ""
     doubtful: float
-    fail: float | None
+    fail: float | None = None
     """None where the figure alone proves no error."""
-    larger_is_better: bool
+    larger_is_better: bool = False
     why: str
     todo: str
 
@@ -58,103 +58,128 @@ THRESHOLDS: dict[str, Threshold] = {
     t.key: t
     for t in (
         Threshold(
-            "registered", "share of the photos of a period that are registered", "",
-            0.6, 0.1, True,
-            "measurements say little about a period most of whose photos are missing",
-            "registration_log.json says why photos are missing; add photos with viewpoints "
+            key="registered",
+            what="share of the photos of a period that are registered",
+            doubtful=0.6, fail=0.1, larger_is_better=True,
+            why="measurements say little about a period most of whose photos are missing",
+            todo="registration_log.json says why photos are missing; add photos with viewpoints "
             "between those of the dates",
         ),
         Threshold(
-            "images", "registered images of a period", "images", 5, 3, True,
-            "fewer images cannot place points by themselves, so nothing can be checked",
-            "add photos of this period",
+            key="images",
+            what="registered images of a period",
+            unit="images", doubtful=5, fail=3, larger_is_better=True,
+            why="fewer images cannot place points by themselves, so nothing can be checked",
+            todo="add photos of this period",
         ),
         Threshold(
-            "rotation", "remaining rotation between two periods", "degrees", 0.1, 0.1, False,
-            "0.1 degrees is 1.7 pixels at a focal length of 1000: twice the error of matching",
-            _CLICK,
+            key="rotation",
+            what="remaining rotation between two periods",
+            unit="degrees", doubtful=0.1, fail=0.1,
+            why="0.1 degrees is 1.7 pixels at a focal length of 1000: twice the error of matching",
+            todo=_CLICK,
         ),
         Threshold(
-            "shift", "remaining displacement between two periods", "% of extent", 0.2, 0.2, False,
-            "0.2% is 20 cm in 100 m: smaller changes cannot be told from misalignment",
-            _CLICK,
+            key="shift",
+            what="remaining displacement between two periods",
+            unit="% of extent", doubtful=0.2, fail=0.2,
+            why="0.2% is 20 cm in 100 m: smaller changes cannot be told from misalignment",
+            todo=_CLICK,
         ),
         Threshold(
-            "held_out", "held-out tracks between two periods", "tracks", 12, None, True,
-            "a similarity has seven unknowns and fits almost any smaller number of tracks",
-            _CLICK,
+            key="held_out",
+            what="held-out tracks between two periods",
+            unit="tracks", doubtful=12, larger_is_better=True,
+            why="a similarity has seven unknowns and fits almost any smaller number of tracks",
+            todo=_CLICK,
         ),
         Threshold(
-            "agreeing", "share of held-out observations that agree", "", 0.75, 0.15, True,
-            "correct registrations reach 0.85 and more; with fewer, part of the matches or of the "
-            "poses is wrong, or matching is misled by repeated structure",
-            "look at the worst pair on the page (--report); remove its photos if they do not fit",
+            key="agreeing",
+            what="share of held-out observations that agree",
+            doubtful=0.75, fail=0.15, larger_is_better=True,
+            why="correct registrations reach 0.85 and more; with fewer, part of the matches or of "
+            "the poses is wrong, or matching is misled by repeated structure",
+            todo="look at the worst pair on the page (--report); remove its photos if they do not "
+            "fit",
         ),
         Threshold(
-            "excess", "held-out residual beyond the noise of matching, as an angle", "degrees",
-            0.1, 0.4, False,
-            "errors that no similarity explains come from drift that deforms a period (doming), or "
-            "from a wrong camera",
-            "calibrate each date (--calibration per-period), or add oblique photos; otherwise "
+            key="excess",
+            what="held-out residual beyond the noise of matching, as an angle",
+            unit="degrees", doubtful=0.1, fail=0.4,
+            why="errors that no similarity explains come from drift that deforms a period "
+            "(doming), or from a wrong camera",
+            todo="calibrate each date (--calibration per-period), or add oblique photos; "
+            "otherwise "
             + _CONTROL,
         ),
         Threshold(
-            "occupied", "share of the overlap of two periods that has tie points", "", 0.15, None,
-            True,
-            "matches in one spot can come from repeated structure, and say little about the rest",
-            _CLICK,
+            key="occupied",
+            what="share of the overlap of two periods that has tie points",
+            doubtful=0.15, larger_is_better=True,
+            why="matches in one spot can come from repeated structure, and say little about the "
+            "rest",
+            todo=_CLICK,
         ),
         Threshold(
-            "tied", "share of the images of a period that see tie points", "", 0.5, None, True,
-            "images without any are held by their own period alone",
-            _CLICK,
+            key="tied",
+            what="share of the images of a period that see tie points",
+            doubtful=0.5, larger_is_better=True,
+            why="images without any are held by their own period alone",
+            todo=_CLICK,
         ),
         Threshold(
-            "localised", "pose error of images localised from the other period, beyond its noise",
-            "times 0.1 degrees or 0.2%", 0.6, 10.0, False,
-            "the points of each period must place the images of the other correctly",
-            _LOOK,
+            key="localised",
+            what="pose error of images localised from the other period, beyond its noise",
+            unit="times 0.1 degrees or 0.2%", doubtful=0.6, fail=10.0,
+            why="the points of each period must place the images of the other correctly",
+            todo=_LOOK,
         ),
         Threshold(
-            "clouds", "shift between the surfaces of two periods, if its interval excludes 0",
-            "% of extent", 0.15, None, False,
-            "surfaces are compared without matches, so repeated structure shows here; but a beach "
-            "or a quarry may really have moved",
-            _LOOK,
+            key="clouds",
+            what="shift between the surfaces of two periods, if its interval excludes 0",
+            unit="% of extent", doubtful=0.15,
+            why="surfaces are compared without matches, so repeated structure shows here; but a "
+            "beach or a quarry may really have moved",
+            todo=_LOOK,
         ),
         Threshold(
-            "surfaces", "share of the surfaces beyond their level of detection", "",
-            0.3, None, False,
-            "correct registrations stay below 0.25 even where two thirds of the scene is new; "
+            key="surfaces",
+            what="share of the surfaces beyond their level of detection",
+            doubtful=0.3,
+            why="correct registrations stay below 0.25 even where two thirds of the scene is new; "
             "above, surfaces contradict the matches, as with repeated structure",
-            _LOOK,
+            todo=_LOOK,
         ),
         Threshold(
-            "gps_offset", "horizontal offset between the GPS of two periods, beyond its spread",
-            "m", 5.0, 15.0, False,
-            "the bias of a receiver varies by up to about 3.5 m from day to day; heights vary "
+            key="gps_offset",
+            what="horizontal offset between the GPS of two periods, beyond its spread",
+            unit="m", doubtful=5.0, fail=15.0,
+            why="the bias of a receiver varies by up to about 3.5 m from day to day; heights vary "
             "more, so they are not judged",
-            f"if the GPS is reliable, {_CLICK}",
+            todo=f"if the GPS is reliable, {_CLICK}",
         ),
         Threshold(
-            "gps_residual", "residual of a period's cameras to its own GPS, median", "m",
-            12.0, None, False,
-            "receivers err by 3 to 8 m; more means that part of the poses is wrong, or that the "
-            "view of the sky was obstructed",
-            "look at the map on the page (--report); register the period alone to see which photos "
-            "deform it",
+            key="gps_residual",
+            what="residual of a period's cameras to its own GPS, median",
+            unit="m", doubtful=12.0,
+            why="receivers err by 3 to 8 m; more means that part of the poses is wrong, or that "
+            "the view of the sky was obstructed",
+            todo="look at the map on the page (--report); register the period alone to see which "
+            "photos deform it",
         ),
         Threshold(
-            "gps_scale", "scale of a period against its own GPS, beyond its spread", "%",
-            2.0, 10.0, False,
-            "GPS errs in position, hardly in scale",
-            _CONTROL,
+            key="gps_scale",
+            what="scale of a period against its own GPS, beyond its spread",
+            unit="%", doubtful=2.0, fail=10.0,
+            why="GPS errs in position, hardly in scale",
+            todo=_CONTROL,
         ),
         Threshold(
-            "gps_turn", "heading of a period against its own GPS, beyond its spread", "degrees",
-            2.0, 10.0, False,
-            "GPS errs in position, hardly in direction",
-            _CONTROL,
+            key="gps_turn",
+            what="heading of a period against its own GPS, beyond its spread",
+            unit="degrees", doubtful=2.0, fail=10.0,
+            why="GPS errs in position, hardly in direction",
+            todo=_CONTROL,
         ),
     )
 }  # fmt: skip
@@ -170,7 +195,7 @@ LACKING = ("held_out", "rotation", "shift", "occupied", "tied")
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Objection:
     """A figure beyond its limit, or one that is needed and missing."""
 
     level: Level
@@ -190,48 +215,48 @@ class Verdict:
     level: Level
     text: str
     """One or two sentences."""
-    findings: tuple[Finding, ...]
+    objections: tuple[Objection, ...]
     """The most severe first."""
     pairs: dict[tuple[int, int], Level | None]
-    """Of each pair of periods; None where nothing links the two directly."""
+    """Level of each pair of periods; None where nothing links the two directly."""
 
     @property
     def todo(self) -> tuple[str, ...]:
-        """What to do, without repetition, the most important first."""
-        return tuple(dict.fromkeys(f.todo for f in self.findings))
+        """Things to do, without repetition, the most important first."""
+        return tuple(dict.fromkeys(f.todo for f in self.objections))
 
 
 def judge(certificate: Certificate) -> Verdict:
     """Judge a registration by its certificate."""
-    findings = [f for p in certificate.periods for f in _of_period(p)]
-    findings += _between_gps(certificate)
+    objections = [f for p in certificate.periods for f in _of_period(p)]
+    objections += _between_gps(certificate)
     pairs: dict[tuple[int, int], Level | None] = {}
     for pair in certificate.pairs:
         mine = list(_of_pair(certificate, pair))
         measured = isinstance(pair.by_all, Misalignment) or not isinstance(pair.held_out, str)
         linked = measured or pair.ties.points >= MIN_TIES
         pairs[pair.a, pair.b] = _worst(f.level for f in mine) if linked else None
-        findings += mine if linked else []
+        objections += mine if linked else []
     good = _bounds(certificate, [k for k, level in pairs.items() if level == "pass"])
     if all(good[k] <= 1 or level == "pass" for k, level in pairs.items()):
-        findings = [f for f in findings if not _is_lack(f)]
-    findings += _links(certificate, pairs, good)
-    level = _worst(f.level for f in findings)
-    findings.sort(key=lambda f: -LEVELS.index(f.level))
-    return Verdict(level, _words(certificate, level, findings), tuple(findings), pairs)
+        objections = [f for f in objections if not _is_lack(f)]
+    objections += _links(certificate, pairs, good)
+    level = _worst(f.level for f in objections)
+    objections.sort(key=lambda f: -LEVELS.index(f.level))
+    return Verdict(level, _words(certificate, level, objections), tuple(objections), pairs)
 
 
-def _is_lack(finding: Finding) -> bool:
-    """Whether a finding does not count if chains of good pairs link all periods."""
-    return finding.level == "doubtful" and finding.check in LACKING
+def _is_lack(objection: Objection) -> bool:
+    """Return True if chains of good pairs that link all periods outweigh an objection."""
+    return objection.level == "doubtful" and objection.check in LACKING
 
 
 def _worst(levels: Iterator[Level]) -> Level:
     return max(levels, key=LEVELS.index, default="pass")
 
 
-def _check(key: str, value: float, place: str, note: str = "") -> Iterator[Finding]:
-    """A finding, unless the figure passes."""
+def _check(key: str, value: float, place: str, note: str = "") -> Iterator[Objection]:
+    """An objection, unless the figure passes."""
     threshold = THRESHOLDS[key]
     level = threshold.level(value)
     if level == "pass":
@@ -240,10 +265,10 @@ def _check(key: str, value: float, place: str, note: str = "") -> Iterator[Findi
     side = "at least" if threshold.larger_is_better else "at most"
     unit = f" {threshold.unit}" if threshold.unit else ""
     found = f"{threshold.what}: {value:.3g}{unit}, expected {side} {limit:g}{note}"
-    yield Finding(level, key, place, found, threshold.why, threshold.todo)
+    yield Objection(level, key, place, found, threshold.why, threshold.todo)
 
 
-def _of_period(p: PeriodFigures) -> Iterator[Finding]:
+def _of_period(p: PeriodFigures) -> Iterator[Objection]:
     place = f"period {p.label}"
     yield from _check("registered", p.registered / max(p.photos, 1), place)
     yield from _check("images", p.registered, place)
@@ -257,8 +282,8 @@ def _of_period(p: PeriodFigures) -> Iterator[Finding]:
             yield from _check("gps_turn", abs(gps.turn) - 3 * gps.turn_error, place)
 
 
-def _between_gps(certificate: Certificate) -> Iterator[Finding]:
-    """Offsets between every two periods: which of them is wrong is not known."""
+def _between_gps(certificate: Certificate) -> Iterator[Objection]:
+    """Judge the GPS offset between every two periods; either of the two may be wrong."""
     fits = [(p, p.gps) for p in certificate.periods if isinstance(p.gps, GpsFit)]
     for i, (p, one) in enumerate(fits):
         for q, other in fits[i + 1 :]:
@@ -270,7 +295,7 @@ def _between_gps(certificate: Certificate) -> Iterator[Finding]:
             yield from _check("gps_offset", beyond, place, f" ({distance:.1f} m in all)")
 
 
-def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Finding]:
+def _of_pair(certificate: Certificate, pair: PairFigures) -> Iterator[Objection]:
     names = certificate.labels
     place = f"periods {names[pair.a]} and {names[pair.b]}"
     yield from _alignment(certificate, pair, place)
@@ -301,8 +326,8 @@ def _localised(found: Localisation, extent: float) -> float:
     return certain if certain > bad else min(likely, bad)
 
 
-def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Finding]:
-    """Whether the periods are aligned, and whether that is certain.
+def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Iterator[Objection]:
+    """Judge the alignment of two periods, and its uncertainty.
 
     They are not if either interval lies beyond the limit. They are if the interval of the precise
     measurement (all ties) ends below the limit, and the independent one (held-out tracks) agrees:
@@ -331,7 +356,9 @@ def _alignment(certificate: Certificate, pair: PairFigures, place: str) -> Itera
                 f"{THRESHOLDS[key].what}: {estimate:.3g} {unit}, but up to {bound:.3g} cannot be "
                 f"ruled out; expected at most {limit:g}"
             )
-            yield Finding("doubtful", key, place, found, THRESHOLDS[key].why, THRESHOLDS[key].todo)
+            yield Objection(
+                "doubtful", key, place, found, THRESHOLDS[key].why, THRESHOLDS[key].todo
+            )
 
 
 def _limit(key: str) -> float:
@@ -352,7 +379,7 @@ def _excess(certificate: Certificate, pair: PairFigures) -> float:
 
 def _links(
     certificate: Certificate, pairs: dict[tuple[int, int], Level | None], good: Array
-) -> Iterator[Finding]:
+) -> Iterator[Objection]:
     """Pairs without a link of their own that no good chain of other periods links.
 
     Args:
@@ -365,7 +392,7 @@ def _links(
     for (a, b), level in pairs.items():
         place = f"periods {names[a]} and {names[b]}"
         if not np.isfinite(some[a, b]):
-            yield Finding(
+            yield Objection(
                 "fail", "link", place, "no measurement links them",
                 "without matches between them, their alignment is unknown", _CLICK,
             )  # fmt: skip
@@ -376,11 +403,13 @@ def _links(
                 if np.isfinite(good[a, b])
                 else "no chain of good pairs links them"
             )
-            yield Finding("doubtful", "chain", place, left, "the errors of a chain add up", _CLICK)
+            yield Objection(
+                "doubtful", "chain", place, left, "the errors of a chain add up", _CLICK
+            )
 
 
 def _bounds(certificate: Certificate, pairs: list[tuple[int, int]]) -> Array:
-    """How far apart two periods can be, in units of the limits, by chains of pairs. [T, T]
+    """Largest misalignment of two periods by chains of pairs, in units of the limits. [T, T]
 
     Errors of the links of a chain are independent: their squares add up.
     """
@@ -398,7 +427,7 @@ def _bounds(certificate: Certificate, pairs: list[tuple[int, int]]) -> Array:
     return np.asarray(np.sqrt(shortest_path(csr_array(weights), directed=False)))
 
 
-def _words(certificate: Certificate, level: Level, findings: list[Finding]) -> str:
+def _words(certificate: Certificate, level: Level, objections: list[Objection]) -> str:
     count = len(certificate.labels)
     if level == "pass" and count == 1:
         return "There is only one period, so there is no alignment to judge."
@@ -407,7 +436,7 @@ def _words(certificate: Certificate, level: Level, findings: list[Finding]) -> s
             f"The {count} periods lie in one frame, within 0.1 degrees and 0.2% of the scene's "
             "extent of each other, according to matches that took no part in the estimation."
         )
-    first = findings[0]
+    first = objections[0]
     start = (
         "The periods do not fit each other; do not use this registration as it is."
         if level == "fail"

@@ -45,7 +45,7 @@ class PointPairs:
     target_pose: NDArray[np.float64]
     """[M, 4, 4]"""
     source_ray: NDArray[np.float64]
-    """Where it is seen, at depth 1 without distortion. [M, 2]"""
+    """Observation of the source point, at depth 1 without distortion. [M, 2]"""
     target_ray: NDArray[np.float64]
     source_focal: NDArray[np.float64]
     """Pixels. [M]"""
@@ -60,7 +60,7 @@ class PointPairs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """How one model lies in another."""
+    """Alignment of one model to another."""
 
     target_from_source: Sim3
     inliers: NDArray[np.bool_]
@@ -72,7 +72,7 @@ class Alignment:
 
     @property
     def is_trustworthy(self) -> bool:
-        """Whether enough pairs in enough places agree."""
+        """True if enough pairs in enough places agree."""
         return int(self.inliers.sum()) >= MIN_INLIERS and self.cells >= MIN_CELLS
 
 

@@ -1,4 +1,4 @@
-"""Which images have poses that their matches contradict. Worker process only.
+"""Detection of images whose matches contradict their poses. Worker process only.
 
 An incremental mapper registers an image by what it has seen so far. Where structure repeats (a row
 of equal windows) it may confuse one place with another, and later images follow. The matches of
@@ -36,7 +36,7 @@ Agreements = Mapping[tuple[int, int], tuple[int, int]]
 
 
 def pair_agreements(model: pycolmap.Reconstruction, matches: Matches) -> Agreements:
-    """How many of the matches of each pair of posed images lie near its epipolar lines."""
+    """Count the matches of each pair of posed images that lie near their epipolar lines."""
     posed = {int(i): model.images[i] for i in model.reg_image_ids()}
     rays, poses, focals = {}, {}, {}
     for i, image in posed.items():
@@ -99,7 +99,7 @@ def misplaced(
 
 
 def _grown(good: NDArray[np.int64], total: NDArray[np.int64], start: Mask) -> Mask:
-    """Which images are trusted, if those of the start are."""
+    """Grow the set of trusted images from a start. [N]"""
     inside = start.copy()
     agreeing, known = good @ inside, total @ inside
     while True:

@@ -48,8 +48,8 @@ def estimate(inputs: Inputs, matched: Matched, context: Context) -> Registered:
         remarks = same_positions(registered, inputs.scene.num_periods)
         context.stages.remark("route", *remarks)
     counts = registered.counts(inputs.totals())
-    told = [f"period {c['label']}: {c['registered']} of {c['photos']} photos" for c in counts]
-    context.stages.remark("result", f"route {registered.route}", *told)
+    remarks = [f"period {c['label']}: {c['registered']} of {c['photos']} photos" for c in counts]
+    context.stages.remark("result", f"route {registered.route}", *remarks)
     return registered
 
 
@@ -69,7 +69,7 @@ def choose_route(inputs: Inputs, matched: Matched, context: Context) -> Route:
 
 
 def connected_periods(matched: Matched, count: int) -> bool:
-    """Whether matches connect all periods, each with enough of them."""
+    """Return True if enough matches connect all periods."""
     links = [
         tuple(int(part) for part in key.split("-"))
         for key, pairs in matched.pairs_across.items()
@@ -266,7 +266,7 @@ def reasons(
     partners: Mapping[str, int],
     left: list[list[str]],
 ) -> dict[str, str]:
-    """Why each image that has no pose has none, as far as is known."""
+    """Reasons why images have no pose, as far as they are known."""
     part_of = {name: len(group) for group in left for name in group}
     found = {}
     for name in sorted(missing):

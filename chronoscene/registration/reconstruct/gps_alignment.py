@@ -16,7 +16,7 @@ from chronoscene.scene.geometry import camera_centre
 from chronoscene.scene.similarity import Sim3, fit_robustly
 
 MAX_SCALE_ERROR = 0.1
-"""Relative standard deviation of the scale above which GPS says nothing useful about it."""
+"""Relative standard deviation of the scale above which GPS does not determine it."""
 
 LINE_RATIO = 0.05
 """Cameras that spread less than this across their line do not fix the rotation around it."""
@@ -38,7 +38,7 @@ class Priors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpsAlignment:
-    """How a model lies in the frame of the GPS positions."""
+    """Alignment of a model to the frame of the GPS positions."""
 
     enu_from_model: Sim3
     inliers: NDArray[np.bool_]
@@ -46,15 +46,15 @@ class GpsAlignment:
     residuals: NDArray[np.float64]
     """Metres, NaN without a position. [N]"""
     rms: float
-    """Of the inliers, metres."""
+    """Root mean square residual of the inliers, metres."""
     scale_error: float
     """Relative standard deviation of the scale, from the residuals."""
     on_a_line: bool
-    """Whether the rotation around the line of the cameras came from the horizon of the photos."""
+    """True if the cameras lie on a line, and the rotation around it is that of the horizon."""
 
     @property
     def is_useful(self) -> bool:
-        """Whether the positions say enough about scale and rotation."""
+        """True if the positions determine scale and rotation well enough."""
         return bool(self.inliers.sum() >= 3 and self.scale_error < MAX_SCALE_ERROR)
 
 
@@ -121,7 +121,7 @@ def _median_distance(sim: Sim3, centres: NDArray[np.float64], enu: NDArray[np.fl
 
 
 def is_line(positions: NDArray[np.float64]) -> bool:
-    """Whether positions lie along a line, on the map."""
+    """Return True if positions lie along a line, seen from above."""
     flat = positions[:, :2] - positions[:, :2].mean(axis=0)
     values = np.linalg.svd(flat, compute_uv=False)
     return bool(values[-1] < LINE_RATIO * values[0])
@@ -131,7 +131,7 @@ def _fit_with_horizon(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> S
     """Similarity in which the photos also stand upright, or else look straight down.
 
     Each camera gets a second point above it, as far up as the cameras are spread along the line.
-    Photos of one heading fit both; what the positions say of the bends in the line decides.
+    Photos of one heading fit both; the bends of the line decide.
     """
     forward = poses[:, 2, :3].mean(axis=0)
     down = -forward / max(float(np.linalg.norm(forward)), 1e-12)
@@ -170,7 +170,7 @@ def upright_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def gps_alignment(model: pycolmap.Reconstruction, priors: Priors) -> GpsAlignment | None:
-    """How a model lies in the frame of the priors; rows in the order of `sorted_ids`."""
+    """Align a model to the frame of the priors; rows in the order of `sorted_ids`."""
     ids = sorted_ids(model)
     names = [str(model.images[i].name) for i in ids]
     nowhere = [np.nan] * 3
@@ -200,11 +200,11 @@ def to_gps_frame(
     if found is None:
         remarks.append("fewer than 3 registered photos have GPS: no frame")
         return False, nothing
-    told = f"GPS against poses: rms {found.rms:.2f} m, scale known to {found.scale_error:.1%}"
+    remark = f"GPS against poses: rms {found.rms:.2f} m, scale known to {found.scale_error:.1%}"
     if not found.is_useful:
-        remarks.append(f"{told}: not accurate enough for this model, which keeps its own scale")
+        remarks.append(f"{remark}: not accurate enough for this model, which keeps its own scale")
         return False, nothing
-    remarks.append(told)
+    remarks.append(remark)
     model.transform(as_pycolmap(found.enu_from_model))
     if found.on_a_line:
         remarks.append("cameras lie on a line: the rotation around it is taken from the horizon")

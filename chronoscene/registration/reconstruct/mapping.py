@@ -50,7 +50,7 @@ SETTINGS: tuple[tuple[str, dict[str, Any]], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What the functions of one step share."""
+    """Arguments and remarks that the functions of one step share."""
 
     database: str
     photos: str

@@ -40,7 +40,7 @@ class Submodel:
     period: int | None = None
     """The period that it is a model of; None for several."""
     is_largest: bool = True
-    """Whether it is the largest of its period."""
+    """True if it is the largest of its period."""
 
     @property
     def size(self) -> int:
@@ -78,8 +78,8 @@ def combine(
         matches: Verified matches of all pairs of images, by image ids of the database. [M, 2]
         priors: Positions, where known.
         database: With all images.
-        keep_unplaced: Whether whole periods that cannot be placed are merged nevertheless, each in
-            its own frame: tie points will place them.
+        keep_unplaced: True to merge whole periods that cannot be placed, too, each in its own
+            frame: tie points will place them.
     """
     links = find_links(submodels, matches)
     remarks = [_describe(submodels[i], submodels[j], k) for (i, j), k in sorted(links.items())]

@@ -7,7 +7,7 @@ computed is ``null``, with the reason beside it.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -37,9 +37,10 @@ class Figure:
     value: float | None
     unit: str
     over: str
-    """What it was taken over, with the number."""
-    absent: str | None = None
-    interval: tuple[float, float] | None = None
+    """Kind and number of the items that it is computed from."""
+    absent: str | None = field(default=None, kw_only=True)
+    """Reason why there is no value."""
+    interval: tuple[float, float] | None = field(default=None, kw_only=True)
     """95%."""
 
     @property
@@ -59,13 +60,13 @@ def period_figures(certificate: Certificate, period: PeriodFigures) -> Iterator[
     photos = f"{period.photos} photos"
     yield Figure("registered images", period.registered, "", photos)
     if period.error is None:
-        yield Figure("reprojection error", None, "px", "", "no observations")
+        yield Figure("reprojection error", None, "px", "", absent="no observations")
     else:
         over = f"{period.observations:,} observations"
         yield Figure("reprojection error, median", period.error, "px", over)
     gps = period.gps
     if not isinstance(gps, GpsFit):
-        yield Figure("GPS residual", None, "m", "", gps)
+        yield Figure("GPS residual", None, "m", "", absent=gps)
         return
     over = f"{gps.positions} positions"
     yield Figure("GPS residual after a similarity, median", gps.median, "m", over)
@@ -73,7 +74,7 @@ def period_figures(certificate: Certificate, period: PeriodFigures) -> Iterator[
     yield Figure("GPS outliers", gps.outliers, "", over)
     offset, error = np.linalg.norm(gps.offset[:2]), np.linalg.norm(gps.offset_error[:2])
     both = (max(0.0, float(offset - 2 * error)), float(offset + 2 * error))
-    yield Figure("GPS against cameras, horizontal", float(offset), "m", over, None, both)
+    yield Figure("GPS against cameras, horizontal", float(offset), "m", over, interval=both)
     yield Figure("GPS against cameras, vertical", float(gps.offset[2]), "m", over)
     short = "the path is too short for the noise of the GPS"
     for name, unit, value, spread in (
@@ -81,10 +82,10 @@ def period_figures(certificate: Certificate, period: PeriodFigures) -> Iterator[
         ("turn against own GPS", "degrees", gps.turn, gps.turn_error),
     ):
         if value is None or spread is None:
-            yield Figure(name, None, unit, over, short)
+            yield Figure(name, None, unit, over, absent=short)
         else:
             span = (value - 1.96 * spread, value + 1.96 * spread)
-            yield Figure(name, value, unit, over, None, span)
+            yield Figure(name, value, unit, over, interval=span)
 
 
 def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure]:
@@ -109,7 +110,7 @@ def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure
     ):
         what = f"images of {name} localised from {other}"
         if not isinstance(local, Localisation):
-            yield Figure(what, None, "", "", local)
+            yield Figure(what, None, "", "", absent=local)
             continue
         over = f"{local.images} of {local.tried} images"
         yield Figure(f"{what}: rotation, median", local.rotation, "degrees", over)
@@ -119,7 +120,7 @@ def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure
 
 def _held_out_figures(held: HeldOut | str, unit: str) -> Iterator[Figure]:
     if not isinstance(held, HeldOut):
-        yield Figure("held-out reprojection error", None, "px", "", held)
+        yield Figure("held-out reprojection error", None, "px", "", absent=held)
         return
     over = f"{held.observations:,} observations of {held.tracks} tracks"
     yield Figure("held-out reprojection error, median", held.median, "px", over)
@@ -128,29 +129,29 @@ def _held_out_figures(held: HeldOut | str, unit: str) -> Iterator[Figure]:
     yield Figure("held-out observations that agree", 100 * held.agreeing, "%", over)
     tracks = f"{held.gap_tracks} tracks"
     missing = None if held.gap is not None else "no track is placed by both periods"
-    yield Figure("gap between both periods' points", held.gap, unit, tracks, missing)
+    yield Figure("gap between both periods' points", held.gap, unit, tracks, absent=missing)
     matches = f"{held.matches:,} matches"
     missing = None if held.epipolar is not None else "no matches of images of both periods"
-    yield Figure("held-out epipolar error, median", held.epipolar, "px", matches, missing)
+    yield Figure("held-out epipolar error, median", held.epipolar, "px", matches, absent=missing)
 
 
 def _misalignment_figures(
     certificate: Certificate, name: str, found: Misalignment | str, unit: str
 ) -> Iterator[Figure]:
     if not isinstance(found, Misalignment):
-        yield Figure(f"misalignment {name}", None, "", "", found)
+        yield Figure(f"misalignment {name}", None, "", "", absent=found)
         return
     over = f"{found.tracks} agreeing tracks"
     percent = 100 / certificate.extent
     yield _interval(f"rotation {name}", found.rotation, "degrees", over)
     yield _interval(f"displacement {name}", found.shift, unit, over)
-    yield _interval(f"displacement {name}", found.shift, "% of extent", over, percent)
+    yield _interval(f"displacement {name}", found.shift, "% of extent", over, factor=percent)
     yield Figure(f"scale ratio {name}", found.similarity.scale, "", over)
 
 
 def _surface_figures(surfaces: SurfaceDistance | str, unit: str) -> Iterator[Figure]:
     if not isinstance(surfaces, SurfaceDistance):
-        yield Figure("distance between surfaces", None, unit, "", surfaces)
+        yield Figure("distance between surfaces", None, unit, "", absent=surfaces)
         return
     over = f"{surfaces.stable:,} of {surfaces.cores:,} core points on stable structure"
     yield Figure("point-to-plane distance, median", surfaces.median, unit, over)
@@ -159,15 +160,15 @@ def _surface_figures(surfaces: SurfaceDistance | str, unit: str) -> Iterator[Fig
     yield _interval("shift between the surfaces", surfaces.shift, unit, over)
 
 
-def _interval(name: str, size: Interval, unit: str, over: str, factor: float = 1.0) -> Figure:
+def _interval(name: str, size: Interval, unit: str, over: str, *, factor: float = 1.0) -> Figure:
     span = (size.low * factor, size.high * factor)
-    return Figure(name, size.value * factor, unit, over, None, span)
+    return Figure(name, size.value * factor, unit, over, interval=span)
 
 
 def to_json(
     certificate: Certificate, verdict: Verdict, ties: TieAlignment | None = None
 ) -> dict[str, Any]:
-    """What ``registration.json`` holds: plain data, finite numbers or null."""
+    """Content of ``registration.json``: plain data, finite numbers or null."""
     return _plain(
         {
             "format": FORMAT,
@@ -175,7 +176,7 @@ def to_json(
             "verdict": verdict.level,
             "text": verdict.text,
             "todo": list(verdict.todo),
-            "findings": [asdict(f) for f in verdict.findings],
+            "findings": [asdict(f) for f in verdict.objections],
             "route": certificate.route,
             "unit": certificate.unit,
             "extent": certificate.extent,
@@ -215,7 +216,7 @@ def to_json(
 
 
 def _similarity(pair: PairFigures) -> dict[str, Any] | None:
-    """What would bring the first period to where the second one sees it."""
+    """Similarity that would align the first period with the second."""
     found = pair.by_all if isinstance(pair.by_all, Misalignment) else pair.misalignment
     if not isinstance(found, Misalignment):
         return None

@@ -26,7 +26,7 @@ MAX_LINES = 120  # Matches that are drawn between two photos
 COLORS = (
     "#2f7ed8", "#d9622b", "#2a9d5c", "#a44bd1", "#b8860b", "#0f9aa7", "#d1477f", "#6b7280",
 )  # fmt: skip
-"""Of the periods, in turn; each is legible on white and on near-black."""
+"""Colours of the periods, in turn; each is legible on white and on near-black."""
 
 
 def render_report(

@@ -111,9 +111,9 @@ class MapCamera:
     tip: tuple[float, float]
     """End of the tick that shows where it looks."""
     gps: tuple[float, float] | None
-    """Where its GPS says that it was."""
+    """GPS position on the map."""
     cut: bool
-    """Whether the GPS lies farther off than is drawn."""
+    """True if the GPS position lies farther off than is drawn."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,7 +128,7 @@ class CameraMap:
     """Length of the scale bar, units of the drawing."""
     bar_label: str
     north: bool
-    """Whether up is north."""
+    """True if up is north."""
     gross: int
 
 

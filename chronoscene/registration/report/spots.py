@@ -1,4 +1,4 @@
-"""What the page shows of the scene: spots seen on two dates, and pairs of images."""
+"""Spots seen on two dates, and pairs of images, for the page."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ class Spot:
 
     xyz: Array
     normal: Array
-    """Of the surface there, towards the cameras."""
+    """Normal of the surface, towards the cameras."""
     a: int
     """Image of the earlier period."""
     b: int
     xy_a: Array
-    """Where the registration puts the spot, pixels."""
+    """Projection of the spot, pixels."""
     xy_b: Array
     more_a: tuple[int, Array] | None
     """A second image of the same period and the spot in it: a click needs two of each."""
     more_b: tuple[int, Array] | None
     tied: bool
-    """Whether the spot is a tie point; else it is where there is none."""
+    """True if the spot is a tie point, False if there is none near it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,11 +61,11 @@ def spots(
 
     Args:
         model: The registration.
-        seen: Whether an image of the period sees the point. [P, T]
+        seen: True if an image of the period sees the point. [P, T]
         pair: Figures of the two periods.
         count: Maximum number of places.
-        gaps: Whether to take places without tie points; else tie points.
-        twice: Whether two images of each period must show a place.
+        gaps: True for places without tie points, False for tie points.
+        twice: True if two images of each period must show a place.
     """
     if gaps:
         places = pair.ties.gaps

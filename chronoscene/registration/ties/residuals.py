@@ -9,7 +9,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.errors import SceneError
-from chronoscene.registration.quality.rays import Placed, Rays, place, project, rays_at
+from chronoscene.registration.quality.rays import Placed, TrackRays, place, project, rays_at
 from chronoscene.registration.result import Registered
 from chronoscene.registration.ties.tie_points import TiePoints, match_images
 
@@ -19,7 +19,7 @@ OUTLIER_PIXELS = 12.0
 
 @dataclass(frozen=True, slots=True)
 class PointResidual:
-    """How well one tie point fits."""
+    """Residuals of one tie point."""
 
     name: str
     clicks: int
@@ -31,7 +31,7 @@ class PointResidual:
     """World units: largest distance between its places by single periods, or to its control."""
     outlier: bool
     note: str
-    """What is wrong with it, or ``""``."""
+    """Problem of the point, or ``""``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +40,7 @@ class Clicks:
 
     names: tuple[str, ...]
     """Points."""
-    rays: Rays
+    rays: TrackRays
     """A track is an index into ``names``."""
     xy: Array
 
@@ -72,11 +72,11 @@ def clicks_of(model: Registered, tie_points: TiePoints) -> tuple[Clicks, list[st
     return Clicks(tuple(p.name for p in tie_points.points), rays, places), remarks
 
 
-def moved(rays: Rays, model: Registered) -> Rays:
+def moved(rays: TrackRays, model: Registered) -> TrackRays:
     return replace(rays, pose=model.cam_from_world[rays.image])
 
 
-def place_clicks(rays: Rays) -> Placed:
+def place_clicks(rays: TrackRays) -> Placed:
     """Points of clicks, without the bad click of a point that only fits without it."""
     placed = place(rays)
     missing = np.setdiff1d(rays.track, placed.track)
@@ -84,7 +84,7 @@ def place_clicks(rays: Rays) -> Placed:
     return Placed.join(placed, *rescued)
 
 
-def _without_one(rays: Rays) -> Placed | None:
+def _without_one(rays: TrackRays) -> Placed | None:
     """A point placed without the click that fits worst; None if nothing fits."""
     if len(rays) < 4:
         return None
@@ -152,12 +152,17 @@ def residuals(
         alone = np.concatenate(places)
         xyz = by_all.get(track, control.get(name, alone.mean(axis=0) if len(alone) else None))
         if xyz is None or not len(mine):
-            note = (
-                "clicked in only one image, or without parallax" if len(mine) else "not registered"
+            disagree = len(mine) > 2
+            note = "not registered"
+            if len(mine):
+                note = (
+                    "its clicks do not meet in one point"
+                    if disagree
+                    else "clicked in only one image, or without parallax"
+                )
+            yield PointResidual(
+                name, len(mine), labels, pixels=None, distance=None, outlier=disagree, note=note
             )
-            if len(mine) > 2:
-                note = "its clicks do not meet in one point"
-            yield PointResidual(name, len(mine), labels, None, None, len(mine) > 2, note)
             continue
         residual = project(mine, np.tile(xyz, (len(mine), 1)))[0]
         error = np.nan_to_num(np.linalg.norm(residual, axis=1), nan=np.inf)
@@ -168,7 +173,7 @@ def residuals(
 
 
 def _of_point(
-    model: Registered, name: str, rays: Rays, labels: tuple[str, ...], error: Array,
+    model: Registered, name: str, rays: TrackRays, labels: tuple[str, ...], error: Array,
     gaps: Array | None,
 ) -> PointResidual:  # fmt: skip
     worst = int(np.argmax(error))
@@ -176,6 +181,12 @@ def _of_point(
     note = ""
     if outlier:
         note = f"{error[worst]:.0f} px off in {model.names[rays.image[worst]]}"
-    distance = float(gaps.max()) if gaps is not None and len(gaps) else None
-    pixels = float(np.sqrt(np.mean(error**2)))
-    return PointResidual(name, len(rays), labels, pixels, distance, outlier, note)
+    return PointResidual(
+        name,
+        len(rays),
+        labels,
+        pixels=float(np.sqrt(np.mean(error**2))),
+        distance=float(gaps.max()) if gaps is not None and len(gaps) else None,
+        outlier=outlier,
+        note=note,
+    )

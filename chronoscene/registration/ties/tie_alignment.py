@@ -46,9 +46,9 @@ class TieAlignment:
 
     model: Registered
     replaced: bool
-    """Whether the alignment of periods was replaced."""
+    """True if the alignment of periods was replaced."""
     controlled: bool
-    """Whether the model was moved to ground control."""
+    """True if the model was moved to ground control."""
     residuals: tuple[PointResidual, ...]
     remarks: tuple[str, ...]
 
@@ -201,8 +201,8 @@ def tie(model: Registered, points: TiePoints, refine: Refine) -> TieAlignment:
     adjusted = refine(refine_arguments(first.model, points))
     adjusted = replace(adjusted, georeference=framed.georeference, gps_enu=framed.gps_enu)
     last = align_with_tie_points(adjusted, points, mode="check")
-    told = replace(last, replaced=True, remarks=(*first.remarks, *last.remarks))
-    return _unless_placed(told, model)
+    both = replace(last, replaced=True, remarks=(*first.remarks, *last.remarks))
+    return _unless_placed(both, model)
 
 
 def _unless_placed(result: TieAlignment, before: Registered) -> TieAlignment:
@@ -216,14 +216,19 @@ def control_frame(points: TiePoints) -> Georeference | None:
     """A local frame at the ground control; None without control in a reference system."""
     if points.crs is None or not any(p.world is not None for p in points.points):
         return None
-    anywhere = Georeference(0.0, 0.0, 0.0, "as stated")
+    anywhere = Georeference(latitude=0.0, longitude=0.0, height=0.0, height_kind="as stated")
     places = anywhere.to_geodetic(np.stack(list(points.located(anywhere).values())))
     latitude, longitude, height = np.median(places, axis=0).tolist()
-    return Georeference(round(latitude, 7), round(longitude, 7), round(height, 2), "as stated")
+    return Georeference(
+        latitude=round(latitude, 7),
+        longitude=round(longitude, 7),
+        height=round(height, 2),
+        height_kind="as stated",
+    )
 
 
 def refine_arguments(model: Registered, points: TiePoints) -> dict[str, Any]:
-    """What `routes.refine` needs to know of an aligned model."""
+    """Poses, cameras and tie points of an aligned model, as arguments of `routes.refine`."""
     tied = with_tie_tracks(model, points)
     starts = tied.track_start[len(model.points) :].tolist()
     ties = []

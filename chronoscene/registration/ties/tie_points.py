@@ -1,4 +1,4 @@
-"""Tie points that a person clicked: files of them, and what they say about a registration.
+"""Files of tie points and ground control that a person clicked.
 
 Two forms are read. A CSV has a row for each click: point id, image, x, y, and for ground control
 also the point's world coordinates. OpenDroneMap's ``gcp_list.txt`` has a line with the projection,
@@ -42,12 +42,12 @@ class Click:
     """One point in one image."""
 
     image: str
-    """As the file names it."""
+    """Name of the image in the file."""
     x: float
     """Pixels."""
     y: float
     line: int
-    """Of the file, from 1."""
+    """Line of the file, from 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +57,12 @@ class TiePoint:
     name: str
     clicks: tuple[Click, ...]
     world: tuple[float, float, float] | None
-    """Where it is, for ground control, in the file's reference system."""
+    """World coordinates of ground control, in the file's reference system."""
 
 
 @dataclass(frozen=True, slots=True)
 class TiePoints:
-    """What a file says."""
+    """Content of a file of tie points."""
 
     path: Path
     points: tuple[TiePoint, ...]
@@ -173,11 +173,11 @@ def _csv_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
                 path, number, "three world coordinates, or none", f"{len(world)}", _TODO_CSV
             )
         xyz = [_number(path, number, text, "a world coordinate") for text in world]
-        yield point, Click(image, xy[0], xy[1], number), (xyz[0], xyz[1], xyz[2]) if xyz else None
+        yield point, Click(image, *xy, line=number), (xyz[0], xyz[1], xyz[2]) if xyz else None
 
 
 def _header(path: Path, number: int, row: Sequence[str]) -> dict[str, int] | None:
-    """Which field is in which column; None if the first line is data."""
+    """Column of each field by name; None if the first line is data."""
     if len(row) > 3 and _is_number(row[2]) and _is_number(row[3]):
         return None
     order = {}
@@ -214,7 +214,7 @@ def _odm_rows(path: Path, lines: Sequence[tuple[int, str]]) -> Iterator[_Row]:
         )
         # Without a name, a point is known by where it is.
         point = fields[6] if len(fields) > 6 and fields[6] else f"{fields[0]} {fields[1]}"
-        yield point, Click(fields[5], u, v, number), (x, y, z)
+        yield point, Click(fields[5], u, v, line=number), (x, y, z)
 
 
 def _is_projection(line: str) -> bool:

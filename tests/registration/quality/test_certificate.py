@@ -45,7 +45,7 @@ def without_held_out(model: Registered) -> Registered:
 
 def test_a_good_registration_passes(certificate: Certificate) -> None:
     verdict = judge(certificate)
-    assert verdict.level == "pass", verdict.findings
+    assert verdict.level == "pass", verdict.objections
     assert "took no part" in verdict.text
     assert verdict.pairs == {(0, 1): "pass"}
 
@@ -122,7 +122,7 @@ def test_no_wrong_registration_passes(name: str) -> None:
     verdict = judge(certify(model))
     assert wrong, "the case must be a wrong one"
     assert verdict.level != "pass"
-    assert verdict.findings and verdict.todo
+    assert verdict.objections and verdict.todo
 
 
 def test_gross_errors_fail() -> None:
@@ -147,7 +147,7 @@ def test_a_chain_of_good_pairs_is_good() -> None:
     certificate = certify(made.model)
     assert sum(p.ties.points == 0 for p in certificate.pairs) == 3
     verdict = judge(certificate)
-    assert verdict.level == "pass", verdict.findings
+    assert verdict.level == "pass", verdict.objections
     assert verdict.pairs[0, 3] is None
 
 
@@ -155,7 +155,7 @@ def test_without_held_out_tracks_there_is_no_pass(good: Registered) -> None:
     certificate = certify(without_held_out(good))
     verdict = judge(certificate)
     assert verdict.level == "doubtful"
-    assert any(f.check == "held_out" for f in verdict.findings)
+    assert any(f.check == "held_out" for f in verdict.objections)
     (pair,) = certificate.pairs
     assert isinstance(pair.held_out, str)
     texts = [f.text for f in pair_figures(certificate, pair)]
@@ -170,7 +170,7 @@ def test_missing_photos_are_counted_with_their_reasons(good: Registered) -> None
     assert certificate.periods[1].reasons == {"too few matches": 40}
     verdict = judge(certificate)
     assert verdict.level == "doubtful"
-    assert verdict.findings[0].check == "registered"
+    assert verdict.objections[0].check == "registered"
 
 
 def test_a_period_without_any_image(good: Registered) -> None:
@@ -178,7 +178,7 @@ def test_a_period_without_any_image(good: Registered) -> None:
     certificate = certify(model)
     verdict = judge(certificate)
     assert verdict.level == "fail"
-    assert any(f.place == "period c" and f.check == "images" for f in verdict.findings)
+    assert any(f.place == "period c" and f.check == "images" for f in verdict.objections)
     json.dumps(to_json(certificate, verdict), allow_nan=False)
 
 
@@ -384,7 +384,7 @@ def test_a_period_far_from_its_own_gps_is_doubtful(good: Registered) -> None:
     gps[half[::2]] += np.array([-150.0, 90.0, 0.0])
     verdict = judge(certify(replace(good, gps_enu=gps)))
     assert verdict.level != "pass"
-    assert any(f.check == "gps_residual" and f.place == "period 2017" for f in verdict.findings)
+    assert any(f.check == "gps_residual" and f.place == "period 2017" for f in verdict.objections)
 
 
 def test_one_period_is_not_praised_for_an_alignment() -> None:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from chronoscene.arrays import Array
 from chronoscene.registration.quality.localisation import Localisation, localise
-from chronoscene.registration.quality.rays import Placed, Rays
+from chronoscene.registration.quality.rays import Placed, TrackRays
 from chronoscene.scene.geometry import pose_from_rotation_translation
 
 IMAGES, FOCAL = 50, 800.0
@@ -22,7 +22,7 @@ POSE = pose_from_rotation_translation(
 
 def observed(
     points: int, noise: Array, point_noise: float = 0.0, images: int = IMAGES
-) -> tuple[Rays, Placed]:
+) -> tuple[TrackRays, Placed]:
     """Images at one pose, each with points of its own.
 
     Args:
@@ -35,7 +35,7 @@ def observed(
     count = images * points
     xyz = rng.uniform([-10, -8, -6], [10, 8, 6], (count, 3))
     local = xyz @ POSE[:3, :3].T + POSE[:3, 3]
-    rays = Rays(
+    rays = TrackRays(
         track=np.arange(count),
         image=np.repeat(np.arange(images), points),
         pose=np.broadcast_to(POSE, (count, 4, 4)),
@@ -51,7 +51,7 @@ def observed(
     return rays, placed
 
 
-def found(rays: Rays, placed: Placed) -> Localisation:
+def found(rays: TrackRays, placed: Placed) -> Localisation:
     result = localise(rays, placed)
     assert isinstance(result, Localisation)
     assert result.images == result.tried

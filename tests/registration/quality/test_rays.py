@@ -10,7 +10,7 @@ import pytest
 from benchmarks.registration.generated import CaseSettings, generate_case
 from chronoscene.registration.output import inspect_registration
 from chronoscene.registration.quality import rays
-from chronoscene.registration.quality.rays import Rays, model_rays, place
+from chronoscene.registration.quality.rays import TrackRays, model_rays, place
 
 
 def test_every_point_is_placed_once_in_each_period(
@@ -19,7 +19,7 @@ def test_every_point_is_placed_once_in_each_period(
     model = generate_case(CaseSettings(periods=3, seed=5)).model
     placed, unprojected = [], []
 
-    def counted(of: Rays) -> rays.Placed:
+    def counted(of: TrackRays) -> rays.Placed:
         placed.append(len(of))
         return place(of)
 

@@ -110,14 +110,14 @@ def apart(certificate: Certificate, pair: tuple[int, int], ties: int = 0) -> Cer
 
 
 def found(verdict: Verdict) -> list[tuple[str, str]]:
-    return [(f.check, f.level) for f in verdict.findings]
+    return [(f.check, f.level) for f in verdict.objections]
 
 
 def test_a_registration_that_is_good_in_everything_passes() -> None:
     for count in (1, 2, 4):
         verdict = judge(made(count))
         assert verdict.level == "pass"
-        assert not verdict.findings
+        assert not verdict.objections
         assert set(verdict.pairs.values()) <= {"pass"}
         assert verdict.text.startswith(
             "There is only" if count == 1 else f"The {count} periods lie"
@@ -255,14 +255,14 @@ def test_each_check_has_its_limit(name: str) -> None:
 
 def test_a_finding_states_the_limit_that_was_passed() -> None:
     for agreeing, limit in ((0.7, "0.75"), (0.1, "0.15")):
-        (finding,) = judge(with_part(made(), "held_out", agreeing=agreeing)).findings
-        assert finding.found.endswith(f": {agreeing}, expected at least {limit}")
-    (finding,) = judge(with_gps(made(), median=14.0)).findings
-    assert finding.found.endswith(": 14 m, expected at most 12")
+        (objection,) = judge(with_part(made(), "held_out", agreeing=agreeing)).objections
+        assert objection.found.endswith(f": {agreeing}, expected at least {limit}")
+    (objection,) = judge(with_gps(made(), median=14.0)).objections
+    assert objection.found.endswith(": 14 m, expected at most 12")
     for part in ("misalignment", "by_all"):
         wide = with_part(made(), part, rotation=Interval(0.04, 0.0, 0.3))
-        (finding,) = judge(wide).findings
-        assert finding.found.endswith(
+        (objection,) = judge(wide).objections
+        assert objection.found.endswith(
             f": {0.04 if part == 'misalignment' else 0.03} degrees, but up to 0.3 cannot be ruled "
             "out; expected at most 0.1"
         )
@@ -271,9 +271,9 @@ def test_a_finding_states_the_limit_that_was_passed() -> None:
 @pytest.mark.parametrize("noisy", [0, 1])
 def test_the_noise_of_matching_is_that_of_the_noisier_period(noisy: int) -> None:
     certificate = with_part(made(), "held_out", noise=1.86)
-    assert not judge(certificate).findings
+    assert not judge(certificate).objections
     calm = with_period(certificate, 1 - noisy, error=0.1)
-    assert not judge(calm).findings
+    assert not judge(calm).objections
     for error in (0.1, None):
         both_calm = with_period(calm, noisy, error=error)
         assert found(judge(both_calm)) == [("excess", "doubtful")]
@@ -320,13 +320,13 @@ def test_without_both_measurements_there_is_no_pass(missing: tuple[str, ...], tr
     certificate = with_part(made(), "held_out", tracks=tracks)
     verdict = judge(with_pair(certificate, **dict.fromkeys(missing, "all in one spot")))
     assert found(verdict) == [("held_out", "doubtful")]
-    assert f"{min(tracks, 11)} tracks, expected at least 12 (" in verdict.findings[0].found
+    assert f"{min(tracks, 11)} tracks, expected at least 12 (" in verdict.objections[0].found
 
 
 def test_without_held_out_tracks_the_ties_can_still_prove_an_error() -> None:
     nothing = with_pair(made(), held_out="no track", misalignment="no track")
     assert found(judge(nothing)) == [("held_out", "doubtful")]
-    assert "0 tracks, expected at least 12" in judge(nothing).findings[0].found
+    assert "0 tracks, expected at least 12" in judge(nothing).objections[0].found
     wrong = with_part(nothing, "by_all", rotation=Interval(0.4, 0.2, 0.6))
     assert found(judge(wrong)) == [("rotation", "fail"), ("held_out", "doubtful")]
 
@@ -361,7 +361,7 @@ def test_a_chain_counts_as_far_as_its_errors_add_up(rotation: float, shift: floa
     assert chained(0.0707).level == "pass"
     beyond = chained(0.0708)
     assert found(beyond) == [("chain", "doubtful")]
-    assert "within 1 times the limits" in beyond.findings[0].found
+    assert "within 1 times the limits" in beyond.objections[0].found
     assert beyond.pairs == {(0, 1): "pass", (0, 2): None, (1, 2): "pass"}
 
 
@@ -369,13 +369,13 @@ def test_a_chain_has_no_doubtful_link() -> None:
     certificate = with_part(apart(made(3), (0, 2)), "held_out", (1, 2), agreeing=0.7)
     verdict = judge(certificate)
     assert found(verdict) == [("agreeing", "doubtful"), ("chain", "doubtful")]
-    assert verdict.findings[1].found == "no chain of good pairs links them"
+    assert verdict.objections[1].found == "no chain of good pairs links them"
 
 
 def test_a_period_that_nothing_links_fails_with_each_of_the_others() -> None:
     verdict = judge(apart(apart(made(3), (0, 2)), (1, 2)))
     assert found(verdict) == [("link", "fail")] * 2
-    assert [f.place for f in verdict.findings] == [
+    assert [f.place for f in verdict.objections] == [
         "periods May 2016 and May 2018",
         "periods May 2017 and May 2018",
     ]
@@ -420,7 +420,7 @@ def test_the_worst_comes_first_and_is_what_the_text_names() -> None:
     assert found(verdict) == [("agreeing", "fail"), ("registered", "doubtful")]
     assert verdict.text.startswith("The periods do not fit each other")
     assert "Periods May 2016 and May 2017: share of held-out observations" in verdict.text
-    assert [len(verdict.todo), verdict.todo[0]] == [2, verdict.findings[0].todo]
+    assert [len(verdict.todo), verdict.todo[0]] == [2, verdict.objections[0].todo]
     doubtful = judge(with_period(made(), photos=50))
     assert "Period May 2017: share of the photos" in doubtful.text
     assert "do not prove it" in doubtful.text
