@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from chronoscene.bench.files.records import Row, RunRecord
+from chronoscene.bench.files.records import RunRecord, ViewScore
 from chronoscene.bench.report.summary import COSTS
 from chronoscene.bench.score.regions import ALL
 from chronoscene.bench.score.scoring import aggregate
@@ -91,16 +91,16 @@ class EntryRun(BaseModel):
         return self
 
     @property
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ViewScore]:
         """The values as rows of a run."""
         return [
-            Row(v.view, v.period, v.period, ALL, metric, value)
+            ViewScore(v.view, v.period, v.period, ALL, metric, value)
             for v in self.views
             for metric, value in v.values.items()
         ]
 
 
-class Entry(BaseModel):
+class MeasuredEntry(BaseModel):
     """What a method reaches on a scene, in one setting and on one machine."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -110,7 +110,7 @@ class Entry(BaseModel):
     runs: tuple[EntryRun, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _of_one_kind(self) -> Entry:
+    def _of_one_kind(self) -> MeasuredEntry:
         for name in KEY:
             if len({getattr(run.record, name) for run in self.runs}) > 1:
                 raise ValueError(f"runs that differ in {name}")
@@ -129,7 +129,7 @@ class Entry(BaseModel):
         return [run.record.model_copy(update={"rows": run.rows}) for run in self.runs]
 
 
-def read_entry(path: Path) -> Entry:
+def read_entry(path: Path) -> MeasuredEntry:
     """Read a measured entry.
 
     Raises:
@@ -138,20 +138,20 @@ def read_entry(path: Path) -> Entry:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise refused(path, f"more than {MAX_BYTES} bytes")
-        return Entry.model_validate_json(path.read_bytes())
+        return MeasuredEntry.model_validate_json(path.read_bytes())
     except ValidationError as error:
         raise refused(path, reason_of(error)) from error
     except OSError as error:
         raise refused(path, error.strerror or str(error)) from error
 
 
-def read_entries(folder: Path) -> dict[Path, Entry]:
+def read_entries(folder: Path) -> dict[Path, MeasuredEntry]:
     """Read all entries below a folder, by file.
 
     Raises:
         ConfigError: If one is refused, or two are of the same runs.
     """
-    entries: dict[Path, Entry] = {}
+    entries: dict[Path, MeasuredEntry] = {}
     keys = set()
     for path in sorted(folder.rglob("*.json")):
         entry = entries[path] = read_entry(path)

@@ -13,7 +13,7 @@ from chronoscene.bench.files.ground_truth import ground_truth_folder
 from chronoscene.bench.files.predictions import ImageEntry, load_image, read_manifest
 from chronoscene.bench.files.records import PREDICTIONS, RunRecord, read_run, run_folders
 from chronoscene.formats.shared.grouping import natural_key
-from leaderboard.entries import Entry, EntryRun
+from leaderboard.entries import EntryRun, MeasuredEntry
 
 VIEWS = 3
 """Of each period, spread over its test views."""
@@ -22,7 +22,7 @@ WIDTH = 640
 QUALITY = 82
 
 
-def find_runs(folders: Iterable[Path], entries: Iterable[Entry]) -> dict[Path, EntryRun]:
+def find_runs(folders: Iterable[Path], entries: Iterable[MeasuredEntry]) -> dict[Path, EntryRun]:
     """Folders of runs whose predictions are those of an entry, of the first seed of each entry."""
     wanted = {
         frozenset((view.view, view.sha256) for view in entry.runs[0].views): entry.runs[0]

@@ -29,7 +29,7 @@ from chronoscene.io.pages import render_page
 from chronoscene.io.staging import staged_folder
 from chronoscene.methods import MethodSpec, installed_methods, load_spec
 from chronoscene.metrics.registry import metric_info
-from leaderboard.entries import Entry
+from leaderboard.entries import MeasuredEntry
 from leaderboard.groups import Setting, comparable, setting_of
 from leaderboard.pareto import Point, plot
 from leaderboard.pictures import find_runs, gallery
@@ -43,7 +43,10 @@ COSTS = {"seconds": "training [s]", SIZE: "size [MB]", "peak_memory_bytes": "mem
 
 
 def write_site(
-    entries: Collection[Entry], published: PublishedTable, out: Path, runs: Iterable[Path] = ()
+    entries: Collection[MeasuredEntry],
+    published: PublishedTable,
+    out: Path,
+    runs: Iterable[Path] = (),
 ) -> int:
     """Write the site.
 
@@ -69,7 +72,9 @@ def write_site(
 class _Site:
     """All pages; methods and scenes have a name for their files each."""
 
-    def __init__(self, entries: Collection[Entry], published: PublishedTable, folder: Path) -> None:
+    def __init__(
+        self, entries: Collection[MeasuredEntry], published: PublishedTable, folder: Path
+    ) -> None:
         self.published, self.folder = published, folder
         self.records = [record for entry in entries for record in entry.records]
         printed = published_entries(published, dict.fromkeys(row.scene for row in published.rows))

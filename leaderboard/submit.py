@@ -13,7 +13,14 @@ from chronoscene.bench.files.predictions import load_image, read_manifest
 from chronoscene.bench.files.records import PREDICTIONS, RUN_FILE, read_rows, read_run, run_folders
 from chronoscene.bench.score.regions import ALL
 from chronoscene.io.staging import write_text_atomic
-from leaderboard.entries import Entry, EntryRun, ScoredView, read_entries, reason_of, refused
+from leaderboard.entries import (
+    EntryRun,
+    MeasuredEntry,
+    ScoredView,
+    read_entries,
+    reason_of,
+    refused,
+)
 
 
 def submit(folders: Iterable[Path], to: Path) -> list[Path]:
@@ -34,11 +41,11 @@ def submit(folders: Iterable[Path], to: Path) -> list[Path]:
     places = {entry.key: path for path, entry in entries.items()}
     changed = {}
     for folder in (run for given in folders for run in _runs_of(given)):
-        entry = Entry(runs=(entry_run(folder),))
+        entry = MeasuredEntry(runs=(entry_run(folder),))
         path = places.setdefault(entry.key, to / file_name(entry))
         known = entries.get(path, entry)
         by_seed = {run.record.seed: run for run in (*known.runs, *entry.runs)}
-        entries[path] = Entry(runs=tuple(by_seed[seed] for seed in sorted(by_seed)))
+        entries[path] = MeasuredEntry(runs=tuple(by_seed[seed] for seed in sorted(by_seed)))
         changed[path] = entries[path]
     for path, entry in changed.items():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -82,7 +89,7 @@ def entry_run(folder: Path) -> EntryRun:
         raise refused(folder, reason_of(error)) from error
 
 
-def file_name(entry: Entry) -> str:
+def file_name(entry: MeasuredEntry) -> str:
     """Return a readable and unique name for the file of an entry, below a folder per scene."""
     run = entry.runs[0].record
     words = run.scene, "-".join((run.method, run.strategy, run.preset))

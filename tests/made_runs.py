@@ -7,7 +7,7 @@ import numpy as np
 
 from chronoscene.bench.files.ground_truth import ground_truth_folder
 from chronoscene.bench.files.predictions import ImageWriter
-from chronoscene.bench.files.records import PREDICTIONS, Row, RunRecord, write_run
+from chronoscene.bench.files.records import PREDICTIONS, RunRecord, ViewScore, write_run
 from chronoscene.bench.score.scoring import aggregate
 
 
@@ -58,7 +58,7 @@ def record(method="chronogs", seed=0, *, psnr=(20.0, 30.0), ssim=None, **changes
 def scored(method="chronogs", seed=0, *, psnr, **changes):
     """A run with the PSNR of each view, by period. [P][N]"""
     rows = [
-        Row(f"{i}/view{k}.png", i, i, "all", "psnr", float(value))
+        ViewScore(f"{i}/view{k}.png", i, i, "all", "psnr", float(value))
         for i, values in enumerate(psnr)
         for k, value in enumerate(values)
     ]

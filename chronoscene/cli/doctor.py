@@ -27,7 +27,7 @@ CPU_TORCH = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Diagnosis:
     """One row of the table."""
 
     what: str
@@ -45,34 +45,34 @@ def command() -> None:
     What is missing comes with what to install, and what for. The exit status is 1 if no method can
     be trained here, else 0. Nothing is downloaded.
     """
-    findings = [check() for check in CHECKS]
+    diagnoses = [check() for check in CHECKS]
     heads = [(head, "") for head in ("part", "state", "found")]
-    rows = [(finding.what, finding.state, finding.found) for finding in findings]
+    rows = [(diagnosis.what, diagnosis.state, diagnosis.found) for diagnosis in diagnoses]
     table = Table(heads, rows, labels=len(heads), title="What works on this machine")
     emit(plain_text(table) + "\n", None)
-    for finding in findings:
-        if finding.todo:
-            emit(f"{finding.what}: {finding.todo}\n", None)
-    if any(finding.state == "needed" for finding in findings):
+    for diagnosis in diagnoses:
+        if diagnosis.todo:
+            emit(f"{diagnosis.what}: {diagnosis.todo}\n", None)
+    if any(diagnosis.state == "needed" for diagnosis in diagnoses):
         emit("No method can be trained here; commands on datasets may work.\n", None)
         click.get_current_context().exit(CANNOT_RUN)
 
 
-def _program() -> Finding:
+def _program() -> Diagnosis:
     system = f"{platform.system()} {platform.machine()}"
     found = f"{__version__}, Python {platform.python_version()}, {system}"
-    return Finding("chronoscene", "ok", found)
+    return Diagnosis("chronoscene", "ok", found)
 
 
-def _torch() -> Finding:
+def _torch() -> Diagnosis:
     todo = f"{CPU_TORCH}, or a CUDA build from pytorch.org; all methods need it"
     return _needed("torch", "torch", todo)
 
 
-def _kernels() -> Finding:
+def _kernels() -> Diagnosis:
     todo = "pip install numba; the rasterizer and the methods are compiled with it"
-    if (finding := _needed("kernels", "numba", todo)).state != "ok":
-        return finding
+    if (diagnosis := _needed("kernels", "numba", todo)).state != "ok":
+        return diagnosis
     from chronoscene.kernels.compilation import kernel
 
     @kernel
@@ -81,93 +81,93 @@ def _kernels() -> Finding:
 
     assert twice(21) == 42
     if folder := twice.stats.cache_path:
-        return Finding("kernels", "ok", f"{finding.found}, compiled once and kept in {folder}")
-    return Finding(
+        return Diagnosis("kernels", "ok", f"{diagnosis.found}, compiled once and kept in {folder}")
+    return Diagnosis(
         "kernels",
         "missing",
-        f"{finding.found}, but no folder that may be written to",
+        f"{diagnosis.found}, but no folder that may be written to",
         "set NUMBA_CACHE_DIR to such a folder; else every process compiles all kernels anew",
     )
 
 
-def _colmap() -> Finding:
+def _colmap() -> Diagnosis:
     todo = "pip install pycolmap; without it no scene can be read"
     return _needed("COLMAP", "chronoscene.io.pycolmap", todo, package="pycolmap")
 
 
-def _needed(what: str, module: str, todo: str, *, package: str = "") -> Finding:
+def _needed(what: str, module: str, todo: str, *, package: str = "") -> Diagnosis:
     """Whether a module without which nothing is trained can be imported."""
     try:
         import_module(module)
-        return Finding(what, "ok", f"{package or module} {version(package or module)}")
+        return Diagnosis(what, "ok", f"{package or module} {version(package or module)}")
     except (ImportError, OSError, PackageNotFoundError) as error:
-        return Finding(what, "needed", str(error).splitlines()[0], todo)
+        return Diagnosis(what, "needed", str(error).splitlines()[0], todo)
 
 
-def _cuda() -> Finding:
+def _cuda() -> Diagnosis:
     try:
         import torch
     except (ImportError, OSError):
-        return Finding("CUDA", "missing", "no torch to ask")
+        return Diagnosis("CUDA", "missing", "no torch to ask")
     if not torch.cuda.is_available():
         build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "CPUs only"
         found = f"no device; this torch is built for {build}"
-        return Finding("CUDA", "missing", found, "not needed: methods are trained on the CPU")
+        return Diagnosis("CUDA", "missing", found, "not needed: methods are trained on the CPU")
     devices = (torch.cuda.get_device_properties(i) for i in range(torch.cuda.device_count()))
-    return Finding(
+    return Diagnosis(
         "CUDA", "ok", ", ".join(f"{d.name}, {in_words(d.total_memory)}" for d in devices)
     )
 
 
-def _gsplat() -> Finding:
+def _gsplat() -> Diagnosis:
     try:
         gsplat_release()
     except BackendError as error:
         found = f"{error.found}, not {error.expected}"
-        return Finding("gsplat", "missing", found, f"{error.todo}; --device cuda needs it")
-    return Finding("gsplat", "ok", f"gsplat {version('gsplat')}")
+        return Diagnosis("gsplat", "missing", found, f"{error.todo}; --device cuda needs it")
+    return Diagnosis("gsplat", "ok", f"gsplat {version('gsplat')}")
 
 
-def _open3d() -> Finding:
+def _open3d() -> Diagnosis:
     try:
         from chronoscene.synth.render.renderer import load_open3d
 
-        return Finding("open3d", "ok", f"open3d {load_open3d().__version__}")
+        return Diagnosis("open3d", "ok", f"open3d {load_open3d().__version__}")
     except ImportError as error:  # of what synth needs besides
-        return Finding("open3d", "missing", str(error))
+        return Diagnosis("open3d", "missing", str(error))
     except ChronoSceneError as error:
         todo = f"{error.todo}; chronoscene synth needs it"
-        return Finding("open3d", "missing", error.found, todo)
+        return Diagnosis("open3d", "missing", error.found, todo)
 
 
-def _lpips() -> Finding:
+def _lpips() -> Diagnosis:
     try:
         check_available()
     except ChronoSceneError as error:
-        return Finding("LPIPS weights", "missing", error.found, error.todo)
-    return Finding("LPIPS weights", "ok", ", ".join(map(str, candidate_files())))
+        return Diagnosis("LPIPS weights", "missing", error.found, error.todo)
+    return Diagnosis("LPIPS weights", "ok", ", ".join(map(str, candidate_files())))
 
 
-def _video() -> Finding:
+def _video() -> Diagnosis:
     if find_spec("av") is None:
-        return Finding("video", "missing", "not installed", "pip install av; MP4 files need it")
-    return Finding("video", "ok", f"av {version('av')}")
+        return Diagnosis("video", "missing", "not installed", "pip install av; MP4 files need it")
+    return Diagnosis("video", "ok", f"av {version('av')}")
 
 
-def _processors() -> Finding:
+def _processors() -> Diagnosis:
     found = f"{available_threads()} of {os.cpu_count()}"
-    return Finding("processors", "ok", found)
+    return Diagnosis("processors", "ok", found)
 
 
-def _memory() -> Finding:
-    return Finding("memory", "ok", in_words(machine_memory()[0]))
+def _memory() -> Diagnosis:
+    return Diagnosis("memory", "ok", in_words(machine_memory()[0]))
 
 
-def _disk() -> Finding:
-    return Finding("disk", "ok", f"{in_words(shutil.disk_usage(Path.cwd()).free)} free here")
+def _disk() -> Diagnosis:
+    return Diagnosis("disk", "ok", f"{in_words(shutil.disk_usage(Path.cwd()).free)} free here")
 
 
-CHECKS: tuple[Callable[[], Finding], ...] = (
+CHECKS: tuple[Callable[[], Diagnosis], ...] = (
     _program,
     _torch,
     _kernels,

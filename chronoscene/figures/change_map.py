@@ -29,7 +29,7 @@ LEFT, RIGHT, BOTTOM, TOP, TITLE = 0.62, 0.15, 0.5, 0.62, 0.26
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Panel:
+class ChangePanel:
     """A pair of periods."""
 
     title: str
@@ -39,7 +39,7 @@ class Panel:
     """Of the places. [N]"""
 
 
-def draw_changes(cloud: Cloud, panels: Sequence[Panel], path: Path) -> None:
+def draw_changes(cloud: Cloud, panels: Sequence[ChangePanel], path: Path) -> None:
     """Draw all pairs at one scale.
 
     Args:

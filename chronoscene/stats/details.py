@@ -16,7 +16,7 @@ MAX_SHOWN = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class DetailColumn:
     """One measured quantity."""
 
     name: str
@@ -31,21 +31,21 @@ class Column:
 
 
 COLUMNS = (
-    Column("images", ("Images", "")),
-    Column("test", ("", "test")),
-    Column("points", ("Points", "")),
-    Column("points_seen", ("", "seen")),
-    Column("observations", ("Observations", "")),
-    Column("track_mean", ("Track", "mean"), decimals=2),
-    Column("track_median", ("", "median"), decimals=1),
-    Column("reprojection_error", ("Error", "[px]"), decimals=3),
-    Column("baseline", ("Baseline", "[% of depth]"), factor=100.0, decimals=1),
-    Column("coverage", ("Coverage", "[%]"), factor=100.0, decimals=1),
+    DetailColumn("images", ("Images", "")),
+    DetailColumn("test", ("", "test")),
+    DetailColumn("points", ("Points", "")),
+    DetailColumn("points_seen", ("", "seen")),
+    DetailColumn("observations", ("Observations", "")),
+    DetailColumn("track_mean", ("Track", "mean"), decimals=2),
+    DetailColumn("track_median", ("", "median"), decimals=1),
+    DetailColumn("reprojection_error", ("Error", "[px]"), decimals=3),
+    DetailColumn("baseline", ("Baseline", "[% of depth]"), factor=100.0, decimals=1),
+    DetailColumn("coverage", ("Coverage", "[%]"), factor=100.0, decimals=1),
 )
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class DetailRow:
     """One period, or a whole scene."""
 
     scene: str
@@ -65,17 +65,22 @@ class Row:
         return "all" if self.period is None else period_title(self.period, self.label, self.date)
 
 
-def rows_of(statistics: SceneStatistics) -> list[Row]:
+def rows_of(statistics: SceneStatistics) -> list[DetailRow]:
     """A row for each period and one for the scene."""
     counts = statistics.counts
     shares = zip(statistics.overlap, statistics.in_view, strict=True)
     rows = [
-        Row(counts.name, count.id, count.label, count.date, asdict(count) | asdict(own), *known)
+        DetailRow(
+            counts.name, count.id, count.label, count.date, asdict(count) | asdict(own), *known
+        )
         for count, own, known in zip(counts.periods, statistics.periods, shares, strict=True)
     ]
     tests = sum(count.test for count in counts.periods)
     whole = {"images": counts.images, "test": tests, "points": counts.points}
-    return [*rows, Row(counts.name, None, "all", None, whole | asdict(statistics.whole), (), ())]
+    return [
+        *rows,
+        DetailRow(counts.name, None, "all", None, whole | asdict(statistics.whole), (), ()),
+    ]
 
 
 def _max_periods(statistics: Sequence[SceneStatistics]) -> int:
@@ -154,7 +159,7 @@ def _table(statistics: Sequence[SceneStatistics]) -> Table:
     return Table(heads, lines, labels=2, breaks=breaks)
 
 
-def _percent(row: Row, shares: tuple[float | None, ...], other: int) -> str:
+def _percent(row: DetailRow, shares: tuple[float | None, ...], other: int) -> str:
     if other >= len(shares):
         return ""
     value = None if other == row.period else shares[other]

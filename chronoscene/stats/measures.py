@@ -92,7 +92,7 @@ def _measures(views: Ints, residual: Array, baselines: Array, coverage: float | 
     )
 
 
-class Reprojection(NamedTuple):
+class SceneReprojection(NamedTuple):
     """Where the points of a scene lie for the cameras that see them."""
 
     residual: Array
@@ -104,7 +104,7 @@ class Reprojection(NamedTuple):
     """Median depth of what each frame sees in front of it; NaN where it sees nothing. [frames]"""
 
 
-def reproject(scene: Scene) -> Reprojection:
+def reproject(scene: Scene) -> SceneReprojection:
     """Project every observed point, distortion included."""
     points = scene.points
     views = [(f.camera, f.cam_from_world) for f in scene.frames]
@@ -118,7 +118,7 @@ def reproject(scene: Scene) -> Reprojection:
         ahead = away[~np.isnan(away)]
         if len(ahead):
             depth_of_frame[frame] = np.median(ahead)
-    return Reprojection(residual, depth, depth_of_frame)
+    return SceneReprojection(residual, depth, depth_of_frame)
 
 
 def camera_baselines(scene: Scene, depths: Array) -> Array:

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.bench.use.changes import CLASSES
-from chronoscene.figures.change_map import COLORS, Panel, draw_changes
+from chronoscene.figures.change_map import COLORS, ChangePanel, draw_changes
 from chronoscene.figures.cloud import Cloud
 
 
@@ -28,7 +28,9 @@ def test_changes_are_drawn_over_what_is_below_them(cloud, tmp_path):
     patch = rng.uniform([10, 5, 0], [12, 7, 0], (5000, 3))
     classes = np.repeat([0, CLASSES.index("new")], [len(ground), len(patch)])
     draw_changes(
-        cloud, [Panel("a $b_c$", np.concatenate([ground, patch]), classes)], tmp_path / "x.png"
+        cloud,
+        [ChangePanel("a $b_c$", np.concatenate([ground, patch]), classes)],
+        tmp_path / "x.png",
     )
     red, green, blue = np.moveaxis(
         np.asarray(Image.open(tmp_path / "x.png"), int)[100:, :, :3], 2, 0
@@ -43,7 +45,7 @@ def test_changes_are_drawn_over_what_is_below_them(cloud, tmp_path):
 
 @pytest.mark.parametrize(("panels", "shape"), [(1, (1, 1)), (3, (1, 3)), (5, (2, 3)), (10, (3, 4))])
 def test_panels_in_rows(cloud, tmp_path, panels, shape):
-    panel = Panel("", cloud.xyz, np.zeros(3000, int))
+    panel = ChangePanel("", cloud.xyz, np.zeros(3000, int))
     draw_changes(cloud, [panel] * panels, tmp_path / "x.png")
     width, height = Image.open(tmp_path / "x.png").size
     one = 3.55 * 200, height / shape[0]

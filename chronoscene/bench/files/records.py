@@ -54,7 +54,7 @@ class CurvePoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ViewScore:
     """One value of one view."""
 
     view: str
@@ -151,7 +151,7 @@ class RunRecord(BaseModel):
     started: str
     """UTC, ISO 8601."""
     notices: list[str]
-    rows: Sequence[Row] = Field(default=(), exclude=True)
+    rows: Sequence[ViewScore] = Field(default=(), exclude=True)
     """What ``rows.csv`` says of single views, where that was read; no part of ``run.json``."""
     folder: Path = Field(default=Path(), exclude=True)
     """Of the run, known where `rows` are."""
@@ -181,10 +181,10 @@ RUN_COLUMNS = (
     *("scene", "scene_hash", "split_hash", "method", "method_version"),
     *("strategy", "preset", "variant", "config_hash", "seed", "device"),
 )
-ROW_COLUMNS = tuple(field.name for field in fields(Row))
+ROW_COLUMNS = tuple(field.name for field in fields(ViewScore))
 
 
-def write_run(folder: Path, record: RunRecord, rows: Iterable[Row]) -> None:
+def write_run(folder: Path, record: RunRecord, rows: Iterable[ViewScore]) -> None:
     """Write ``rows.csv`` and then ``run.json``, whose presence says that the run is complete."""
     shared = [getattr(record, name) for name in RUN_COLUMNS]
     table = [[*shared, *astuple(row)] for row in rows]
@@ -226,7 +226,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     return document
 
 
-def read_rows(folder: Path) -> list[Row]:
+def read_rows(folder: Path) -> list[ViewScore]:
     """Read ``rows.csv`` of one run.
 
     Raises:
@@ -245,8 +245,8 @@ def read_rows(folder: Path) -> list[Row]:
         ) from error
 
 
-def _parse_row(line: Mapping[str, str]) -> Row:
-    return Row(
+def _parse_row(line: Mapping[str, str]) -> ViewScore:
+    return ViewScore(
         line["view"],
         int(line["camera_period"]),
         int(line["rendered_period"]),

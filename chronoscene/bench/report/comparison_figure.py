@@ -34,7 +34,7 @@ FRAME = "#00c8ff"  # Colour around what is enlarged
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class ShownRun:
     """One method in a figure."""
 
     title: str
@@ -90,12 +90,12 @@ def chosen_views(truth: Path, per_period: int) -> list[ImageEntry]:
     return chosen
 
 
-def column_of(record: RunRecord) -> Column:
+def column_of(record: RunRecord) -> ShownRun:
     """The predictions of a run."""
     predictions = record.folder / PREDICTIONS
     entries = {e.view: e for e in read_manifest(predictions).images}
     title = f"{record.title}\n{kind_of(record)}"
-    return Column(title, predictions, entries)
+    return ShownRun(title, predictions, entries)
 
 
 def _draw(
@@ -103,7 +103,7 @@ def _draw(
     scene: str,
     truth: Path,
     rows: Sequence[ImageEntry],
-    columns: Sequence[Column],
+    columns: Sequence[ShownRun],
     labels: dict[str, str],
     *,
     errors: bool,
@@ -141,7 +141,7 @@ def _draw_row(
     axes: Any,
     truth: Path,
     entry: ImageEntry,
-    columns: Sequence[Column],
+    columns: Sequence[ShownRun],
     labels: dict[str, str],
     *,
     errors: bool,

@@ -14,7 +14,7 @@ from chronoscene.bench.files.ground_truth import ground_truth_folder
 from chronoscene.bench.files.predictions import ImageEntry, load_image, load_mask, read_manifest
 from chronoscene.bench.files.records import Failure, RunRecord
 from chronoscene.bench.report.comparison_figure import (
-    Column,
+    ShownRun,
     by_scene,
     chosen_views,
     column_of,
@@ -116,7 +116,7 @@ def _shown_views(
 
 
 def _shown_view(
-    truth: Path, entry: ImageEntry, columns: Sequence[Column], labels: dict[str, str]
+    truth: Path, entry: ImageEntry, columns: Sequence[ShownRun], labels: dict[str, str]
 ) -> ShownView:
     photo, mask = load_image(truth, entry), load_mask(truth, entry)
     predictions = []

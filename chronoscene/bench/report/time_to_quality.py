@@ -30,7 +30,7 @@ Curve = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class CurveValue:
     """A number that curves give for a configuration, a mean over its seeds."""
 
     scene: str
@@ -114,7 +114,7 @@ def seconds_until(curve: Curve, psnr: float) -> float:
     return float(np.interp(psnr, values, times))
 
 
-def readings(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -> list[Reading]:
+def curve_values(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -> list[CurveValue]:
     """All that curves give, by device, scene and configuration; what a seed lacks is left out.
 
     Args:
@@ -125,7 +125,7 @@ def readings(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -> li
     if not known:
         return []
     levels = psnr_levels([curve for _, curve in known])
-    found: list[Reading] = []
+    found: list[CurveValue] = []
     for device in dict.fromkeys(run.device for run, _ in known):
         here = [(run, curve) for run, curve in known if run.device == device]
         labels = labelled([run for run, _ in here]).label
@@ -133,11 +133,11 @@ def readings(records: Sequence[RunRecord], curves: Sequence[Curve | None]) -> li
         for (run, curve), label in zip(here, labels, strict=True):
             groups.setdefault((run.scene, label), []).append(curve)
         single = [
-            reading
+            value
             for (scene, label), seeds in groups.items()
-            for reading in _of_seeds(scene, device, label, seeds, levels)
+            for value in _of_seeds(scene, device, label, seeds, levels)
         ]
-        scenes = {reading.scene for reading in single}
+        scenes = {value.scene for value in single}
         found += single
         if len(scenes) > 1:
             found += _over_scenes(single, len(scenes))
@@ -154,7 +154,7 @@ def psnr_levels(curves: Sequence[Curve]) -> list[float]:
 
 def _of_seeds(
     scene: str, device: str, label: str, curves: Sequence[Curve], levels: Iterable[float]
-) -> Iterator[Reading]:
+) -> Iterator[CurveValue]:
     wanted: list[tuple[str, float | None, list[float]]] = [
         ("psnr", float(time), [psnr_after(curve, time) for curve in curves]) for time in LADDER
     ]
@@ -171,27 +171,27 @@ def _of_seeds(
     for quantity, at, values in wanted:
         if all(map(math.isfinite, values)):
             sd = stdev(values) if len(values) > 1 else None
-            yield Reading(scene, device, label, quantity, at, mean(values), sd, len(values))
+            yield CurveValue(scene, device, label, quantity, at, mean(values), sd, len(values))
 
 
-def _over_scenes(single: Sequence[Reading], scenes: int) -> Iterator[Reading]:
+def _over_scenes(single: Sequence[CurveValue], scenes: int) -> Iterator[CurveValue]:
     """Means over scenes of what is known for all of them."""
-    parts: dict[tuple[str, str, float | None], list[Reading]] = {}
-    for reading in single:
-        key = reading.label, reading.quantity, reading.at
-        parts.setdefault(key, []).append(reading)
+    parts: dict[tuple[str, str, float | None], list[CurveValue]] = {}
+    for value in single:
+        key = value.label, value.quantity, value.at
+        parts.setdefault(key, []).append(value)
     for (label, quantity, at), part in parts.items():
         if len(part) == scenes:
-            sds = [reading.sd for reading in part if reading.sd is not None]
+            sds = [value.sd for value in part if value.sd is not None]
             sd = math.hypot(*sds) / scenes if len(sds) == scenes else None
-            value, n = mean(reading.mean for reading in part), min(r.n for r in part)
-            yield Reading(ALL_SCENES, part[0].device, label, quantity, at, value, sd, n)
+            value, n = mean(value.mean for value in part), min(r.n for r in part)
+            yield CurveValue(ALL_SCENES, part[0].device, label, quantity, at, value, sd, n)
 
 
-def time_tables(found: Sequence[Reading]) -> list[Table]:
+def time_tables(found: Sequence[CurveValue]) -> list[Table]:
     """For each device and scene: PSNR after times, and times until PSNR levels."""
     made = []
-    for device, scene in dict.fromkeys((reading.device, reading.scene) for reading in found):
+    for device, scene in dict.fromkeys((value.device, value.scene) for value in found):
         part = [r for r in found if (r.device, r.scene) == (device, scene)]
         place = f"on {device}"
         title = f"{scene}: PSNR [dB] of the probe views after so much training {place}"
@@ -206,7 +206,7 @@ def time_tables(found: Sequence[Reading]) -> list[Table]:
     return made
 
 
-def _table(title: str, part: Sequence[Reading], quantity: str, more: dict[str, str]) -> Table:
+def _table(title: str, part: Sequence[CurveValue], quantity: str, more: dict[str, str]) -> Table:
     """Configurations by what a quantity was asked for at, and more columns."""
     columns = {(quantity, r.at) for r in part if r.quantity == quantity}
     ordered: list[tuple[str, float | None]] = sorted(columns, key=lambda column: column[1] or 0)
@@ -220,9 +220,9 @@ def _table(title: str, part: Sequence[Reading], quantity: str, more: dict[str, s
     return Table(heads, rows, title=title)
 
 
-def _text(reading: Reading) -> str:
-    unit = "seconds" if reading.quantity.startswith("seconds") else "psnr"
-    return with_spread(unit, reading.mean, reading.sd)
+def _text(value: CurveValue) -> str:
+    unit = "seconds" if value.quantity.startswith("seconds") else "psnr"
+    return with_spread(unit, value.mean, value.sd)
 
 
 def in_time(seconds: float) -> str:

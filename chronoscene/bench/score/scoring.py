@@ -16,9 +16,9 @@ from chronoscene.bench.files.records import (
     PREDICTIONS,
     STAGES,
     UNTRAINED,
-    Row,
     RunRecord,
     Values,
+    ViewScore,
     read_rows,
     read_run,
     run_folders,
@@ -40,7 +40,7 @@ NO_TESTS = "trained on all photos: there are no test views"
 class Scores:
     """All values of a run."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[ViewScore, ...]
     skipped: dict[str, str]
     """Metric to the reason for its absence."""
     unscored: tuple[str, ...] = ()
@@ -65,7 +65,7 @@ def score_folder(
     """
     predicted, truth = read_manifest(predictions), read_manifest(ground_truth)
     pairs = match_views(predictions, predicted, truth, stage=stage)
-    rows: list[Row] = []
+    rows: list[ViewScore] = []
     skipped, unscored = dict(scorers.skipped), []
     for entry, target in pairs:
         image, reference = load_image(predictions, entry), load_image(ground_truth, target)
@@ -78,7 +78,7 @@ def score_folder(
             values, refused = score_pair(image, reference, scorers, mask)
             if region == ALL:
                 skipped |= {name: f"{entry.view}: {reason}" for name, reason in refused.items()}
-            rows += [Row(entry.view, *periods, region, *value) for value in values.items()]
+            rows += [ViewScore(entry.view, *periods, region, *value) for value in values.items()]
     if not pairs:
         skipped = dict.fromkeys([*scorers.functions, *scorers.skipped], NO_TESTS)
     elif len(unscored) == len(pairs):
@@ -194,7 +194,7 @@ def _mismatch(folder: Path, expected: str, found: str) -> CheckpointError:
 
 
 def aggregate(
-    rows: Iterable[Row], region: str = ALL
+    rows: Iterable[ViewScore], region: str = ALL
 ) -> tuple[dict[str, Values], dict[str, Values]]:
     """Means of the rows of a region.
 

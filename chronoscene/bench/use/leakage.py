@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.bench.files.predictions import to_bytes
-from chronoscene.bench.files.records import Row
+from chronoscene.bench.files.records import ViewScore
 from chronoscene.bench.score.regions import ALL, CHANGED, INVARIANT
 from chronoscene.bench.use.trained_run import TrainedRun
 from chronoscene.images.store import ImageStore
@@ -48,7 +48,7 @@ COLUMNS: dict[Key, tuple[str, int]] = {
 """Heading and decimals of what is measured, in the order of the table."""
 
 
-def measure_leakage(run: TrainedRun, scene: Scene, truth: Path) -> Iterator[list[Row]]:
+def measure_leakage(run: TrainedRun, scene: Scene, truth: Path) -> Iterator[list[ViewScore]]:
     """What one test view after the other shows at each period.
 
     Args:
@@ -69,7 +69,7 @@ def measure_leakage(run: TrainedRun, scene: Scene, truth: Path) -> Iterator[list
 
 def _of_view(
     run: TrainedRun, store: ImageStore, frame: Frame, truth: Path, counted: Mask
-) -> list[Row]:
+) -> list[ViewScore]:
     camera, own, photo = store.camera(frame), frame.period, store.load(frame)
     rendered = [run.render(camera, frame.cam_from_world, p) for p in range(run.num_periods)]
     images = [to_bytes(prediction.rgb) for prediction in rendered]
@@ -85,7 +85,7 @@ def _of_view(
         if other is not None and path.is_file():
             changes = load_changes(path, camera.size, run.record.max_width)
             values |= pair_values(images[own], images[period], photo, true, changes, counted)
-        rows += [Row(frame.name, own, period, *key, value) for key, value in values.items()]
+        rows += [ViewScore(frame.name, own, period, *key, value) for key, value in values.items()]
     return rows
 
 
@@ -138,7 +138,7 @@ def pair_values(
     return values
 
 
-def leakage_table(rows: Iterable[Row], labels: Mapping[str, str], title: str) -> Table:
+def leakage_table(rows: Iterable[ViewScore], labels: Mapping[str, str], title: str) -> Table:
     """A row for each pair of periods, mean over its views; then means over the pairs.
 
     Args:

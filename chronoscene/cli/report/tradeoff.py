@@ -15,9 +15,9 @@ from chronoscene.bench.plan.stop import parse_duration
 from chronoscene.bench.report.summary import COSTS, read_runs, summarise
 from chronoscene.bench.report.tables import COST_TITLES, footnotes, tables_text
 from chronoscene.bench.report.time_to_quality import (
-    Reading,
+    CurveValue,
+    curve_values,
     read_curve,
-    readings,
     time_tables,
     whole_curve,
 )
@@ -85,7 +85,7 @@ def command(
         emit("".join(f"{line}\n" for line in choose(records, limits, " ".join(given))), out)
         return
     curves = [whole_curve(read_curve(run.folder), run.strategy) for run in records]
-    points, times = front_points(records), readings(records, curves)
+    points, times = front_points(records), curve_values(records, curves)
     emit(_text(points, times, _notes(records, failures), style, out), out)
     if points:
         figure = (figures or folders[0] / FIGURES) / FIGURE
@@ -123,7 +123,7 @@ def _notes(records: Sequence[RunRecord], failures: Sequence[Failure]) -> list[st
 
 def _text(
     points: Sequence[FrontPoint],
-    times: Sequence[Reading],
+    times: Sequence[CurveValue],
     notes: list[str],
     style: str,
     out: Path | None,

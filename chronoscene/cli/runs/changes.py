@@ -16,7 +16,7 @@ from chronoscene.cli.output import emit, tell_written, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
 from chronoscene.figures.canvas import rgb_of
-from chronoscene.figures.change_map import COLORS, Panel, draw_changes
+from chronoscene.figures.change_map import COLORS, ChangePanel, draw_changes
 from chronoscene.figures.cloud import cloud_of
 from chronoscene.formats.shared.ply import write_vertices
 from chronoscene.io.staging import check_outside, staged_folder
@@ -110,6 +110,6 @@ def _write_cloud(path: Path, made: ChangeMap) -> None:
     )
 
 
-def _panel(made: ChangeMap, labels: Mapping[str, str]) -> Panel:
+def _panel(made: ChangeMap, labels: Mapping[str, str]) -> ChangePanel:
     title = " \N{RIGHTWARDS ARROW} ".join(labels[str(period)] for period in made.periods)
-    return Panel(title, made.xyz, made.classes)
+    return ChangePanel(title, made.xyz, made.classes)

@@ -51,7 +51,7 @@ SOME_FAILED, ALL_FAILED = 1, 2
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class StatsRequest:
     """What to do with each scene."""
 
     dataset_format: str | None
@@ -142,7 +142,7 @@ def command(
     A scene that cannot be read is named and the others are reported. Exit status: 0 if all scenes
     were read, 1 if some were, 2 if none was or the command is used wrongly.
     """
-    request = Request(**options)  # type: ignore[arg-type]
+    request = StatsRequest(**options)  # type: ignore[arg-type]
     paths = [p for f in folders for p in in_paper_order(_scenes(f, request))]
     _check_places(request, out, paths)
     items = list(zip(paths, _file_names(paths), strict=True))
@@ -178,7 +178,9 @@ def command(
         context.exit(SOME_FAILED if counts else ALL_FAILED)
 
 
-def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStatistics | Unreadable:
+def examine(
+    request: StatsRequest, item: tuple[Path, str]
+) -> SceneCount | SceneStatistics | Unreadable:
     """Read one scene, measure it, and draw what is asked for.
 
     Args:
@@ -209,7 +211,7 @@ def examine(request: Request, item: tuple[Path, str]) -> SceneCount | SceneStati
     return measure_scene(scene, count=request.count)
 
 
-def _scenes(folder: Path, request: Request) -> list[Path]:
+def _scenes(folder: Path, request: StatsRequest) -> list[Path]:
     """The scenes of a folder, and beside them what looks like one, so that nothing is lost."""
     found = find_scenes(folder, format=request.dataset_format, period_by=request.period_by)
     if found == [folder]:
@@ -239,7 +241,7 @@ def _file_names(paths: Sequence[Path]) -> list[str]:
     return names
 
 
-def _check_places(request: Request, out: Path | None, paths: Sequence[Path]) -> None:
+def _check_places(request: StatsRequest, out: Path | None, paths: Sequence[Path]) -> None:
     """Make the folders for figures and pages; refuse to write into a scene."""
     if out is not None:
         check_outside(out, paths, option="--out")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from chronoscene.bench.files.records import (
-    Row,
+    ViewScore,
     read_rows,
     read_run,
     run_folders,
@@ -27,7 +27,7 @@ def refuse(constant):
 def test_infinite_psnr_is_plain_json(runs):
     record = read_run(runs / JOINT)
     record.aggregates["macro"]["psnr"] = math.inf
-    rows = [Row("a/2.png", 0, 0, "all", "psnr", math.inf)]
+    rows = [ViewScore("a/2.png", 0, 0, "all", "psnr", math.inf)]
     write_run(runs / JOINT, record, rows)
     document = json.loads((runs / JOINT / "run.json").read_text(), parse_constant=refuse)
     assert document["aggregates"]["macro"]["psnr"] == "Infinity"

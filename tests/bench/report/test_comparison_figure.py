@@ -8,7 +8,7 @@ from chronoscene.bench.files.ground_truth import ground_truth_folder
 from chronoscene.bench.files.predictions import ImageWriter, load_image, read_manifest
 from chronoscene.bench.files.records import read_run
 from chronoscene.bench.report.comparison_figure import (
-    Column,
+    ShownRun,
     _draw_row,
     chosen_views,
     draw_figures,
@@ -72,7 +72,7 @@ def test_what_a_mask_ignores_is_neither_error_nor_psnr(tmp_path):
     entries = {entry.view: entry for entry in read_manifest(tmp_path / "p").images}
     for entry, label in zip(read_manifest(tmp_path / "t").images, ("13.98", "not"), strict=True):
         axes = Figure().subplots(1, 2, squeeze=False)
-        column = Column("", tmp_path / "p", entries)
+        column = ShownRun("", tmp_path / "p", entries)
         shown = _draw_row(axes, tmp_path / "t", entry, [column], {}, errors=True)
         assert axes[0, 1].get_xlabel().startswith(label)
         drawn = np.ma.filled(shown.get_array().astype(float), np.nan)
@@ -107,7 +107,7 @@ def test_the_window_is_enlarged_below_each_image(tmp_path):
         writer.add("v", pixels, camera_period=0, rendered_period=0)
         writer.close(kind="predictions", scene="s", scene_hash="h", details={})
         entries = {entry.view: entry for entry in read_manifest(tmp_path / name).images}
-        columns.append(Column(name, tmp_path / name, entries))
+        columns.append(ShownRun(name, tmp_path / name, entries))
     (entry,) = columns[0].entries.values()
     axes = Figure().subplots(2, 3)
     _draw_row(axes, tmp_path / "t", entry, columns[1:], {}, errors=False)

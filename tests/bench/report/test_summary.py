@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from made_runs import record, scored, smooth
 
-from chronoscene.bench.files.records import Row
+from chronoscene.bench.files.records import ViewScore
 from chronoscene.bench.report.intervals import interval, resampled_means
 from chronoscene.bench.report.published import load_published
 from chronoscene.bench.report.summary import (
@@ -98,8 +98,8 @@ def test_periods_are_resampled_apart_and_seeds_are_averaged():
 
 def test_other_regions_and_other_periods_are_no_views_of_the_run():
     run = scored(psnr=VIEWS)
-    rows = [*run.rows, Row("0/view0.png", 0, 1, "all", "psnr", 0.0)]
-    rows.append(Row("0/view0.png", 0, 0, "changed", "psnr", 0.0))
+    rows = [*run.rows, ViewScore("0/view0.png", 0, 1, "all", "psnr", 0.0)]
+    rows.append(ViewScore("0/view0.png", 0, 0, "changed", "psnr", 0.0))
     assert macro([scored(psnr=VIEWS, rows=rows)])["chronogs"].low == macro([run])["chronogs"].low
 
 

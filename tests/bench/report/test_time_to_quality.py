@@ -10,11 +10,11 @@ from chronoscene.bench.files.records import CURVE_FILE, CurvePoint, run_folders
 from chronoscene.bench.report.tables import ALL_SCENES
 from chronoscene.bench.report.time_to_quality import (
     MAX_LEVELS,
+    curve_values,
     in_time,
     psnr_after,
     psnr_levels,
     read_curve,
-    readings,
     seconds_until,
     time_tables,
     whole_curve,
@@ -60,7 +60,7 @@ def test_models_count_as_if_trained_by_turns():
 
 def test_readings_of_seeds():
     runs = [record(seed=0), record(seed=1)]
-    found = readings(runs, [CURVE, BETTER])
+    found = curve_values(runs, [CURVE, BETTER])
     name, sd = "CHRONOGS (joint, fast)", pytest.approx(2**0.5)
     after = values(found, "psnr")
     assert after[name, 5.0] == (20.75, sd, 2)
@@ -74,7 +74,7 @@ def test_readings_of_seeds():
 def test_devices_are_apart_and_scenes_averaged():
     quay = {"scene": "quay", "scene_hash": "q"}
     runs = [record("a"), record("a", **quay), record("b"), record("a", seed=1, device="other")]
-    found = readings(runs, [CURVE, BETTER, CURVE, CURVE])
+    found = curve_values(runs, [CURVE, BETTER, CURVE, CURVE])
     assert values(found, "psnr_end", ALL_SCENES) == {("A (joint, fast)", None): (24.0, None, 1)}
     assert {r.device for r in found if r.scene == ALL_SCENES} == {runs[0].device}
     assert all(r.n == 1 for r in found)
@@ -84,7 +84,7 @@ def test_devices_are_apart_and_scenes_averaged():
 
 def test_tables_leave_out_what_is_not_known():
     short = CURVE[:, :2]
-    after, until = time_tables(readings([record("a"), record("b")], [CURVE, short]))
+    after, until = time_tables(curve_values([record("a"), record("b")], [CURVE, short]))
     assert after.flat_heads == [
         *("method", "2 s", "5 s", "10 s", "at the end", "training [s]", "gain of the second half")
     ]
@@ -99,7 +99,7 @@ def test_levels_are_whole_and_few():
     assert psnr_levels([np.array([[1, 2], [19.5, 22.5]])]) == [20, 21, 22]
     levels = psnr_levels([np.array([[1, 2], [10.0, 40.0]])])
     assert len(levels) <= MAX_LEVELS and levels[-1] == 40 and levels[0] > 9
-    assert readings([record()], [None]) == []
+    assert curve_values([record()], [None]) == []
 
 
 def test_curves_of_runs_are_read(bench_here, tmp_path):

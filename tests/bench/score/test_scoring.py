@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from chronoscene.bench.files.predictions import ImageWriter, encode_png
-from chronoscene.bench.files.records import Row, read_rows, read_run, run_folders, write_run
+from chronoscene.bench.files.records import ViewScore, read_rows, read_run, run_folders, write_run
 from chronoscene.bench.score.scoring import aggregate, changes, rescore, score_folder
 from chronoscene.errors import CheckpointError
 from chronoscene.metrics.registry import Scorers, make_scorers
 
 
 def rows(metric, values):
-    return [Row(f"{i}.png", p, p, "all", metric, v) for i, (p, v) in enumerate(values)]
+    return [ViewScore(f"{i}.png", p, p, "all", metric, v) for i, (p, v) in enumerate(values)]
 
 
 def test_macro_micro_and_worst_by_hand():
@@ -46,7 +46,7 @@ def test_infinite_values_stay_infinite():
 
 
 def test_parts_of_the_image_do_not_enter_the_means():
-    part = Row("0.png", 0, 0, "changed", "psnr", 1.0)
+    part = ViewScore("0.png", 0, 0, "changed", "psnr", 1.0)
     both = [*rows("psnr", [(0, 9.0)]), part]
     assert aggregate(both)[0]["micro"]["psnr"] == 9.0
     assert aggregate(both, "changed") == (
@@ -230,7 +230,9 @@ def test_edited_ground_truth_is_an_error(runs, scorers):
 
 def test_metrics_that_this_machine_lacks_keep_their_values(runs, scorers):
     record, rows = read_run(runs / JOINT), read_rows(runs / JOINT)
-    rows += [Row(v, p, p, "all", "lpips_vgg", 0.25) for v, p in (("a/2.png", 0), ("b/1.png", 1))]
+    rows += [
+        ViewScore(v, p, p, "all", "lpips_vgg", 0.25) for v, p in (("a/2.png", 0), ("b/1.png", 1))
+    ]
     for values in (*record.aggregates.values(), *record.periods.values()):
         values["lpips_vgg"] = 0.25
     write_run(runs / JOINT, record, rows)

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from chronoscene.bench.files.predictions import to_bytes
-from chronoscene.bench.files.records import Row, read_rows
+from chronoscene.bench.files.records import ViewScore, read_rows
 from chronoscene.bench.use.leakage import depth_values, leakage_table, pair_values
 from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli import cli
@@ -109,9 +109,9 @@ def test_depth_of_the_size_of_the_truth_only():
 
 def test_the_table_has_means_over_views_and_pairs():
     values = {(0, 0): (20, 30), (0, 1): (10,), (1, 0): (13, 17), (1, 1): (40,)}
-    rows = [Row(str(i), *pair, "all", "psnr", v) for pair in values
+    rows = [ViewScore(str(i), *pair, "all", "psnr", v) for pair in values
             for i, v in enumerate(values[pair])]  # fmt: skip
-    rows.append(Row("0", 0, 1, "changed", "ghosting", 0.25))
+    rows.append(ViewScore("0", 0, 1, "changed", "ghosting", 0.25))
     table = leakage_table(rows, {"0": "may", "1": "june"}, "title")
     assert [head for head, _ in table.heads] == ["camera of", "rendered", "PSNR", "ghosting"]
     assert table.rows == [
