@@ -13,10 +13,12 @@ from chronoscene.scene.geometry import quaternion_from_rotation, rotation_from_q
 from chronoscene.validation.rule import SceneReport
 from chronoscene.validation.run import validate_scene
 
-PERIODS = {f"{'ab'[period]}{i:03d}.png": period for period in (0, 1) for i in range(7)}
+PERIODS = {f"{'ab'[period]}{i:03d}.png": period for period in (0, 1) for i in range(9)}
 """Image name to period."""
 
-TESTS = ("a003.png", "b003.png")
+TESTS = ("a003.png", "a007.png", "a008.png", "b003.png", "b007.png", "b008.png")
+"""Three of each period, and six to train on, so that rules on small numbers say nothing."""
+
 WIDTH, HEIGHT = 64, 48
 POINTS = 40
 

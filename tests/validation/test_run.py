@@ -23,9 +23,9 @@ def test_good_scene(scene):
     report = scene.validate()
     assert [f.code for f in report.findings] == ["CS507"]
     assert (report.name, report.path) == ("scene", scene.root)
-    assert report.summary.images == 14
+    assert report.summary.images == 18
     assert report.summary.points == 40
-    assert report.summary.observations == 560
+    assert report.summary.observations == 720
     assert [s.code for s in report.skipped] == ["CS206", "CS216", "CS231", "CS604"]
 
 

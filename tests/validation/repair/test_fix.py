@@ -185,7 +185,7 @@ def test_short_tracks_are_removed_with_their_points(scene, fix):
         lines[row] = " ".join(words[: 8 + 2 * kept])
         scene.write(POINTS, lines)
     lines = scene.lines(IMAGES)
-    for image in range(14):
+    for image in range(18):
         words = lines[2 * image + 1].split()
         words[2] = "1" if image == 0 else "-1"
         words[5] = "-1"
@@ -234,7 +234,7 @@ def test_text_beside_binary(scene, fix):
 def test_misspelt_image(scene, fix, tmp_path):
     """Its mask follows, and so do the masks that need not be renamed, and those that are links."""
     scene.path("masks").mkdir()
-    for name in ("A000.PNG", *(f"a{i:03d}.png" for i in range(1, 7))):
+    for name in ("A000.PNG", *(f"a{i:03d}.png" for i in range(1, 9))):
         Image.new("L", (64, 48), 255).save(scene.path(f"masks/{name}.png"))
     scene.path("masks/a006.png.png").rename(tmp_path / "mask.png")
     scene.path("masks/a006.png.png").symlink_to(tmp_path / "mask.png")
@@ -243,7 +243,7 @@ def test_misspelt_image(scene, fix, tmp_path):
     assert fixed == {"CS201"} and after == {"CS507"}
     assert not (out / "images/A000.PNG").exists()
     assert sorted(p.name for p in (out / "masks").iterdir()) == [
-        f"a{i:03d}.png.png" for i in range(7)
+        f"a{i:03d}.png.png" for i in range(9)
     ]
 
 

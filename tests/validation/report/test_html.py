@@ -51,7 +51,7 @@ def test_every_finding_is_there(bad):
     for finding in report.findings:
         for text in (finding.code, finding.name, finding.place, finding.found):
             assert text in page.text, text
-    assert "not valid" in page.text and "14\nregistered images" in page.text
+    assert "not valid" in page.text and "18\nregistered images" in page.text
 
 
 def test_nothing_is_loaded_from_elsewhere(bad):
@@ -96,7 +96,7 @@ def test_no_pictures_of_files_outside(scene, tmp_path):
 
 def test_errors_of_periods_are_shown(scene):
     page = Page(write_html([scene.validate()]))
-    assert re.search(r"error, px\s+07\s+6\s+1\s+0\.00", page.text)
+    assert re.search(r"error, px\s+09\s+6\s+3\s+0\.00", page.text)
 
 
 def test_strict_makes_a_scene_with_warnings_not_valid(scene):

@@ -68,7 +68,7 @@ def test_line_of_a_finding(document):
     (result,) = (r for r in document["runs"][0]["results"] if r["ruleId"] == "CS309")
     physical = result["locations"][0]["physicalLocation"]
     assert physical["artifactLocation"] == {"uri": "sparse/split.txt", "uriBaseId": "SCENE"}
-    assert physical["region"] == {"startLine": 15}
+    assert physical["region"] == {"startLine": 19}
 
 
 def test_strict_makes_errors_of_warnings(scene):

@@ -120,7 +120,7 @@ def test_scene_of_another_format(studio):
     before = sorted(studio.rglob("*"))
     report = validate_scene(studio, decode=True)
     assert (report.name, report.path) == ("studio", studio)
-    assert report.summary.images == 14 and len(report.summary.periods) == 2
+    assert report.summary.images == 18 and len(report.summary.periods) == 2
     # It has no tracks: that is what the format cannot say.
     assert codes(report) == {"CS006", "CS507", "CS509", "CS514"}
     said = next(f for f in report.findings if f.code == "CS006")
@@ -191,8 +191,8 @@ def test_colmap_project(project):
     (said,) = [f for f in report.findings if f.code == "CS006"]
     assert said.found == "a scene in colmap-folders, with the periods '2016', '2023'"
     assert [(p.label, p.images, p.test) for p in report.summary.periods] == [
-        ("2016", 7, 1),
-        ("2023", 7, 1),
+        ("2016", 9, 3),
+        ("2023", 9, 3),
     ]
     assert {s.reason for s in report.skipped} == {
         "sparse/split.txt is no part of a COLMAP project",
@@ -245,7 +245,7 @@ def test_images_of_a_project_outside_of_its_periods(project):
 
 
 def test_dates_that_contradict_the_folders_of_a_project(project):
-    for i in range(7):
+    for i in range(9):
         image, exif = project.path(f"images/2023/b00{i}.png"), Image.Exif()
         exif.get_ifd(0x8769)[0x9003] = "2016:05:03 12:00:00"
         exif[0x8769] = 0
@@ -259,7 +259,7 @@ def test_dates_that_contradict_the_folders_of_a_project(project):
 def test_projects_whose_test_images_their_format_chooses(project, tmp_path):
     street = project.root.rename(tmp_path / "street")  # a name of WAT, which has no test.txt
     report = validate_scene(street)
-    assert [(p.images, p.test) for p in report.summary.periods] == [(7, 1), (7, 1)]
+    assert [(p.images, p.test) for p in report.summary.periods] == [(9, 2), (9, 2)]
     assert codes(report) == {"CS006", "CS507"}
     (street / "sparse/0/test.txt").write_text("")
     assert codes(validate_scene(street)) == {"CS006", "CS507"}

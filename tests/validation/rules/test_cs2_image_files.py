@@ -123,7 +123,7 @@ def test_shape_as_the_orientation_tag_says(scene):
 
 def test_pixels_are_decoded_only_on_demand(scene):
     assert RawScene(scene.root).pixels is None
-    assert len(RawScene(scene.root, decode=True).pixels) == 14
+    assert len(RawScene(scene.root, decode=True).pixels) == 18
 
 
 def noise(mode="RGB", size=(64, 48), seed=99):

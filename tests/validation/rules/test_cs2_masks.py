@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-NAMES = [f"{p}{i:03d}.png" for p in "ab" for i in range(7)]
-PERIOD_B = NAMES[7:]
+NAMES = [f"{p}{i:03d}.png" for p in "ab" for i in range(9)]
+PERIOD_B = NAMES[9:]
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from PIL import Image
 from chronoscene.validation.folder.scene_folder import RawScene
 
 IMAGES, WORLD = "sparse/0/images.txt", "sparse/world.json"
-NAMES = [f"{p}{i:03d}.png" for p in "ab" for i in range(7)]
+NAMES = [f"{p}{i:03d}.png" for p in "ab" for i in range(9)]
 METRES = 25.0
 """Metres for one world unit in these tests."""
 
@@ -139,7 +139,7 @@ def test_focal_length_of_the_photos(scene):
 def test_scale_by_positions(scene):
     tag_places(scene, metres=METRES)
     scene.write(WORLD, '{"unit": "metre"}')
-    scene.expect("CS520", place=WORLD, found="per unit, by the GPS positions of 14 photos")
+    scene.expect("CS520", place=WORLD, found="per unit, by the GPS positions of 18 photos")
     tag_places(scene, metres=METRES)
     scene.write(WORLD, '{"unit": "unknown"}')
     assert {f.code for f in scene.validate().findings} == {"CS507"}
@@ -161,7 +161,7 @@ def tag_date(scene, name, taken):
 
 def tag_all(scene, a, b):
     """Dates with ``{}`` for the minute."""
-    for i in range(7):
+    for i in range(9):
         tag_date(scene, f"a{i:03d}.png", a.format(f"{i:02d}"))
         tag_date(scene, f"b{i:03d}.png", b.format(f"{i + 20:02d}"))
 
@@ -169,7 +169,7 @@ def tag_all(scene, a, b):
 def rename(scene, a, b):
     """Give the images of the periods names like ``2016/x{}.png``."""
     for letter, form in (("a", a), ("b", b)):
-        for i in range(7):
+        for i in range(9):
             old, new = f"{letter}{i:03d}.png", form.format(f"{i:03d}")
             scene.path(f"images/{new}").parent.mkdir(exist_ok=True)
             scene.path(f"images/{old}").rename(scene.path(f"images/{new}"))

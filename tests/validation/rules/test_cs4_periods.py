@@ -23,7 +23,7 @@ def test_period_empty(scene):
 
 
 def test_period_without_train(scene):
-    scene.write(TEST, [f"b{i:03d}.png" for i in range(7)] + ["a003.png"])
+    scene.write(TEST, [f"b{i:03d}.png" for i in range(9)] + ["a003.png"])
     scene.expect("CS403", place=TEST, found="none")
 
 
@@ -48,7 +48,7 @@ def test_no_test_view(scene):
 
 
 def test_period_with_few_views(scene):
-    scene.write(TEST, ["a003.png", "b000.png", "b001.png", "b002.png"])
+    scene.write(TEST, [f"{p}{i:03d}.png" for p, n in (("a", 3), ("b", 5)) for i in range(n)])
     scene.expect("CS405", place="period 1", found="4 training views")
 
 
@@ -60,7 +60,7 @@ def test_single_period(scene):
 
 def test_summary_counts_views(scene):
     periods = scene.validate().summary.periods
-    assert [(p.id, p.images, p.train, p.test) for p in periods] == [(0, 7, 6, 1), (1, 7, 6, 1)]
+    assert [(p.id, p.images, p.train, p.test) for p in periods] == [(0, 9, 6, 3), (1, 9, 6, 3)]
 
 
 def names(**numbers):

@@ -5,7 +5,7 @@ from chronoscene.scene.similarity import Sim3
 from chronoscene.validation.rules.cs5_across_periods import connected
 
 IMAGES, POINTS, WORLD = "sparse/0/images.txt", "sparse/0/points3D.txt", "sparse/world.json"
-PERIOD_1 = range(7, 14)
+PERIOD_1 = range(9, 18)
 
 
 def turn(axis, degrees):
@@ -32,17 +32,17 @@ def separate(scene, shift=(0.0, 0.0, 0.0), scale=1.0):
     lines = scene.lines(POINTS)
     for row, line in enumerate(lines):
         words = line.split()
-        mine = range(7) if row < 20 else PERIOD_1
+        mine = range(9) if row < 20 else PERIOD_1
         if row >= 20:
             moved = scale * np.array(words[1:4], float) + shift
             words[1:4] = [f"{x:.17g}" for x in moved]
         lines[row] = " ".join(words[:8] + [f"{i + 1} {row}" for i in mine])
     scene.write(POINTS, lines)
     lines = scene.lines(IMAGES)
-    for image in range(14):
+    for image in range(18):
         words = lines[2 * image + 1].split()
         for row in range(40):
-            if (row < 20) != (image < 7):
+            if (row < 20) != (image < 9):
                 words[3 * row + 2] = "-1"
         lines[2 * image + 1] = " ".join(words)
     scene.write(IMAGES, lines)
@@ -76,7 +76,7 @@ def test_focal_length_of_one_period(scene):
     scene.write(
         "sparse/0/cameras.txt", ["1 PINHOLE 64 48 50 50 32 24", "2 PINHOLE 64 48 62.5 62.5 32 24"]
     )
-    for row in range(14, 28, 2):
+    for row in range(18, 36, 2):
         scene.edit_fields(IMAGES, row, {8: "2"})
     scene.expect("CS515", place="period 1", found="px; the worst are")
 
@@ -108,7 +108,7 @@ def test_separate_points_in_one_frame_need_a_match_only(scene):
 
 @pytest.mark.parametrize("scale", [1e-4, 1e6])
 def test_absurd_metres(scene, scale):
-    scene.change_poses(lambda r, t: (r, t * scale), range(14))
+    scene.change_poses(lambda r, t: (r, t * scale), range(18))
     lines = scene.lines(POINTS)
     for row, line in enumerate(lines):
         words = line.split()
@@ -121,45 +121,44 @@ def test_absurd_metres(scene, scale):
 
 
 def test_period_without_points(scene):
-    scene.keep_images(range(40), range(1, 8))
+    scene.keep_images(range(40), range(1, 10))
     scene.expect("CS506", place="period 1", found="0 of 40", also={"CS509"})
 
 
 def test_points_of_one_period(scene):
-    scene.keep_images(range(10), range(8, 15))
+    scene.keep_images(range(10), range(10, 19))
     scene.expect(
         "CS507", place=POINTS, found="10 of 40 in one only (25.0 %): period 0 0, period 1 10"
     )
 
 
 def test_period_unconnected(scene):
-    scene.keep_images(range(10), range(8, 15))
-    scene.keep_images(range(10, 40), range(1, 8))
+    scene.keep_images(range(10), range(10, 19))
+    scene.keep_images(range(10, 40), range(1, 10))
     scene.expect("CS508", place="period 1", found="0 of 10")
 
 
 def test_period_hardly_connected(scene):
     """Nine points in common are too few, ten are enough."""
-    scene.keep_images(range(9, 25), range(8, 15))
-    scene.keep_images(range(25, 40), range(1, 8))
+    scene.keep_images(range(9, 25), range(10, 19))
+    scene.keep_images(range(25, 40), range(1, 10))
     scene.expect("CS508", place="period 0", found="9 of 24")
 
 
 def test_period_barely_connected(scene):
-    scene.keep_images(range(10, 25), range(8, 15))
-    scene.keep_images(range(25, 40), range(1, 8))
+    scene.keep_images(range(10, 25), range(10, 19))
+    scene.keep_images(range(25, 40), range(1, 10))
     assert "CS508" not in {f.code for f in scene.validate().findings}
 
 
 def test_groups_of_periods_unconnected(scene):
     """Periods 0 and 1 share points, 2 and 3 share points, no others do."""
     names = sorted(p.name for p in scene.path("images").iterdir())
-    scene.write(
-        "sparse/split.txt",
-        [f"{n} {[0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 3, 3, 3, 3][i]}" for i, n in enumerate(names)],
-    )
-    scene.keep_images(range(15), range(8, 15))
-    scene.keep_images(range(15, 40), range(1, 8))
+    periods = [0] * 4 + [1] * 5 + [2] * 4 + [3] * 5
+    pairs = zip(names, periods, strict=True)
+    scene.write("sparse/split.txt", [f"{name} {period}" for name, period in pairs])
+    scene.keep_images(range(15), range(10, 19))
+    scene.keep_images(range(15, 40), range(1, 10))
     found = [f for f in scene.validate().findings if f.code == "CS508"]
     assert [(f.place, f.found) for f in found] == [("periods 2, 3", "0 of 15")]
 
@@ -167,9 +166,9 @@ def test_groups_of_periods_unconnected(scene):
 def test_periods_connected_by_a_chain(scene):
     """Periods 0 and 2 share nothing, but both share points with period 1."""
     names = sorted(p.name for p in scene.path("images").iterdir())
-    scene.write("sparse/split.txt", [f"{n} {min(2, i // 5)}" for i, n in enumerate(names)])
-    scene.keep_images(range(20), range(1, 11))
-    scene.keep_images(range(20, 40), range(6, 15))
+    scene.write("sparse/split.txt", [f"{n} {min(2, i // 6)}" for i, n in enumerate(names)])
+    scene.keep_images(range(20), range(1, 13))
+    scene.keep_images(range(20, 40), range(10, 19))
     assert "CS508" not in {f.code for f in scene.validate().findings}
 
 

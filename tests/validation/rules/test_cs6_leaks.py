@@ -115,9 +115,9 @@ def test_test_image_with_the_pose_of_a_training_image(scene):
 
 def test_one_pose_in_two_periods_is_a_tripod(scene):
     lines = scene.lines("sparse/0/images.txt")
-    words = lines[20].split()
-    lines[20] = " ".join([words[0], *lines[0].split()[1:8], *words[8:]])
-    lines[21] = lines[1]
+    words = lines[24].split()
+    lines[24] = " ".join([words[0], *lines[0].split()[1:8], *words[8:]])
+    lines[25] = lines[1]
     scene.write("sparse/0/images.txt", lines)
     assert {f.code for f in scene.validate().findings} == {"CS507"}
 
