@@ -1,4 +1,4 @@
-"""Where a photo shows something else than the render of the model before it."""
+"""Detection of pixels where a photo differs from the render of the model before it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 _ROUNDS = 4
-"""Of the fit of colours; each leaves out what the one before fits worse than most."""
+"""Rounds of the fit of colours; each leaves out what the one before fits worse than most."""
 _FIT_WIDTH = 80
-"""Pixels across the image that it looks at."""
+"""Pixels across the image that the fit looks at."""
 _DARK = 0.03
 """Added before logarithms, so that noise in the dark is no change."""
 _FLAT = 0.03**2
@@ -27,7 +27,7 @@ def change_scores(
     counts: Mask | None,
     config: CLSplatsConfig,
 ) -> Image:
-    """How much each pixel has changed, 0 for not at all; the mean of two scales.
+    """Score of change of each pixel, 0 for none; the mean of two scales.
 
         chromaticity + structure_weight (1 - structure) + brightness_weight brightness
 

@@ -20,16 +20,16 @@ class CLSplatsConfig(GaussianConfig):
     sh_degree: int = 0
     """Highest degree of the spherical harmonics, 0 to 3."""
     opacity_lr: float = 0.025
-    """Of the logit of the opacity."""
+    """Learning rate of the logit of the opacity."""
 
     # Change detection
     patch: float = 0.006
     """Standard deviation of the windows in which render and photo are compared; those of a second
     scale are twice as wide."""
     structure_weight: float = 0.3
-    """Of 1 - structural similarity; chromaticity has weight 1."""
+    """Weight of 1 - structural similarity; chromaticity has weight 1."""
     brightness_weight: float = 0.0
-    """Of the difference in brightness. 0: shadows are no changes, nor is what turns darker."""
+    """Weight of the difference in brightness. 0: shadows are no changes."""
     change_threshold: float = 0.3
     """Score from which on a pixel has changed."""
     cleaning: float = 0.006
@@ -50,7 +50,7 @@ class CLSplatsConfig(GaussianConfig):
     sphere_link: float = 0.1
     """Gaussians nearer than this, times their extent, are in one sphere."""
     sphere_share: float = 0.95
-    """Of the Gaussians of a sphere that lie within its radius."""
+    """Share of the Gaussians of a sphere that lie within its radius."""
     sphere_margin: float = 0.02
     """Outside of a sphere, times the extent of the cameras, that is still inside."""
     stray_checks: int = 3

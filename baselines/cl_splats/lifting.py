@@ -46,11 +46,11 @@ class Comparison:
     photo: NDArray[np.uint8]
     """[H, W, 3]"""
     counts: Mask
-    """Where the photo counts. [H, W]"""
+    """Pixels of the photo that count. [H, W]"""
     changed: Mask
-    """Not where it does not count. [H, W]"""
+    """Changed pixels, all of which count. [H, W]"""
     depth: NDArray[np.floating]
-    """Of the render; infinite where it shows nothing. [H, W]"""
+    """Depth of the render; infinite where it shows nothing. [H, W]"""
 
 
 @torch.no_grad()
@@ -139,7 +139,7 @@ def new_points(
     config: CLSplatsConfig,
     generator: np.random.Generator,
 ) -> tuple[Points, NDArray[np.uint8]]:
-    """Where new Gaussians start, and their colours. [n, 3], [n, 3]
+    """Starting positions of new Gaussians, and their colours. [n, 3], [n, 3]
 
     Sparse points that the new period alone sees, and points drawn on the rays of changed pixels, in
     front of what the render shows there and away from its Gaussians. Those stay that lie in changed
@@ -191,7 +191,7 @@ def _draw(
 
 
 def _look(points: Points, item: Comparison) -> tuple[Mask, Mask]:
-    """Whether points are in changed pixels of a view, and whether it sees them at all. [n], [n]"""
+    """Masks of the points in changed pixels of a view, and of those that it sees. [n], [n]"""
     K, pose = item.view.K, item.view.cam_from_world
     x, y, z = ((points[:, None] * pose[:3, :3]).sum(-1) + pose[:3, 3]).T
     with np.errstate(divide="ignore", invalid="ignore"):

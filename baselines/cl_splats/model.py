@@ -30,7 +30,7 @@ class PeriodModel(GaussianModel):
     kept: dict[str, Tensor]
     """Groups of `SHAPES` and `LIVES`; read only. [M, ...]"""
     period: int = 0
-    """That of the training."""
+    """Period in training."""
     spheres: Tensor = field(default_factory=lambda: torch.zeros(0, 4))
     """Centres and radii of where Gaussians in training may be; none if anywhere. [S, 4]"""
 

@@ -26,11 +26,11 @@ class Deformation4DGSConfig(GaussianConfig):
     coarse_until: int = 3_000
     """Moments of the first stage, which trains static Gaussians on the photos of all periods."""
     white_background: bool = True
-    """Whether white is behind everything, whatever the benchmark asks for."""
+    """True for a white background, whatever the benchmark asks for."""
 
     # Field
     channels: int = 16
-    """Of the planes."""
+    """Channels of the planes."""
     plane_size: int = 64
     """Cells along each spatial axis of the first level; twice as many on each next."""
     levels: int = 2
@@ -40,34 +40,34 @@ class Deformation4DGSConfig(GaussianConfig):
     width: int = 128
     """Hidden units of the trunk, and of each head."""
     deform_opacity: bool = True
-    """Whether the opacity may change from period to period."""
+    """True if the opacity may change from period to period."""
     deform_color: bool = True
-    """The same of the spherical harmonics."""
+    """True if the spherical harmonics may change from period to period."""
     box_quantile: float = 0.0
     """Share of the sparse points that may lie outside the box of the field at each of its sides.
     0: it holds all of them, however far a wrong one is."""
     half_time_axis: bool = True
-    """Whether times 0 to 1 are read from the second half of the planes' time axis only."""
+    """True to read times 0 to 1 from the second half of the planes' time axis only."""
     zero_start: bool = False
-    """Whether the heads start at zero, so that the second stage begins where the first ended."""
+    """True to start the heads at zero, so that the second stage begins where the first ended."""
     offset_unit: float = 1.0
-    """What the head of the positions gives is multiplied by it; in `length_unit`."""
+    """Factor of the output of the position head, in `length_unit`."""
 
     # Learning rates, times the extent of the cameras in `length_unit`
     field_lr_initial: float = 1.6e-4
-    """Of the trunk and the heads."""
+    """Initial learning rate of the trunk and the heads."""
     field_lr_final: float = 1.6e-5
-    """The same, at the end of the schedule; log-linear between."""
+    """Final learning rate of the trunk and the heads, reached log-linearly."""
     plane_lr_initial: float = 1.6e-3
-    """Of the planes; as `field_lr_initial` otherwise."""
+    """Initial learning rate of the planes."""
     plane_lr_final: float = 1.6e-4
-    """The same, at the end of the schedule."""
+    """Final learning rate of the planes, reached log-linearly."""
 
     # Weights of terms of the loss
     space_smoothness: float = 2e-4
     """Squared second differences of the planes without time."""
     time_smoothness: float = 1e-3
-    """The same of the planes with time, along the time axis."""
+    """Squared second differences of the planes with time, along the time axis."""
     time_sparsity: float = 1e-4
     """Distance of the planes with time from one, where time changes nothing."""
 

@@ -32,14 +32,14 @@ class DeformedModel(GaussianModel):
     """False in the first stage, which leaves the field alone."""
 
     def at_period(self, period: float) -> Mapping[str, Tensor]:
-        """What the field makes of the Gaussians; between periods at a time between theirs."""
+        """Gaussians deformed by the field; between periods at a time between theirs."""
         if not self.is_deforming:
             return self.parameters
         time = float(np.interp(period, range(len(self.times)), self.times))
         return self.parameters | deform(self.parameters, self.shared, self.field, time)
 
     def with_new_period(self) -> Self:
-        """The same model with a row for one more period at the end of the planes with time.
+        """Return the model with a row for one more period at the end of the planes with time.
 
         The row holds what the planes hold at the last period; earlier ones keep their rows.
         """
@@ -69,8 +69,8 @@ def start_field(field: Field, seed: int, *, zero_outputs: bool) -> dict[str, Ten
     biases uniform up to 1 / sqrt(inputs).
 
     Args:
-        seed: All of them follow from it.
-        zero_outputs: Whether the output layers are zero, so that nothing is deformed.
+        seed: Seed of all draws.
+        zero_outputs: True for output layers of zeros, so that nothing is deformed.
     """
     generator = np.random.default_rng((seed, _STREAM))
 

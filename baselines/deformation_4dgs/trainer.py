@@ -21,7 +21,7 @@ class TwoStages(Timeline):
     config: Deformation4DGSConfig
 
     def is_fine(self, progress: float) -> bool:
-        """Whether the second stage has begun."""
+        """Return True if the second stage has begun."""
         return super().moment(progress) > self.config.coarse_until
 
     def moment(self, progress: float) -> int:

@@ -24,7 +24,7 @@ class FourDGaussiansConfig(ProgramConfig):
     """Options of the official 4DGaussians."""
 
     iterations: int = 14_000
-    """Of the fine stage; the coarse one before it has 3,000."""
+    """Iterations of the fine stage; the coarse one before it has 3,000."""
     arguments: str = "arguments/hypernerf/default.py"
     """File below `source` with all other options: the one that its page names for own scenes."""
 

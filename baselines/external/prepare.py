@@ -1,4 +1,4 @@
-"""What exported training sets lack for programs that do not read them as they are.
+"""Additions to exported training sets for programs that do not read them as they are.
 
 A function gets the folder of the training set, that of the output, and the config, and returns what
 the program does with the scene that the user must know.
@@ -30,7 +30,7 @@ PUBLISHED_ITERATIONS = "40_000"
 
 
 def splatfacto(data: Path, output: Path, config: ProgramConfig) -> list[str]:
-    """Nothing to write; refuses what ``ns-render`` would fail on after the training.
+    """Write nothing; refuse scenes on which ``ns-render`` would fail after the training.
 
     It names images by what follows the folder that all test views have in common.
     """
@@ -139,7 +139,7 @@ def _write_cloud(path: Path, xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -
 
 
 def _ignored(scene: Scene) -> list[str]:
-    """What of the cameras programs that derive from 3DGS do not read."""
+    """Describe what programs that derive from 3DGS ignore of the cameras."""
     offsets = [
         float(np.abs(f.camera.K[:2, 2] - np.divide(f.camera.size, 2)).max()) for f in scene.frames
     ]

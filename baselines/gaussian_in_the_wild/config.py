@@ -38,7 +38,7 @@ class GaussianInTheWildConfig(GaussianConfig):
     """``resnet18`` | ``small``: four convolutions of ResNet-18 per stage, or one in three stages;
     both start at random."""
     map_channels: int = 16
-    """Of each of the three maps."""
+    """Channels of each of the three maps."""
     box_pixels: int = 1024
     """Side of the box by which projected positions are divided before the training. 0: it is the
     image, and its sides count in those of the image."""
@@ -47,38 +47,38 @@ class GaussianInTheWildConfig(GaussianConfig):
     width: int = 128
     """Units of the first layer; the others have 3/4, 1/2 and 3/8 as many."""
     frequencies: int = 10
-    """Of the encoding of positions."""
+    """Frequencies of the encoding of positions."""
     position_unit: float = 1.0
     """Positions are encoded as multiples of this length, in `length_unit`."""
     start_from_points: bool = False
-    """Whether the network gives a difference to the constant colour of each Gaussian, at first
+    """True for a network whose output is added to the constant colour of each Gaussian, at first
     zero, so that the training starts with the colours of the sparse points."""
     dropout: float = 0.1
     """Share of the features read from photos that a step sets to zero, below 1."""
 
     # Visibility of what a photo shows
     visibility: bool = True
-    """Whether to learn where a photo shows what does not belong to the scene, and to count less
-    there. Only with ``reference=image``."""
+    """True to learn where a photo shows what does not belong to the scene, and to reduce the
+    weight there. Only with ``reference=image``."""
     visibility_from: int = 2_500
     """Moment after which it counts."""
     visibility_weight: float = 0.15
-    """In the loss, of the mean square of what is taken for not visible."""
+    """Weight, in the loss, of the mean square of one minus the visibility."""
 
     coordinate_weight: float = 0.001
-    """In the loss, of how far coordinates in the maps are outside of these."""
+    """Weight, in the loss, of the distance of coordinates outside the maps."""
 
     # Learning rates
     cnn_lr_initial: float = 2e-3
-    """Of the network that reads photos."""
+    """Initial learning rate of the network that reads photos."""
     cnn_lr_final: float = 2e-4
-    """The same, at the end of the schedule; log-linear between."""
+    """Final learning rate of the network that reads photos, reached log-linearly."""
     coordinate_lr_initial: float = 1.0
-    """Of the coordinates in the maps and of the boxes; as `cnn_lr_initial` otherwise."""
+    """Initial learning rate of the coordinates in the maps and of the boxes."""
     coordinate_lr_final: float = 0.01
-    """The same, at the end of the schedule."""
+    """Final learning rate of the coordinates and the boxes, reached log-linearly."""
     network_lr: float = 5e-4
-    """Of the colour network."""
+    """Learning rate of the colour network."""
 
     minima: ClassVar[Mapping[str, int]] = {**GaussianConfig.minima, "map_channels": 1, "width": 8}
 

@@ -1,4 +1,4 @@
-"""What Gaussians read from the feature maps of a photo, and where in them they start to read."""
+"""Features that Gaussians read from the maps of a photo, and their initial coordinates there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _UNKNOWN = 128
 
 
 def start_coordinates(means: Tensor, box: float, seed: int) -> Tensor:
-    """Where Gaussians read before the training; neighbours read near each other.
+    """Initial coordinates of Gaussians in the maps; neighbours read near each other.
 
     Each axis of a free map is a random mixture of the axes of space, both -1..1; the projection map
     has the sides of a box instead.
@@ -60,7 +60,7 @@ def small_photo(
 def read_features(
     maps: Tensor, means: Tensor, coordinates: Tensor, view: View, *, box_in_pixels: bool
 ) -> tuple[Tensor, Tensor]:
-    """What Gaussians read from the maps of the photo of a view.
+    """Read the features of Gaussians from the maps of the photo of a view.
 
     A free map is read at a Gaussian's coordinates, -1..1. The projection map is read where the
     Gaussian is projected to, with the edges of its box as those of the map; outside of the box, and
@@ -71,11 +71,11 @@ def read_features(
         means: Centres in the training frame. [N, 3]
         coordinates: As of `start_coordinates`. [N, 3, 2]
         view: The camera of the photo.
-        box_in_pixels: Whether the sides of boxes count in pixels of the view, or in its sides.
+        box_in_pixels: True if the sides of boxes count in pixels of the view, else in its sides.
 
     Returns:
         dynamic: Map by map. [N, 3 C]
-        inside: Whether a Gaussian is in front of the camera and within its box. bool [N]
+        inside: True where a Gaussian is in front of the camera and within its box. bool [N]
     """
     viewmats, Ks = camera_tensors(view, means.device)
     viewmats, Ks = viewmats[0].to(means), Ks[0].to(means)

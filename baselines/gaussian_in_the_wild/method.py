@@ -113,7 +113,7 @@ class GaussianInTheWild(GaussianMethod):
         return GaussianCloud(*(tensor.cpu().contiguous().numpy() for tensor in tensors))
 
     def stored_tensors(self) -> dict[str, Tensor]:
-        """What a view is rendered from: no photo and no network that reads one is kept."""
+        """Tensors that views are rendered from: no photo and no network that reads one is kept."""
         model, features = self.model, self._read_periods()
         kept = {k: v for k, v in model.shared.items() if not k.startswith(_PHOTO)}
         groups = {name: model.parameters[name] for name in SHAPES}

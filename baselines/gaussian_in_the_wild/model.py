@@ -35,7 +35,7 @@ class WildModel(GaussianModel):
     _: KW_ONLY
     networks: Networks
     period_features: Tensor | None = None
-    """What Gaussians read from photos of each period, to render it; None while unknown.
+    """Features that Gaussians read from photos of each period, to render it; None while unknown.
     [N, T, D]"""
 
     def splats(self, view: View, period: float) -> Splats:

@@ -44,7 +44,7 @@ class Networks:
     position_unit: float
     """Positions are encoded as multiples of it, in units of the training frame."""
     from_constant: bool
-    """Whether colours are differences to the constant colour."""
+    """True if colours are differences to the constant colour."""
 
     @property
     def dynamic(self) -> int:
@@ -144,7 +144,7 @@ def read_photo(photo: Tensor, tensors: Tensors, networks: Networks) -> tuple[Ten
 
 
 def see(stages: list[Tensor], tensors: Tensors, height: int, width: int) -> Tensor:
-    """Where a photo shows the scene, 0..1, from what `read_photo` saw in it. [height, width]"""
+    """Visibility of the scene in a photo, 0..1, from the stages of `read_photo`. [height, width]"""
     x, i = stages[-1], 0
     while f"photo.see.up.{i}.weight" in tensors:
         x, i = relu(_up(tensors, f"photo.see.up.{i}", x)), i + 1

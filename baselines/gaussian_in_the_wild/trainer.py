@@ -40,12 +40,12 @@ def one_thread() -> Iterator[None]:
 
 
 class WildTrainer(GaussianTrainer):
-    """What a step reads from its photo is known from `splats` to `compare`."""
+    """Trainer of GS-W: what a step reads from its photo is known from `splats` to `compare`."""
 
     config: GaussianInTheWildConfig
     model: WildModel
     _visible: Tensor | None = None
-    """Where the photo of this step shows the scene; None for everywhere. [H, W]"""
+    """Visibility of the scene in the photo of this step; None for everywhere. [H, W]"""
     _last_reset: int = -PAUSE
     """Views drawn before the latest opacity reset."""
 
@@ -110,7 +110,7 @@ class WildTrainer(GaussianTrainer):
 
     @torch.no_grad()
     def period_features(self) -> Tensor:
-        """What Gaussians read from the training photos of each period, never from another photo.
+        """Features that Gaussians read from the training photos of each period, never from others.
 
         The mean over the photos of the period, for the projection map over those in which a
         Gaussian is inside; zero where there is none. [N, T, D]
@@ -141,7 +141,7 @@ class WildTrainer(GaussianTrainer):
         return found
 
     def _read(self, number: int, rows: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """What some Gaussians read from a training photo, as `read_features`, and the stages."""
+        """Features of some Gaussians from a training photo, as `read_features`, and the stages."""
         model, train = self.model, self.train
         p, device = model.parameters, self.background.device
         if self.config.reference == "none":

@@ -9,4 +9,4 @@ from chronoscene.gaussians.config import GaussianConfig
 
 @dataclass(frozen=True)
 class GaussianSplattingConfig(GaussianConfig):
-    """Nothing beside the shared options, whose defaults are those of the 2023 release."""
+    """Shared options alone, whose defaults are those of the 2023 release."""

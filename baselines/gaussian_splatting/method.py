@@ -20,6 +20,6 @@ class GaussianSplatting(GaussianMethod):
 
 
 class GaussianSplattingPeriod(GaussianSplatting):
-    """The same scene at all periods, with the exposure of each."""
+    """One scene at all periods, with the exposure of each."""
 
     name = "3dgs-period"

@@ -31,9 +31,9 @@ class Realtime4DGSConfig(GaussianConfig):
 
     # Learning rates
     time_lr: float = 1.6e-4
-    """Of the time centres, times the extent of the cameras in `length_unit`, as released."""
+    """Learning rate of the time centres, times the extent of the cameras in `length_unit`."""
     wave_dc_lr: float = 0.000125
-    """Of the waves of the constant coefficients."""
+    """Learning rate of the waves of the constant coefficients."""
 
     minima: ClassVar[Mapping[str, int]] = {**GaussianConfig.minima, "wave_interval": 1}
 

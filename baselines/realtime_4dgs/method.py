@@ -42,7 +42,7 @@ class Realtime4DGS(GaussianMethod):
         )
 
     def extended_model(self, train: TrainingSet) -> SpacetimeModel:
-        """The same model: a new period comes as long after the last one as that after the first."""
+        """Keep the model; new periods follow at the distance of the first two."""
         self.meta["first_periods"] = self.model.periods
         return self.model
 
@@ -67,7 +67,7 @@ class Realtime4DGS(GaussianMethod):
         }
 
     def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
-        """Those that are there at the time."""
+        """Gaussians that are there at the time."""
         cloud = super().static_gaussians(period, views)
         alive = cloud.opacities > 0
         return GaussianCloud(*(getattr(cloud, field.name)[alive] for field in fields(cloud)))

@@ -25,11 +25,11 @@ class SpacetimeModel(GaussianModel):
 
     _: KW_ONLY
     periods: int
-    """Of the first training, which lie from time 0 to 1."""
+    """Number of periods of the first training, which lie from time 0 to 1."""
     cycle: float
     """Length of the longest wave of the colours."""
     order: int = ORDERS
-    """Of the shortest wave in use; those not yet in use are zero."""
+    """Order of the shortest wave in use; those not yet in use are zero."""
 
     def at_period(self, period: float) -> Mapping[str, Tensor]:
         """The Gaussians in space that are there at the time."""

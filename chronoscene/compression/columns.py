@@ -13,7 +13,7 @@ TURNED = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Columns:
-    """How a tensor [N, C] is rounded: x = centre + basis y, and y to multiples of a step."""
+    """Quantisation of a tensor [N, C]: x = centre + basis y, with y in multiples of a step."""
 
     centre: NDArray[np.float32]
     """[C]"""
@@ -35,7 +35,7 @@ class Columns:
         return replace(start, steps=(0.5 * start.turn(values).std(axis=0)).astype(np.float32))
 
     def turn(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """What is rounded. [N, C]"""
+        """Coordinates y of the rows of a tensor, before rounding. [N, C]"""
         centred: NDArray[np.float64] = np.subtract(values, self.centre, dtype=np.float64)
         if self.basis is None:
             return centred

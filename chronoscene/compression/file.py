@@ -173,7 +173,7 @@ def decode(data: bytes, place: object = COMPRESSED_FILE) -> dict[str, NDArray[An
 
 
 def _unpack(packed: bytes, size: int) -> bytes:
-    """Of another size, or empty, where the block is not what it should be."""
+    """Decompress the first block; a damaged one gives other bytes than ``size``, or none."""
     try:
         return lzma.LZMADecompressor(memlimit=MEMORY).decompress(packed, size + 1)
     except lzma.LZMAError:

@@ -21,7 +21,7 @@ MAX_DEPTH = 21
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Where positions may be."""
+    """Regular grid that positions are rounded to."""
 
     origin: NDArray[np.float64]
     """[3]"""

@@ -36,19 +36,19 @@ class GaussianConfig(SplattingConfig):
 
     # Learning rates of Adam
     position_lr_initial: float = 1.6e-4
-    """Times the extent of the cameras."""
+    """Initial learning rate of positions, times the extent of the cameras."""
     position_lr_final: float = 1.6e-6
-    """The same, at the end of the schedule; log-linear between."""
+    """Final learning rate of positions, reached log-linearly at the end of the schedule."""
     sh_dc_lr: float = 0.0025
-    """Of the constant coefficients."""
+    """Learning rate of the constant coefficients."""
     sh_rest_lr: float = 0.000125
-    """Of the others."""
+    """Learning rate of the other coefficients."""
     opacity_lr: float = 0.05
-    """Of the logit of the opacity. Late 2024 releases have 0.025."""
+    """Learning rate of the logit of the opacity. Late 2024 releases have 0.025."""
     scale_lr: float = 0.005
-    """Of the logarithm of the scale."""
+    """Learning rate of the logarithm of the scale."""
     rotation_lr: float = 0.001
-    """Of the quaternion."""
+    """Learning rate of the quaternion."""
 
     # Densification
     densification: str = "adaptive"
@@ -58,9 +58,9 @@ class GaussianConfig(SplattingConfig):
     positions move at random: `chronoscene.gaussians.mcmc`. Its authors train so with
     ``densify_until=25000``, ``initial_opacity=0.5`` and ``initial_scale=0.1``."""
     initial_opacity: float = 0.1
-    """Of each Gaussian at the start."""
+    """Opacity of each Gaussian at the start."""
     initial_scale: float = 1.0
-    """Times the distance of the points around it."""
+    """Scale of each Gaussian at the start, times the distance of the points around it."""
     densify_from: int = 500
     """Moment after which Gaussians are added and pruned."""
     densify_until: int = 15_000
@@ -94,12 +94,12 @@ class GaussianConfig(SplattingConfig):
     mcmc_growth: float = 0.05
     """Share of the set that a round adds."""
     mcmc_noise: float = 5e5
-    """Of the random moves of positions, times their learning rate; one over `length_unit`
-    squared."""
+    """Strength of the random moves of positions, times their learning rate; one over
+    `length_unit` squared."""
     mcmc_opacity_weight: float = 0.01
-    """In the loss, of the mean opacity."""
+    """Weight of the mean opacity in the loss."""
     mcmc_scale_weight: float = 0.01
-    """In the loss, of the mean scale in `length_unit`."""
+    """Weight of the mean scale, in `length_unit`, in the loss."""
 
     minima: ClassVar[Mapping[str, int]] = dict.fromkeys(
         (

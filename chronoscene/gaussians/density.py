@@ -33,7 +33,7 @@ class GradientStatistics:
 
     def __init__(self, count: int, device: str | torch.device) -> None:
         self.sums = torch.zeros(count, device=device)
-        """Of the norms. [N]"""
+        """Sums of the norms. [N]"""
         self.views = torch.zeros(count, device=device)
         """Number of views. [N]"""
 
@@ -65,7 +65,7 @@ class GradientStatistics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Round:
-    """What a round of densification decided. The new set is the kept rows, then the new ones."""
+    """Outcome of a round of densification: the new set is the kept rows, then the new ones."""
 
     keep: Tensor
     """Old rows that stay; a Gaussian that was split does not. bool [N]"""
@@ -157,5 +157,5 @@ def _useless(
 
 
 def reset_opacities(logit_opacities: Tensor, max_opacity: float) -> Tensor:
-    """The same with no opacity above a limit. [N]"""
+    """Clamp opacities, given and returned as logits, to a maximum. [N]"""
     return logit_opacities.clamp_max(logit(max_opacity))

@@ -31,7 +31,7 @@ _GATE_STEEPNESS = 100.0
 
 
 def shared_opacity_and_scale(opacity: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """What N equal Gaussians in one place need to look like one.
+    """Opacity and scale with which N equal Gaussians in one place look like one.
 
         o' = 1 - (1 - o)^(1/N),  s'/s = o / sum_j C(N, j) (-1)^(j-1) o'^j / sqrt(j),  j = 1..N
 
@@ -103,7 +103,7 @@ def _draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
 def noise(
     parameters: dict[str, Tensor], rate: float, config: GaussianConfig, generator: torch.Generator
 ) -> Tensor:
-    """What is added to the centres after a step: the fainter a Gaussian is, the more. [N, 3]
+    """Random moves of the centres after a step: the fainter a Gaussian is, the larger. [N, 3]
 
         rate * mcmc_noise * sigmoid(100 (0.005 - o)) * Sigma * normal(0, 1)^3
 

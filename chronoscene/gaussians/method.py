@@ -1,4 +1,4 @@
-"""What methods with explicit Gaussians have in common as plug-ins."""
+"""Base class of methods with explicit Gaussians."""
 
 from __future__ import annotations
 

@@ -42,15 +42,15 @@ _NOISE_STREAM = 5
 
 @dataclass(frozen=True, slots=True)
 class Due:
-    """What one training step has to do."""
+    """Actions and settings of one training step."""
 
     moment: int
     """Iteration of the schedule, from 1."""
     sh_degree: int
     position_lr: float
-    """Before it is multiplied by the extent of the cameras."""
+    """Learning rate of positions, not yet multiplied by the extent of the cameras."""
     collect: bool
-    """Whether the gradients of this step count for the next round of densification."""
+    """True if the gradients of this step count for the next round of densification."""
     densify: bool
     prune_large: bool
     reset: bool
@@ -62,7 +62,7 @@ class Timeline:
     def __init__(self, config: GaussianConfig) -> None:
         self.config = config
         self.last_moment = 0
-        """Of the latest step; 0 before the first."""
+        """Moment of the latest step; 0 before the first."""
 
     def moment(self, progress: float) -> int:
         """Iteration of the schedule, from 1."""
@@ -71,7 +71,7 @@ class Timeline:
         return round(progress * length) + 1
 
     def at(self, index: int, progress: float) -> Due:
-        """What is due at a step; arguments as `chronoscene.methods.Method.step`."""
+        """Return what is due at a step; arguments as in `chronoscene.methods.Method.step`."""
         config, moment = self.config, self.moment(progress)
         # A squeezed schedule jumps over moments, so what counts is that a multiple was passed.
         passed_reset = moment // config.reset_interval > self.last_moment // config.reset_interval
@@ -101,7 +101,7 @@ class GaussianTrainer:
     train: TrainingSet
     _: KW_ONLY
     seed: int
-    """All random choices follow from it."""
+    """Seed of all random choices."""
     background: Tensor
     """[3]"""
     learning_rates: Callable[[Due], Mapping[str, float]]
@@ -109,7 +109,7 @@ class GaussianTrainer:
 
     timeline_class: ClassVar[type[Timeline]] = Timeline
     scatter = staticmethod(scatter_in_space)
-    """How Gaussians are split, a `density.Scatter`."""
+    """Function that splits Gaussians, a `density.Scatter`."""
 
     def __post_init__(self) -> None:
         self.timeline = self.timeline_class(self.config)
@@ -198,7 +198,7 @@ class GaussianTrainer:
         model.sh_degree = state.values["sh_degree"]
 
     def splats(self, number: int) -> Splats:
-        """What is drawn in training view ``number``; methods may look at its photo."""
+        """Gaussians to draw in training view ``number``; methods may look at its photo."""
         view = self.train.views[number]
         return self.model.splats(view, view.period)
 
@@ -213,7 +213,7 @@ class GaussianTrainer:
         return photometric_loss(image, photo, ssim_weight=self.config.ssim_weight, mask=mask)
 
     def _regulariser(self, splats: Splats) -> Tensor | float:
-        """What else keeps Gaussians faint and small, so that they can move elsewhere."""
+        """Terms of the loss that keep Gaussians faint and small, so that they can relocate."""
         config = self.config
         if config.densification != "mcmc":
             return 0.0

@@ -1,4 +1,4 @@
-"""How Python functions become machine code.
+"""Decorators that compile Python functions to machine code.
 
 `kernel` is for functions that Python calls, `inner` and `inlined` for those that only other
 compiled functions call. All release Python's lock, and division by zero gives inf or nan.
@@ -94,7 +94,7 @@ def source_stamp(folder: Path, *files: Path) -> str:
 
 
 def _forgiving(load: Callable[[], dict[Any, Any]]) -> Callable[[], dict[Any, Any]]:
-    """Nothing instead of an error that an unreadable index causes."""
+    """Make a loader of the index return an empty one instead of failing on an unreadable file."""
 
     def load_or_nothing() -> dict[Any, Any]:
         try:

@@ -124,4 +124,4 @@ Args:
 relu_product = _make_product(relu=True)
 """out = max(0, first + left @ right); nan stays nan."""
 pair_product = _make_product(emit_add_pair_products)
-"""The same of matrices of int32, each a pair of int16: sums of the products of both."""
+"""Matrix product of int32 matrices, each number a pair of int16: sums of the products of both."""

@@ -1,4 +1,4 @@
-"""What kernels find on this machine: threads, memory, gsplat; and settings of their process."""
+"""Resources of this machine (threads, memory, gsplat) and settings of the process."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pathlib import Path
 from chronoscene.errors import BackendError
 
 CONTAINER = Path("/sys/fs/cgroup")
-"""Where Linux says what the container of a process may have (cgroup v2)."""
+"""Folder with the limits of the process's container on Linux (cgroup v2)."""
 
 GSPLAT_ALPHA_MAX = {"1.5": 0.999, "1.6": 0.99}
 """Cap of alpha in the kernels of gsplat, by version. Others were not looked at and are refused."""

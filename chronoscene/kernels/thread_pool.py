@@ -60,7 +60,7 @@ def wait_for(control, phase, jobs):
 
 @kernel
 def _wait_for_change(shared, offset, value, looks):
-    """Wait a while for a number to become another one. Returns whether it did."""
+    """Wait a while for a number to change; True if it did."""
     for look in range(looks):
         if load_shared(shared, offset) != value:
             return True
@@ -75,8 +75,8 @@ Kernel = Callable[..., Any]
 
 _GENERATION, _ACTIVE = 0, 8  # Numbers that are watched without Python's lock
 _LOOKS = 20_000
-"""How often a worker looks for the next launch before it sleeps: tens of microseconds, which is
-what passes between the kernels of one image. Waking a thread takes longer than that."""
+"""Number of checks for the next launch before a worker sleeps: tens of microseconds, the pause
+between the kernels of one image. Waking a thread takes longer than that."""
 
 
 @dataclass(slots=True, eq=False)
@@ -151,7 +151,7 @@ class _Pool:
             threading.Thread(target=self._serve, args=args, name=name, daemon=True).start()
 
     def _serve(self, me: int) -> None:
-        """What a thread does for ever."""
+        """Main loop of a worker thread."""
         while True:
             self._wake[me].acquire()
             while self._stay(me):
@@ -160,7 +160,7 @@ class _Pool:
                     self._work(*claim)
 
     def _stay(self, me: int) -> bool:
-        """Whether there is a task, waiting a little for one; without, this thread is asleep."""
+        """Wait a little for a task; False, with this thread marked as asleep, if there is none."""
         for last_look in (False, True):
             with self._mutex:
                 generation = int(self._shared[_GENERATION])

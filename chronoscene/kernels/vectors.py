@@ -309,7 +309,7 @@ maximum = _make_extremum("gt")
 
 @intrinsic
 def any_lane(typingctx: Any, mask: Any) -> Any:
-    """Whether any lane of the mask is set."""
+    """Return True if any lane of the mask is set."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         bits = builder.bitcast(args[0], ir.IntType(sig.args[0].lanes))

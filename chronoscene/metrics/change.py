@@ -19,7 +19,7 @@ def change_scores(
     *,
     threshold: float | None = None,
 ) -> dict[str, float]:
-    """How well a map of scores tells changed pixels from unchanged ones.
+    """Score how well a map separates changed pixels from unchanged ones.
 
     ``change_ap`` is the average precision. With a threshold, ``change_f1`` and ``change_iou`` take
     the pixels that reach it for changed. Names that end in ``_geometry`` and ``_appearance`` are of
@@ -67,7 +67,7 @@ def average_precision(scores: Array, changed: NDArray[np.bool_]) -> float:
 def share_of_other(
     image: ArrayLike, own: ArrayLike, other: ArrayLike, mask: ArrayLike | None = None
 ) -> float:
-    """Where an image lies between the truths of two periods: 0 is its own, 1 the other.
+    """Position of an image between the truths of two periods: 0 is its own, 1 the other.
 
     The w that minimises the squared error of (1 - w) own + w other; errors at right angles to the
     change do not count. Of an image that is to show its own period, it is the *ghosting*. What it

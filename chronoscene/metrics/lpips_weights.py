@@ -1,4 +1,4 @@
-"""Where the weights of LPIPS are found. Nothing is unpickled, and nothing is downloaded from here:
+"""Search for the weights of LPIPS. Nothing is unpickled, and nothing is downloaded from here:
 ``chronoscene download lpips-weights`` does that.
 
 Two parts are needed: the convolutions of VGG16 trained on ImageNet (``vgg16-397923af.pth``, the
@@ -46,7 +46,7 @@ class LpipsWeights:
     heads: tuple[Tensor, ...]
     """Weights of the five channels-to-one heads. [channels]"""
     files: tuple[Path, Path]
-    """Where backbone and heads came from."""
+    """Files that backbone and heads were read from."""
 
 
 def candidate_files(explicit: Path | None = None) -> Iterator[Path]:

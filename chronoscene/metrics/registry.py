@@ -23,20 +23,20 @@ from chronoscene.metrics.psnr_ssim import IMAGE_METRICS
 
 @dataclass(frozen=True, slots=True)
 class MetricInfo:
-    """What tables and aggregates must know of a metric."""
+    """Description of a metric for tables and aggregates."""
 
     name: str
     title: str
     """Heading in tables."""
     variant: str
-    """What exactly is computed, in a sentence."""
+    """Exact definition, in a sentence."""
     higher_is_better: bool
     decimals: int
     """Digits after the point in tables."""
     function: Callable[..., float] | None = None
     """``f(image, reference, mask)``, as in `Scorers`; None for `IMAGE_METRICS` and LPIPS."""
     on_request: bool = False
-    """Whether it is computed only where it is named."""
+    """True if it is computed only where it is named."""
     package: str = ""
     """Package that it needs and that may be missing, as it is imported."""
 
@@ -151,7 +151,7 @@ def metric_info(name: str) -> MetricInfo:
 
 @dataclass(frozen=True, slots=True)
 class Scorers:
-    """What can be computed, and why the rest cannot."""
+    """Metrics that can be computed here, and the reasons for those that cannot."""
 
     functions: dict[str, Callable[..., float]]
     """Metric name to ``f(image, reference, mask)`` with [H, W, 3] uint8 images; the mask, bool

@@ -1,4 +1,4 @@
-"""What a backend gets, and the checks on it: shapes always, finite numbers unless switched off."""
+"""Arguments of a backend and their checks: shapes always, finite numbers unless switched off."""
 
 from __future__ import annotations
 

@@ -180,7 +180,8 @@ def _extents(axes: Tensor, opacities: Tensor, eps2d: float) -> Tensor:
 
 
 def _determinants(axes: Tensor, eps2d: float) -> Tensor:
-    """Of the covariances: |a x b|^2 + eps2d (|a|^2 + |b|^2) + eps2d^2; nothing cancels. [M]"""
+    """Determinants of the covariances: |a x b|^2 + eps2d (|a|^2 + |b|^2) + eps2d^2, which does not
+    cancel. [M]"""
     area = torch.linalg.cross(axes[:, 0], axes[:, 1])
     return (area**2).sum(-1) + eps2d * (axes**2).sum((-2, -1)) + eps2d**2
 

@@ -1,4 +1,4 @@
-"""What to generate: sizes, number of periods, kind of flight."""
+"""Settings of generated scenes: sizes, number of periods, kind of flight."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SynthSettings:
     seed: int = _within(0, 2**31 - 1, 0)
     """Each seed gives another city."""
     off_centre: bool = False
-    """Whether the principal point lies away from the image centre (and fx differs from fy)."""
+    """True for a principal point away from the image centre (and fx different from fy)."""
     blocks: int = _within(2, 9, 3)
     """Blocks of the city core per axis."""
     block_size: float = _within(15.0, 120.0, 40.0)
@@ -48,7 +48,7 @@ class SynthSettings:
     """Share of blocks that are torn down and rebuilt with another role at one period, in addition
     to the changes of every scene. At 1, little more than the streets remains."""
     same_light: bool = False
-    """Whether sun, sky and season of the first period stay."""
+    """True to keep sun, sky and season of the first period."""
     probe_spacing: float = _within(0.5, 50.0, 3.0)
     """Distance between the probes of indirect light."""
     noise: float = _within(0.0, 100.0, 0.0)

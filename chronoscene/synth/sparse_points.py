@@ -33,7 +33,7 @@ class Candidates(NamedTuple):
     xyz: Array
     """[N, 3]"""
     period: NDArray[np.int64]
-    """Where the point was found. [N]"""
+    """Period in which the point was found. [N]"""
     element: NDArray[np.int32]
     """Object. [N]"""
     albedo: Array
@@ -105,7 +105,7 @@ def _rays(origin: NDArray[np.floating], directions: NDArray[np.floating]) -> NDA
 def _visibility(
     candidates: Candidates, frames: Sequence[Frame], renderers: Sequence[PeriodRenderer]
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Which frames see which points, and where. [N, F], [N, F, 2]"""
+    """Mask of the frames that see each point, and its pixels there. [N, F], [N, F, 2]"""
     seen = np.zeros((len(candidates.xyz), len(frames)), bool)
     xy = np.zeros((len(candidates.xyz), len(frames), 2))
     same = _unchanged(candidates, renderers)
@@ -127,7 +127,7 @@ def _visibility(
 
 
 def _unchanged(candidates: Candidates, renderers: Sequence[PeriodRenderer]) -> NDArray[np.bool_]:
-    """Whether the surface at a point is the same in each period, apart from the light. [N, T]"""
+    """Mask of the periods in which the surface at a point is the same but for the light. [N, T]"""
     same = np.zeros((len(candidates.xyz), len(renderers)), bool)
     for period, renderer in enumerate(renderers):
         found = renderer.surface_near(candidates.xyz)

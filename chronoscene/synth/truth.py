@@ -98,7 +98,7 @@ def _story(world: World, periods: Sequence[Period]) -> dict[str, Any]:
     objects: dict[str, Any] = {}
     for e in world.elements:
         entry = objects.setdefault(e.name, {"kind": e.kind, "states": []})
-        bounds = np.round(e.part.bounds, 3).tolist()
+        bounds = np.round(e.mesh.bounds, 3).tolist()
         entry["states"].append({"state": e.state, "periods": e.periods, "bounds": bounds})
     return {
         "periods": [

@@ -188,7 +188,7 @@ def ramps(height: int, width: int) -> torch.Tensor:
 
 
 def test_gaussians_read_at_their_coordinates_and_where_they_are_projected_to() -> None:
-    """Of a camera whose principal point is not the middle."""
+    """The camera's principal point is not the middle."""
     view = ring_of_views(3)[0]
     pose, means = (
         view.cam_from_world,

@@ -150,7 +150,7 @@ def test_where_gaussians_start_in_time() -> None:
 
 
 def test_parts_are_samples_in_space_and_time() -> None:
-    """Of Gaussians that are long along one line through both: parts lie on it."""
+    """Parts of Gaussians that are long along one line through both lie on it."""
     model = random_model(1)
     p = {
         name: rows.detach().repeat(4_000, *(1,) * (rows.dim() - 1))
@@ -210,7 +210,7 @@ def test_waves_stay_in_use_where_a_training_is_resumed_or_extended(tmp_path: Pat
 
 
 def test_a_colour_of_the_first_period_is_that_of_the_last_where_a_wave_is_as_long() -> None:
-    """As in the released code; with waves of twice the length they differ."""
+    """Colours agree as in the released code; with waves of twice the length they differ."""
     for cycle, alike in ((1.0, True), (2.0, False)):
         model = random_model(50, cycle=cycle)
         model.parameters["log_time_scales"].fill_(5.0)

@@ -153,7 +153,7 @@ def plain_mlp(weights: Any, inputs: torch.Tensor) -> torch.Tensor:
 
 
 def plain_inputs(model: Any, row: int, centre: torch.Tensor) -> dict[str, torch.Tensor]:
-    """What each MLP sees of one anchor, in the order of its columns."""
+    """Inputs of each MLP for one anchor, in the order of its columns."""
     layout, feature = model.layout, model.features[row].clone()
     offset = model.anchors[row] - centre
     distance = torch.linalg.vector_norm(offset)[None]

@@ -42,7 +42,7 @@ def run_round(parameters, gradient, *, prune_large=False, config=None, seed=0):
 
 
 def view_of(gradients, radii):
-    """Of a call with one camera whose ``backward`` is done."""
+    """Info of a call with one camera whose ``backward`` is done."""
     means2d = torch.zeros(1, len(gradients), 2, requires_grad=True)
     means2d.grad = torch.tensor([gradients])
     return RasterInfo(means2d, torch.tensor([radii], dtype=torch.int32), torch.ones(1, 1))
@@ -57,7 +57,7 @@ def test_gradients_count_in_half_images_and_are_averaged_over_the_views():
 
 
 def test_views_do_not_count_for_gaussians_in_what_their_mask_ignores():
-    """Of four, one lies where the photo counts, one where it does not, two beside the photo."""
+    """One of four lies where the photo counts, one where it does not, two beside the photo."""
     info = view_of([[1e-3, 0.0]] * 4, [[1, 1]] * 4)
     with torch.no_grad():
         info.means2d[0] = torch.tensor([[19.9, 0.1], [0.1, 39.9], [-0.1, 5.0], [5.0, 40.0]])

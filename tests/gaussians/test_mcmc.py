@@ -145,7 +145,7 @@ def test_noise_without_a_rotation_is_none():
 
 
 def test_lengths_in_world_units_are_converted():
-    """The same scene in another unit trains the same."""
+    """A scene in another unit trains the same."""
     world = GaussianConfig(densification="mcmc", max_gaussians=9)
     config = world.in_training_frame(0.25)
     sizes = {"log_scales": torch.full((1, 3), float(np.log(2.0)))}

@@ -73,7 +73,7 @@ class PaintedModel(GaussianModel):
 
 
 class Painted(GaussianMethod):
-    """What a method with a field has to write."""
+    """The least that a method with a field has to write."""
 
     name = "painted"
     config_class = GaussianSplattingConfig

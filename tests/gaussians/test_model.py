@@ -1,4 +1,4 @@
-"""Where Gaussians start, and their activations."""
+"""Initial Gaussians and their activations."""
 
 from dataclasses import replace
 

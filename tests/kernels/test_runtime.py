@@ -1,4 +1,4 @@
-"""What a process finds on its machine, and freed memory, which is kept."""
+"""Resources that a process finds on its machine, and freed memory, which is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the rasterizer's tests share."""
+"""Fixtures of the rasterizer's tests."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def tolerances() -> ModuleType:
 
 @pytest.fixture(scope="session")
 def tools() -> SimpleNamespace:
-    """What the test files share."""
+    """Functions that the test files share."""
     return SimpleNamespace(
         compare=compare,
         random_scene=random_scene,

@@ -1,4 +1,4 @@
-"""What is particular to the CPU backend: equal bits, buffers kept between calls, stages."""
+"""Properties of the CPU backend: equal bits, buffers kept between calls, stages."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def assert_close(
 
 
 def radius_spread(moved: Comparison) -> float:
-    """How far the rounding of inputs changes a radius, relatively."""
+    """Largest relative change of a radius by the rounding of inputs."""
     got, expected = moved.got["radii"], moved.expected["radii"]
     return float((np.abs(got - expected) / np.maximum(1, expected)).max(initial=0))
 

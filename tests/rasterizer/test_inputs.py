@@ -1,4 +1,4 @@
-"""What a caller gets for wrong arguments, and the contract of the outputs."""
+"""Messages for wrong arguments, and the contract of the outputs."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def test_kernels_that_cannot_be_built_are_one_error(
     failure: Exception | None,
     found: str,
 ) -> None:
-    """What fails first: without nvcc the kernels are None, or else the build ends."""
+    """Both first failures: without nvcc the kernels are None, or else the build ends."""
     other_gsplat("1.5.3")
 
     def load(name: str) -> Any:

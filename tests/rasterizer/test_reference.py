@@ -46,7 +46,7 @@ def render(
 
 
 def squared_distance(x: float, y: float) -> np.ndarray:
-    """Of pixel centres from a point. [SIZE, SIZE]"""
+    """Squared distances of pixel centres from a point. [SIZE, SIZE]"""
     c = np.arange(SIZE) + 0.5
     return (c[None, :] - x) ** 2 + (c[:, None] - y) ** 2
 

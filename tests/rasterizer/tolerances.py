@@ -1,4 +1,4 @@
-"""How far backends may be from the float64 reference, what was measured, and why.
+"""Tolerances of backends against the float64 reference, with what was measured and why.
 
 Differences are divided by the largest magnitude of the compared array (of at least `FLOOR`), so
 that they are relative to the array, not to each element: sums over pixels cancel, and the error of
@@ -35,17 +35,17 @@ from case to case. It is measured (`rasterizer_cases.comparison.rounding`), and 
 this times as much, plus what its own arithmetic adds, below. Measured 1.1 where this counts."""
 
 EXTREME_IMAGE = 2e-5
-"""Of images, opacities and depths. Measured 6.4e-7 at the extremes. In mixtures of them, which
+"""Images, opacities and depths. Measured 6.4e-7 at the extremes. In mixtures of them, which
 hide each other behind almost opaque ones, none of 18,000 was at half of its limit."""
 
 EXTREME_GRADIENT = 6e-5
 """Measured 1.4e-5, at a focal length of 1/1000 of the width."""
 
 EXTREME_BACKGROUND = 2e-4
-"""Where almost no light is left it is one minus a float32 opacity. Likewise."""
+"""Gradient of the background: almost no light is left, one minus a float32 opacity. Likewise."""
 
 MIXTURE_GRADIENT = 2e-3
-"""Where Gaussians of every kind hide each other. Likewise."""
+"""Gradients in mixtures, where Gaussians of every kind hide each other. Likewise."""
 
 EXTREME_MOST = 0.02
 """No error may be larger than this, whatever rounding does. Measured 9e-3. In mixtures an array can
@@ -54,7 +54,7 @@ that of the inputs alone is more than this, it is the limit."""
 
 
 def of_extreme(name: str, rounding: float, mixture: bool = False) -> float:
-    """How far an output or a gradient of that name may be from the reference."""
+    """Tolerance of an output or a gradient of that name."""
     own = EXTREME_IMAGE
     if name == "grad backgrounds":
         own = EXTREME_BACKGROUND

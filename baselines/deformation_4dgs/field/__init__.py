@@ -27,7 +27,7 @@ _AXES = {"x": 0, "y": 1, "z": 2, "t": 3}
 def deform(
     parameters: Mapping[str, Tensor], tensors: Mapping[str, Tensor], field: Field, time: float
 ) -> dict[str, Tensor]:
-    """What the heads of a field make of Gaussians at a time: `deform_reference`, compiled.
+    """Deform Gaussians by the heads of a field at a time: `deform_reference`, compiled.
 
     Values and gradients have equal bits for any number of threads. Other types than float32 and
     other devices than a CPU go through `deform_reference`.

@@ -43,7 +43,7 @@ SLICE = 1024  # Gradients summed over the parts in one job; multiple of LANES
 
 @inner
 def _has_gradient(layout, grads, n):  # type: ignore[no-untyped-def]
-    """Whether a Gaussian has one: it may be out of the image, or behind others."""
+    """Return True if a Gaussian has a gradient: it may be out of the image, or behind others."""
     found = layout.opacity and read(grads.logit_opacities, n) != ZERO
     for i in range(3):
         found |= read(grads.means, 3 * n + i) != ZERO

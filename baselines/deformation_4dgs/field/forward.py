@@ -35,7 +35,7 @@ def worker_space(work, number, size):  # type: ignore[no-untyped-def]
 
 @inner
 def coordinate(planes, means, n, axis):  # type: ignore[no-untyped-def]
-    """Where a Gaussian is in the box, 0..1 within it."""
+    """Position of a Gaussian in the box, 0..1 within it."""
     return (read(means, 3 * n + axis) - read(planes.box, axis)) * read(planes.box, 3 + axis)
 
 

@@ -164,8 +164,8 @@ def _plane_gradients(field: Field, time: float, sums: Tensor) -> dict[str, Tenso
 
 
 def _blocks(field: Field) -> list[tuple[str, str, slice, slice]]:
-    """Which block of which joined weight each layer is: its name, that of the weight, rows,
-    columns. A bias goes with its rows."""
+    """Place of each layer in the joined weights: its name, that of the weight, rows, columns. A
+    bias goes with its rows."""
     layout = make_layout(field)
     inside = slice(0, field.width)
     blocks = [("trunk", "trunk", inside, slice(0, layout.features))]

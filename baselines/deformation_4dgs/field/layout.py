@@ -20,7 +20,7 @@ from chronoscene.training.spherical_harmonics import NUM_BASES
 PAIRS = ("xy", "xz", "xt", "yz", "yt", "zt")
 """Axes of the six planes of a level: that of the columns, that of the rows."""
 HEADS = {"means": 3, "log_scales": 3, "quats": 4, "logit_opacities": 1, "sh": 3 * NUM_BASES}
-"""What a head changes, and its number of outputs; those for the colour go basis by basis."""
+"""Parameters that heads change, and numbers of outputs; those for the colour go basis by basis."""
 MIN_EDGE = 1e-6
 """Smallest edge of a box, in units of the training frame: all points may be in one place."""
 
@@ -95,9 +95,9 @@ class Layout(NamedTuple):
     hiddens: int
     """Hidden units of all heads: width_pad each."""
     small: int
-    """Of all but the colour's."""
+    """Hidden units of all heads but the colour's."""
     opacity: bool
-    """Whether there is a head for it."""
+    """True if there is a head for the opacity."""
     color: bool
 
 
@@ -162,7 +162,7 @@ class Weights(NamedTuple):
     color_t: int
     color_bias: int
     zeros: int
-    """As many as the longest row."""
+    """Zeros, as many as the longest row has numbers."""
 
 
 class Gradients(NamedTuple):
@@ -183,7 +183,7 @@ class Work(NamedTuple):
     """Addresses of what one worker works in."""
 
     rows: int
-    """Which Gaussians are in the block. int64 [BLOCK]"""
+    """Indices of the Gaussians in the block. int64 [BLOCK]"""
     x: int
     """Features. [BLOCK, features_pad], and some more"""
     trunk: int

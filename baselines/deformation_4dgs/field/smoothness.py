@@ -16,14 +16,14 @@ from chronoscene.training import devices
 
 
 class Weights(NamedTuple):
-    """Of the three terms."""
+    """Weights of the three terms."""
 
     space: float
     """Second differences along the rows of planes xy, xz and yz."""
     time: float
-    """The same of xt, yt and zt, whose rows are times."""
+    """Second differences along the rows, which are times, of planes xt, yt and zt."""
     ones: float
-    """Distance of those from one."""
+    """Distance of planes xt, yt and zt from one."""
 
     def of(self, name: str) -> tuple[float, float]:
         """Weights of second differences and of the distance from one in a plane."""

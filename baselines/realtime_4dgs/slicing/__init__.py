@@ -32,7 +32,7 @@ from chronoscene.gaussians.model import axes_of, dot
 from chronoscene.training import devices
 
 ORDERS = 2
-"""Of the waves of colours in time, beside what is constant."""
+"""Orders of the waves of colours in time, beside the constant term."""
 
 SHAPES: dict[str, tuple[int, ...]] = {
     **model.SHAPES,
@@ -48,7 +48,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
 def slice_at(
     parameters: Mapping[str, Tensor], time: float, *, cycle: float, order: int
 ) -> dict[str, Tensor]:
-    """What Gaussians in space and time are at one time, before the activations.
+    """Slice Gaussians in space and time at one time, before the activations.
 
     With M = R S, its rows X of space and tau of time, dt = t - mu_t:
 
@@ -110,7 +110,7 @@ def slice_reference(
 
 
 def turned(left: Tensor, right: Tensor, vectors: Tensor) -> Tensor:
-    """What pairs of quaternions, of any length, make of vectors in (x, y, z, t). [N, 4]"""
+    """Rotate vectors in (x, y, z, t) by pairs of quaternions of any length. [N, 4]"""
     turn = _product(_product(_unit(left), vectors.roll(1, -1)), _conjugate(_unit(right)))
     return turn.roll(-1, -1)
 
@@ -161,7 +161,7 @@ def _jacobi(Y: Tensor) -> Tensor:
 
 
 def _unit(quats: Tensor) -> Tensor:
-    """The same at length 1; one of length zero stays as it is, and makes a Gaussian that is
+    """Normalise quaternions; one of length zero stays as it is, and makes a Gaussian that is
     nowhere in time."""
     return quats / quats.square().sum(-1, keepdim=True).clamp_min(1e-60).sqrt()
 
@@ -171,7 +171,7 @@ def _conjugate(quats: Tensor) -> Tensor:
 
 
 def _product(left: Tensor, right: Tensor) -> Tensor:
-    """Of quaternions wxyz. [N, 4]"""
+    """Product of quaternions wxyz. [N, 4]"""
     w, x, y, z = left.unbind(-1)
     a, b, c, d = right.unbind(-1)
     return torch.stack(
@@ -186,7 +186,7 @@ def _product(left: Tensor, right: Tensor) -> Tensor:
 
 
 def _left_matrix(quats: Tensor) -> Tensor:
-    """What the product from the left does to (x, y, z, t). [N, 4] -> [N, 4, 4]"""
+    """Matrix of the product from the left, on (x, y, z, t). [N, 4] -> [N, 4, 4]"""
     w, x, y, z = quats.unbind(-1)
     rows = ((w, -z, y, x), (z, w, -x, y), (-y, x, w, z), (-x, -y, -z, w))
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

@@ -35,7 +35,7 @@ BLOCK = 256  # Rows that one task handles. Fixed, so that the result does not de
 
 @inner(forceinline=True)
 def _product(a, b):  # type: ignore[no-untyped-def]
-    """Of quaternions wxyz."""
+    """Product of quaternions wxyz."""
     return (
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
         a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
@@ -107,7 +107,7 @@ def _open(n, dt, left, right, log_scales, log_time_scales, m, y):  # type: ignor
 
 @inner(forceinline=True)
 def _dot(y, i, j):  # type: ignore[no-untyped-def]
-    """Of two rows. [3, 4]"""
+    """Dot product of two rows. [3, 4]"""
     return y[i, 0] * y[j, 0] + y[i, 1] * y[j, 1] + y[i, 2] * y[j, 2] + y[i, 3] * y[j, 3]
 
 
@@ -154,7 +154,7 @@ def _reciprocal(a, b):  # type: ignore[no-untyped-def]
 
 @inner(forceinline=True)
 def _rest_of_turn(y):  # type: ignore[no-untyped-def]
-    """What the Jacobi rotations left to do, to first order."""
+    """First-order correction of what the Jacobi rotations left to do."""
     a, b, c = _dot(y, 0, 0), _dot(y, 1, 1), _dot(y, 2, 2)
     return (
         1.0,
@@ -233,7 +233,7 @@ def slice_forward(  # type: ignore[no-untyped-def]
 
 @inner
 def _is_zero(g_means, g_scales, g_quats, g_logits, g_dc, g_rest, n):  # type: ignore[no-untyped-def]
-    """Whether no output of a Gaussian has a gradient."""
+    """Return True if no output of a Gaussian has a gradient."""
     found = g_logits[n] != 0
     for c in range(3):
         found |= (g_means[n, c] != 0) | (g_scales[n, c] != 0) | (g_dc[n, c] != 0)

@@ -84,7 +84,7 @@ def _stack(parts: list[Tensor]) -> Tensor:
 
 
 def _slot(leaf: Tensor, c: int, padded: int) -> Tensor:
-    """What receives the gradient of one camera's means2d, with ``padded`` rows.
+    """Return the tensor that receives the gradient of one camera's means2d, with ``padded`` rows.
 
     The usual single camera gets the leaf itself: taking a part of it costs two copies on the way
     back.
@@ -123,7 +123,7 @@ def _flat(info: RasterInfo, c: int) -> tuple[AnyArray, AnyArray, AnyArray]:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What to render besides the tensors, and where to put what the projection finds."""
+    """Camera, options and output arrays of one image."""
 
     view: View
     visible: tuple[AnyArray, AnyArray, AnyArray]

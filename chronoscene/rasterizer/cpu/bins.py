@@ -1,4 +1,4 @@
-"""Which blocks of which tiles a Gaussian touches, and the list of Gaussians of every tile.
+"""Tiles and blocks that each Gaussian touches, and the list of Gaussians of every tile.
 
 In the order of drawing, the (Gaussian, tile, blocks) pairs of each part are written to a region of
 a list; a stable counting sort by tile then keeps the order of drawing in every tile,
@@ -170,7 +170,7 @@ def _sum_up(row_bases):
 
 @inner(fast_math=True)
 def _list_phase(control, phase, starts, ends, order, count, view, scene, counts, listed):
-    """List the pairs of each part and count them by tile. Returns whether there was room."""
+    """List the pairs of each part and count them by tile; True if the memory sufficed."""
     parts = ends.size
     part = draw(control, phase)
     while part < parts:

@@ -69,7 +69,7 @@ def start_gaussian(records: Any, at: int, left: Any, top: Any, state: Any, steps
 
 @inlined
 def slopes(records: Any, at: int) -> Any:
-    """How u changes along x and y, and v."""
+    """Derivatives of u and v along x and y."""
     u_x, u_y, v = records[at + layout.U_X], records[at + layout.U_Y], records[at + layout.V]
     zero = np.float32(0.0)
     return (u_x, u_y, zero, v) if v > zero else (u_x, u_y, v, zero)
@@ -127,7 +127,7 @@ def _start_tile(left, top, width, height, state, planes, plane, end):
 
 @inner(fast_math=True)
 def _any_light(state, at):
-    """Whether any pixel of a block is active."""
+    """Return True if any pixel of a block is active."""
     found = False
     for part in range(PARTS):
         found |= any_lane(load(state, at + LANES * part) > 0.0)

@@ -99,7 +99,7 @@ def cross(a: Any, b: Any) -> Any:
 
 @inlined
 def _image_row(focal: Any, ratio: Any, m: Any, depth_row: Any) -> Any:
-    """How a step along each axis of the Gaussian, as long as the depth, moves on an image axis."""
+    """Motion along an image axis for a step along each Gaussian axis, as long as the depth."""
     return (
         focal * (m[0] - ratio * depth_row[0]),
         focal * (m[1] - ratio * depth_row[1]),
@@ -109,7 +109,7 @@ def _image_row(focal: Any, ratio: Any, m: Any, depth_row: Any) -> Any:
 
 @inlined
 def project_axes(camera: Any, position: Any, r: Any) -> Any:
-    """Where a Gaussian is and how its axes appear on the screen.
+    """Project the centre and the axes of a Gaussian onto the screen.
 
     Args:
         camera: `layout.CAMERA` numbers.

@@ -1,4 +1,4 @@
-"""What the CPU kernels agree on: tiles, records, camera numbers, and the width of vectors.
+"""Memory layout shared by the CPU kernels: tiles, records, camera numbers, vector width.
 
 Numba reads these numbers when a kernel is compiled.
 """
@@ -71,7 +71,7 @@ CHUNK = 1024  # Gaussians that a thread takes at a time
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Where one image is taken from."""
+    """Camera of one image, in the form that the kernels read."""
 
     camera: AnyArray
     """`CAMERA` numbers, float32."""
@@ -109,7 +109,7 @@ def make_view(viewmat: AnyArray, K: AnyArray, inputs: Inputs) -> View:
 
 
 def _centre(viewmat: AnyArray) -> AnyArray:
-    """Where the camera stands, also if rounding has left the rotation not quite one."""
+    """Camera centre, also valid for a rotation that is slightly off by rounding."""
     try:
         return -np.linalg.solve(viewmat[:3, :3], viewmat[:3, 3])
     except np.linalg.LinAlgError:  # nan: all is culled

@@ -197,7 +197,7 @@ class Rendering:
         return touched, rows
 
     def transmittance(self) -> AnyArray:
-        """What light is left at each pixel, with more digits than 1 - opacity has. [H, W]"""
+        """Transmittance of each pixel, with more digits than 1 - opacity has. [H, W]"""
         tiles_x, tiles_y = self.view.tiles_x, self.view.tiles // self.view.tiles_x
         # By tile, block, row and column.
         plane = self.planes[0].reshape(tiles_y, tiles_x, layout.BLOCKS, layout.BLOCKS, 4, 4)

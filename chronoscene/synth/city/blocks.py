@@ -13,7 +13,7 @@ from chronoscene.synth.city import furniture as fur
 from chronoscene.synth.city.buildings import SLAB, Building, finished, foundation, frame, rubble
 from chronoscene.synth.city.placing import Block, Rect, floor
 from chronoscene.synth.city.world import renewal_stages, site_stages, visits
-from chronoscene.synth.render.mesh import Part
+from chronoscene.synth.render.mesh import Mesh
 from chronoscene.synth.render.noise import rng_for
 
 X = np.array([1.0, 0.0, 0.0])
@@ -44,9 +44,9 @@ def square(block: Block) -> None:
         if np.linalg.norm((at - mid)[:2]) < radius + 3.5:
             at = mid + _flat_unit(at - mid) * (radius + 4.5)
         turn = float(rng.uniform(0, 6.28))
-        part, make = (f"stall_{i}", fur.stall) if i % 2 else (f"kiosk_{i}", fur.kiosk)
+        label, make = (f"stall_{i}", fur.stall) if i % 2 else (f"kiosk_{i}", fur.kiosk)
         here = visits(rng, world.periods, 0.5)
-        block.put(part, "kiosk", make, at, turn, world.seed, present=here)
+        block.put(label, "kiosk", make, at, turn, world.seed, present=here)
 
 
 def _flat_unit(v: Array) -> Array:
@@ -190,12 +190,12 @@ def site(block: Block) -> None:
     ground = block.named("floor")
     world.add(ground, "ground", surfaces, lambda s: floor(block.name, inner, s))
 
-    def make(stage: str) -> Part:
+    def make(stage: str) -> Mesh:
         if stage == "foundation":
             return foundation(spec, world.seed)
         if stage.startswith("frame"):
-            part = 0.5 if stage == "frame_low" else 0.85
-            return frame(spec, max(1, int(part * spec.storeys)), world.seed)
+            share = 0.5 if stage == "frame_low" else 0.85
+            return frame(spec, max(1, int(share * spec.storeys)), world.seed)
         return finished(spec, world.seed)
 
     world.add(spec.name, "building", [None if s == "lot" else s for s in steps], make)
@@ -235,7 +235,7 @@ def renewal(block: Block) -> None:
         int(rng.integers(3, 5)), "gable", "brick",
     )  # fmt: skip
 
-    def make(stage: str) -> Part:
+    def make(stage: str) -> Mesh:
         return finished(spec, world.seed) if stage == "house" else rubble(spec, world.seed)
 
     world.add(spec.name, "building", [None if s == "park" else s for s in steps], make)

@@ -11,7 +11,7 @@ from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.facades import Front, Wall
 from chronoscene.synth.city.roofs import add_roof
-from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 
 X, Y, Z = np.eye(3)
@@ -59,10 +59,10 @@ class Building:
         return [(a, X, dx), (b, Y, dy), (c, -X, dx), (d, -Y, dy)]
 
 
-def finished(spec: Building, seed: int) -> Part:
+def finished(spec: Building, seed: int) -> Mesh:
     """The finished building."""
     rng = rng_for(seed, spec.name, "look", spec.look)
-    b = PartBuilder(key_number(spec.name, spec.look))
+    b = MeshBuilder(key_number(spec.name, spec.look))
     shape = rng_for(seed, spec.name, "shape")
     front = Front.random(b, spec.wall, rng, shape, spec.storey, spec.ground)
     for i, (corner, along, width) in enumerate(spec.sides):
@@ -79,9 +79,9 @@ def finished(spec: Building, seed: int) -> Part:
     return b.build()
 
 
-def frame(spec: Building, storeys: int, seed: int) -> Part:
+def frame(spec: Building, storeys: int, seed: int) -> Mesh:
     """Concrete frame of the first storeys: slabs, columns, core, and a scaffold on one side."""
-    b = PartBuilder(key_number(spec.name, "frame"))
+    b = MeshBuilder(key_number(spec.name, "frame"))
     rng = rng_for(seed, spec.name, "frame")
     concrete = pal.wall_style(b, "concrete", rng, spec.storey)
     dx, dy = spec.x1 - spec.x0, spec.y1 - spec.y0
@@ -102,7 +102,7 @@ def frame(spec: Building, storeys: int, seed: int) -> Part:
     return b.build()
 
 
-def _rods(b: PartBuilder, spec: Building, grid: Array, top: float) -> None:
+def _rods(b: MeshBuilder, spec: Building, grid: Array, top: float) -> None:
     """Starter bars for the next storey, and pallets on the top slab."""
     steel = pal.plain_style(b, srgb(122, 78, 52))
     base = np.column_stack([grid + 0.1, np.full(len(grid), top)])
@@ -117,7 +117,7 @@ def _rods(b: PartBuilder, spec: Building, grid: Array, top: float) -> None:
     b.boxes(base, size[:, :1] * X, size[:, 1:2] * Y, size[:, 2:] * Z, wood, bottom=False)
 
 
-def _scaffold(b: PartBuilder, spec: Building, top: float) -> None:
+def _scaffold(b: MeshBuilder, spec: Building, top: float) -> None:
     """Poles and boards along the south side."""
     pole = pal.metal_style(b, srgb(176, 150, 60))
     board = pal.wood_style(b, srgb(184, 150, 100))
@@ -130,9 +130,9 @@ def _scaffold(b: PartBuilder, spec: Building, top: float) -> None:
     b.boxes(base, [spec.x1 - spec.x0, 0, 0], [0, 0.9, 0], 0.08 * Z, board)
 
 
-def foundation(spec: Building, seed: int) -> Part:
+def foundation(spec: Building, seed: int) -> Mesh:
     """Ground slab with starter walls and stacks of material."""
-    b = PartBuilder(key_number(spec.name, "foundation"))
+    b = MeshBuilder(key_number(spec.name, "foundation"))
     rng = rng_for(seed, spec.name, "foundation")
     concrete = pal.wall_style(b, "concrete", rng, spec.storey)
     dx, dy = spec.x1 - spec.x0, spec.y1 - spec.y0
@@ -144,9 +144,9 @@ def foundation(spec: Building, seed: int) -> Part:
     return b.build()
 
 
-def rubble(spec: Building, seed: int) -> Part:
-    """What a demolition leaves: heaps of debris and a stump of wall."""
-    b = PartBuilder(key_number(spec.name, "rubble"))
+def rubble(spec: Building, seed: int) -> Mesh:
+    """Heaps of debris and a stump of wall, left by a demolition."""
+    b = MeshBuilder(key_number(spec.name, "rubble"))
     rng = rng_for(seed, spec.name, "rubble")
     n = 160
     center = np.array([spec.x0 + spec.x1, spec.y0 + spec.y1]) / 2

@@ -8,7 +8,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
-from chronoscene.synth.render.mesh import PartBuilder, srgb
+from chronoscene.synth.render.mesh import MeshBuilder, srgb
 from chronoscene.synth.render.textures import DOOR, SIGN
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -36,7 +36,7 @@ class Front:
     @classmethod
     def random(
         cls,
-        b: PartBuilder,
+        b: MeshBuilder,
         wall: str,
         rng: np.random.Generator,
         shape: np.random.Generator,
@@ -81,7 +81,7 @@ class Wall:
     """
 
     def __init__(
-        self, b: PartBuilder, front: Front, corner: Array, along: Array, width: float
+        self, b: MeshBuilder, front: Front, corner: Array, along: Array, width: float
     ) -> None:
         self.b, self.front = b, front
         self.corner, self.along, self.width = corner, along, width

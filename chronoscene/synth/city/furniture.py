@@ -9,7 +9,7 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.vegetation import trunk
-from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import CORRUGATED, PAINT, SIGN, WATER
 
@@ -17,7 +17,7 @@ Triple = tuple[float, float, float]
 Z = np.array([0.0, 0.0, 1.0])
 
 
-class Placed(PartBuilder):
+class Placed(MeshBuilder):
     """A builder with local axes: shapes are given in local metres and rotated into the world.
 
     Args:
@@ -60,7 +60,7 @@ class Placed(PartBuilder):
             self.polygon([near[j], near[i], far[i], far[j]], style, seed=2 + i)
 
 
-def car(name: str, base: Array, turn: float, seed: int) -> Part:
+def car(name: str, base: Array, turn: float, seed: int) -> Mesh:
     """A car or a van with wheels, windows and lights; the name determines type and colour."""
     rng = rng_for(seed, name, "car")
     p = Placed(name, base, turn)
@@ -100,7 +100,7 @@ def _wheel(p: Placed, x: float, y: float, style: int) -> None:
     p.prism(profile, y - 0.01, y + 0.21, [style] * len(profile), style)
 
 
-def bench(name: str, base: Array, turn: float) -> Part:
+def bench(name: str, base: Array, turn: float) -> Mesh:
     """Wooden bench."""
     p = Placed(name, base, turn)
     wood = pal.wood_style(p, srgb(150, 104, 62), 0.11)
@@ -112,7 +112,7 @@ def bench(name: str, base: Array, turn: float) -> Part:
     return p.build()
 
 
-def lamp(name: str, base: Array, turn: float) -> Part:
+def lamp(name: str, base: Array, turn: float) -> Mesh:
     """Street lamp with an arm."""
     p = Placed(name, base, turn)
     iron = pal.metal_style(p, srgb(66, 74, 72))
@@ -124,7 +124,7 @@ def lamp(name: str, base: Array, turn: float) -> Part:
     return p.build()
 
 
-def kiosk(name: str, base: Array, turn: float, seed: int) -> Part:
+def kiosk(name: str, base: Array, turn: float, seed: int) -> Mesh:
     """Kiosk with a sign, a counter and an awning."""
     rng = rng_for(seed, name, "kiosk")
     p = Placed(name, base, turn)
@@ -142,7 +142,7 @@ def kiosk(name: str, base: Array, turn: float, seed: int) -> Part:
     return p.build()
 
 
-def stall(name: str, base: Array, turn: float, seed: int) -> Part:
+def stall(name: str, base: Array, turn: float, seed: int) -> Mesh:
     """Market stall: a table with goods under a tent roof."""
     rng = rng_for(seed, name, "stall")
     p = Placed(name, base, turn)
@@ -161,7 +161,7 @@ def stall(name: str, base: Array, turn: float, seed: int) -> Part:
     return p.build()
 
 
-def container(name: str, base: Array, turn: float, seed: int) -> Part:
+def container(name: str, base: Array, turn: float, seed: int) -> Mesh:
     """Shipping container or site office."""
     rng = rng_for(seed, name, "container")
     p = Placed(name, base, turn)
@@ -171,9 +171,9 @@ def container(name: str, base: Array, turn: float, seed: int) -> Part:
     return p.build()
 
 
-def fence(name: str, points: list[tuple[float, float]], z: float) -> Part:
+def fence(name: str, points: list[tuple[float, float]], z: float) -> Mesh:
     """Site fence along a path: posts and boards."""
-    b = PartBuilder(key_number(name))
+    b = MeshBuilder(key_number(name))
     post = pal.plain_style(b, srgb(120, 120, 118))
     board = pal.sheet_style(b, srgb(196, 198, 194), 0.25, False)
     for (x0, y0), (x1, y1) in pairwise(points):
@@ -187,7 +187,7 @@ def fence(name: str, points: list[tuple[float, float]], z: float) -> Part:
     return b.build()
 
 
-def crane(name: str, base: Array, turn: float, height: float) -> Part:
+def crane(name: str, base: Array, turn: float, height: float) -> Mesh:
     """Tower crane with lattice mast and jib."""
     p = Placed(name, base, turn)
     yellow = pal.metal_style(p, srgb(222, 172, 30), dust=0.1)
@@ -228,7 +228,7 @@ def _lattice(p: Placed, low: Array, way: Array, wide: float, style: int) -> None
             p.boxes(o, wide * u, thin * w, thin * along, style)
 
 
-def fountain(name: str, base: Array, radius: float) -> Part:
+def fountain(name: str, base: Array, radius: float) -> Mesh:
     """Round basin with a column."""
     p = Placed(name, base, 0.0)
     stone = pal.plain_style(p, srgb(176, 168, 152), 0.35, 0.5)
@@ -249,7 +249,7 @@ def fountain(name: str, base: Array, radius: float) -> Part:
     return p.build()
 
 
-def statue(name: str, base: Array) -> Part:
+def statue(name: str, base: Array) -> Mesh:
     """Stepped plinth with an obelisk."""
     p = Placed(name, base, 0.3)
     stone = pal.plain_style(p, srgb(164, 156, 140), 0.35, 0.5)
@@ -262,7 +262,7 @@ def statue(name: str, base: Array) -> Part:
     return p.build()
 
 
-def digger(name: str, base: Array, turn: float) -> Part:
+def digger(name: str, base: Array, turn: float) -> Mesh:
     """Excavator."""
     p = Placed(name, base, turn)
     yellow = pal.metal_style(p, srgb(224, 160, 30), dust=0.3)

@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from chronoscene.synth.render import textures as tex
-from chronoscene.synth.render.mesh import Color, PartBuilder, srgb
+from chronoscene.synth.render.mesh import Color, MeshBuilder, srgb
 
 T = TypeVar("T")
 
@@ -84,7 +84,7 @@ def tint(rng: np.random.Generator, color: Color, amount: float = 0.08) -> Color:
     return red, green, blue
 
 
-def wall_style(b: PartBuilder, kind: str, rng: np.random.Generator, storey: float) -> int:
+def wall_style(b: MeshBuilder, kind: str, rng: np.random.Generator, storey: float) -> int:
     """Style of an outer wall: ``plaster``, ``brick``, ``panel`` or ``concrete``."""
     if kind == "brick":
         first, second = pick(rng, BRICKS)
@@ -107,13 +107,13 @@ def wall_style(b: PartBuilder, kind: str, rng: np.random.Generator, storey: floa
     return b.style(tex.PLASTER, c, srgb(168, 152, 130), below, (wear, line, 0.2))
 
 
-def glass_style(b: PartBuilder, frame: Color, panes: tuple[int, int] = (2, 2)) -> int:
+def glass_style(b: MeshBuilder, frame: Color, panes: tuple[int, int] = (2, 2)) -> int:
     """Style of a window; the seed of each window determines its curtains."""
     room, curtain = srgb(42, 50, 60), srgb(206, 196, 176)
     return b.style(tex.GLASS, frame, room, curtain, (0.07, *panes), reflect=0.12, sharp=0.9)
 
 
-def roof_tile_style(b: PartBuilder, rng: np.random.Generator) -> int:
+def roof_tile_style(b: MeshBuilder, rng: np.random.Generator) -> int:
     """Style of a pitched roof."""
     first, second = pick(rng, ROOFS)
     moss = float(rng.uniform(0.05, 0.35))
@@ -122,56 +122,56 @@ def roof_tile_style(b: PartBuilder, rng: np.random.Generator) -> int:
     )
 
 
-def flat_roof_style(b: PartBuilder, rng: np.random.Generator) -> int:
+def flat_roof_style(b: MeshBuilder, rng: np.random.Generator) -> int:
     """Style of a flat roof."""
     gravel = float(rng.random() < 0.5)
     c = tint(rng, srgb(150, 144, 134) if gravel else srgb(104, 104, 108))
     return b.style(tex.FLAT_ROOF, c, srgb(66, 66, 68), srgb(112, 106, 96), (1.1, gravel))
 
 
-def asphalt_style(b: PartBuilder, marking: int, parking: float = 0.0) -> int:
+def asphalt_style(b: MeshBuilder, marking: int, parking: float = 0.0) -> int:
     """Style of a road; marking 0 none, 1 lanes, 2 zebra, 3 parking lot."""
     return b.style(
         tex.ASPHALT, srgb(84, 84, 88), srgb(112, 110, 108), srgb(224, 222, 212), (marking, parking)
     )
 
 
-def grass_style(b: PartBuilder, season: str, wear: float, stripes: float = 0.0) -> int:
+def grass_style(b: MeshBuilder, season: str, wear: float, stripes: float = 0.0) -> int:
     """Style of a lawn in a season."""
     first, second, litter = GRASSES[season]
     return b.style(tex.GRASS, first, second, srgb(132, 110, 80), (wear, litter, stripes))
 
 
-def leaf_style(b: PartBuilder, season: str, species: int, size: float) -> int:
+def leaf_style(b: MeshBuilder, season: str, species: int, size: float) -> int:
     """Style of foliage in a season; species 2 is evergreen."""
     c0, c1, c2 = EVERGREEN if species == 2 else CROWNS[season][species]
     return b.style(tex.LEAVES, c0, c1, c2, (size, 0.10), translucent=0.35)
 
 
-def soil_style(b: PartBuilder, stones: float, ruts: float) -> int:
+def soil_style(b: MeshBuilder, stones: float, ruts: float) -> int:
     """Style of bare ground."""
     return b.style(tex.SOIL, *SOILS, (stones, ruts))
 
 
-def metal_style(b: PartBuilder, color: Color, stripe: float = 0.0, dust: float = 0.15) -> int:
+def metal_style(b: MeshBuilder, color: Color, stripe: float = 0.0, dust: float = 0.15) -> int:
     """Style of painted metal."""
     return b.style(
         tex.PAINT, color, WHITE, srgb(130, 118, 100), (dust, stripe), reflect=0.04, sharp=0.6
     )
 
 
-def plain_style(b: PartBuilder, color: Color, strength: float = 0.25, size: float = 0.6) -> int:
+def plain_style(b: MeshBuilder, color: Color, strength: float = 0.25, size: float = 0.6) -> int:
     """Style of surfaces without a pattern."""
     dark = (0.8 * color[0], 0.8 * color[1], 0.8 * color[2])
     return b.style(tex.PLAIN, color, dark, None, (strength, size))
 
 
-def wood_style(b: PartBuilder, color: Color, board: float = 0.16) -> int:
+def wood_style(b: MeshBuilder, color: Color, board: float = 0.16) -> int:
     """Style of boards."""
     dark = (0.6 * color[0], 0.6 * color[1], 0.6 * color[2])
     return b.style(tex.WOOD, color, dark, None, (board, 0.02))
 
 
-def sheet_style(b: PartBuilder, color: Color, rust: float, band: bool) -> int:
+def sheet_style(b: MeshBuilder, color: Color, rust: float, band: bool) -> int:
     """Style of corrugated metal."""
     return b.style(tex.CORRUGATED, color, srgb(110, 62, 36), WHITE, (0.3, rust, float(band)))

@@ -16,7 +16,7 @@ from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.buildings import SLAB, Building, finished
 from chronoscene.synth.city.vegetation import hedge, tree
 from chronoscene.synth.city.world import World, looks, tree_heights
-from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import PAVING
 
@@ -51,7 +51,7 @@ class Rect:
         return np.array([self.x0 + fx * dx, self.y0 + fy * dy, z])
 
 
-def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
+def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Mesh:
     """A rectangle of ground.
 
     Args:
@@ -61,7 +61,7 @@ def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
             ``slabs``.
         z: Height in metres.
     """
-    b = PartBuilder(key_number(name, "floor"))
+    b = MeshBuilder(key_number(name, "floor"))
     kind, _, season = surface.partition(" ")
     dx, dy = rect.size
     if kind == "lawn":
@@ -91,9 +91,9 @@ def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Part:
     return b.build()
 
 
-def pavement(name: str, low: Array, high: Array, ring: float, seed: int) -> Part:
+def pavement(name: str, low: Array, high: Array, ring: float, seed: int) -> Mesh:
     """Kerb and paving slabs around a block, without its inside."""
-    b = PartBuilder(key_number(name, "pavement"))
+    b = MeshBuilder(key_number(name, "pavement"))
     rng = rng_for(seed, name, "pavement")
     grey = pal.tint(rng, srgb(158, 154, 146))
     light = pal.tint(rng, srgb(182, 174, 160))
@@ -133,44 +133,44 @@ class Block:
         world.always(f"{name}/pavement", "ground", make)
         return cls(world, name, rect.inset(ring), rng_for(world.seed, name))
 
-    def named(self, part: str) -> str:
-        """Name of a part of the block."""
-        return f"{self.name}/{part}" if part else self.name
+    def named(self, label: str) -> str:
+        """Name of something in the block."""
+        return f"{self.name}/{label}" if label else self.name
 
     def put(
-        self, part: str, kind: str, make: Callable[..., Part], *args: Any,
+        self, label: str, kind: str, make: Callable[..., Mesh], *args: Any,
         present: Sequence[bool] | None = None,
     ) -> None:  # fmt: skip
         """Add an object, in all periods by default; ``make`` receives its name and ``args``."""
-        name, every = self.named(part), [True] * self.world.periods
+        name, every = self.named(label), [True] * self.world.periods
         self.world.place(name, kind, present or every, partial(make, name, *args))
 
-    def pave(self, part: str, rect: Rect, surface: str) -> None:
+    def pave(self, label: str, rect: Rect, surface: str) -> None:
         """Add ground that never changes; see `floor`."""
-        self.world.always(self.named(part), "ground", partial(floor, self.name, rect, surface))
+        self.world.always(self.named(label), "ground", partial(floor, self.name, rect, surface))
 
-    def lawn(self, rect: Rect, part: str = "", kind: str = "lawn", z: float = SLAB) -> None:
+    def lawn(self, rect: Rect, label: str = "", kind: str = "lawn", z: float = SLAB) -> None:
         """Add grass that changes with the seasons."""
-        name = self.named(part)
+        name = self.named(label)
         states = [f"{kind} {season}" for season in self.world.seasons]
         self.world.add(f"{name}/lawn", "lawn", states, lambda s: floor(name, rect, s, z))
 
-    def plant(self, part: str, at: Array, size: float = 6.5, broad: bool = False) -> None:
+    def plant(self, label: str, at: Array, size: float = 6.5, broad: bool = False) -> None:
         """Add a tree that grows, and may be planted late or felled."""
         world = self.world
         height = float(self.rng.uniform(0.75, 1.25) * size)
         heights = tree_heights(self.rng, world.periods, height)
-        self.tree(part, at, heights, 2, broad)
+        self.tree(label, at, heights, 2, broad)
 
     def tree(
-        self, part: str, at: Array, heights: Sequence[float | None], detail: int, broad: bool
+        self, label: str, at: Array, heights: Sequence[float | None], detail: int, broad: bool
     ) -> None:
         """Add a tree with the given height in each period; None where it is absent."""
         states = [
             None if height is None else (height, season)
             for height, season in zip(heights, self.world.seasons, strict=True)
         ]
-        name = self.named(part)
+        name = self.named(label)
         make = partial(tree, name, at, self.world.seed, detail, broad)
         self.world.add(name, "tree", states, make)
 
@@ -185,21 +185,21 @@ class Block:
                     self.plant(f"tree_{i}", at)
                     break
 
-    def hedge(self, part: str, low: Array, high: Array) -> None:
+    def hedge(self, label: str, low: Array, high: Array) -> None:
         """Add a hedge between two points."""
-        name = self.named(part)
+        name = self.named(label)
         make = partial(hedge, name, low, high, self.world.seed)
         self.world.add(name, "tree", self.world.seasons, make)
 
-    def gravel_path(self, part: str, points: Array, width: float) -> None:
+    def gravel_path(self, label: str, points: Array, width: float) -> None:
         """Add a gravel path along a curve, slightly above the lawn."""
         way = np.gradient(points, axis=0)
         way /= np.linalg.norm(way, axis=1, keepdims=True)
         side = np.column_stack([-way[:, 1], way[:, 0]]) * width / 2
         height = np.full(len(points), SLAB + 0.02)
 
-        def make(name: str) -> Part:
-            b = PartBuilder(key_number(name))
+        def make(name: str) -> Mesh:
+            b = MeshBuilder(key_number(name))
             style = pal.soil_style(b, 0.05, 0.0)
             left = np.column_stack([points + side, height])
             right = np.column_stack([points - side, height])
@@ -208,7 +208,7 @@ class Block:
                 b.polygon([right[i], right[i + 1], left[i + 1], left[i]], style, frame=frame)
             return b.build()
 
-        self.put(part, "ground", make)
+        self.put(label, "ground", make)
 
     def house(self, spec: Building, chance: float) -> None:
         """Add a finished building whose facade may be renewed once, with the given chance."""
@@ -224,11 +224,11 @@ class Block:
         )
 
     def park_cars(
-        self, part: str, places: list[tuple[float, float, float, float]], chance: float
+        self, label: str, places: list[tuple[float, float, float, float]], chance: float
     ) -> None:
         """Add parked cars: a place (x, y, z, heading) is empty or taken in each period."""
         periods = range(self.world.periods)
-        rng = rng_for(self.world.seed, self.named(part), "cars")
+        rng = rng_for(self.world.seed, self.named(label), "cars")
         for i, (x, y, z, turn) in enumerate(places):
             stay = rng.random() < 0.2
             here = rng.random(len(periods)) < chance
@@ -236,10 +236,10 @@ class Block:
             groups = [list(periods)] if stay else [[p] for p in periods]
             for k, group in enumerate(groups):
                 present = [p in group and bool(here[group[0]]) for p in periods]
-                self.car(f"{part}/car_{i}_{k}".lstrip("/"), np.array([x, y, z]), heading, present)
+                self.car(f"{label}/car_{i}_{k}".lstrip("/"), np.array([x, y, z]), heading, present)
 
-    def car(self, part: str, at: Array, heading: float, present: Sequence[bool]) -> None:
-        self.put(part, "car", fur.car, at, heading, self.world.seed, present=present)
+    def car(self, label: str, at: Array, heading: float, present: Sequence[bool]) -> None:
+        self.put(label, "car", fur.car, at, heading, self.world.seed, present=present)
 
 
 def curb_side(world: World, name: str, rect: Rect) -> None:
@@ -281,8 +281,8 @@ def _avenue(block: Block) -> None:
         length = float(np.linalg.norm(b - a))
         for i in range(int((length - 10) // 9.5)):
             at = a + (8.0 + 9.5 * i + rng.uniform(-0.5, 0.5)) / length * (b - a)
-            part = f"avenue_{side}{i}"
+            label = f"avenue_{side}{i}"
             pit = Rect(at[0] - 0.6, at[1] - 0.6, at[0] + 0.6, at[1] + 0.6)
-            make = partial(floor, block.named(part), pit, "soil", SLAB + 0.015)
-            block.world.always(block.named(f"{part}/pit"), "ground", make)
-            block.plant(part, at, 5.6, broad=True)
+            make = partial(floor, block.named(label), pit, "soil", SLAB + 0.015)
+            block.world.always(block.named(f"{label}/pit"), "ground", make)
+            block.plant(label, at, 5.6, broad=True)

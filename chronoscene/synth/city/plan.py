@@ -16,7 +16,7 @@ from chronoscene.synth.city.placing import PARKING, RING, Block, Rect, curb_side
 from chronoscene.synth.city.vegetation import tree
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.light import make_lights
-from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 from chronoscene.synth.render.textures import FIELDS
 from chronoscene.synth.settings import SynthSettings
@@ -115,7 +115,7 @@ def _roles(settings: SynthSettings) -> dict[tuple[int, int], str]:
 
 def _add_roads(world: World, plan: Plan) -> None:
     """Add the roads between blocks, with junctions and zebra crossings."""
-    b = PartBuilder(key_number("roads"))
+    b = MeshBuilder(key_number("roads"))
     lanes, bare = pal.asphalt_style(b, 1, PARKING), pal.asphalt_style(b, 0)
     zebra = pal.asphalt_style(b, 2)
 
@@ -178,10 +178,10 @@ def _farm(world: World, name: str, at: Array, z: float, rng: np.random.Generator
         name, at[0] - w / 2, at[1] - d / 2, at[0] + w / 2, at[1] + d / 2, int(rng.integers(1, 4)),
         str(rng.choice(["gable", "hip"])), str(rng.choice(["plaster", "brick"])), simple=True,
     )  # fmt: skip
-    part = finished(spec, world.seed)
-    part.vertices[..., 2] += np.float32(z - 0.8)
-    part.patches[:, 2] += z - 0.8
-    world.always(name, "building", lambda: part)
+    mesh = finished(spec, world.seed)
+    mesh.vertices[..., 2] += np.float32(z - 0.8)
+    mesh.patches[:, 2] += z - 0.8
+    world.always(name, "building", lambda: mesh)
 
 
 class _Hills:
@@ -204,9 +204,9 @@ class _Hills:
         return height
 
 
-def _terrain(hills: _Hills) -> Part:
+def _terrain(hills: _Hills) -> Mesh:
     """Terrain grid with smooth normals, finer near the city."""
-    b = PartBuilder(key_number("country"))
+    b = MeshBuilder(key_number("country"))
     fields = b.style(FIELDS, srgb(104, 120, 62), srgb(164, 152, 96), srgb(128, 104, 76))
     t = np.linspace(-1, 1, 121)
     line = FAR * (0.45 * t + 0.55 * t**3)

@@ -8,7 +8,7 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
-from chronoscene.synth.render.mesh import PartBuilder, srgb
+from chronoscene.synth.render.mesh import MeshBuilder, srgb
 from chronoscene.synth.render.textures import SOLAR
 
 X, Y, Z = np.eye(3)
@@ -18,7 +18,7 @@ EAVE = 0.45  # How far pitched roofs reach beyond the walls
 
 
 def add_roof(
-    b: PartBuilder, kind: str, corner: Array, size: tuple[float, float], wall: int,
+    b: MeshBuilder, kind: str, corner: Array, size: tuple[float, float], wall: int,
     rng: np.random.Generator, *, plain: bool,
 ) -> None:  # fmt: skip
     """Add a roof and the objects on it.
@@ -54,7 +54,7 @@ def add_roof(
 
 
 def _flat_roof(
-    b: PartBuilder, corner: Array, size: tuple[float, float], wall: int,
+    b: MeshBuilder, corner: Array, size: tuple[float, float], wall: int,
     rng: np.random.Generator, plain: bool,
 ) -> None:  # fmt: skip
     """Parapet, surface, and rooftop equipment."""
@@ -77,7 +77,7 @@ def _flat_roof(
 
 
 def _roof_boxes(
-    b: PartBuilder, corner: Array, dx: float, dy: float, rng: np.random.Generator
+    b: MeshBuilder, corner: Array, dx: float, dy: float, rng: np.random.Generator
 ) -> None:
     """Stair heads, ventilation and solar panels in the cells of a grid, so that none overlap."""
     metal = pal.metal_style(b, srgb(178, 180, 180), dust=0.3)
@@ -112,7 +112,7 @@ def _roof_boxes(
 class _PitchedRoof:
     """Pitched roof with corner ``o``, axis ``a`` along the ridge and axis ``c`` across it."""
 
-    b: PartBuilder
+    b: MeshBuilder
     o: Array
     a: Array
     c: Array
@@ -131,7 +131,7 @@ class _PitchedRoof:
 
     @property
     def drop(self) -> float:
-        """How far the eaves hang below the corner."""
+        """Height of the corner above the eaves."""
         return self.slope * EAVE
 
     def add_gable(self) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
-from chronoscene.synth.render.mesh import Part, PartBuilder, cross, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, cross, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -38,7 +38,7 @@ def icosphere(level: int) -> tuple[Array, NDArray[np.int64]]:
     return vertices, faces
 
 
-class Foliage(PartBuilder):
+class Foliage(MeshBuilder):
     """Builder of a plant from lumpy balls and loose leaves.
 
     Normals lean away from the ``heart`` of a crown, so that the crown is shaded as one volume.
@@ -80,7 +80,7 @@ class Foliage(PartBuilder):
         self.triangles(tris, np.repeat(normals[:, None], 3, axis=1), leaf, origin=heart)
 
 
-def trunk(b: PartBuilder, base: Array, top: Array, radius: float, style: int) -> None:
+def trunk(b: MeshBuilder, base: Array, top: Array, radius: float, style: int) -> None:
     """Tapered stem with seven sides."""
     turn = np.linspace(0, 2 * np.pi, 8)
     ring = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(8)])
@@ -96,7 +96,7 @@ def _facets(low: Array, high: Array) -> Array:
 
 def tree(
     name: str, base: Array, seed: int, detail: int, broad: bool, state: tuple[float, str]
-) -> Part:
+) -> Mesh:
     """A tree; name and seed determine species and shape, the state its height and season.
 
     Args:
@@ -175,7 +175,7 @@ def _broadleaf(b: Foliage, base: Array, top: Array, height: float, leaf: int, de
             b.leaves(center, r, heart, leaf, count=int(40 + 30 * min(4.0, r[0])), size=0.42)
 
 
-def hedge(name: str, low: Array, high: Array, seed: int, season: str) -> Part:
+def hedge(name: str, low: Array, high: Array, seed: int, season: str) -> Mesh:
     """A row of balls between two points."""
     b = Foliage(name, rng_for(seed, name, "hedge"))
     leaf = pal.leaf_style(b, season, 1, 0.2)

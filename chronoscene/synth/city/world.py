@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from chronoscene.arrays import Array
 from chronoscene.synth.render.light import Light
-from chronoscene.synth.render.mesh import Part, merge
+from chronoscene.synth.render.mesh import Mesh, merge
 
 CHANGE_VERBS = {
     "building": "rebuild",
@@ -33,7 +33,7 @@ class Element:
     kind: str
     state: str
     periods: tuple[int, ...]
-    part: Part
+    mesh: Mesh
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class World:
     core: Array
     """Rectangle of the city core: minimum and maximum corner. [2, 2]"""
     near: bool = False
-    """Whether cameras come close to the suburbs, which then need more detail."""
+    """True if cameras come close to the suburbs, which then need more detail."""
     roads: list[tuple[Array, Array]] = field(default_factory=list)
     """Start and end of the centre lines of the core's roads, for walks. [2] each"""
     focus: list[Array] = field(default_factory=list)
@@ -90,7 +90,7 @@ class World:
             self.lifetime = None
 
     def add(
-        self, name: str, kind: str, states: Sequence[Hashable], make: Callable[[Any], Part]
+        self, name: str, kind: str, states: Sequence[Hashable], make: Callable[[Any], Mesh]
     ) -> None:
         """Add an object by its state in each period.
 
@@ -103,27 +103,27 @@ class World:
         assert len(states) == self.periods
         if self.lifetime is not None:
             states = [s if p in self.lifetime else None for p, s in enumerate(states)]
-        parts: dict[Hashable, Part] = {}
+        meshes: dict[Hashable, Mesh] = {}
         for state in states:
-            if state is not None and state not in parts:
-                parts[state] = make(state)
-        for state, part in parts.items():
+            if state is not None and state not in meshes:
+                meshes[state] = make(state)
+        for state, mesh in meshes.items():
             periods = tuple(p for p, s in enumerate(states) if s == state)
-            self.elements.append(Element(name, kind, _label(state), periods, part))
+            self.elements.append(Element(name, kind, _label(state), periods, mesh))
         for p in range(1, self.periods):
             before, after = states[p - 1], states[p]
             if before != after:
-                known = [parts[s] for s in (before, after) if s is not None]
+                known = [meshes[s] for s in (before, after) if s is not None]
                 self.edits.append(_edit(p, name, kind, before, after, known))
 
     def place(
-        self, name: str, kind: str, present: Sequence[bool], make: Callable[[], Part]
+        self, name: str, kind: str, present: Sequence[bool], make: Callable[[], Mesh]
     ) -> None:
         """Add an object that looks the same in every period in which it is present."""
         if any(present):
             self.add(name, kind, ["there" if p else None for p in present], lambda _: make())
 
-    def always(self, name: str, kind: str, make: Callable[[], Part]) -> None:
+    def always(self, name: str, kind: str, make: Callable[[], Mesh]) -> None:
         """Add an object that never changes."""
         self.place(name, kind, [True] * self.periods, make)
 
@@ -132,12 +132,12 @@ class World:
         """Season of each period."""
         return [light.season for light in self.lights]
 
-    def geometry(self, period: int) -> tuple[Part, NDArray[np.int32]]:
+    def geometry(self, period: int) -> tuple[Mesh, NDArray[np.int32]]:
         """All geometry of a period and the identity number of each triangle's object."""
         number = {name: i for i, name in enumerate(self.names)}
         here = [e for e in self.elements if period in e.periods]
-        ids = [np.full(len(e.part.tri_patch), number[e.name], np.int32) for e in here]
-        return merge([e.part for e in here]), np.concatenate(ids)
+        ids = [np.full(len(e.mesh.tri_patch), number[e.name], np.int32) for e in here]
+        return merge([e.mesh for e in here]), np.concatenate(ids)
 
 
 def _label(state: Hashable) -> str:
@@ -148,12 +148,12 @@ def _label(state: Hashable) -> str:
 
 
 def _edit(
-    period: int, name: str, kind: str, before: Hashable, after: Hashable, parts: list[Part]
+    period: int, name: str, kind: str, before: Hashable, after: Hashable, meshes: list[Mesh]
 ) -> Edit:
     verb = "add" if before is None else "remove"
     if before is not None and after is not None:
         verb = CHANGE_VERBS.get(kind, "change")
-    bounds = np.stack([p.bounds for p in parts])
+    bounds = np.stack([p.bounds for p in meshes])
     low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
     return Edit(
         period,
@@ -216,5 +216,5 @@ def tree_heights(rng: np.random.Generator, periods: int, start: float) -> list[f
 
 
 def visits(rng: np.random.Generator, periods: int, chance: float) -> list[bool]:
-    """Whether a movable object is present, per period."""
+    """Draw in which periods a movable object is present."""
     return [bool(x) for x in rng.random(periods) < chance]

@@ -43,7 +43,7 @@ def srgb(red: float, green: float, blue: float) -> Color:
     return (float(linear[0]), float(linear[1]), float(linear[2]))
 
 
-class Part(NamedTuple):
+class Mesh(NamedTuple):
     """Geometry as tables of T triangles, P patches and S styles, which kernels read directly."""
 
     vertices: NDArray[np.float32]
@@ -68,11 +68,11 @@ class Part(NamedTuple):
         return np.stack([flat.min(axis=0), flat.max(axis=0)])
 
 
-class PartBuilder:
-    """Collects quads, boxes and triangles into a `Part`.
+class MeshBuilder:
+    """Collects quads, boxes and triangles into a `Mesh`.
 
     Args:
-        seed: Base of the texture hashes of this part.
+        seed: Base of the texture hashes of this mesh.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -213,9 +213,9 @@ class PartBuilder:
         row = _frame_row(frame, vertices.reshape(-1, 3))
         self._add_patches(row, style, seed, per_patch=len(vertices))
 
-    def build(self) -> Part:
+    def build(self) -> Mesh:
         """The collected geometry."""
-        return Part(
+        return Mesh(
             vertices=np.concatenate(self._vertices).astype(np.float32),
             normals=np.concatenate(self._normals).astype(np.float32),
             tri_patch=np.concatenate(self._tri_patch).astype(np.int32),
@@ -251,13 +251,13 @@ def _frame_row(frame: TextureFrame, points: Array) -> Array:
     return np.concatenate([origin, u, v, [(local @ u).max(), (local @ v).max()]])[None]
 
 
-def merge(parts: Sequence[Part]) -> Part:
-    """Several parts as one, with shifted indices."""
-    patch_shift = np.cumsum([0, *(len(p.patches) for p in parts)])
-    style_shift = np.cumsum([0, *(len(p.styles) for p in parts)])
-    tri_patch = [p.tri_patch + np.int32(n) for p, n in zip(parts, patch_shift, strict=False)]
-    patch_style = [p.patch_style + np.int32(n) for p, n in zip(parts, style_shift, strict=False)]
-    return Part(*map(np.concatenate, zip(*parts, strict=True)))._replace(
+def merge(meshes: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one, with shifted indices."""
+    patch_shift = np.cumsum([0, *(len(p.patches) for p in meshes)])
+    style_shift = np.cumsum([0, *(len(p.styles) for p in meshes)])
+    tri_patch = [p.tri_patch + np.int32(n) for p, n in zip(meshes, patch_shift, strict=False)]
+    patch_style = [p.patch_style + np.int32(n) for p, n in zip(meshes, style_shift, strict=False)]
+    return Mesh(*map(np.concatenate, zip(*meshes, strict=True)))._replace(
         tri_patch=np.concatenate(tri_patch), patch_style=np.concatenate(patch_style)
     )
 

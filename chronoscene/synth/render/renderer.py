@@ -13,7 +13,7 @@ from chronoscene.arrays import Array
 from chronoscene.errors import BackendError
 from chronoscene.scene import Camera
 from chronoscene.synth.render.light import Light, Probes, probe_values, sky_args
-from chronoscene.synth.render.mesh import MISS, Part
+from chronoscene.synth.render.mesh import MISS, Mesh
 from chronoscene.synth.render.shade import albedo_at, camera_rays, shade, shadow_rays
 
 MAX_SAMPLES = 1_500_000  # Maximum number of rays in memory at once
@@ -24,7 +24,7 @@ SUN_SPREAD = 0.009
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PixelMaps:
-    """What the rays through pixel centres hit. Sky has depth 0 and element -1."""
+    """First hits of the rays through pixel centres. Sky has depth 0 and element -1."""
 
     depth: NDArray[np.float32]
     """z-depth in metres. [H, W]"""
@@ -49,7 +49,7 @@ class PeriodRenderer:
     """Ray caster and shader of the world at one period.
 
     Args:
-        part: All geometry of the period.
+        mesh: All geometry of the period.
         tri_element: Identity of the object of each triangle. [T]
         light: Light settings.
         supersample: Samples per pixel and axis.
@@ -59,7 +59,7 @@ class PeriodRenderer:
 
     def __init__(
         self,
-        part: Part,
+        mesh: Mesh,
         tri_element: NDArray[np.int32],
         light: Light,
         *,
@@ -72,9 +72,9 @@ class PeriodRenderer:
         self._element = tri_element
         self._ss = supersample
         self._box, self._spacing = probe_box, probe_spacing
-        self.tables = part
+        self.tables = mesh
         self._scene = load_open3d().t.geometry.RaycastingScene()
-        corners = np.ascontiguousarray(part.vertices.reshape(-1, 3))
+        corners = np.ascontiguousarray(mesh.vertices.reshape(-1, 3))
         index = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
         self._scene.add_triangles(_tensor(corners), _tensor(index))
 
@@ -86,7 +86,7 @@ class PeriodRenderer:
         )
 
     def occluded(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """Whether rays hit anything. [n]"""
+        """Mask of the rays that hit anything. [n]"""
         return np.asarray(self._scene.test_occlusions(_tensor(rays)).numpy(), np.bool_)
 
     def clearance(self, points: Array) -> Array:
@@ -186,7 +186,7 @@ class PeriodRenderer:
         )
 
     def _lit(self, rays: NDArray[np.float32], hits: Hits, count: int) -> NDArray[np.bool_]:
-        """Whether the sun reaches each hit. [n]"""
+        """Mask of the hits that the sun reaches. [n]"""
         towards, need = shadow_rays(
             rays, hits.t, hits.tri, hits.uv, self.tables, self._sky.direction, SUN_SPREAD, count
         )

@@ -171,7 +171,7 @@ def _share(lit, first, count):  # type: ignore[no-untyped-def]
 
 @inner
 def _uniform(tri, first, end, tables):  # type: ignore[no-untyped-def]
-    """Whether all samples of a pixel lie on one opaque patch."""
+    """Return True if all samples of a pixel lie on one opaque patch."""
     if tri[first] == MISS:
         return False
     patch = tables.tri_patch[tri[first]]

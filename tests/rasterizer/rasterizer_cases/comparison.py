@@ -191,7 +191,7 @@ def compare(
 
 
 def at_camera(scene: SmallScene) -> SmallScene:
-    """The same images from float64 coordinates whose origin is the first camera."""
+    """Move the origin of a scene, in float64, to its first camera."""
     viewmats, means = scene.viewmats.astype(np.float64), scene.means.astype(np.float64)
     origin = -np.linalg.solve(viewmats[0, :3, :3], viewmats[0, :3, 3])
     viewmats[:, :3, 3] += viewmats[:, :3, :3] @ origin

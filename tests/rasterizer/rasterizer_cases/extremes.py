@@ -27,13 +27,13 @@ class Extreme:
 
     name: str
     why: str
-    """What happens and why that is right, for the README."""
+    """Outcome and its reason, for the README."""
     build: Callable[[], SmallScene]
     outcome: str = AGREES
     """AGREES with the reference; CULLED: the background and gradients of zero; or how the error
     begins."""
     truth: Callable[[], SmallScene] | None = None
-    """What the reference is given, if it is not the same numbers."""
+    """Scene for the reference, if it is not the same numbers."""
     fixed: bool = False
     """Positions may not be rounded otherwise: depths are equal or at a plane on purpose."""
     seen: float = 0.01
@@ -41,7 +41,7 @@ class Extreme:
 
     @property
     def compared(self) -> bool:
-        """Whether there are errors to measure."""
+        """True if there are errors to measure."""
         return self.outcome == AGREES
 
 
@@ -105,13 +105,13 @@ def world(origin: np.ndarray) -> SmallScene:
 
 
 def rounded(scene: SmallScene) -> SmallScene:
-    """What float32 leaves of a scene, cameras too."""
+    """Round a scene, cameras too, to float32."""
     names = ("means", "quats", "scales", "viewmats", "Ks")
     return scene.with_(**{name: _f(getattr(scene, name)) for name in names})
 
 
 def in_training_frame(scene: SmallScene) -> SmallScene:
-    """As the bench hands a scene to methods, but still float64."""
+    """Move a scene into the training frame, as the bench does, but keep float64."""
     frames = [SimpleNamespace(cam_from_world=pose, period=0) for pose in scene.viewmats]
     described: Any = SimpleNamespace(
         num_periods=1, select=lambda split: frames, points=SimpleNamespace(xyz=scene.means)

@@ -73,7 +73,7 @@ class SmallScene:
 
 
 def well_posed(scene: SmallScene) -> bool:
-    """Whether float32 and float64 see the same Gaussians in the same order: no two depths are so
+    """Return True if float32 and float64 see the same Gaussians in order: no two depths are so
     close that rounding may swap them, no depth is at a plane, no opacity at the threshold."""
     if (np.abs(255 * scene.opacities - 1) < 1e-5).any():
         return False

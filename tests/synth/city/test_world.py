@@ -15,11 +15,11 @@ from chronoscene.synth.city.plan import make_world
 from chronoscene.synth.city.world import SITE, World, renewal_stages, site_stages, tree_heights
 from chronoscene.synth.generation import make_periods
 from chronoscene.synth.render.light import make_lights
-from chronoscene.synth.render.mesh import Part, PartBuilder
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder
 
 
-def cube(size: float) -> Part:
-    b = PartBuilder()
+def cube(size: float) -> Mesh:
+    b = MeshBuilder()
     b.boxes([0.0, 0, 0], [size, 0, 0], [0, size, 0], [0, 0, size], b.style(0, (1.0, 1.0, 1.0)))
     return b.build()
 
@@ -40,8 +40,8 @@ def test_states_become_lifetimes_and_edits() -> None:
         (3, "add", "car"),
     ]
     assert world.edits[1].bounds == ((0.0, 0.0, 0.0), (2.0, 2.0, 2.0))
-    part, ids = world.geometry(3)
-    assert len(part.tri_patch) == len(ids) == 24
+    mesh, ids = world.geometry(3)
+    assert len(mesh.tri_patch) == len(ids) == 24
     assert sorted(set(ids)) == [0, 1]
 
 

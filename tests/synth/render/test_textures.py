@@ -10,7 +10,7 @@ from numba import njit
 
 from chronoscene.synth.render import noise
 from chronoscene.synth.render import textures as tex
-from chronoscene.synth.render.mesh import Part, PartBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
 from chronoscene.synth.render.shade import albedo_at
 
 # Inner functions have no entry for Python; these give them one.
@@ -67,9 +67,9 @@ ORDER = sorted(KINDS)
 SIZE = 12.0
 
 
-def sheet() -> Part:
+def sheet() -> Mesh:
     """One square of 12 m per kind, all in the same place; triangle 2 * i is of kind ORDER[i]."""
-    b = PartBuilder(seed=77)
+    b = MeshBuilder(seed=77)
     for kind in ORDER:
         colors = srgb(150, 80, 60), srgb(90, 110, 140), srgb(200, 200, 190)
         b.quads(np.zeros(3), [SIZE, 0, 0], [0, SIZE, 0], b.style(kind, *colors, KINDS[kind]))
@@ -136,7 +136,7 @@ def test_far_pixels_are_calm_and_keep_the_mean(kind: int) -> None:
 
 def test_boxes_are_closed_and_face_outwards() -> None:
     """The divergence theorem gives the volume only if every face is there and turned right."""
-    b = PartBuilder()
+    b = MeshBuilder()
     a, c, d = np.array([2.0, 0.5, 0]), np.array([-0.4, 3.0, 0.1]), np.array([0.1, 0.2, 1.5])
     b.boxes([[5.0, 6.0, 7.0], [0.0, 0.0, 0.0]], a, c, d, b.style(0, (1.0, 1.0, 1.0)))
     t = b.build().vertices.astype(float)
@@ -146,11 +146,11 @@ def test_boxes_are_closed_and_face_outwards() -> None:
 
 def test_pieces_of_one_frame_share_one_texture() -> None:
     """Walls are cut around windows; the bricks must run on as if they were not."""
-    b = PartBuilder(seed=4)
+    b = MeshBuilder(seed=4)
     s = b.style(tex.BRICK, (0.3, 0.1, 0.1))
     frame = (np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 0, 1.0]))
     b.quads([0.0, 0, 0], [2.0, 0, 0], [0, 0, 1.0], s, frame=frame)
     b.quads([0.0, 0, 2.0], [2.0, 0, 0], [0, 0, 1.0], s, frame=frame)
-    part = b.build()
-    assert part.patch_seed[0] == part.patch_seed[1]
-    assert (part.patches[0, :9] == part.patches[1, :9]).all()
+    mesh = b.build()
+    assert mesh.patch_seed[0] == mesh.patch_seed[1]
+    assert (mesh.patches[0, :9] == mesh.patches[1, :9]).all()
