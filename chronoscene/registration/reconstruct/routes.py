@@ -201,10 +201,10 @@ def add_period(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     report("adjusting", 0, 1)
     ended = adjust(model, constant=old, threads=job.threads)
     moved = _max_change(model, poses)
-    job.remarks += [
-        f"{len(new)} new images registered",
-        f"bundle adjustment of the new images: {ended.lower()}; old poses changed by {moved:.1e}",
-    ]
+    job.remarks.append(f"{len(new)} new images registered")
+    job.remarks.append(
+        f"bundle adjustment of the new images: {ended.lower()}; old poses changed by {moved:.1e}"
+    )
     return job.finish(model)
 
 
