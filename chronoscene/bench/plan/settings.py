@@ -1,0 +1,130 @@
+"""Settings of a bench, and those of them that each run carries along."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from chronoscene.errors import ConfigError
+from chronoscene.formats.shared.grouping import absolute_rule
+from chronoscene.images.store import MAX_WIDTH
+
+PHOTO_MEMORY = 2 * 10**9
+PHOTO_DISK = 20 * 10**9
+
+SHARING = ("total", "each")
+"""The models of ``separate``, or the stages of ``sequential``, share iterations and time, or each
+get all of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunSettings:
+    """Settings that all runs of a bench share; every job has a copy."""
+
+    runs: Path
+    """Folder of all runs."""
+    preset: str = "balanced"
+    overrides: Mapping[str, str] = field(default_factory=dict)
+    """Options of the methods: ``key`` for all that are run, or ``method.key`` for one. Those of a
+    job have no prefix."""
+    iterations: int | None = None
+    budget_seconds: float | None = None
+    separate_iterations: str = "total"
+    """One of `SHARING`."""
+    max_width: int = MAX_WIDTH
+    """Pixels; wider images are scaled down to it."""
+    threads: int | None = None
+    device: str = "auto"
+    """``auto``, ``cpu`` or ``cuda``."""
+    period_by: str | None = None
+    """Rule by which images are grouped into periods, as for `read_scene`."""
+    photo_memory: int = PHOTO_MEMORY
+    """Bytes that training photos may take in memory, those that are being decoded included."""
+    photo_disk: int = PHOTO_DISK
+    """Bytes that decoded photos may take on disk."""
+    checkpoint_seconds: float = 300.0
+    """Time from one checkpoint of a training to the next."""
+    keep_training: bool = False
+    """True if finished runs keep what it takes to train them further."""
+    lpips_weights: Path | None = None
+
+    def absolute(self) -> RunSettings:
+        """Return the settings with paths that hold in every folder and process."""
+        weights = self.lpips_weights
+        return replace(
+            self,
+            runs=self.runs.resolve(),
+            period_by=absolute_rule(self.period_by),
+            lpips_weights=weights.resolve() if weights else None,
+        )
+
+    def overrides_of(self, method: str) -> dict[str, str]:
+        """Return the options of one method; those with its name win over those of all."""
+        prefix = f"{method}."
+        common = {key: value for key, value in self.overrides.items() if "." not in key}
+        own = {
+            key.removeprefix(prefix): value
+            for key, value in self.overrides.items()
+            if key.startswith(prefix)
+        }
+        return common | own
+
+
+@dataclass(frozen=True, slots=True)
+class BenchSettings:
+    """A bench as the user asked for it."""
+
+    scenes: tuple[Path, ...]
+    methods: tuple[str, ...]
+    """Names, or ``module:SPEC``."""
+    run: RunSettings
+    strategies: tuple[str, ...] = ("joint",)
+    seeds: tuple[int, ...] = (0,)
+    continue_to: int | None = None
+    """Train finished runs further, up to this many iterations."""
+    dataset_format: str | None = None
+    """Format of the scenes; None to detect it."""
+    overwrite: bool = False
+    """True if finished runs with other settings may be replaced."""
+    jobs: int | None = None
+    """Runs at a time; None for one, or as many as the cluster has room for."""
+    job_memory: int | None = None
+    """Bytes of memory that a run takes; None for an estimate."""
+    ray: str | None = None
+    """Address of the Ray cluster to run on; None for this machine."""
+
+    def check(self, names: Sequence[str]) -> None:
+        """Refuse settings that contradict each other.
+
+        Args:
+            names: Methods that are run.
+
+        Raises:
+            ConfigError: If several options give a number of iterations, of which one would win
+                silently, or an override names a method that is not run.
+        """
+        overrides = self.run.overrides
+        given = {
+            "--continue-to": self.continue_to,
+            "--iterations": self.run.iterations,
+            "--set iterations": any(key.rpartition(".")[2] == "iterations" for key in overrides),
+            "--budget": self.continue_to and self.run.budget_seconds,
+        }
+        options = [name for name, value in given.items() if value]
+        if len(options) > 1:
+            raise ConfigError(
+                options[0],
+                expected=f"no {' and no '.join(options[1:])} beside it",
+                found=" and ".join(options[1:]),
+                todo="leave all of them but one out",
+            )
+        for key in overrides:
+            method, dot, _ = key.rpartition(".")
+            if dot and method not in names:
+                raise ConfigError(
+                    f"--set {key}",
+                    expected=f"a key, or one after {', '.join(f'{n}.' for n in names)}",
+                    found=repr(method),
+                    todo="use the name of a method that is run",
+                )
