@@ -39,7 +39,8 @@ from chronoscene.bench.files.provenance import code_version, peak_memory_bytes, 
 from chronoscene.bench.files.records import PHOTOS
 from chronoscene.bench.plan.memory import open_store
 from chronoscene.bench.plan.parts import Part, make_parts
-from chronoscene.bench.plan.plan import BenchSettings, plan_jobs
+from chronoscene.bench.plan.plan import plan_runs
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.plan.stop import StopRule
 from chronoscene.bench.train.loop import forget_peak_memory, train
 from chronoscene.formats import chronoscene as scene_format
@@ -154,7 +155,7 @@ def drop_from_page_cache(folder: Path) -> None:
 def measure(scene_root: Path, runs: Path, memory: float, passes: int, step: float | None) -> None:
     """Train without and with loading, and print what it takes."""
     fixed = {"densify_until": "0", "sh_degree": "0"}
-    settings = BenchSettings(
+    settings = bench_settings(
         scenes=(scene_root,),
         methods=("3dgs",),
         runs=runs,
@@ -162,15 +163,15 @@ def measure(scene_root: Path, runs: Path, memory: float, passes: int, step: floa
         overrides=fixed,
         photo_memory=round(memory * 1e9),
     )
-    ((job, spec),) = plan_jobs(settings, print)
+    (planned,) = plan_runs(settings, print)
 
     def make() -> Method:
         if step is not None:
             return Sleeper(step / 1e3)
-        return import_object(spec.method)(job.method_config(spec))
+        return import_object(planned.spec.method)(planned.config)
 
     scene = read_scene(scene_root)
-    (part,) = make_parts(scene, open_store(scene, job), "joint")
+    (part,) = make_parts(scene, open_store(scene, planned.job.settings), "joint")
     count = len(part.train.views)
 
     times: list[float] = []
@@ -181,7 +182,7 @@ def measure(scene_root: Path, runs: Path, memory: float, passes: int, step: floa
     beside = peak_memory_bytes() or 0
     print(f"photo at hand: {reference:.0f} ms per step (median)")
 
-    (part,) = make_parts(scene, open_store(scene, job), "joint")
+    (part,) = make_parts(scene, open_store(scene, planned.job.settings), "joint")
     rows: list[tuple[float, ...]] = [(0.0, 0.0, time.process_time(), time.perf_counter())]
 
     def observe(step: int, seconds: float, report: StepReport, psnr: float | None) -> None:

@@ -6,7 +6,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -17,7 +17,7 @@ from PIL import Image
 
 from chronoscene.bench.files.records import Failure, read_run
 from chronoscene.bench.plan.job import Job
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.run.process import put_in_place
 from chronoscene.bench.run.runner import BenchOutcome, run_bench
 from chronoscene.bench.train.worker import execute
@@ -149,7 +149,7 @@ def bench(scene_folder: Path, tmp_path: Path) -> Bench:
             "runs": tmp_path / "runs",
             "threads": 1,
         }
-        outcome = run_bench(BenchSettings(**{**fields, **changes}), said.append)
+        outcome = run_bench(bench_settings(**{**fields, **changes}), said.append)
         return outcome, said
 
     return run
@@ -157,8 +157,8 @@ def bench(scene_folder: Path, tmp_path: Path) -> Bench:
 
 def execute_here(job: Job) -> Failure | None:
     """A job in this process, which costs no time to start."""
-    staging = Path(mkdtemp(dir=job.runs))
-    execute(asdict(replace(job, staging=str(staging))), lambda *progress: None)
+    staging = Path(mkdtemp(dir=job.settings.runs))
+    execute(replace(job, staging=str(staging)).document(), lambda *progress: None)
     job.folder.parent.mkdir(parents=True, exist_ok=True)
     return put_in_place(job, staging)
 
@@ -171,7 +171,7 @@ def bench_here(scene_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def run(*methods: str, **changes: Any) -> tuple[BenchOutcome, list[str]]:
         said: list[str] = []
         fields = {"scenes": (scene_folder,), "methods": methods, "runs": tmp_path / "runs"}
-        settings = BenchSettings(**{**fields, **changes})
+        settings = bench_settings(**{**fields, **changes})
         return run_bench(settings, said.append, execute=execute_here), said
 
     return run
@@ -185,14 +185,14 @@ def finished_bench(
     runs = tmp_path_factory.mktemp("bench") / "runs"
     said: list[str] = []
     names = ("MEAN", "BLIND", "RAISES", "NOT_FINITE", "KILLED")
-    first = BenchSettings(
+    first = bench_settings(
         scenes=(scene_folder,),
         methods=tuple(f"toy_methods:{name}" for name in names),
         runs=runs,
         threads=1,
     )
     outcome = run_bench(first, said.append)
-    others = BenchSettings(
+    others = bench_settings(
         scenes=(scene_folder,),
         methods=("toy_methods:MEAN",),
         runs=runs,
@@ -217,7 +217,7 @@ def trained(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("chronoscene.bench.train.worker.warm_up", lambda *args, **options: None)
         for methods, strategy in ((("chronogs", "3dgs-period"), "joint"), (("4dgs",), "separate")):
-            settings = BenchSettings(
+            settings = bench_settings(
                 **common, methods=methods, strategies=(strategy,), iterations=12
             )
             finished += run_bench(settings, lambda line: None, execute=execute_here).finished

@@ -16,7 +16,7 @@ def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None)
 
     Args:
         scene: Argument that stands for its folder.
-        config: ``method``, ``strategy``, ``preset`` and ``variant`` (`Job.with_variant`, and what
+        config: ``method``, ``strategy``, ``preset`` and ``variant`` (`ResolvedMethod.run`, and what
             `compress_run` adds to it).
         seed: None leaves the option out.
     """

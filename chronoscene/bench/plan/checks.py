@@ -8,11 +8,12 @@ from itertools import chain
 from string import Formatter
 
 from chronoscene.bench.files.strategies import STRATEGIES
-from chronoscene.bench.plan.job import SHARING, Job
+from chronoscene.bench.plan.resolve import ResolvedRun
+from chronoscene.bench.plan.settings import SHARING
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
 from chronoscene.formats import writable_formats
-from chronoscene.methods import MethodSpec, ProgramConfig, Runner, import_object
+from chronoscene.methods import ProgramConfig, Runner, import_object
 
 VALUES = ("data", "output", "work", "iterations", "seconds", "seed")
 """What a `Runner` may name besides the options of its config."""
@@ -24,14 +25,14 @@ def used_values(runner: Runner, prefix: str) -> set[str]:
     return {name for word in words for _, name, _, _ in Formatter().parse(word) if name}
 
 
-def check_runner(job: Job, spec: MethodSpec, runner: Runner) -> None:
+def check_runner(run: ResolvedRun, runner: Runner) -> None:
     """Check what another program needs before it is run.
 
     Raises:
         ConfigError: If a command names a value that does not exist or is not set, or the program
             cannot be stopped by the clock.
     """
-    config = job.method_config(spec)
+    spec, config = run.spec, run.config
     if not isinstance(config, ProgramConfig):
         raise ConfigError(
             f"{spec.name}: {spec.config}",
@@ -59,7 +60,7 @@ def check_runner(job: Job, spec: MethodSpec, runner: Runner) -> None:
                 found="none",
                 todo=f"pass --set {name}=..., as docs/guides/other-programs.md says",
             )
-    if job.budget_seconds is not None and "seconds" not in used:
+    if run.stop.seconds is not None and "seconds" not in used:
         raise ConfigError(
             f"{spec.name} --budget",
             expected="a program that ends by the clock",
@@ -69,27 +70,28 @@ def check_runner(job: Job, spec: MethodSpec, runner: Runner) -> None:
     check_choice(f"{spec.name}: exports", runner.exports, writable_formats())
 
 
-def check_stages(job: Job, spec: MethodSpec) -> None:
+def check_stages(run: ResolvedRun) -> None:
     """Check that a method can be trained in stages.
 
     Raises:
         ConfigError: If it cannot, or is to be trained further after the last one.
     """
+    job, spec = run.job, run.spec
     if spec.runner is not None or not hasattr(import_object(spec.method), "extend"):
         raise ConfigError(
             f"{spec.name} --strategy {job.strategy}",
             expected="a method that can be trained on one period after the other",
             found="one without extend",
-            todo="use another strategy, or write the function: docs/guides/adding-a-method.md",
+            todo="use another strategy, or write the function: docs/adding-a-method.md",
         )
-    if job.keep_training:
+    if job.settings.keep_training:
         raise ConfigError(
             f"--keep-training, --continue-to with --strategy {job.strategy}",
             expected="neither, as a stage ends for good when the next one begins",
             found="one of them",
             todo="train anew with --iterations",
         )
-    if teachers := getattr(job.method_config(spec), "teachers", 0):
+    if teachers := getattr(run.config, "teachers", 0):
         raise ConfigError(
             f"{spec.name} --strategy {job.strategy}: teachers",
             expected="0, as they would have to learn each further period as well",
@@ -98,31 +100,24 @@ def check_stages(job: Job, spec: MethodSpec) -> None:
         )
 
 
-def check_job(job: Job, spec: MethodSpec) -> None:
-    """Check the settings before anything is trained.
+def check_run(run: ResolvedRun) -> None:
+    """Check a run before anything is trained.
 
     Raises:
-        ConfigError: If a preset, key, value or device does not exist.
+        ConfigError: If the method cannot do what is asked for, or an option has no such value.
     """
-    if (job.keep_training or job.continued_from) and not spec.resumable:
+    job, spec, settings = run.job, run.spec, run.job.settings
+    if settings.keep_training and not spec.resumable:
         raise ConfigError(
             "--keep-training, --continue-to",
             expected="methods that can be trained further",
             found=spec.name,
             todo="run this method without",
         )
-    check_choice("--separate-iterations", job.separate_iterations, SHARING)
+    check_choice("--separate-iterations", settings.separate_iterations, SHARING)
     if STRATEGIES[job.strategy].in_order:
-        check_stages(job, spec)
+        check_stages(run)
     if spec.runner is not None:
-        check_runner(job, spec, spec.runner)
-    if job.device != "auto":
-        check_choice(f"{spec.name} --device", job.device, spec.devices)
-    config = job.method_config(spec)
-    if not isinstance(getattr(config, "iterations", None), int) or config.iterations < 1:
-        raise ConfigError(
-            f"{spec.name}: iterations",
-            expected="a positive number",
-            found=repr(getattr(config, "iterations", None)),
-            todo="correct --iterations",
-        )
+        check_runner(run, spec.runner)
+    if settings.device != "auto":
+        check_choice(f"{spec.name} --device", settings.device, spec.devices)

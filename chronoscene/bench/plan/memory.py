@@ -13,6 +13,7 @@ from pathlib import Path
 
 from chronoscene.bench.files.records import PHOTOS
 from chronoscene.bench.plan.job import Job
+from chronoscene.bench.plan.settings import RunSettings
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.images.disk_cache import DiskCache, files_of
@@ -64,38 +65,38 @@ class PhotoNeeds:
         return min(self.allowed, self.total + self.decoders * self.decoding)
 
 
-def photo_needs(scene: Scene, job: Job) -> PhotoNeeds:
-    """What the photos of a job take."""
-    sizes = ImageStore(scene, max_width=job.max_width)
+def photo_needs(scene: Scene, settings: RunSettings) -> PhotoNeeds:
+    """Return what the photos of a run take."""
+    sizes = ImageStore(scene, max_width=settings.max_width)
     frames = scene.select(split="train")
     photos = [sizes.bytes_of(frame) for frame in frames]
     total, largest = sum(photos), max(photos)
     # With two copies of the result: as it is decoded, and as it goes into memory.
     decoding = _DECODING * max(_pixels(frame) for frame in frames) + 2 * largest
     # Files that are being decoded take half of the memory, or there is one at a time.
-    threads = job.threads or available_threads()
-    decoders = max(1, min(max(2, threads // 2), job.photo_memory // (2 * decoding)))
-    fits = total + decoders * decoding <= job.photo_memory
+    threads = settings.threads or available_threads()
+    decoders = max(1, min(max(2, threads // 2), settings.photo_memory // (2 * decoding)))
+    fits = total + decoders * decoding <= settings.photo_memory
     return PhotoNeeds(
         count=len(photos),
         total=total,
         largest=largest,
         decoding=decoding,
         decoders=decoders,
-        allowed=job.photo_memory,
-        on_disk=0 if fits else min(total, job.photo_disk),
+        allowed=settings.photo_memory,
+        on_disk=0 if fits else min(total, settings.photo_disk),
         training=_LIBRARIES + _STEP * max(math.prod(sizes.camera(f).size) for f in frames),
         tests=sum(sizes.bytes_of(frame) for frame in scene.select(split="test")),
     )
 
 
-def open_store(scene: Scene, job: Job) -> ImageStore:
-    """The photos of a job, within its limits."""
-    needs = photo_needs(scene, job)
-    disk = DiskCache(Path(job.runs) / PHOTOS, job.photo_disk) if needs.on_disk else None
+def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
+    """Open the photos of a run, within its limits."""
+    needs = photo_needs(scene, settings)
+    disk = DiskCache(settings.runs / PHOTOS, settings.photo_disk) if needs.on_disk else None
     return ImageStore(
         scene,
-        max_width=job.max_width,
+        max_width=settings.max_width,
         memory_limit=needs.allowed - needs.decoders * needs.decoding,
         decoders=needs.decoders,
         disk=disk,
@@ -103,23 +104,24 @@ def open_store(scene: Scene, job: Job) -> ImageStore:
 
 
 def read_scene_of(job: Job) -> Scene:
-    """The scene of a job, from where this machine has it."""
-    rule = None if job.period_by is None else job.here(job.period_by)
+    """Read the scene of a job, from where this machine has it."""
+    rule = job.settings.period_by
+    rule = None if rule is None else job.here(rule)
     return read_scene(job.here(job.scene_root), format=job.scene_format, period_by=rule)
 
 
-def expected_memory(scene: Scene, job: Job) -> int:
+def expected_memory(scene: Scene, settings: RunSettings) -> int:
     """Bytes of memory that a run takes, with a model of half a million Gaussians."""
-    needs = photo_needs(scene, job)
+    needs = photo_needs(scene, settings)
     return needs.in_memory + needs.training + _MODEL
 
 
-def check_room(scene: Scene, job: Job, runs: int, *, here: bool = True) -> str:
+def check_room(scene: Scene, settings: RunSettings, runs: int, *, here: bool = True) -> str:
     """Check that memory and disk have room for the photos of a scene.
 
     Args:
         scene: What is trained on.
-        job: One of its runs; the others have the same limits.
+        settings: Of its runs.
         runs: How many runs are to be done.
         here: Whether this machine does them, so that its memory counts.
 
@@ -129,9 +131,9 @@ def check_room(scene: Scene, job: Job, runs: int, *, here: bool = True) -> str:
     Raises:
         ConfigError: If they have not; the message says which setting would do.
     """
-    needs = photo_needs(scene, job)
+    needs = photo_needs(scene, settings)
     _check_memory(scene, needs, machine_memory()[1] if here else None)
-    _check_disk(job, needs, (1 + runs) * needs.tests)
+    _check_disk(settings.runs, needs, (1 + runs) * needs.tests)
     photos = f"{counted(needs.count, 'training photo')}, {_gb(needs.total)} when decoded"
     kept = f", {_gb(needs.on_disk)} on disk" if needs.on_disk else ""
     return (
@@ -163,9 +165,9 @@ def _check_memory(scene: Scene, needs: PhotoNeeds, free: int | None) -> None:
         )
 
 
-def _check_disk(job: Job, needs: PhotoNeeds, images: int) -> None:
-    """Whether decoded photos, and test images of so many bytes, have room."""
-    folder = Path(job.runs)
+def _check_disk(runs: Path, needs: PhotoNeeds, images: int) -> None:
+    """Check that decoded photos, and test images of this many bytes, have room."""
+    folder = runs
     kept = sum(stat.st_size for stat in files_of(folder / PHOTOS).values())
     while not folder.exists():
         folder = folder.parent
@@ -173,7 +175,7 @@ def _check_disk(job: Job, needs: PhotoNeeds, images: int) -> None:
     if free < needs.on_disk + images:
         smaller = max(0.0, math.floor((free - images) / 1e7) / 100)
         raise ConfigError(
-            f"--out {job.runs}",
+            f"--out {runs}",
             expected=f"room for {_gb(needs.on_disk)} of decoded photos and at most {_gb(images)} "
             "of test images",
             found=f"{_gb(free)} free",

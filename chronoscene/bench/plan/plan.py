@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -20,14 +20,13 @@ from chronoscene.bench.plan.settings import SHARING, BenchSettings
 from chronoscene.errors import ConfigError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
+from chronoscene.io.log import Log
 from chronoscene.methods import load_spec
 from chronoscene.metrics.lpips_weights import check_available
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
 
 BUDGET_NOTICE = "--budget: schedules follow the clock, and equal seeds do not give equal models"
-
-Log = Callable[[str], None]
 
 Plan = list[ResolvedRun]
 

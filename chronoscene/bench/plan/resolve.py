@@ -11,6 +11,7 @@ from chronoscene.bench.files.provenance import config_hash
 from chronoscene.bench.plan.job import Job
 from chronoscene.bench.plan.settings import SHARING, RunSettings
 from chronoscene.bench.plan.stop import StopRule
+from chronoscene.errors import ConfigError
 from chronoscene.methods import MethodSpec, ProgramConfig, as_typed, build_config, load_spec
 
 
@@ -119,7 +120,16 @@ def _config(spec: MethodSpec, settings: RunSettings) -> Any:
     overrides: dict[str, Any] = dict(settings.overrides)
     if settings.iterations is not None:
         overrides["iterations"] = settings.iterations
-    return build_config(spec, preset=settings.preset, overrides=overrides)
+    config = build_config(spec, preset=settings.preset, overrides=overrides)
+    iterations = getattr(config, "iterations", None)
+    if not isinstance(iterations, int) or iterations < 1:
+        raise ConfigError(
+            f"{spec.name}: iterations",
+            expected="a positive number",
+            found=repr(iterations),
+            todo="correct --iterations",
+        )
+    return config
 
 
 def deciding_options(config: Any) -> dict[str, Any]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 from chronoscene.errors import ConfigError
 from chronoscene.formats.shared.grouping import absolute_rule
@@ -128,3 +129,12 @@ class BenchSettings:
                     found=repr(method),
                     todo="use the name of a method that is run",
                 )
+
+
+def bench_settings(
+    scenes: tuple[Path, ...], methods: tuple[str, ...], runs: Path, **options: Any
+) -> BenchSettings:
+    """Make the settings of a bench from fields of both classes by their names."""
+    ours = {one.name for one in fields(BenchSettings)} & options.keys()
+    run = RunSettings(runs, **{k: value for k, value in options.items() if k not in ours})
+    return BenchSettings(scenes, methods, run, **{name: options[name] for name in ours})

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from chronoscene.bench.files import records
 from chronoscene.bench.plan.job import Job
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import BenchSettings
 from chronoscene.bench.run.process import run_in_process
 from chronoscene.io.processes import Report, Stop, process_tree
 from chronoscene.kernels.runtime import available_threads, machine_memory
@@ -71,7 +71,8 @@ class LocalPool:
 
     def run(self, job: Job, report: Report) -> records.Failure | None:
         """See `Pool.run`."""
-        job = replace(job, threads=job.threads or self._threads, reports=True)
+        job = job.with_settings(threads=job.settings.threads or self._threads)
+        job = replace(job, reports=True)
         with self._room(job, report):
             return run_in_process(job, report=report, stop=self.stop)
 

@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 from chronoscene.bench.files import records
@@ -58,7 +58,7 @@ def run_staged(job: Job, *, report: Report | None = None, stop: Stop | None = No
     """
     staging = Path(job.staging)
     outcome = run_worker(
-        "chronoscene.bench.train.worker:execute", asdict(job), report=report, stop=stop
+        "chronoscene.bench.train.worker:execute", job.document(), report=report, stop=stop
     )
     if outcome.message is not None and "error" in outcome.message:
         raise DiskFullError(**outcome.message["error"])
@@ -86,7 +86,7 @@ def settle_training(job: Job) -> None:
     if records.read_config(job.training) != records.read_config(job.folder):
         return  # of a longer training that is under way
     os.sync()  # the result, before that from which it could be made again goes
-    if job.keep_training:
+    if job.settings.keep_training:
         shutil.rmtree(job.folder / records.TRAINING, ignore_errors=True)
         os.replace(job.training, job.folder / records.TRAINING)
     else:

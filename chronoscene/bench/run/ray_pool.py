@@ -16,7 +16,7 @@ import threading
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,10 @@ import chronoscene
 from chronoscene.bench.files import records
 from chronoscene.bench.files.ground_truth import ground_truth_folder
 from chronoscene.bench.files.provenance import code_version
+from chronoscene.bench.plan.finished import is_obsolete
 from chronoscene.bench.plan.job import LOCKS, Job
-from chronoscene.bench.plan.plan import BenchSettings, is_obsolete
+from chronoscene.bench.plan.resolve import resolve
+from chronoscene.bench.plan.settings import BenchSettings
 from chronoscene.bench.run.process import put_in_place, run_in_process, run_staged, staged
 from chronoscene.bench.run.transfer import (
     check_arrived,
@@ -85,19 +87,19 @@ class RemoteRun:
 
     def run(self, document: dict[str, Any]) -> None:
         """Run a job whose staging folder this machine sees."""
-        run_staged(Job(**document), report=self._report, stop=self._stop)
+        run_staged(Job.from_document(document), report=self._report, stop=self._stop)
 
     def run_apart(self, document: dict[str, Any], owner: str) -> str:
         """Run a job in a folder of this machine for that owner; returns the hash of the result."""
-        job = Job(**document)
-        truth = Path(job.here(str(ground_truth_folder(Path(job.runs), job.scene))))
-        job = replace(job, runs=str(self._folder / "runs" / owner))
-        link = ground_truth_folder(Path(job.runs), job.scene)
+        job = Job.from_document(document)
+        truth = Path(job.here(str(ground_truth_folder(job.settings.runs, job.scene))))
+        job = job.with_settings(runs=self._folder / "runs" / owner)
+        link = ground_truth_folder(job.settings.runs, job.scene)
         link.parent.mkdir(parents=True, exist_ok=True)
         partial = link.with_name(partial_name(link.name))
         partial.symlink_to(truth)
         os.replace(partial, link)
-        if is_obsolete(job, load_spec(job.method), overwrite=True):
+        if is_obsolete(resolve(job), overwrite=True):
             shutil.rmtree(job.training)
         run_in_process(job, report=self._report, stop=self._stop)
         self._pieces = read_pieces(job.folder)
@@ -109,7 +111,8 @@ class RemoteRun:
 
     def forget(self, document: dict[str, Any], owner: str) -> None:
         """Remove the result, which has arrived."""
-        shutil.rmtree(replace(Job(**document), runs=str(self._folder / "runs" / owner)).folder)
+        job = Job.from_document(document).with_settings(runs=self._folder / "runs" / owner)
+        shutil.rmtree(job.folder)
 
     def progress(self) -> list[tuple[str, int, int]]:
         """What there is to report since the last call."""
@@ -157,7 +160,7 @@ def open_ray(settings: BenchSettings) -> Iterator[RayPool]:
             found=str(error).partition("\n")[0],
             todo="start one with ray start --head, or correct the address",
         ) from error
-    token = settings.runs.resolve() / LOCKS / f"{uuid.uuid4()}.token"
+    token = settings.run.runs.resolve() / LOCKS / f"{uuid.uuid4()}.token"
     token.parent.mkdir(parents=True, exist_ok=True)
     try:
         write_text_atomic(token, token.stem)
@@ -175,7 +178,7 @@ class RayPool:
         self._ray, self._token = ray, token
         self._machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         processors = [int(machine.get("CPU", 0)) for machine in self._machines]
-        self._threads = settings.threads or min(filter(None, processors), default=1)
+        self._threads = settings.run.threads or min(filter(None, processors), default=1)
         self.at_once = settings.jobs or max(1, sum(n // self._threads for n in processors))
         self._option = f"--ray {settings.ray}"
         self._commit = code_version()
@@ -185,7 +188,8 @@ class RayPool:
 
     def run(self, job: Job, report: Report) -> records.Failure | None:
         """See `Pool.run`."""
-        job = replace(job, threads=job.threads or self._threads, reports=True)
+        job = job.with_settings(threads=job.settings.threads or self._threads)
+        job = replace(job, reports=True)
         with staged(job) as job:
             try:
                 self._run(job, report)
@@ -197,7 +201,11 @@ class RayPool:
 
     def _run(self, job: Job, report: Report) -> None:
         """Fill the staging folder of a job by an actor of its own."""
-        needs = {"CPU": job.threads or 1, "memory": job.memory, "GPU": int(self._on_gpu(job))}
+        needs = {
+            "CPU": job.settings.threads or 1,
+            "memory": job.memory,
+            "GPU": int(self._on_gpu(job)),
+        }
         if not any(all(m.get(k, 0) >= n for k, n in needs.items()) for m in self._machines):
             raise BackendError(
                 self._option,
@@ -214,7 +222,8 @@ class RayPool:
             machine = self._describe(remote, report)
             travels = "" if machine["shared"] else ", to and from which files travel"
             report(f"{job.label}: on {machine['host']}{travels}", 0, 0)
-            document = asdict(replace(job, moved=self._send(remote, job, machine["shared"])))
+            moved = self._send(remote, job, machine["shared"])
+            document = replace(job, moved=moved).document()
 
             def tell() -> None:
                 for progress in self._get(remote.progress.remote()):
@@ -258,12 +267,13 @@ class RayPool:
     def _send(self, remote: Any, job: Job, shared: bool) -> dict[str, str]:
         """Send what a machine has not; returns `Job.moved`."""
         places = {job.scene_root: Path(job.scene_root)}
-        if job.lpips_weights is not None:
-            places[job.lpips_weights] = Path(job.lpips_weights)
-        if job.period_by is not None and job.period_by.startswith(TABLE):
-            places[job.period_by] = Path(job.period_by.removeprefix(TABLE))
+        settings = job.settings
+        if settings.lpips_weights is not None:
+            places[str(settings.lpips_weights)] = settings.lpips_weights
+        if settings.period_by is not None and settings.period_by.startswith(TABLE):
+            places[settings.period_by] = Path(settings.period_by.removeprefix(TABLE))
         if not shared:
-            truth = ground_truth_folder(Path(job.runs), job.scene)
+            truth = ground_truth_folder(settings.runs, job.scene)
             places[str(truth)] = truth
             if job.continues:
                 places[job.continues] = Path(job.continues)
@@ -285,7 +295,9 @@ class RayPool:
         self, remote: Any, job: Job, document: dict[str, Any], tell: Callable[[], None]
     ) -> None:
         """Run a job on a machine that does not see the folder of runs, and fetch the result."""
-        owner = hashlib.sha256(f"{socket.gethostname()} {job.runs}".encode()).hexdigest()[:16]
+        owner = hashlib.sha256(f"{socket.gethostname()} {job.settings.runs}".encode()).hexdigest()[
+            :16
+        ]
         digest = self._get(remote.run_apart.remote(document, owner), tell)
         staging = Path(job.staging)
         with needing_space(job.folder):
@@ -306,8 +318,8 @@ class RayPool:
 
     def _on_gpu(self, job: Job) -> bool:
         """Whether a job gets a GPU: where it is asked for, or could be used and there are some."""
-        if job.device != "auto":
-            return job.device == "cuda"
+        if job.settings.device != "auto":
+            return job.settings.device == "cuda"
         return "cuda" in load_spec(job.method).devices and any("GPU" in m for m in self._machines)
 
     def _reason(self, error: Exception) -> str:

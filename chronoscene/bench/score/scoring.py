@@ -134,8 +134,9 @@ def score_stages(folder: Path, record: RunRecord, truth: Path, scorers: Scorers)
 
 def score_job(job: Job, record: RunRecord) -> None:
     """`score_run` of a job, by all metrics that can be computed here."""
-    weights = Path(job.here(job.lpips_weights)) if job.lpips_weights else None
-    truth = ground_truth_folder(Path(job.runs), job.scene)
+    weights = job.settings.lpips_weights
+    weights = Path(job.here(str(weights))) if weights else None
+    truth = ground_truth_folder(job.settings.runs, job.scene)
     score_run(Path(job.staging), record, truth, make_scorers(lpips_weights=weights))
 
 

@@ -14,13 +14,14 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from chronoscene.bench.files.records import RUN_FILE
 from chronoscene.bench.files.strategies import STRATEGIES
-from chronoscene.bench.plan.job import SHARING
-from chronoscene.bench.plan.plan import BenchSettings, Plan, Say, plan_jobs, split_overrides
+from chronoscene.bench.plan.plan import Plan, plan_runs
+from chronoscene.bench.plan.settings import SHARING, BenchSettings
 from chronoscene.bench.report.summary import COSTS
 from chronoscene.bench.run.local_pool import open_pool
 from chronoscene.bench.run.runner import BenchOutcome, Execute, run_plan
 from chronoscene.checks import check_choice
 from chronoscene.errors import ConfigError
+from chronoscene.io.log import Log
 from chronoscene.methods import as_typed, installed_methods, load_spec
 from chronoscene.metrics.registry import all_metrics
 
@@ -124,7 +125,7 @@ def _wrong(path: Path, found: str) -> ConfigError:
 
 
 def run_study(
-    study: Study, settings: BenchSettings, say: Say, *, execute: Execute | None = None
+    study: Study, settings: BenchSettings, log: Log, *, execute: Execute | None = None
 ) -> tuple[BenchOutcome, dict[str, list[Path]]]:
     """Run all rows of a study that are not finished; those of every row are checked before.
 
@@ -132,7 +133,7 @@ def run_study(
         study: What to run.
         settings: Scenes, preset, seeds, machine; `overrides` hold for all rows that do not set the
             option themselves. Methods and strategies are those of the study.
-        say: Called with lines for the user, each once.
+        log: Called with lines for the user, each once.
         execute: As for `run_bench`.
 
     Returns:
@@ -143,31 +144,30 @@ def run_study(
     """
     methods = tuple(dict.fromkeys(row.method or study.method for row in study.rows))
     specs = {name: load_spec(name) for name in methods}
-    shared = split_overrides(replace(settings, methods=methods), list(specs.values()))
-    said: set[str] = set()
+    settings.check([spec.name for spec in specs.values()])
+    logged: set[str] = set()
 
     def once(line: str) -> None:
-        if line not in said:
-            said.add(line)
-            say(line)
+        if line not in logged:
+            logged.add(line)
+            log(line)
 
     plans: dict[str, Plan] = {}
     with open_pool(settings) as pool:
         for row in study.rows:
             method = row.method or study.method
             own = {key: as_typed(value) for key, value in row.options.items()}
-            changes = replace(
-                settings,
-                methods=(method,),
-                strategies=(row.strategy,),
+            changed = replace(
+                settings.run,
                 separate_iterations=row.separate_iterations,
-                overrides=shared[specs[method].name] | own,
+                overrides=settings.run.overrides_of(specs[method].name) | own,
             )
-            plans[row.label] = plan_jobs(changes, once)
-        plan = {job.folder: (job, spec) for job, spec in chain(*plans.values())}
-        outcome = run_plan(list(plan.values()), settings, say, execute=execute, pool=pool)
+            asked = replace(settings, methods=(method,), strategies=(row.strategy,), run=changed)
+            plans[row.label] = plan_runs(asked, once)
+        plan = {run.job.folder: run for run in chain(*plans.values())}
+        outcome = run_plan(list(plan.values()), settings, log, execute=execute, pool=pool)
     finished = {
-        label: [job.folder for job, _ in rows if (job.folder / RUN_FILE).is_file()]
+        label: [run.job.folder for run in rows if (run.job.folder / RUN_FILE).is_file()]
         for label, rows in plans.items()
     }
     return outcome, finished

@@ -25,9 +25,10 @@ from chronoscene.bench.files import records
 from chronoscene.bench.files.predictions import ImageWriter, encode_png
 from chronoscene.bench.files.provenance import method_version, processor_name
 from chronoscene.bench.plan.checks import used_values
-from chronoscene.bench.plan.job import Job, write_source
+from chronoscene.bench.plan.job import Job
 from chronoscene.bench.plan.memory import read_scene_of
 from chronoscene.bench.plan.parts import Part, make_parts
+from chronoscene.bench.plan.resolve import ResolvedRun
 from chronoscene.bench.plan.stop import StopRule
 from chronoscene.bench.score.images import add_images, foreign_record
 from chronoscene.bench.score.scoring import score_job
@@ -40,7 +41,7 @@ from chronoscene.io.processes import Report
 from chronoscene.io.programs import Usage, log_lines, run_program
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import shown
-from chronoscene.methods import MethodSpec, Runner, import_object
+from chronoscene.methods import Runner, import_object
 from chronoscene.scene import Frame, Period, Scene
 
 LOG = "program.log"
@@ -59,23 +60,24 @@ class Trained:
     notices: list[str]
 
 
-def run_external(job: Job, spec: MethodSpec, runner: Runner, report: Report | None) -> None:
+def run_external(run: ResolvedRun, runner: Runner, report: Report | None) -> None:
     """Train another program, import its images and score them; arguments as for `run_job`."""
-    staging, document = Path(job.staging), job.document(spec)
-    write_text_atomic(staging / records.CONFIG_FILE, json.dumps(document, indent=1) + "\n")
+    job, spec = run.job, run.spec
+    settings, staging = job.settings, Path(job.staging)
+    write_text_atomic(staging / records.CONFIG_FILE, json.dumps(run.document, indent=1) + "\n")
     scene = read_scene_of(job)
     parts = make_parts(
-        scene, ImageStore(scene, max_width=job.max_width, memory_limit=0), job.strategy
+        scene, ImageStore(scene, max_width=settings.max_width, memory_limit=0), job.strategy
     )
-    write_source(job, parts[0].train.training_from_world)
+    job.write_source(parts[0].train.training_from_world)
     writer = ImageWriter(staging / records.PREDICTIONS)
-    stops = job.stop_rules(spec, len(parts))
+    stops = run.stops(len(parts))
     trained = []
     with ProgressDisplay(job.label, report=report) as display:
         for part, stop in zip(parts, stops, strict=True):
             model = " ".join(filter(None, ("trains", part.subfolder)))
             display.wait(f"{spec.title} {model}; what it prints goes to {staging / LOG}")
-            trained.append(_run_part(job, spec, runner, scene, part, stop, writer))
+            trained.append(_run_part(run, runner, scene, part, stop, writer))
     primitives = [model.primitives for model in trained]
     iterations = [stop.iterations for stop in stops]
     record = foreign_record(
@@ -84,7 +86,7 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner, report: Report | No
         title=spec.title,
         method=spec.name,
         strategy=job.strategy,
-        preset=job.preset,
+        preset=settings.preset,
         variant=job.variant,
         seed=job.seed,
         seconds=sum(model.seconds for model in trained),
@@ -96,9 +98,9 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner, report: Report | No
         device=f"the program's choice, {processor_name()}",
         commit=job.commit,
         method_version="; ".join(filter(None, (method_version(job.method), trained[0].version))),
-        config_hash=document["config_hash"],
+        config_hash=run.document["config_hash"],
         scene_hash=job.scene_hash,
-        max_width=job.max_width,
+        max_width=settings.max_width,
         notices=list(dict.fromkeys([*job.notices, *chain(*(m.notices for m in trained))])),
     )
     if job.seed and "seed" not in used_values(runner, ""):
@@ -110,16 +112,11 @@ def run_external(job: Job, spec: MethodSpec, runner: Runner, report: Report | No
 
 
 def _run_part(
-    job: Job,
-    spec: MethodSpec,
-    runner: Runner,
-    scene: Scene,
-    part: Part,
-    stop: StopRule,
-    writer: ImageWriter,
+    run: ResolvedRun, runner: Runner, scene: Scene, part: Part, stop: StopRule, writer: ImageWriter
 ) -> Trained:
     """Train one model and import its images."""
-    staging, config = Path(job.staging), job.method_config(spec)
+    job, spec, config = run.job, run.spec, run.config
+    staging = Path(job.staging)
     work, log = staging / WORK, staging / LOG
     data, output = work / "data", work / "output"
     values = {
@@ -132,7 +129,7 @@ def _run_part(
         "seconds": stop.seconds or 0,
     }
 
-    def run(words: Iterable[str]) -> Usage:
+    def execute(words: Iterable[str]) -> Usage:
         command = [word.format(**values) for word in (*shlex.split(config.prefix), *words)]
         return run_program(command, folder=output, log=log)
 
@@ -141,16 +138,16 @@ def _run_part(
         version = ""
         with suppress(ProgramError):  # an archive of source code has no commit
             if runner.version:
-                run(runner.version)
+                execute(runner.version)
                 version = log_lines(log)[-1]
         names = export_part(scene, part, data, runner.exports)
         notices = []
         if runner.prepare is not None:
             chosen = replace(config, iterations=values["iterations"])
-            told = import_object(runner.prepare)(data, output, chosen)
-            notices = [f"{spec.title} {notice}" for notice in told]
-        usage = run(runner.train)
-        peaks = [usage.peak_memory_bytes, *(run(c).peak_memory_bytes for c in runner.render)]
+            found = import_object(runner.prepare)(data, output, chosen)
+            notices = [f"{spec.title} {notice}" for notice in found]
+        usage = execute(runner.train)
+        peaks = [usage.peak_memory_bytes, *(execute(c).peak_memory_bytes for c in runner.render)]
         images = _find_images(runner, output, part.test, names, values)
         add_images(writer, part.test, images, part.store)
         primitives = _keep_model(job, runner, output, part, values)

@@ -30,9 +30,10 @@ from chronoscene.bench.files.provenance import (
 )
 from chronoscene.bench.files.records import CurvePoint
 from chronoscene.bench.files.strategies import STRATEGIES
-from chronoscene.bench.plan.job import Job, write_source
+from chronoscene.bench.plan.job import Job
 from chronoscene.bench.plan.memory import open_store, read_scene_of
 from chronoscene.bench.plan.parts import Part, make_parts
+from chronoscene.bench.plan.resolve import ResolvedRun, resolve
 from chronoscene.bench.plan.stop import StopRule
 from chronoscene.bench.score.scoring import NO_TESTS, score_job
 from chronoscene.bench.train.checkpoints import Checkpoints, LoopState
@@ -53,7 +54,7 @@ from chronoscene.io.processes import Report
 from chronoscene.io.staging import needing_space, write_text_atomic
 from chronoscene.io.tables import csv_text
 from chronoscene.kernels.runtime import check_device, keep_freed_memory, set_threads
-from chronoscene.methods import Method, MethodSize, MethodSpec, import_object, load_spec
+from chronoscene.methods import Method, MethodSize, MethodSpec, import_object
 from chronoscene.scene import Frame, Scene
 
 
@@ -87,43 +88,44 @@ def run_job(job: Job, report: Report | None = None) -> None:
         report: Called with the progress, which is not shown then.
     """
     started = datetime.now(UTC).isoformat(timespec="seconds")
-    spec, staging = load_spec(job.method), Path(job.staging)
-    if spec.runner is not None:
-        run_external(job, spec, spec.runner, report)
+    run, staging = resolve(job), Path(job.staging)
+    if run.spec.runner is not None:
+        run_external(run, run.spec.runner, report)
         return
     keep_freed_memory()
-    machine = Machine(pick_device(job.device, spec), set_threads(job.threads))
-    write_text_atomic(staging / records.CONFIG_FILE, dumps(job.document(spec), indent=1) + "\n")
+    settings = job.settings
+    machine = Machine(pick_device(settings.device, run.spec), set_threads(settings.threads))
+    write_text_atomic(staging / records.CONFIG_FILE, dumps(run.document, indent=1) + "\n")
     scene = read_scene_of(job)
-    takes_period = spec.period_input != "none"
-    parts = make_parts(scene, open_store(scene, job), job.strategy, takes_period=takes_period)
-    write_source(job, parts[0].train.training_from_world)
+    takes_period = run.spec.period_input != "none"
+    store = open_store(scene, settings)
+    parts = make_parts(scene, store, job.strategy, takes_period=takes_period)
+    job.write_source(parts[0].train.training_from_world)
     # All stages but the last have folders of their own, as they predict the same views.
     stages = [part.name for part in parts[:-1]] if STRATEGIES[job.strategy].in_order else []
     writers = {name: ImageWriter(staging / records.STAGES / name) for name in stages}
     final = ImageWriter(staging / records.PREDICTIONS)
-    method, outcomes = _new_method(job, spec), []
+    method, outcomes = _new_method(run), []
     with ProgressDisplay(job.label, report=report, models=len(parts)) as display:
         display.wait("warm-up: kernels compile at first use, for a minute or more")
         before = time.perf_counter()
         periods = parts[0].train.num_periods
-        config = job.method_config(spec)
-        notice = warm_up(spec, config, num_periods=periods, device=machine.device)
+        notice = warm_up(run.spec, run.config, num_periods=periods, device=machine.device)
         forget_peak_memory()
         warmup_seconds = time.perf_counter() - before
         if stages:
             writers[records.UNTRAINED] = ImageWriter(staging / records.STAGES / records.UNTRAINED)
-            _render_untrained(job, spec, parts, machine, writers[records.UNTRAINED])
-        for part, stop in zip(parts, job.stop_rules(spec, len(parts)), strict=True):
+            _render_untrained(run, parts, machine, writers[records.UNTRAINED])
+        for part, stop in zip(parts, run.stops(len(parts)), strict=True):
             display.begin(part.name, stop)
             if not part.extends:
-                method = _new_method(job, spec)
+                method = _new_method(run)
             checkpoints = None
-            if spec.resumable:
-                checkpoints = _checkpoints(job, spec, part, len(parts), display)
+            if run.spec.resumable:
+                checkpoints = _checkpoints(run, part, len(parts), display)
             writer = writers.get(part.name, final)
             outcomes.append(
-                _run_part(job, spec, method, part, stop, machine, writer, display, checkpoints)
+                _run_part(run, method, part, stop, machine, writer, display, checkpoints)
             )
     found = (peak_memory_bytes() or 0, *(o.trained.peak_memory_bytes for o in outcomes))
     peaks = max(found) or None, _peak_device_memory(machine.device)
@@ -132,7 +134,7 @@ def run_job(job: Job, report: Report | None = None) -> None:
     write_text_atomic(staging / records.CURVE_FILE, csv_text(columns, points))
     with ProgressDisplay(job.label, report=report) as display:
         display.wait("scores")
-        record = _record(job, spec, scene, machine, outcomes, peaks, started)
+        record = _record(run, scene, machine, outcomes, peaks, started)
         record.warmup_seconds = warmup_seconds
         record.notices = [*job.notices, *([notice] if notice else []), *_skips(job, record)]
         for writer in (*writers.values(), final):
@@ -157,19 +159,19 @@ def pick_device(wanted: str, spec: MethodSpec) -> str:
     return "cpu"
 
 
-def _new_method(job: Job, spec: MethodSpec) -> Method:
-    """An empty method."""
-    method: Method = import_object(spec.method)(job.method_config(spec))
+def _new_method(run: ResolvedRun) -> Method:
+    """Make an empty method."""
+    method: Method = import_object(run.spec.method)(run.config)
     return method
 
 
 def _render_untrained(
-    job: Job, spec: MethodSpec, parts: Sequence[Part], machine: Machine, writer: ImageWriter
+    run: ResolvedRun, parts: Sequence[Part], machine: Machine, writer: ImageWriter
 ) -> None:
     """Render what the first stage does not learn, with the model that it begins with."""
-    method, first = _new_method(job, spec), parts[0]
-    seed_everything(job.seed)
-    method.setup(first.train, seed=job.seed, device=machine.device)
+    method, first = _new_method(run), parts[0]
+    seed_everything(run.job.seed)
+    method.setup(first.train, seed=run.job.seed, device=machine.device)
     for part in parts:
         for frame in part.ahead:
             _render_view(method, first, frame, writer)
@@ -188,8 +190,7 @@ def _render_view(
 
 
 def _run_part(
-    job: Job,
-    spec: MethodSpec,
+    run: ResolvedRun,
     method: Method,
     part: Part,
     stop: StopRule,
@@ -199,14 +200,14 @@ def _run_part(
     checkpoints: Checkpoints | None,
 ) -> PartOutcome:
     """Train a method, save its model, and render the test views that it answers for."""
-    checkpoint = Path(job.staging) / records.CHECKPOINT
+    checkpoint = Path(run.job.staging) / records.CHECKPOINT
     try:
         trained = train(
             method,
             part,
             stop,
-            _probe_truth(job, part),
-            seed=job.seed,
+            _probe_truth(run.job, part),
+            seed=run.job.seed,
             device=machine.device,
             observer=display.update,
             checkpoints=checkpoints,
@@ -217,7 +218,7 @@ def _run_part(
     display.wait(f"{len(part.test)} test views")
     saved = _save(method, checkpoint, part)
     # What is scored is what the checkpoint holds, and nothing that only the training knows.
-    loaded = _new_method(job, spec)
+    loaded = _new_method(run)
     loaded.load(saved, device=machine.device)
     for frame in part.test[:1]:
         loaded.render(part.view(frame), part.method_period(frame))  # the first time takes longer
@@ -233,18 +234,17 @@ def _run_part(
     return PartOutcome(trained, saved, loaded.size(), seconds, total)
 
 
-def _checkpoints(
-    job: Job, spec: MethodSpec, part: Part, parts: int, display: ProgressDisplay
-) -> Checkpoints:
-    """Those of one model of the run."""
+def _checkpoints(run: ResolvedRun, part: Part, parts: int, display: ProgressDisplay) -> Checkpoints:
+    """Return the checkpoints of one model of the run."""
+    job = run.job
     start = job.here(job.continues)
     return Checkpoints(
         folder=job.training / part.name,
-        settings=job.document(spec),
+        settings=run.document,
         commit=job.commit,
-        every=job.checkpoint_seconds,
+        every=job.settings.checkpoint_seconds,
         # With several models, those that are done must not be trained again.
-        keep_last=job.keep_training or parts > 1,
+        keep_last=job.settings.keep_training or parts > 1,
         start=Path(start) / records.TRAINING / part.name if start else None,
         say=display.say,
     )
@@ -252,7 +252,7 @@ def _checkpoints(
 
 def _probe_truth(job: Job, part: Part) -> Truth:
     """Ground truth of the probe views, from the frozen images."""
-    folder = ground_truth_folder(Path(job.runs), job.scene)
+    folder = ground_truth_folder(job.settings.runs, job.scene)
     names = {frame.name for frame in probe_frames(part)}
     entries = [e for e in read_manifest(folder).images if e.view in names]
     found = {e.view: (load_image(folder, e), load_mask(folder, e)) for e in entries}
@@ -280,8 +280,7 @@ def _peak_device_memory(device: str) -> int | None:
 
 
 def _record(
-    job: Job,
-    spec: MethodSpec,
+    run: ResolvedRun,
     scene: Scene,
     machine: Machine,
     outcomes: list[PartOutcome],
@@ -289,7 +288,7 @@ def _record(
     started: str,
 ) -> records.RunRecord:
     """The record of the run, without its scores."""
-    tests = len(scene.select(split="test"))
+    job, spec, tests = run.job, run.spec, len(scene.select(split="test"))
     code = [commit for outcome in outcomes for commit in outcome.trained.commits]
     # The stages of a training leave one model.
     models = outcomes[-1:] if STRATEGIES[job.strategy].in_order else outcomes
@@ -316,10 +315,10 @@ def _record(
         skipped={},
         absent={} if tests else dict.fromkeys(("drawn", "render_seconds"), NO_TESTS),
         title=spec.title,
-        preset=job.preset,
+        preset=job.settings.preset,
         variant=job.variant,
         method_version=method_version(job.method),
-        config_hash=job.document(spec)["config_hash"],
+        config_hash=run.document["config_hash"],
         scene_hash=job.scene_hash,
         split_hash=job.split_hash,
         period_labels={str(p.id): p.label for p in scene.periods},
@@ -330,7 +329,7 @@ def _record(
         render_seconds=sum(m.render_seconds for m in models) / tests if tests else None,
         peak_device_memory_bytes=peaks[1],
         threads=machine.threads,
-        max_width=job.max_width,
+        max_width=job.settings.max_width,
         libraries=library_versions(),
         started=started,
         notices=[],
@@ -349,7 +348,7 @@ def _skips(job: Job, record: records.RunRecord) -> list[str]:
 
 def execute(document: dict[str, Any], report: Report) -> None:
     """Run the job in ``document``; every failure ends in ``failed.json``."""
-    job = replace(Job(**document), commit=code_version())
+    job = replace(Job.from_document(document), commit=code_version())
     staging = Path(job.staging)
     if job.plugin_path is not None:
         sys.path.append(job.plugin_path)

@@ -9,8 +9,13 @@ import click
 
 from chronoscene.bench.files.records import read_failures
 from chronoscene.bench.files.strategies import STRATEGIES
-from chronoscene.bench.plan.job import PHOTO_DISK, PHOTO_MEMORY
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import (
+    PHOTO_DISK,
+    PHOTO_MEMORY,
+    SHARING,
+    BenchSettings,
+    bench_settings,
+)
 from chronoscene.bench.plan.stop import parse_duration
 from chronoscene.bench.run.runner import BenchOutcome, run_bench
 from chronoscene.checks import check_choice
@@ -77,8 +82,8 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 )
 @click.option(
     "--separate-iterations",
-    type=click.Choice(["total", "each"]),
-    default="total",
+    type=click.Choice(SHARING),
+    default=SHARING[0],
     show_default=True,
     help="Whether the models of strategy separate, or the stages of strategy sequential, share "
     "iterations and budget or each get them.",
@@ -109,47 +114,60 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 @click.option(
     "--overwrite", is_flag=True, help="Replace finished runs that were made with other settings."
 )
-def command(
-    methods: str,
-    strategies: str,
-    budget: str | None,
-    checkpoint_every: str,
-    photo_memory: float,
-    photo_disk: float,
-    seeds: int,
-    seed: int,
-    assignments: tuple[str, ...],
-    out: Path,
-    **options: Any,
-) -> None:
+def command(methods: str, strategies: str, seeds: int, seed: int, **options: Any) -> None:
     """Train, render and score methods on scenes.
 
     Each run (one method, strategy, scene and seed) gets a folder below --out with its checkpoint,
     predictions and scores. Finished runs are kept, so the same command resumes after an
     interruption. docs/guides/benchmark.md describes strategies, budget and seeds.
     """
-    check_outside(out, options["scenes"], option="--out")
-    check_place("--out", out)
     names = split_list("--method", methods)
     look_here_for(names)
-    settings = BenchSettings(
+    settings = settings_from(
         methods=names,
-        runs=out,
         strategies=tuple(
             check_choice("--strategy", s, STRATEGIES) for s in split_list("--strategy", strategies)
         ),
+        seeds=tuple(range(seed, seed + seeds)),
+        **options,
+    )
+    outcome = run_bench(settings, lambda line: click.echo(line, err=True))
+    report(outcome, settings.run.runs)
+
+
+def settings_from(
+    *,
+    scenes: tuple[Path, ...],
+    methods: tuple[str, ...],
+    out: Path,
+    assignments: tuple[str, ...],
+    budget: str | None = None,
+    checkpoint_every: str = "5m",
+    photo_memory: float = PHOTO_MEMORY / 1e9,
+    photo_disk: float = PHOTO_DISK / 1e9,
+    **options: Any,
+) -> BenchSettings:
+    """Make settings from the options of ``bench`` or ``study``, in the units of the terminal.
+
+    Raises:
+        ConfigError: If one of them is wrong.
+    """
+    check_outside(out, scenes, option="--out")
+    check_place("--out", out)
+    settings = bench_settings(
+        scenes,
+        methods,
+        out,
         overrides=parse_assignments(assignments),
         budget_seconds=None if budget is None else parse_duration(budget),
         checkpoint_seconds=parse_duration(checkpoint_every, "--checkpoint-every"),
         photo_memory=round(photo_memory * 1e9),
         photo_disk=round(photo_disk * 1e9),
-        seeds=tuple(range(seed, seed + seeds)),
         **options,
     )
     if settings.ray is None:  # else the machine that runs a job checks its own
-        check_device(settings.device)
-    outcome = run_bench(settings, lambda line: click.echo(line, err=True))
-    report(outcome, out)
+        check_device(settings.run.device)
+    return settings
 
 
 def report(outcome: BenchOutcome, out: Path) -> None:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import click
 
-from chronoscene.bench.plan.plan import BenchSettings
 from chronoscene.bench.study.plan import find_study, read_study, run_study
 from chronoscene.bench.study.tables import study_texts
 from chronoscene.cli.options import (
@@ -15,14 +13,11 @@ from chronoscene.cli.options import (
     LPIPS_WEIGHTS,
     RUNS_OUT,
     look_here_for,
-    parse_assignments,
     reading_options,
     training_options,
 )
-from chronoscene.cli.output import check_place, emit, terminal_width
-from chronoscene.cli.runs.bench import SOME_FAILED
-from chronoscene.io.staging import check_outside
-from chronoscene.kernels.runtime import check_device
+from chronoscene.cli.output import emit, terminal_width
+from chronoscene.cli.runs.bench import SOME_FAILED, settings_from
 
 ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 
@@ -34,7 +29,7 @@ ENDINGS = {"markdown": "md", "csv": "csv", "json": "json"}
 @training_options
 @LPIPS_WEIGHTS
 @RUNS_OUT
-def command(name: str, seeds: int, assignments: tuple[str, ...], out: Path, **options: Any) -> None:
+def command(name: str, seeds: int, **options: Any) -> None:
     """Run variants of a method on scenes, for one table.
 
     NAME is a study that comes with a method, such as components of ChronoGS, or FILE.toml one of
@@ -42,26 +37,16 @@ def command(name: str, seeds: int, assignments: tuple[str, ...], out: Path, **op
     kept; --set is for the rows that do not set the option themselves. The table says what was
     published beside what was measured, and is written to --out as Markdown, CSV and JSON, too.
     """
-    check_outside(out, options["scenes"], option="--out")
-    check_place("--out", out)
     file = find_study(name)
     study = read_study(file)
     look_here_for([study.method, *(row.method for row in study.rows)])
-    if options["ray"] is None:
-        check_device(options["device"])
-    settings = BenchSettings(
-        methods=(),
-        runs=out,
-        overrides=parse_assignments(assignments),
-        seeds=tuple(range(seeds)),
-        **options,
-    )
+    settings = settings_from(methods=(), seeds=tuple(range(seeds)), **options)
     outcome, finished = run_study(study, settings, lambda line: click.echo(line, err=True))
     if outcome.finished:
         texts = study_texts(study, finished, outcome.failures, width=terminal_width(None))
         emit(texts["table"], None)
         for style, ending in ENDINGS.items():
-            emit(texts[style], out / f"study-{file.stem}.{ending}")
+            emit(texts[style], settings.run.runs / f"study-{file.stem}.{ending}")
     else:
         for failure in outcome.failures:
             click.echo(f"failed: {failure.scene}, {failure.method}: {failure.reason}", err=True)

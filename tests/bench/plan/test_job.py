@@ -1,7 +1,10 @@
 """Budgets are parsed, progress never leaves 0..1, shares add up."""
 
+import json
 import shlex
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -9,17 +12,24 @@ from hypothesis import strategies as st
 
 from chronoscene.bench.files.command_line import command_line
 from chronoscene.bench.plan.job import Job
+from chronoscene.bench.plan.resolve import resolve, resolve_method
+from chronoscene.bench.plan.settings import RunSettings
 from chronoscene.bench.plan.stop import StopRule, parse_duration
 from chronoscene.errors import ConfigError
 from chronoscene.methods import load_spec
 
 JOB = Job(
     scene_root="/scene", scene_format="chronoscene", scene="scene", scene_hash="1", split_hash="2",
-    method="toy_methods:MEAN", method_name="mean", strategy="separate", preset="balanced",
-    overrides={}, iterations=9,
-    budget_seconds=None, separate_iterations="total", seed=0, max_width=1600, threads=None,
-    device="cpu", runs="/runs", lpips_weights=None, commit="3",
+    method="toy_methods:MEAN", method_name="mean", strategy="separate", seed=0, commit="3",
+    settings=RunSettings(Path("/runs"), iterations=9, device="cpu"),
 )  # fmt: skip
+
+
+def changed(change: dict[str, Any]) -> Job:
+    """The job with other values of its own or of its settings."""
+    own = {name: value for name, value in change.items() if name in Job.__slots__}
+    others = {name: value for name, value in change.items() if name not in own}
+    return replace(JOB, **own).with_settings(**others)
 
 
 @pytest.mark.parametrize(
@@ -85,14 +95,17 @@ def test_time_left_follows_the_pace():
     ids=str,
 )  # fmt: skip
 def test_what_decides_the_result_is_compared(change):
-    spec = load_spec("toy_methods:MEAN")
-    assert replace(JOB, **change).document(spec) != JOB.document(spec)
+    assert resolve(changed(change)).document != resolve(JOB).document
 
 
 def test_where_and_how_fast_it_runs_is_not_compared():
-    spec = load_spec("toy_methods:MEAN")
-    other = replace(JOB, runs="/other", threads=3, commit="5", scene_root="/copy")
-    assert other.document(spec) == JOB.document(spec)
+    other = changed({"runs": Path("/other"), "threads": 3, "commit": "5", "scene_root": "/copy"})
+    assert resolve(other).document == resolve(JOB).document
+
+
+def test_a_job_goes_through_json_unchanged():
+    job = changed({"lpips_weights": Path("/weights"), "overrides": {"rate": "1"}, "memory": 7})
+    assert Job.from_document(json.loads(json.dumps(job.document()))) == job
 
 
 def test_folders_have_names_that_file_systems_take():
@@ -114,7 +127,9 @@ def test_folders_have_names_that_file_systems_take():
     ids=str,
 )
 def test_variants_are_named_by_what_differs_from_the_preset(changes, variant):
-    assert replace(JOB, **changes).with_variant(load_spec("toy_methods:MEAN")).variant == variant
+    job = changed(changes)
+    method = resolve_method(job.method, load_spec(job.method), job.settings)
+    assert method.run(job).job.variant == variant
 
 
 def test_the_command_names_what_differs_from_the_preset():

@@ -25,10 +25,10 @@ LITTLE = DECODING + 3 * PHOTO
 
 
 @pytest.fixture
-def job(tmp_path):
-    """What of a job matters here."""
+def settings(tmp_path):
+    """Fields of `RunSettings` that matter here."""
     return SimpleNamespace(
-        max_width=1600, threads=1, photo_memory=10**6, photo_disk=10**6, runs=str(tmp_path / "runs")
+        max_width=1600, threads=1, photo_memory=10**6, photo_disk=10**6, runs=tmp_path / "runs"
     )
 
 
@@ -43,51 +43,51 @@ def free(monkeypatch):
     return free
 
 
-def test_the_estimate_counts_photos_masks_and_decoding(make_scene, job, tmp_path):
+def test_the_estimate_counts_photos_masks_and_decoding(make_scene, settings, tmp_path):
     scene = make_scene()
-    needs = photo_needs(scene, job)
+    needs = photo_needs(scene, settings)
     assert (needs.count, needs.total, needs.largest) == (5, 5 * PHOTO, PHOTO)
     assert (needs.decoding, needs.decoders) == (DECODING, 2)
     assert needs.in_memory == 5 * PHOTO + 2 * DECODING and needs.on_disk == 0
     masked = replace(scene, masks={"a/0.png": tmp_path / "m.png"})
-    assert photo_needs(masked, job).total == 5 * PHOTO + PIXELS
-    job.max_width = 12
-    assert photo_needs(scene, job).largest == PHOTO // 4
+    assert photo_needs(masked, settings).total == 5 * PHOTO + PIXELS
+    settings.max_width = 12
+    assert photo_needs(scene, settings).largest == PHOTO // 4
 
 
-def test_what_does_not_fit_goes_to_the_disk(make_scene, job):
-    job.photo_memory = 5 * PHOTO + DECODING
-    needs = photo_needs(make_scene(), job)
+def test_what_does_not_fit_goes_to_the_disk(make_scene, settings):
+    settings.photo_memory = 5 * PHOTO + DECODING
+    needs = photo_needs(make_scene(), settings)
     assert needs.decoders == 1 and needs.on_disk == 0
-    job.photo_memory -= 1
-    needs = photo_needs(make_scene(), job)
-    assert needs.on_disk == 5 * PHOTO and needs.in_memory == job.photo_memory
-    job.photo_disk = 100
-    assert photo_needs(make_scene(), job).on_disk == 100
+    settings.photo_memory -= 1
+    needs = photo_needs(make_scene(), settings)
+    assert needs.on_disk == 5 * PHOTO and needs.in_memory == settings.photo_memory
+    settings.photo_disk = 100
+    assert photo_needs(make_scene(), settings).on_disk == 100
 
 
-def test_half_of_the_threads_decode_if_memory_allows_it(make_scene, job):
-    job.threads = 12
-    assert photo_needs(make_scene(), job).decoders == 6
-    job.photo_memory = 8 * DECODING
-    assert photo_needs(make_scene(), job).decoders == 4
+def test_half_of_the_threads_decode_if_memory_allows_it(make_scene, settings):
+    settings.threads = 12
+    assert photo_needs(make_scene(), settings).decoders == 6
+    settings.photo_memory = 8 * DECODING
+    assert photo_needs(make_scene(), settings).decoders == 4
 
 
-def test_the_line_says_what_is_taken(make_scene, job, free):
+def test_the_line_says_what_is_taken(make_scene, settings, free):
     free(2 * 10**9, 10**9)
-    line = check_room(make_scene(), job, runs=1)
+    line = check_room(make_scene(), settings, runs=1)
     assert line.startswith("ring: 5 training photos, 0.00 GB when decoded: 0.00 GB in memory; a ")
     assert line.endswith("training takes 0.50 GB and its model besides")
-    job.photo_memory = LITTLE
-    assert "GB in memory, 0.00 GB on disk; a" in check_room(make_scene(), job, runs=1)
+    settings.photo_memory = LITTLE
+    assert "GB in memory, 0.00 GB on disk; a" in check_room(make_scene(), settings, runs=1)
 
 
-def test_memory_counts_where_the_run_will_be(make_scene, job, free):
+def test_memory_counts_where_the_run_will_be(make_scene, settings, free):
     free(10**6, 10**9)
     with pytest.raises(ConfigError, match=r"expected 0\.50 GB of memory"):
-        check_room(make_scene(), job, runs=1)
-    check_room(make_scene(), job, runs=1, here=False)
-    assert 1.50e9 < expected_memory(make_scene(), job) < 1.51e9
+        check_room(make_scene(), settings, runs=1)
+    check_room(make_scene(), settings, runs=1, here=False)
+    assert 1.50e9 < expected_memory(make_scene(), settings) < 1.51e9
 
 
 def big(scene):
@@ -100,45 +100,47 @@ def big(scene):
     return replace(scene, frames=tuple(frames))
 
 
-def refusal(scene, job, runs=1):
+def refusal(scene, settings, runs=1):
     with pytest.raises(ConfigError) as caught:
-        check_room(scene, job, runs)
+        check_room(scene, settings, runs)
     return str(caught.value)
 
 
-def test_too_little_memory_for_one_photo_is_refused_with_what_is_enough(make_scene, job, free):
+def test_too_little_memory_for_one_photo_is_refused_with_what_is_enough(make_scene, settings, free):
     free(10**12, 10**12)
     scene = big(make_scene())
-    assert refusal(scene, job) == (
+    assert refusal(scene, settings) == (
         "ring: --photo-memory: expected at least 0.51 GB to decode photos of 6000 x 4000 pixels, "
         "found 0.00 GB; use --photo-memory 0.51"
     )
-    job.photo_memory = 510_000_000
-    check_room(scene, job, runs=1)
+    settings.photo_memory = 510_000_000
+    check_room(scene, settings, runs=1)
 
 
-def test_more_than_is_free_is_refused_with_a_smaller_setting(make_scene, job, free):
+def test_more_than_is_free_is_refused_with_a_smaller_setting(make_scene, settings, free):
     scene = big(make_scene())
-    job.photo_memory, job.max_width = 900_000_000, 6000
+    settings.photo_memory, settings.max_width = 900_000_000, 6000
     free(7_400_000_000, 10**12)
-    check_room(scene, job, runs=1)
+    check_room(scene, settings, runs=1)
     free(7_390_000_000, 10**12)
-    assert refusal(scene, job) == (
+    assert refusal(scene, settings) == (
         "ring: expected 7.40 GB of memory, 0.90 GB of it for photos, found 7.39 GB free; "
         "use --photo-memory 0.89"
     )
     free(7_330_000_000, 10**12)
-    assert refusal(scene, job).endswith("end other programs, or use a machine with more memory")
+    assert refusal(scene, settings).endswith(
+        "end other programs, or use a machine with more memory"
+    )
 
 
-def test_a_full_disk_is_refused_with_a_smaller_setting(make_scene, job, free, tmp_path):
+def test_a_full_disk_is_refused_with_a_smaller_setting(make_scene, settings, free, tmp_path):
     scene = big(make_scene())
-    job.photo_memory, job.photo_disk, job.max_width = 900_000_000, 10**9, 6000
+    settings.photo_memory, settings.photo_disk, settings.max_width = 900_000_000, 10**9, 6000
     decoded, images = 5 * 72_000_000, 3 * 3 * 12_000_000
     free(10**12, decoded + images)
-    check_room(scene, job, runs=2)
+    check_room(scene, settings, runs=2)
     free(10**12, decoded + images - 10_000_000)
-    message = refusal(scene, job, runs=2)
+    message = refusal(scene, settings, runs=2)
     assert "expected room for 0.36 GB of decoded photos and at most 0.11 GB of test" in message
     assert "found 0.46 GB free" in message
     assert message.endswith("or make room there, or use --photo-disk 0.35")
@@ -146,7 +148,7 @@ def test_a_full_disk_is_refused_with_a_smaller_setting(make_scene, job, free, tm
     kept.mkdir(parents=True)
     (kept / "x.npz").write_bytes(b"")
     (kept / "x.npz").open("r+b").truncate(10_000_000)  # what is there already needs no room
-    check_room(scene, job, runs=2)
+    check_room(scene, settings, runs=2)
 
 
 def test_bench_says_it_and_refuses_before_anything_is_written(bench, tmp_path):
@@ -173,11 +175,11 @@ def test_limits_do_not_change_results(bench_here, tmp_path, method):
     assert len({(f / "checkpoint" / "model.safetensors").read_bytes() for f in folders}) == 1
 
 
-def test_a_training_that_goes_on_with_photos_from_disk_ends_alike(make_scene, job, tmp_path):
+def test_a_training_that_goes_on_with_photos_from_disk_ends_alike(make_scene, settings, tmp_path):
     """Without disk and interruption, and with both; one photo has a mask."""
     Image.fromarray(np.eye(16, 24, dtype=np.uint8)).save(tmp_path / "m.png")
     scene = replace(make_scene(), masks={"a/0.png": tmp_path / "m.png"})
-    job.photo_memory = LITTLE + 2 * PIXELS + 3 * PIXELS
+    settings.photo_memory = LITTLE + 2 * PIXELS + 3 * PIXELS
     spec = load_spec("3dgs")
     config = build_config(spec, preset="fast", overrides={"iterations": 16})
 
@@ -193,14 +195,14 @@ def test_a_training_that_goes_on_with_photos_from_disk_ends_alike(make_scene, jo
         return method
 
     undisturbed = run(ImageStore(scene))
-    settings = {"settings": {}, "commit": "abc", "every": 0.0, "keep_last": False, "start": None}
+    common = {"settings": {}, "commit": "abc", "every": 0.0, "keep_last": False, "start": None}
     folder = tmp_path / "training" / "all"
     for until in (5, 9):
         with pytest.raises(SystemExit):
-            checkpoints = Checkpoints(folder=folder, say=lambda line: None, **settings)
-            run(open_store(scene, job), until, checkpoints=checkpoints)
+            checkpoints = Checkpoints(folder=folder, say=lambda line: None, **common)
+            run(open_store(scene, settings), until, checkpoints=checkpoints)
     assert len(list((tmp_path / "runs" / "photos").iterdir())) == 5
-    checkpoints = Checkpoints(folder=folder, say=lambda line: None, **settings)
-    resumed = run(open_store(scene, job), checkpoints=checkpoints)
+    checkpoints = Checkpoints(folder=folder, say=lambda line: None, **common)
+    resumed = run(open_store(scene, settings), checkpoints=checkpoints)
     for name, tensor in undisturbed.stored_tensors().items():
         assert tensor.equal(resumed.stored_tensors()[name])

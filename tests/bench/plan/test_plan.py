@@ -2,9 +2,12 @@
 
 import shutil
 
-from chronoscene.bench.plan.plan import BenchSettings, first_difference, split_overrides
+from chronoscene import methods
+from chronoscene.bench.plan import resolve
+from chronoscene.bench.plan.finished import first_difference
+from chronoscene.bench.plan.plan import plan_runs
+from chronoscene.bench.plan.settings import RunSettings, bench_settings
 from chronoscene.bench.use.trained_run import open_run
-from chronoscene.methods import load_spec
 
 
 def test_differences_are_named():
@@ -14,9 +17,24 @@ def test_differences_are_named():
 
 
 def test_overrides_with_a_prefix_are_for_one_method(tmp_path):
-    settings = BenchSettings((), (), tmp_path, overrides={"blind.rate": "1", "rate": "2"})
-    specs = [load_spec("toy_methods:MEAN"), load_spec("toy_methods:BLIND")]
-    assert split_overrides(settings, specs) == {"mean": {"rate": "2"}, "blind": {"rate": "1"}}
+    settings = RunSettings(tmp_path, overrides={"blind.rate": "1", "rate": "2"})
+    assert settings.overrides_of("mean") == {"rate": "2"}
+    assert settings.overrides_of("blind") == {"rate": "1"}
+
+
+def test_planning_builds_each_configuration_once(scene_folder, tmp_path, monkeypatch):
+    """That of the preset and that with overrides of each method, whatever the number of runs."""
+    built = []
+
+    def build_config(spec, **options):
+        built.append(spec.name)
+        return methods.build_config(spec, **options)
+
+    monkeypatch.setattr(resolve, "build_config", build_config)
+    names = ("toy_methods:MEAN", "toy_methods:BLIND")
+    settings = bench_settings((scene_folder,), names, tmp_path / "runs", seeds=(0, 1))
+    assert len(plan_runs(settings, lambda line: None)) == 4
+    assert sorted(built) == ["blind", "blind", "mean", "mean"]
 
 
 def test_periods_that_the_user_names_hold_for_the_whole_run(

@@ -102,9 +102,9 @@ def test_a_run_that_is_alone_begins_without_memory(run_pool):
 SCRIPT = """
 import sys
 from pathlib import Path
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.run.runner import run_bench
-settings = BenchSettings(
+settings = bench_settings(
     (Path(sys.argv[1]),), ("toy_methods:MEAN", "toy_methods:BLIND"), Path(sys.argv[2]), jobs=2
 )
 run_bench(settings, print)

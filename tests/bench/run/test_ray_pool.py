@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from chronoscene.bench.files.records import read_run
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.run import ray_pool
 from chronoscene.bench.run.runner import run_bench
 from chronoscene.errors import ConfigError
@@ -82,7 +82,7 @@ def on_ray(cluster, scene_folder, tmp_path):
             "job_memory": 10**8,
             "ray": cluster.address,
         }
-        return run_bench(BenchSettings(**{**settings, **changes}), said.append), said
+        return run_bench(bench_settings(**{**settings, **changes}), said.append), said
 
     return run
 
@@ -110,7 +110,7 @@ def test_results_are_those_of_a_local_run_with_and_without_shared_files(
     for found in outcome.finished:
         method = names["methods"]["3dgs" in found.parent.name]
         (one,) = run_bench(
-            BenchSettings(**local, **{**names, "methods": (method,)}), lambda line: None
+            bench_settings(**local, **{**names, "methods": (method,)}), lambda line: None
         ).finished
         assert files_of(found) == files_of(one)
         ours, theirs = read_run(one), read_run(found)
@@ -149,10 +149,10 @@ def test_other_code_is_told_and_another_version_refused(on_ray, monkeypatch):
 SCRIPT = """
 import sys
 from pathlib import Path
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.run.runner import run_bench
 run_bench(
-    BenchSettings(
+    bench_settings(
         scenes=(Path(sys.argv[1]),),
         methods=("toy_methods:MEAN", "toy_methods:BLIND"),
         runs=Path(sys.argv[2]),
@@ -200,7 +200,7 @@ def test_runs_end_with_their_bench_on_any_machine(number, on_ray, cluster, scene
 
 
 def test_without_ray_or_a_cluster(scene_folder, tmp_path, monkeypatch):
-    settings = BenchSettings(
+    settings = bench_settings(
         (scene_folder,), ("toy_methods:MEAN",), tmp_path / "runs", ray="127.0.0.1:1"
     )
     with pytest.raises(
@@ -220,12 +220,12 @@ def test_runs_get_what_the_machines_of_a_cluster_have(tmp_path):
     nodes.append({"Alive": False, "Resources": {"CPU": 2.0}})
 
     def pool(**changes):
-        settings = BenchSettings((), (), tmp_path, ray="auto", **changes)
+        settings = bench_settings((), (), tmp_path, ray="auto", **changes)
         return ray_pool.RayPool(SimpleNamespace(nodes=lambda: nodes), settings, tmp_path)
 
     assert pool().at_once == 3 and pool(threads=4).at_once == 5 and pool(jobs=2).at_once == 2
-    job = replace(JOB, method="3dgs", device="auto")
-    assert pool()._on_gpu(job) and pool()._on_gpu(replace(job, device="cuda"))
-    assert not pool()._on_gpu(replace(job, device="cpu")) and not pool()._on_gpu(JOB)
+    job = replace(JOB, method="3dgs").with_settings(device="auto")
+    assert pool()._on_gpu(job) and pool()._on_gpu(job.with_settings(device="cuda"))
+    assert not pool()._on_gpu(job.with_settings(device="cpu")) and not pool()._on_gpu(JOB)
     machines[0].pop("GPU")
     assert not pool()._on_gpu(job) and not pool()._on_gpu(replace(job, method="toy_methods:MEAN"))

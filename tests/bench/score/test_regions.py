@@ -17,7 +17,7 @@ from chronoscene.bench.files.predictions import (
     write_png,
 )
 from chronoscene.bench.files.records import read_rows, read_run
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.report.summary import in_region, read_runs, summarise
 from chronoscene.bench.run.runner import run_bench
 from chronoscene.bench.score.regions import change_masks_hash, freeze_change_masks, regions_of
@@ -104,7 +104,7 @@ def test_other_masks_invalidate_scores_and_no_training(runs, truth, scorers, sce
     assert first.change_masks != second.change_masks and first.aggregates == second.aggregates
     assert first.regions["changed"]["periods"]["0"] != second.regions["changed"]["periods"]["0"]
     assert first.regions["changed"]["periods"]["1"] == second.regions["changed"]["periods"]["1"]
-    settings = BenchSettings(
+    settings = bench_settings(
         scenes=(scene_folder,), methods=("toy_methods:MEAN",), runs=runs, threads=1
     )
     outcome = run_bench(settings, lambda line: None, execute=lambda job: pytest.fail(job.label))

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from chronoscene.bench.files.records import read_run
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.study.plan import Study, find_study, installed_studies, read_study, run_study
 from chronoscene.errors import ConfigError
 from chronoscene.methods import build_config, load_spec
@@ -43,7 +43,7 @@ def study_file(tmp_path):
 def run(study, scene, tmp_path, **changes):
     fields = {"scenes": (scene,), "methods": (), "runs": tmp_path / "runs", "threads": 1}
     said = []
-    settings = BenchSettings(**{**fields, **changes})
+    settings = bench_settings(**{**fields, **changes})
     return *run_study(study, settings, said.append, execute=execute_here), said
 
 

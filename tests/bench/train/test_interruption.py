@@ -17,10 +17,10 @@ from chronoscene.io.processes import process_tree
 SCRIPT = """
 import sys
 from pathlib import Path
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.run.runner import run_bench
 run_bench(
-    BenchSettings(
+    bench_settings(
         scenes=(Path(sys.argv[1]),),
         methods=(sys.argv[3] if len(sys.argv) > 3 else "toy_methods:MEAN",),
         runs=Path(sys.argv[2]),

@@ -21,10 +21,10 @@ TOY = "toy_methods:DRAWING"
 SCRIPT = """
 import sys
 from pathlib import Path
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.run.runner import run_bench
 run_bench(
-    BenchSettings(
+    bench_settings(
         scenes=(Path(sys.argv[1]),),
         methods=(sys.argv[2],),
         runs=Path(sys.argv[3]),

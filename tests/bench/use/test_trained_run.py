@@ -10,7 +10,7 @@ import pytest
 
 from chronoscene.bench.files.predictions import load_image, read_manifest, to_bytes
 from chronoscene.bench.files.records import CONFIG_FILE, PREDICTIONS, SOURCE_FILE
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import bench_settings
 from chronoscene.bench.run.runner import run_bench
 from chronoscene.bench.use.trained_run import TrainedRun, open_run
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
@@ -42,7 +42,7 @@ def test_a_run_of_gaussians_renders_its_predictions_with_depth_in_world_units(
     scene_folder, tmp_path
 ):
     """The camera, pose and training frame matter here, unlike to a method of one colour."""
-    settings = BenchSettings(
+    settings = bench_settings(
         scenes=(scene_folder,), methods=("3dgs",), runs=tmp_path, threads=1, iterations=5
     )
     run_bench(settings, lambda line: None)
