@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from chronoscene.bench.files.records import ROWS_FILE, Failure
 from chronoscene.bench.files.strategies import STRATEGIES
-from chronoscene.bench.plan.plan import BenchSettings
+from chronoscene.bench.plan.settings import BenchSettings, RunSettings
 from chronoscene.bench.plan.stop import parse_duration
 from chronoscene.bench.report.summary import ENTRY_COLUMNS, read_with_rows, summarise
 from chronoscene.bench.run.runner import run_bench
@@ -251,23 +251,26 @@ def benchmark(
         >>> result.table(["psnr"])
     """
     check_device(device)
+    run = RunSettings(
+        Path(out),
+        preset=preset,
+        overrides={key: as_typed(value) for key, value in (overrides or {}).items()},
+        iterations=iterations,
+        budget_seconds=parse_duration(budget, "budget") if isinstance(budget, str) else budget,
+        max_width=max_width,
+        threads=threads,
+        device=device,
+        period_by=period_by,
+    )
     settings = BenchSettings(
         scenes=tuple(map(Path, [scenes] if isinstance(scenes, str | Path) else scenes)),
         methods=_several(methods),
-        runs=Path(out),
-        preset=preset,
-        iterations=iterations,
-        budget_seconds=parse_duration(budget, "budget") if isinstance(budget, str) else budget,
-        seeds=tuple(seeds),
+        run=run,
         strategies=tuple(check_choice("strategy", s, STRATEGIES) for s in _several(strategies)),
-        overrides={key: as_typed(value) for key, value in (overrides or {}).items()},
-        max_width=max_width,
-        device=device,
-        threads=threads,
-        jobs=jobs,
-        overwrite=overwrite,
+        seeds=tuple(seeds),
         dataset_format=format,
-        period_by=period_by,
+        overwrite=overwrite,
+        jobs=jobs,
     )
     outcome = run_bench(settings, log or (lambda line: None))
     return BenchmarkResult(outcome.finished, outcome.failures)

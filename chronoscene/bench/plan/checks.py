@@ -82,7 +82,7 @@ def check_stages(run: ResolvedRun) -> None:
             f"{spec.name} --strategy {job.strategy}",
             expected="a method that can be trained on one period after the other",
             found="one without extend",
-            todo="use another strategy, or write the function: docs/adding-a-method.md",
+            todo="use another strategy, or write the function: docs/guides/adding-a-method.md",
         )
     if job.settings.keep_training:
         raise ConfigError(
