@@ -38,8 +38,7 @@ class ChronoGSModel(AnchorModel):
     def input_dim(layout: AnchorLayout, head: str) -> int:
         if layout.fusion == "concat":
             return AnchorModel.input_dim(layout, head)
-        direction = 3 if head in layout.direction_heads else 0
-        return max(layout.base_dim, layout.period_dim, layout.global_dim) + direction
+        return max(layout.base_dim, layout.period_dim, layout.global_dim) + 3
 
     def first_layer(self, head: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         layout, w1 = self.layout, self.heads[head].w1

@@ -1,7 +1,8 @@
 """Scaffold-GS as a plug-in of the harness.
 
 Source: Scaffold-GS (Lu et al., CVPR 2024) and its official code. The unused opacity logit of an
-anchor and its rotation, which never gets a gradient, are left out.
+anchor and its rotation, which never gets a gradient, are left out; so are the feature bank and the
+distance as an input of the MLPs, which the paper has and all published scripts leave off.
 """
 
 from __future__ import annotations
@@ -13,9 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from baselines.scaffold_gs.config import ScaffoldGSConfig
-from baselines.scaffold_gs.model import ScaffoldModel
 from chronoscene.anchors.method import AnchorMethod
-from chronoscene.anchors.model import BANK, LAYERS, AnchorLayout
+from chronoscene.anchors.model import AnchorLayout
 from chronoscene.methods import TrainingSet
 
 
@@ -23,7 +23,6 @@ class ScaffoldGSPeriod(AnchorMethod):
     """Scaffold-GS whose colour MLP sees a vector of the period: the least that time can be."""
 
     name = "scaffold-gs-period"
-    model_class = ScaffoldModel
     config: ScaffoldGSConfig
 
     def layout(self, train: TrainingSet) -> AnchorLayout:
@@ -31,10 +30,7 @@ class ScaffoldGSPeriod(AnchorMethod):
         return replace(super().layout(train), global_dim=dim, global_heads=("color",))
 
     def rates(self, camera_extent: float) -> dict[str, tuple[float, float]]:
-        rates = super().rates(camera_extent) | {"global_features": self.config.appearance_lr}
-        if self.config.feature_bank:
-            rates |= {f"{BANK}.{layer}": self.config.bank_lr for layer in LAYERS}
-        return rates
+        return super().rates(camera_extent) | {"global_features": self.config.appearance_lr}
 
 
 class ScaffoldGS(ScaffoldGSPeriod):

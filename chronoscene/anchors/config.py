@@ -33,8 +33,6 @@ class AnchorConfig(SplattingConfig):
     voxel_origin: str = "zero"
     """``zero``: cells centred on multiples of the size (code); ``box``: counted from the lower
     corner of the bounding box (paper)."""
-    point_stride: int = 1
-    """Use every n-th sparse point."""
     max_initial_anchors: int = 0
     """Coarsen the voxel until there are at most so many anchors; 0: no limit."""
     max_anchors: int = 0
@@ -52,37 +50,14 @@ class AnchorConfig(SplattingConfig):
     direction: str = "unit"
     """``unit``: viewing direction of length one (code); ``full``: anchor minus camera centre
     (paper)."""
-    direction_heads: tuple[str, ...] = ("opacity", "covariance", "color")
-    """MLPs that see the viewing direction; all three in the papers."""
-    offset_unit: str = "anchor"
-    """``anchor``: offsets are multiples of the anchor's scale (code); ``frame``: of the training
-    frame's unit (paper)."""
-    scale_unit: str = "anchor"
-    """``anchor``: the MLP's sigmoid times the anchor's scale (code); ``frame``: times one unit of
-    the training frame (paper)."""
     visibility: str = "radius"
     """Anchors decoded per view. ``radius``: projected footprint touches the image (code);
     ``frustum``: centre inside the image (paper)."""
-
-    # Resolution
-    coarse_until: float = 0.0
-    """Share of the training in which photos are 1/`coarse_factor` of their size; faster there.
-    Not in the papers."""
-    coarse_factor: int = 2
-    """How much smaller than the photos the images are until then."""
 
     # Loss
     scale_weight: float = 0.01
     """Weight of the mean product of the three scales, a volume in `length_unit` (code; 0 in the
     paper)."""
-    direction_noise: float = 0.0
-    """Standard deviation of the random shift of the camera centre that the MLPs see in training,
-    in units of the camera's distance from the mean anchor. Not in the papers."""
-    feature_decay: float = 0.0
-    """Decoupled weight decay of the anchor features, per step and learning rate. Not in the
-    papers."""
-    head_decay: float = 0.0
-    """The same for the first layer of the MLPs."""
 
     # Learning rates
     offset_lr: tuple[float, float] = (0.01, 0.0001)
@@ -147,8 +122,6 @@ class AnchorConfig(SplattingConfig):
         super().__post_init__()
         for name, known in _CHOICES.items():
             check_choice(name, getattr(self, name), known)
-        for head in self.direction_heads:
-            check_choice("direction_heads", head, HEADS)
         for name, low in _LOWER_BOUNDS.items():
             check_at_least(name, getattr(self, name), low)
         if self.unused_share and self.offsets_per_anchor > _MAX_OFFSETS:
@@ -168,7 +141,7 @@ class AnchorConfig(SplattingConfig):
         config = super().in_training_frame(training_from_world)
         if self.length_unit == "training":
             return config
-        factor = 1 / training_from_world if self.offset_unit == "anchor" else 1.0
+        factor = 1 / training_from_world
         return replace(
             config,
             max_log_scale=self.max_log_scale + math.log(training_from_world),
@@ -184,8 +157,6 @@ _CHOICES: dict[str, tuple[str, ...]] = {
     "voxel_origin": ("zero", "box"),
     "feature_init": ("zero", "uniform", "gaussian"),
     "direction": ("unit", "full"),
-    "offset_unit": ("anchor", "frame"),
-    "scale_unit": ("anchor", "frame"),
     "visibility": ("radius", "frustum"),
     "first_round": ("after", "at"),
     "prune_by": ("opacity", "gradient", "both"),
@@ -197,15 +168,12 @@ _LOWER_BOUNDS: dict[str, float] = {
     "iterations": 1,
     "offsets_per_anchor": 1,
     "voxel_size": 0.0,
-    "point_stride": 1,
     "max_initial_anchors": 0,
     "max_anchors": 0,
     "base_dim": 0,
     "hidden_dim": 0,
     "density_interval": 1,
-    "coarse_until": 0.0,
     "cooldown": 0.0,
-    "coarse_factor": 1,
     "growth_levels": 0,
     "coarsest_cell": 1,
     "cell_refinement": 1,

@@ -91,8 +91,7 @@ class AnchorMethod(SplattingMethod):
 
     def start(self, train: TrainingSet, *, seed: int, device: str) -> AnchorTrainer:
         config = self.config
-        points = train.points[:: config.point_stride]
-        points = points[finite_rows(points)].astype(np.float64)
+        points = train.points[finite_rows(train.points)].astype(np.float64)
         scale = train.training_from_world.scale
         size = resolve_voxel_size(
             points, config.voxel_size, config.voxel_unit, training_from_world=scale

@@ -35,9 +35,17 @@ TABLES = (*PER_ANCHOR, "blocks")  # Trained tensors of which a view needs some r
 FIXED = ("anchors", "used_offsets", "block_rows")  # Tensors that are not trained
 _TENSORS = ("anchors", *TABLES, "block_rows", "global_features")  # Beside the MLPs
 LAYERS = HeadWeights._fields
-BANK = "bank"  # Name of the MLP that mixes features, where there is one
-_ADDED_LATER = ("near_plane", "antialiased", "distance_heads", "distance_scale", "feature_bank")
+_ADDED_LATER = ("near_plane", "antialiased")
 """Fields of `AnchorLayout` that the files of older models do not have."""
+_REMOVED = {
+    "direction_heads": list(HEADS),
+    "offset_unit": "anchor",
+    "scale_unit": "anchor",
+    "distance_heads": [],
+    "distance_scale": 1.0,
+    "feature_bank": False,
+}
+"""Fields that they may have, with the values that all models of today have."""
 _OUTPUTS = {"opacity": 1, "covariance": 7, "color": 3}
 
 
@@ -54,24 +62,11 @@ class AnchorLayout:
     fusion: str = "concat"
     """How the MLPs get the features: ``concat``, side by side; ``sum``: see `chronogs.model`."""
     direction: str = "unit"
-    direction_heads: tuple[str, ...] = HEADS
     global_heads: tuple[str, ...] = HEADS
     """MLPs that see the global feature."""
-    offset_unit: str = "anchor"
-    scale_unit: str = "anchor"
     visibility: str = "radius"
     near_plane: float = NEAR_PLANE
     antialiased: bool = False
-    distance_heads: tuple[str, ...] = ()
-    """MLPs that see how far from the camera an anchor is."""
-    distance_scale: float = 1.0
-    feature_bank: bool = False
-    """Whether an MLP mixes the features: `baselines.scaffold_gs.model`."""
-
-    @property
-    def mlps(self) -> tuple[str, ...]:
-        """Names of all MLPs."""
-        return (*HEADS, BANK) if self.feature_bank else HEADS
 
     @classmethod
     def of(cls, config: AnchorConfig, num_periods: int) -> AnchorLayout:
@@ -90,7 +85,10 @@ class AnchorLayout:
         """Read what ``dataclasses.asdict`` stored in ``model.json``."""
         fields = dataclasses.fields(cls)
         values: dict[str, Any] = {f.name: f.default for f in fields if f.name in _ADDED_LATER}
-        values |= {k: tuple(v) if isinstance(v, list) else v for k, v in meta.items()}
+        for key, value in meta.items():
+            # With no MLP that sees distances, their scale means nothing.
+            if _REMOVED.get(key, ...) != value and key != "distance_scale":
+                values[key] = tuple(value) if isinstance(value, list) else value
         known = {f.name for f in fields}
         if set(values) != known:
             raise CheckpointError(
@@ -178,7 +176,7 @@ class AnchorModel:
         """
         head, axes = self.heads["opacity"], torch.cat([torch.eye(3), -torch.eye(3)])
         _, _, direction, _ = self.first_layer("opacity")
-        hidden = (axes[:, : direction.shape[1]] @ direction.T + head.b1).relu()
+        hidden = (axes @ direction.T + head.b1).relu()
         shown = (hidden @ head.w2.T + head.b2 > 0).any(dim=1)
         if shown.float().mean() >= 0.5:
             return head
@@ -201,7 +199,7 @@ class AnchorModel:
     @classmethod
     def from_tensors(cls, layout: AnchorLayout, tensors: Mapping[str, Tensor]) -> Self:
         """Inverse of `tensors`."""
-        heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in LAYERS)) for h in layout.mlps}
+        heads = {h: HeadWeights(*(tensors[f"{h}.{n}"] for n in LAYERS)) for h in HEADS}
         named = {name: tensors[name] for name in _TENSORS}
         return cls(layout, **named, heads=heads, used_offsets=tensors.get("used_offsets"))
 
@@ -248,7 +246,7 @@ class AnchorModel:
             offsets=self.offsets,
             features=self.seen_features(centre),
             blocks=self.blocks,
-            log_scales=self._scales_in_use(),
+            log_scales=self.log_scales,
             global_features=self.global_features,
             period_weights=period_weights,
             opacity_head=opacity,
@@ -265,44 +263,19 @@ class AnchorModel:
         features = self.features
         if self.layout.direction == "full":  # a second base feature that nothing trains
             features = torch.cat([features, self.anchors - centre], dim=1)
-        if self.layout.distance_heads:
-            distances = self.layout.distance_scale * self.distances(centre)
-            features = torch.cat([features, distances], dim=1)
         return features
-
-    def distances(self, centre: Tensor) -> Tensor:
-        """Of the anchors from a camera. [A, 1]"""
-        return (self.anchors - centre).square().sum(dim=1, keepdim=True).sqrt()
-
-    def _scales_in_use(self) -> Tensor:
-        """Log-scales with zeros where a rule says that the unit of the frame counts. [A, 6]"""
-        rules = (self.layout.offset_unit, self.layout.scale_unit)
-        if rules == ("anchor", "anchor"):
-            return self.log_scales
-        zeros = torch.zeros_like(self.log_scales[:, :3])
-        halves = (self.log_scales[:, :3], self.log_scales[:, 3:])
-        kept = [h if r == "anchor" else zeros for h, r in zip(halves, rules, strict=True)]
-        return torch.cat(kept, dim=1)
 
     @staticmethod
     def input_dim(layout: AnchorLayout, head: str) -> int:
-        """Inputs of the first layer of an MLP: base, distance, period, direction, global side by
-        side."""
-        direction = 3 if head in layout.direction_heads else 0
+        """Inputs of the first layer of an MLP: base, period, direction, global side by side."""
         global_dim = layout.global_dim if head in layout.global_heads else 0
-        base_dim = layout.base_dim + (head in layout.distance_heads)
-        return base_dim + layout.period_dim + direction + global_dim
+        return layout.base_dim + layout.period_dim + 3 + global_dim
 
     def first_layer(self, head: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Columns of ``w1`` that act on the base (and distance), period, direction and global
-        input. [H, ·]"""
+        """Columns of ``w1`` that act on the base, period, direction and global input. [H, ·]"""
         layout, w1 = self.layout, self.heads[head].w1
-        direction = 3 if head in layout.direction_heads else 0
-        distance = head in layout.distance_heads
-        dims = [layout.base_dim + distance, layout.period_dim, direction]
+        dims = [layout.base_dim, layout.period_dim, 3]
         base, period, directions, table = w1.split([*dims, w1.shape[1] - sum(dims)], dim=1)
-        if layout.distance_heads and not distance:
-            base = torch.cat([base, zero_columns(w1, 1)], dim=1)
         if head not in layout.global_heads:
             table = zero_columns(w1, layout.global_dim)
         return base, period, directions, table
@@ -328,14 +301,11 @@ class AnchorModel:
         """Weights with the inputs of the kernel; one that the MLP does not see has zero columns."""
         layout, head = self.layout, self.heads[name]
         base, period, direction, table = self.first_layer(name)
-        if direction.shape[1] == 0:
-            direction = zero_columns(head.w1, 3)
         widths = (part.shape[1] for part in (base, period, direction, table))
         if layout.direction == "unit" and head.w1.shape[1] == sum(widths):
             return head
         if layout.direction == "full":
-            at = layout.base_dim
-            parts = [base[:, :at], direction, base[:, at:], period, zero_columns(head.w1, 3), table]
+            parts = [base, direction, period, zero_columns(head.w1, 3), table]
         else:
             parts = [base, period, direction, table]
         return head._replace(w1=torch.cat(parts, dim=1))

@@ -24,19 +24,17 @@ from chronoscene.anchors.model import FIXED, PER_ANCHOR, TABLES, AnchorModel
 from chronoscene.anchors.visibility import projected_centres
 from chronoscene.methods import Skipped, StepReport, TrainingSet, TrainingView
 from chronoscene.rasterizer import RasterInfo
-from chronoscene.scene.geometry import camera_centre
 from chronoscene.training.checkpoint import TrainingState, parts
 from chronoscene.training.devices import to_device
-from chronoscene.training.drawing import draw, step_background
+from chronoscene.training.drawing import camera_centre_tensor, draw, step_background
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import centre_gradients, centres_count, collect_gradients
 from chronoscene.training.losses import mean_volume
 from chronoscene.training.optimizers.adam import Adam, DenseTable
 from chronoscene.training.optimizers.row_adam import make_table
 from chronoscene.training.photometric import photometric_loss
-from chronoscene.training.points import finite_rows
 from chronoscene.training.schedules import log_linear
-from chronoscene.training.views import ViewSampler, downscale_image, downscale_mask, downscale_view
+from chronoscene.training.views import ViewSampler
 
 _COOLED = 0.1  # Factor of the learning rates at the end of a cooldown
 _MARGIN = 1e-9
@@ -81,10 +79,7 @@ class AnchorTrainer:
         self.background = torch.from_numpy(train.background).to(model.device)
         self.sampler = ViewSampler(len(train.views), seed, train.expect)
         self.exposure = Exposure(self.config.exposure, train, model.device)
-        points = train.points[finite_rows(train.points)]
-        self._middle = points.astype(np.float64).mean(axis=0)
         self.growth_generator = np.random.default_rng((seed, 1))
-        self.noise_generator = np.random.default_rng((seed, 2))
         self.statistics: DensityStatistics | None = None
         self.block_statistics: BlockStatistics | None = None
         self._dropped = False
@@ -95,10 +90,6 @@ class AnchorTrainer:
         position = self.sampler.next()
         view = self.train.views[position]
         photo, mask = self.train.load_image(position), self.train.load_mask(position)
-        if done <= self.config.coarse_until:
-            factor = self.config.coarse_factor
-            view, photo = downscale_view(view, factor), downscale_image(photo, factor)
-            mask = None if mask is None else downscale_mask(mask, factor)
         loss, skipped = self._learn(view, photo, mask, position, done)
         resized = self._densify_if_due(index, done) or self._drop_if_due(done)
         resized |= self._merge_if_due(index, done)
@@ -123,7 +114,7 @@ class AnchorTrainer:
         visible, row = self.model.visible(view), int(self.feature_rows[position])
         everything = torch.arange(len(visible), device=visible.device)
         splats, positions = self._seen(visible, row).decode_active(
-            self._one_period, self._seen_from(view), everything
+            self._one_period, camera_centre_tensor(view, visible.device), everything
         )
         background = step_background(
             self.background, self.config, seed=self.seed, number=self.sampler.drawn
@@ -190,7 +181,6 @@ class AnchorTrainer:
             "views_drawn": self.sampler.drawn,
             "dropped": self._dropped,
             "growth_generator": self.growth_generator.bit_generator.state,
-            "noise_generator": self.noise_generator.bit_generator.state,
         }
         return TrainingState(tensors, values)
 
@@ -218,22 +208,12 @@ class AnchorTrainer:
         self.sampler.drawn = state.values["views_drawn"]
         self._dropped = state.values["dropped"]
         self.growth_generator.bit_generator.state = state.values["growth_generator"]
-        self.noise_generator.bit_generator.state = state.values["noise_generator"]
 
     def snapshot(self) -> AnchorModel:
         """The model up to date: in `model`, anchors that no view saw lately lag behind."""
         tensors = self.model.tensors()
         tensors |= {name: table.snapshot() for name, table in self.tables.items()}
         return self.model.from_tensors(self.model.layout, tensors)
-
-    def _seen_from(self, view: TrainingView) -> Tensor:
-        """Camera centre for the viewing directions, with random noise if so configured. [3]"""
-        centre = camera_centre(view.cam_from_world.astype(np.float64)).astype(np.float32)
-        if self.config.direction_noise:
-            distance = float(np.linalg.norm(centre - self._middle))
-            shift = self.noise_generator.normal(0.0, self.config.direction_noise * distance, 3)
-            centre += shift.astype(np.float32)
-        return to_device(centre, self.model.device)
 
     def _collect(
         self,
@@ -395,16 +375,3 @@ class AnchorTrainer:
             for name, table in self.tables.items():
                 if name in rates:
                     table.step(rates[name])
-        self._decay(rates, resized)
-
-    @torch.no_grad()
-    def _decay(self, rates: Mapping[str, float], resized: bool) -> None:
-        """Decoupled weight decay; off unless configured."""
-        config = self.config
-        for name in ("features", "blocks") if config.feature_decay and not resized else ():
-            if name in rates:
-                self.tables[name].flush().mul_(1.0 - rates[name] * config.feature_decay)
-        if config.head_decay:
-            for name, value in self.optimizer.params.items():
-                if name.endswith(".w1"):
-                    value.mul_(1.0 - rates[name] * config.head_decay)

@@ -37,13 +37,8 @@ class SplattingConfig:
     exposure: str = "none"
     """``image`` | ``period``: learn an affine transform of the colours for each training image, or
     for each period. A rendered view has that of its period: `chronoscene.training.exposure`."""
-    teachers: int = 0
-    """How many models are trained first, in the first half of the training; the one that stays
-    learns from the photos and from what these show, on average, between the photos. Worth it in
-    long trainings: `chronoscene.training.teachers`. Not in any of the papers."""
 
     def __post_init__(self) -> None:
-        check_at_least("teachers", self.teachers, 0)
         check_choice("exposure", self.exposure, KINDS)
         check_choice("length_unit", self.length_unit, ("world", "training"))
         check_at_least("near_plane", self.near_plane, 0.0)

@@ -25,7 +25,6 @@ from chronoscene.training.drawing import Splats, camera_centre_tensor, predictio
 from chronoscene.training.exposure import exposed, of_period
 from chronoscene.training.periods import with_new_periods
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, evaluate
-from chronoscene.training.teachers import Lessons
 
 _EXPOSURE = "exposure"  # Name of the stored transforms
 
@@ -55,7 +54,6 @@ class SplattingMethod(ABC):
         self.trainer: Any = None
         """What `start` gave, which has an `Exposure` as ``exposure``; None after `load`."""
         self._exposure: Tensor | None = None
-        self._lessons: Lessons | None = None
 
     @abstractmethod
     def start(self, train: TrainingSet, *, seed: int, device: str) -> Any:
@@ -97,16 +95,7 @@ class SplattingMethod(ABC):
             "num_periods": train.num_periods,
             "background": background.tolist(),
         }
-        if self.config.teachers:
-            self._lessons = Lessons(self.config.teachers, seed, train, device)
-            self._begin_lesson(self._lessons)
-        else:
-            self.trainer = self.start(train, seed=seed, device=device)
-
-    def _begin_lesson(self, lessons: Lessons) -> None:
-        """Begin the next model: a teacher, or the one that stays."""
-        train = lessons.training_set(lambda: type(self)(self.config))
-        self.trainer = self.start(train, seed=lessons.own_seed(), device=lessons.device)
+        self.trainer = self.start(train, seed=seed, device=device)
 
     def go_on(self, train: TrainingSet, trainer: Any) -> None:
         """Put another trainer in place of the one before: the last part of `extend`.
@@ -121,11 +110,6 @@ class SplattingMethod(ABC):
 
     def step(self, index: int, progress: float) -> StepReport:
         assert self.trainer is not None, "setup comes first"
-        if (lessons := self._lessons) is not None:
-            while lessons.is_over(progress):
-                lessons.end(self, index)
-                self._begin_lesson(lessons)
-            index, progress = lessons.own_time(index, progress)
         return self.trainer.step(index, progress)
 
     def render(self, view: View, period: float) -> Prediction:
@@ -186,16 +170,11 @@ class SplattingMethod(ABC):
     def save_training(self, folder: Path) -> None:
         state = self.trainer.state()
         meta = {"method": self.name, "version": self.version, "values": state.values}
-        if self._lessons is not None:
-            meta["lessons"] = self._lessons.write(folder)
         save_tensors(folder, state.tensors, meta, stem=TRAINING)
 
     def load_training(self, folder: Path) -> None:
         tensors, meta = load_tensors(folder, method=self.name, stem=TRAINING)
         try:
-            if self._lessons is not None:
-                self._lessons.read(folder, meta["lessons"])
-                self._begin_lesson(self._lessons)
             self.trainer.load_state(TrainingState(tensors, meta["values"]))
         except (KeyError, RuntimeError, ShapeError) as error:
             raise CheckpointError(

@@ -81,11 +81,3 @@ def downscale_image(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
         for column in range(wide):
             sums += image[row : height * tall : tall, column : width * wide : wide]
     return (sums // (tall * wide)).astype(np.uint8)
-
-
-def downscale_mask(mask: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
-    """The mask of `downscale_image`: all pixels of a square must count for it to count. [H, W]"""
-    tall, wide = (min(factor, size) for size in mask.shape)
-    height, width = mask.shape[0] // tall, mask.shape[1] // wide
-    squares = mask[: height * tall, : width * wide].reshape(height, tall, width, wide)
-    return np.asarray(squares.all(axis=(1, 3)))

@@ -25,13 +25,15 @@ def ring(count, phase=0.0):
     return [View(K, 48, 36, look_at(eye, np.zeros(3))) for eye in eyes]
 
 
-def make_model(direction_heads):
+def make_model(see_direction):
     """Anchors in a ball with features that are not zero, half of their Gaussians switched on."""
-    layout = AnchorLayout(1, offsets=4, base_dim=8, direction_heads=direction_heads)
+    layout = AnchorLayout(1, offsets=4, base_dim=8)
     rng = np.random.default_rng(0)
     anchors = rng.normal(size=(150, 3)).astype(np.float32) * 0.25
     config = AnchorConfig(feature_init="gaussian", feature_init_scale=1.0)
     model = AnchorModel.start(layout, config, anchors, torch.Generator().manual_seed(3))
+    for head in set(HEADS) - set(see_direction):
+        model.first_layer(head)[2].zero_()
     model.offsets.copy_(torch.from_numpy(rng.normal(size=(150, 4, 3)).astype(np.float32)))
     return model
 

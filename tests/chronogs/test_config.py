@@ -26,7 +26,6 @@ def test_the_paper_preset_is_what_the_official_code_does() -> None:
     assert (config.iterations, config.offsets_per_anchor) == (40_000, 10)
     assert (config.base_dim, config.period_dim, config.global_dim) == (16, 16, 32)
     assert (config.voxel_size, config.voxel_unit) == (0.001, "world")
-    assert (config.direction_noise, config.feature_decay, config.head_decay) == (0, 0, 0)
     assert (config.antialiased, config.cooldown) == (False, 0)
     assert config.density_from * config.iterations == 1_500
     assert config.statistics_from * config.iterations == 500
@@ -47,7 +46,7 @@ def test_reading_the_specs_imports_nothing_heavy() -> None:
     [
         ({"fusion": "product"}, "fusion: expected one of concat, sum"),
         ({"voxel_unit": "mile"}, "voxel_unit: expected one of spacing, training, world"),
-        ({"direction_heads": ("colour",)}, "direction_heads: .*did you mean 'color'"),
+        ({"global_heads": ("colour",)}, "global_heads: .*did you mean 'color'"),
         ({"period_dim": -1}, "period_dim: expected at least 0, found -1"),
         ({"merge_share": -1.0}, "merge_share: expected at least 0, found -1.0"),
         ({"trim_global": True, "fusion": "sum"}, "trim_global: expected False with fusion=sum"),

@@ -6,13 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chronoscene.methods import TrainingView
-from chronoscene.training.views import (
-    AHEAD,
-    ViewSampler,
-    downscale_image,
-    downscale_mask,
-    downscale_view,
-)
+from chronoscene.training.views import AHEAD, ViewSampler, downscale_image, downscale_view
 
 
 @given(st.integers(1, 40), st.integers(0, 2**32), st.integers(1, 4))
@@ -83,12 +77,3 @@ def test_a_point_lands_at_the_same_place() -> None:
     point = np.linalg.inv(original.K) @ [5.0, 3.0, 1.0]  # corner of pixels (4, 2) and (5, 3)
     np.testing.assert_allclose(small.K @ point, [2.5, 1.5, 1.0])
     np.testing.assert_array_equal(original.K[0], [50.0, 0.0, 4.0])
-
-
-def test_a_square_of_pixels_counts_if_all_of_it_does():
-    mask = np.ones((5, 7), bool)
-    mask[1, 2] = mask[4, 0] = mask[0, 6] = False
-    np.testing.assert_array_equal(
-        downscale_mask(mask, 2), [[True, False, True], [True, True, True]]
-    )
-    assert downscale_mask(np.ones((1, 3), bool), 4).shape == (1, 1)

@@ -269,10 +269,6 @@ def test_separate_models_and_stages_share_or_repeat(bench, strategy):
         ({"strategies": ("sequential",), "methods": ("toy_methods:FIXED",)}, "without extend"),
         ({"strategies": ("sequential",), "methods": ("toy_programs:PROGRAM",)}, "without extend"),
         ({"strategies": ("sequential",), "keep_training": True}, "--keep-training, --continue-to"),
-        (
-            {"strategies": ("sequential",), "methods": ("3dgs",), "overrides": {"teachers": "1"}},
-            "teachers: expected 0",
-        ),
     ],
 )
 def test_wrong_settings_end_before_anything_is_trained(bench, tmp_path, changes, message):
