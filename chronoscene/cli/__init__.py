@@ -1,4 +1,4 @@
-"""The ``chronoscene`` command. The module of a subcommand is imported only when it is called."""
+"""The ``chronoscene`` command; the module of a subcommand is imported only when it is called."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ USAGE_ERROR = 2  # Exit status for wrong usage and for input that cannot be read
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command's module only when the command is needed."""
+    """Group that imports the module of a command at its first use."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return sorted(COMMANDS)
@@ -66,9 +66,9 @@ def cli() -> None:
 
 
 def main() -> None:
-    """Run the command line; turns our errors into one line and exit status 2.
+    """Run the command line; print errors of ours in one line, with exit status 2.
 
-    A command that SIGTERM ends cleans up like one that is interrupted.
+    SIGTERM ends a command like an interruption, so that it cleans up.
     """
     try:
         with stoppable():

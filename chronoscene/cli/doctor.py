@@ -1,4 +1,4 @@
-"""``chronoscene doctor``: what works on this machine, and what to install."""
+"""``chronoscene doctor``: state of this machine, and what to install."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ class Diagnosis:
     """``ok``, ``needed`` if no method can be trained without it, or ``missing``."""
     found: str
     todo: str = ""
-    """What to do about it, and what for."""
+    """Command that installs it, and its purpose."""
 
 
 @click.command("doctor")
 def command() -> None:
-    """Say what works on this machine.
+    """Report what works on this machine.
 
-    What is missing comes with what to install, and what for. The exit status is 1 if no method can
-    be trained here, else 0. Nothing is downloaded.
+    For what is missing, it says what to install and why. The exit status is 1 if no method can be
+    trained here, else 0. Nothing is downloaded.
     """
     diagnoses = [check() for check in CHECKS]
     heads = [(head, "") for head in ("part", "state", "found")]
@@ -96,7 +96,7 @@ def _colmap() -> Diagnosis:
 
 
 def _needed(what: str, module: str, todo: str, *, package: str = "") -> Diagnosis:
-    """Whether a module without which nothing is trained can be imported."""
+    """Check a module without which nothing is trained."""
     try:
         import_module(module)
         return Diagnosis(what, "ok", f"{package or module} {version(package or module)}")

@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and how their texts are parsed."""
+"""Options and arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from chronoscene.formats import format_names, load_format
 def _period_help() -> str:
     known = {name: getattr(load_format(name), "PERIOD_BY", ()) for name in format_names()}
     rules = "; ".join(f"{name}: {', '.join(by)}" for name, by in known.items() if by)
-    return f"How images are grouped into periods, where the format leaves a choice. {rules}."
+    return f"Rule that groups images into periods, for formats with a choice. {rules}."
 
 
 def reading_options(scene: str) -> Callable[[Any], Any]:
-    """The options ``--dataset-format`` and ``--period-by`` of a command that reads scenes."""
+    """Add the options ``--dataset-format`` and ``--period-by`` of a command that reads scenes."""
     help = f"Format of {scene}.  [default: detected]"
     format_option = click.option("--dataset-format", type=click.Choice(format_names()), help=help)
     period_option = click.option("--period-by", metavar="RULE", help=_period_help())
@@ -54,7 +54,7 @@ RUNS_OUT = click.option(
 
 
 def split_list(option: str, text: str) -> tuple[str, ...]:
-    """Items of a comma-separated list, each once.
+    """Split a comma-separated list, without repetitions.
 
     Raises:
         ConfigError: If an item is empty.
@@ -73,15 +73,15 @@ RUN = click.argument("folder", metavar="RUN", type=click.Path(path_type=Path))
 SCENE = click.option(
     "--scene",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Where the scene of the run is now, if it has moved.",
+    help="Folder of the scene of the run, if it has moved.",
 )
 
 
 STAGE = click.option(
     "--stage",
     type=click.IntRange(min=0),
-    help="For a run under strategy sequential: use its model as it was after the period with this "
-    "number.  [default: the last]",
+    help="For strategy sequential: use the model after the period with this number.  "
+    "[default: the last]",
 )
 
 
@@ -114,25 +114,25 @@ _TRAINING = (
     click.option(
         "--jobs",
         type=click.IntRange(min=1),
-        help="Number of runs at a time.  [default: 1; with --ray as many as have room]",
+        help="Number of runs at a time.  [default: 1; with --ray, as many as fit]",
     ),
     click.option(
         "--job-memory",
         type=click.FloatRange(min=0, min_open=True),
         callback=lambda _context, _option, value: value and round(value * 1e9),
-        help="Memory that a run takes, in GB: another one begins if so much is free.  "
+        help="Memory of a run in GB: the next one starts if this much is free.  "
         "[default: an estimate]",
     ),
     click.option(
         "--ray",
         metavar="ADDRESS",
-        help="Address of the Ray cluster to run on; auto for that of this machine.",
+        help="Address of a Ray cluster to run on; auto for that of this machine.",
     ),
     click.option(
         "--threads",
         type=click.IntRange(min=1),
         help="Number of threads of a run.  [default: one per processor, divided by --jobs; "
-        "with --ray those of the smallest machine]",
+        "with --ray, those of the smallest machine]",
     ),
     click.option(
         "--device",
@@ -145,12 +145,12 @@ _TRAINING = (
 
 
 def training_options(command: Any) -> Any:
-    """The options that ``bench`` and ``study`` share."""
+    """Add the options that ``bench`` and ``study`` share."""
     return reduce(lambda found, option: option(found), reversed(_TRAINING), command)
 
 
 def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
-    """``KEY=VALUE`` texts as a mapping.
+    """Parse ``KEY=VALUE`` texts.
 
     Raises:
         ConfigError: If one has no ``=``.
@@ -167,6 +167,6 @@ def parse_assignments(assignments: tuple[str, ...]) -> dict[str, str]:
 
 
 def look_here_for(names: Iterable[str]) -> None:
-    """Let ``module:SPEC`` name a plug-in under development in the current folder."""
+    """Make a plug-in ``module:SPEC`` in the current folder importable."""
     if any(":" in name for name in names) and str(Path.cwd()) not in sys.path:
         sys.path.append(str(Path.cwd()))

@@ -1,4 +1,4 @@
-"""What commands print or write, with errors that name the option that a path came from."""
+"""Output of commands; errors name the option that a path came from."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ OUT_FILE = click.option(
 
 
 def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
-    """Print a text; or write it to a file, without colours, and say so on standard error.
+    """Print a text, or write it to a file without colours.
 
-    What the terminal's encoding lacks is printed as an escape sequence.
+    Characters that the terminal lacks are printed as escape sequences.
 
     Args:
         text: With the end of its last line.
         out: The file; None to print.
-        option: The option that the file came from.
+        option: Option that named the file.
 
     Raises:
         ConfigError: If the file cannot be written.
@@ -52,16 +52,16 @@ def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
     whole = click.unstyle(text).encode("utf-8", "backslashreplace").decode()  # names may be bytes
     with writing_to(option, out, expected=FILE):
         write_text_atomic(out, whole)
-    tell_written(out)
+    report_written(out)
 
 
 def terminal_width(out: Path | None) -> int | None:
-    """Columns of the terminal, if a text goes to one and not to a file."""
+    """Return the width of the terminal in characters; None if the text does not go to one."""
     return get_terminal_size().columns if out is None and sys.stdout.isatty() else None
 
 
-def tell_written(*places: Path) -> None:
-    """Name files that were written, on standard error: standard output is for results."""
+def report_written(*places: Path) -> None:
+    """Print the names of written files to standard error: standard output is for results."""
     for place in places:
         click.echo(printable(f"wrote {place}"), err=True)
 
@@ -70,11 +70,7 @@ def tell_written(*places: Path) -> None:
 def writing_to(
     option: str, place: Path, *, expected: str = "a place that can be written to"
 ) -> Iterator[None]:
-    """Report an OSError in the block under the option that the path came from.
-
-    Raises:
-        ConfigError: Instead of an OSError.
-    """
+    """Turn an OSError in the block into a ConfigError that names the option."""
     try:
         yield
     except OSError as error:
@@ -87,7 +83,7 @@ def writing_to(
 
 
 def check_place(option: str, folder: Path) -> None:
-    """Check before long work that a folder can be created and written to; creates nothing.
+    """Check that a folder can be created and written to; create nothing.
 
     Raises:
         ConfigError: If it cannot.
@@ -99,11 +95,11 @@ def check_place(option: str, folder: Path) -> None:
 
 
 def check_file(option: str, file: Path | None) -> None:
-    """Check before long work that a file can be written; leaves nothing there.
+    """Check that a file can be written; leave nothing there.
 
     Args:
-        option: The option that the file came from.
-        file: None where there is none to write.
+        option: Option that named the file.
+        file: None if there is none to write.
 
     Raises:
         ConfigError: If it cannot.

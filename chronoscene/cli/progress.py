@@ -18,18 +18,18 @@ from chronoscene.io.processes import Report
 
 T = TypeVar("T")
 BAR_WIDTH = 20
-"""Characters: with the names of our steps, the rest of a line of 80 is for the numbers."""
-BETWEEN_LINES = 30.0  # Seconds after which a step that goes on is told again without a terminal
+"""Characters: the rest of a line of 80 is for the name of the step and the numbers."""
+BETWEEN_LINES = 30.0  # Seconds after which a step that goes on is printed again, without a terminal
 MEMORY = 300.0  # Seconds over which the rate is a mean; a step may be a scene, which takes a minute
 
 
 @contextmanager
 def progress_bar(first: str = "") -> Iterator[Report]:
-    """A function that reports progress.
+    """Yield a function that reports progress.
 
-    On a terminal it draws a bar with counts, rate, elapsed and remaining time, which disappears
-    when the block ends. Elsewhere it prints a line when a step begins, and its counts twice a
-    minute. Pass ``partial(report, "images")`` to what counts only images.
+    On a terminal, it draws a bar with counts, rate, elapsed and remaining time, which disappears
+    when the block ends. Elsewhere, it prints a line when a step begins, and its counts twice a
+    minute. ``partial(report, "images")`` is for work that counts only images.
 
     Args:
         first: The first step, which has no counts.
@@ -45,12 +45,12 @@ def progress_bar(first: str = "") -> Iterator[Report]:
 
 
 def announce(step: str) -> None:
-    """Say that a step begins whose progress cannot be counted."""
+    """Print the name of a step whose progress cannot be counted."""
     click.echo(step, err=True)
 
 
 def tracked(items: Iterable[T], what: str, *, total: int | None = None) -> Iterator[T]:
-    """Yield items while a bar counts those that the caller has finished.
+    """Yield items while a bar counts the finished ones.
 
     Args:
         items: Any iterable; one without a length needs a ``total``.
@@ -106,20 +106,20 @@ def _bar(first: str = "") -> Iterator[Report]:
 
 
 def _print_steps() -> Report:
-    last, told = "", 0.0
+    last, printed = "", 0.0
 
     def report(what: str, done: int, total: int) -> None:
-        nonlocal last, told
+        nonlocal last, printed
         now = time.monotonic()
-        if what != last or (now - told >= BETWEEN_LINES and done < total):
+        if what != last or (now - printed >= BETWEEN_LINES and done < total):
             click.echo(f"{what}: {done} of {total}" if total > 1 else what, err=True)
-            last, told = what, now
+            last, printed = what, now
 
     return report
 
 
 def format_rate(speed: float | None) -> str:
-    """``120/s``, ``0.25/s``; nothing where it is not known yet."""
+    """Return ``120/s`` or ``0.25/s``, or nothing if the rate is not known yet."""
     if not speed:
         return ""
     return f"{speed:,.0f}/s" if speed >= 9.5 else f"{speed:.2g}/s"

@@ -22,10 +22,10 @@ KINDS = ("*.py", "*.toml", "*.md")  # Its own files; others are left there by Py
 @click.command("check-method")
 @click.argument("name")
 def check(name: str) -> None:
-    """Check that the method NAME does what bench asks of methods.
+    """Check that a method keeps the rules for methods.
 
-    NAME is that of an installed method, or module:SPEC. It is trained on made-up images on the CPU;
-    that takes about a minute. Each rule is a line; exit status 1 says that one was broken.
+    NAME is an installed method, or module:SPEC. It is trained on generated images on the CPU, which
+    takes about a minute. Each rule is printed on a line. Exit status: 1 if a rule was broken.
     """
     from chronoscene.bench.contract import check_method
 
@@ -53,9 +53,9 @@ def check(name: str) -> None:
     help="New folder for the package.  [default: NAME]",
 )
 def new(name: str, out: Path | None) -> None:
-    """Write the package of a new method called NAME.
+    """Create the package of a new method.
 
-    It is a method that works, to be changed: Gaussians with a tint per period.
+    The package is a working method to begin with: Gaussians with a tint per period.
     """
     if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", name):
         raise ConfigError(

@@ -34,10 +34,10 @@ from chronoscene.methods import (
     help="Folder of finished runs, which say what the method NAME costs.",
 )
 def command(name: str | None, runs: Path) -> None:
-    """List the installed methods, or describe the one called NAME.
+    """List the installed methods, or describe one.
 
-    A description has all options with default, meaning and values in the presets, and what the
-    finished runs of the method took. NAME may be module:SPEC.
+    For the method NAME (or module:SPEC), print all options with their defaults, meaning and values
+    in the presets, and the costs of finished runs.
     """
     if name is None:
         list_methods()
@@ -62,7 +62,7 @@ def list_methods() -> None:
 
 
 def _program_table(names: tuple[str, ...]) -> Table:
-    """Methods that are other programs, which are installed on their own."""
+    """Return the table of methods that are other programs."""
     table = Table(title="External programs, installed apart from ChronoScene")
     for column in ("name", "title", "period input", "tested"):
         table.add_column(column, no_wrap=column == "name")
@@ -73,7 +73,7 @@ def _program_table(names: tuple[str, ...]) -> Table:
 
 
 def describe(spec: MethodSpec, runs: Path) -> Iterator[str]:
-    """Everything about a method, in lines."""
+    """Yield the description of a method, line by line."""
     yield f"{spec.title} ({spec.name})"
     yield f"paper: {spec.paper}"
     yield f"licence: {spec.licence}"
@@ -92,7 +92,7 @@ def describe(spec: MethodSpec, runs: Path) -> Iterator[str]:
 
 
 def describe_option(option: Option) -> str:
-    """Name and default, values of presets, and the meaning below."""
+    """Return name, default and values in presets of an option, and its meaning below."""
     presets: dict[str, list[str]] = {}
     for preset, value in option.presets.items():
         presets.setdefault(as_typed(value), []).append(preset)
@@ -102,7 +102,7 @@ def describe_option(option: Option) -> str:
 
 
 def describe_cost(spec: MethodSpec, runs: Path) -> str:
-    """What finished runs took; without any, how to measure it."""
+    """Return the costs of finished runs; without any, the command that measures them."""
     from chronoscene.bench.files.records import read_run, run_folders
     from chronoscene.bench.report.tables import cost_tables
     from chronoscene.io.tables import plain_text

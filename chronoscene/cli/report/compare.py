@@ -10,7 +10,14 @@ from chronoscene.bench.report.comparison_figure import draw_figures
 from chronoscene.bench.report.comparison_page import comparison_page
 from chronoscene.bench.report.single_views import view_scores, worst_views
 from chronoscene.bench.report.summary import read_runs
-from chronoscene.cli.output import FILE, check_file, emit, tell_written, terminal_width, writing_to
+from chronoscene.cli.output import (
+    FILE,
+    check_file,
+    emit,
+    report_written,
+    terminal_width,
+    writing_to,
+)
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import boxed_text
 from chronoscene.metrics.registry import metric_info
@@ -48,10 +55,11 @@ from chronoscene.metrics.registry import metric_info
 def command(
     runs: Path, views: int, metric: str, style: str, out: Path | None, html: Path | None
 ) -> None:
-    """Show where the methods of the finished runs in RUNS differ.
+    """Show where the methods of finished runs differ.
 
-    Writes RUNS/figures: photos and predictions side by side, the window in which methods differ
-    most enlarged, and error maps on one scale. Prints the test views that they reproduce worst.
+    Figures are written to RUNS/figures: photos and predictions side by side, with the window in
+    which methods differ most enlarged, and error maps on one scale. The worst test views of all
+    methods are printed.
     """
     check_file("--out", out)
     check_file("--html", html)
@@ -65,9 +73,9 @@ def command(
         width = terminal_width(out)
         emit("\n".join(boxed_text(table, width=width) for table in worst), out)
     with writing_to("RUNS", runs):
-        tell_written(*draw_figures(runs, records, views_per_period=views))
+        report_written(*draw_figures(runs, records, views_per_period=views))
     if html is not None:
         text = comparison_page(runs, records, failures, worst)
         with writing_to("--html", html, expected=FILE):
             write_text_atomic(html, text)
-        tell_written(html)
+        report_written(html)

@@ -8,7 +8,7 @@ import click
 
 from chronoscene.bench.report.published import load_published
 from chronoscene.cli.options import RUNS
-from chronoscene.cli.output import check_place, tell_written, writing_to
+from chronoscene.cli.output import check_place, report_written, writing_to
 from leaderboard.entries import read_entries
 from leaderboard.site import write_site
 from leaderboard.submit import submit
@@ -25,13 +25,13 @@ from leaderboard.submit import submit
 def submit_command(folders: tuple[Path, ...], to: Path) -> None:
     """Add finished runs to the entries of the leaderboard.
 
-    Each of RUNS is the folder of a run, or one with many. An entry is a JSON file with the values
-    of all test views, what the runs cost, and the hashes of the predictions, which are checked.
-    Seeds of one setting are in one file; a seed that is there is replaced.
+    RUNS are folders of single runs or of many. An entry is a JSON file with the values of all test
+    views, the costs of the runs, and the hashes of the predictions, which are checked. Seeds of one
+    setting share a file; a seed that is already there is replaced.
     """
     with writing_to("--to", to):
         written = submit(folders, to)
-    tell_written(*written)
+    report_written(*written)
 
 
 @click.command("leaderboard")
@@ -50,12 +50,13 @@ def submit_command(folders: tuple[Path, ...], to: Path) -> None:
     "there. May be repeated.",
 )
 def leaderboard_command(entries: Path, out: Path, runs: tuple[Path, ...]) -> None:
-    """Make a site of the measured ENTRIES and of what was published.
+    """Build the site of the leaderboard.
 
-    It needs no server: open its index.html.
+    ENTRIES is a folder of measured entries; published figures are shown beside them. The site needs
+    no server: open its index.html.
     """
     check_place("--out", out)
     found = [*read_entries(entries).values()]
     pictured = write_site(found, load_published(), out, runs)
     click.echo(f"{len(found)} measured entries, {pictured} of them with pictures")
-    tell_written(out / "index.html")
+    report_written(out / "index.html")

@@ -44,10 +44,11 @@ SOME_FAILED = 1  # Exit status when a run could not be scored
 def score(
     runs: Path, metrics: tuple[str, ...], truth: Path | None, lpips_weights: Path | None
 ) -> None:
-    """Score the finished runs in RUNS again and print what changed.
+    """Score finished runs again and print what changed.
 
-    Only the predictions of each run and the frozen ground truth are read; their hashes are checked.
-    Change masks are frozen with the ground truth, and later runs in RUNS are scored by them, too.
+    Only the stored predictions and the frozen ground truth are read; their hashes are checked.
+    Change masks are frozen with the ground truth, so that later runs in RUNS are scored with them,
+    too.
     """
     with progress_bar("load the metrics") as bar:
         scorers = make_scorers(parse_metrics(metrics) or None, lpips_weights=lpips_weights)
@@ -113,12 +114,13 @@ def table(
     periods: bool,
     out: Path | None,
 ) -> None:
-    """Print the results in one or several folders of runs.
+    """Print the results of finished runs.
 
-    First come the means of all scenes, as papers print them. Then there is a table per scene and
-    metric, with each period, macro (the mean over periods), micro (the mean over views) and the
-    worst period, and one of costs. Several seeds give the mean, the sample standard deviation and
-    the number of runs. Intervals and differences are at 95 % over test views.
+    RUNS are folders of runs. The first table has means over all scenes, as papers print them.
+    Further tables have, per scene and metric, each period, macro (mean over periods), micro (mean
+    over views) and the worst period, and the costs. Several seeds give the mean, the sample
+    standard deviation and the number of runs. Intervals and differences are at 95 % over test
+    views.
     """
     records, failures = read_runs(folders)
     if region != ALL:

@@ -30,7 +30,14 @@ from chronoscene.bench.report.tradeoff import (
     front_tables,
 )
 from chronoscene.cli.options import RUNS
-from chronoscene.cli.output import FORMAT, OUT_FILE, emit, tell_written, terminal_width, writing_to
+from chronoscene.cli.output import (
+    FORMAT,
+    OUT_FILE,
+    emit,
+    report_written,
+    terminal_width,
+    writing_to,
+)
 from chronoscene.errors import ConfigError
 from chronoscene.io import tables
 from chronoscene.metrics.registry import metric_info
@@ -48,7 +55,7 @@ FIGURE = "tradeoff.png"
     help=f"Folder for {FIGURE}.  [default: {FIGURES}/ in the first of RUNS]",
 )
 @click.option(
-    "--budget", help="Say which configuration to use for this training time, such as 90s or 5m."
+    "--budget", help="Print the configuration to use for this training time, such as 90s or 5m."
 )
 @click.option("--max-bytes", help="The same for models of this size, such as 500kB, 10MB or 1GB.")
 @click.option(
@@ -63,13 +70,12 @@ def command(
     max_bytes: str | None,
     target_psnr: float | None,
 ) -> None:
-    """Show what quality costs in the finished runs in RUNS.
+    """Show what quality costs in finished runs.
 
-    Draws Pareto fronts of PSNR, SSIM and LPIPS against training time, rendering rate, size and
-    memory, and prints them; then the PSNR of the probe views after given times of training, and the
-    times until they have a given PSNR. CSV has the points of the fronts and all others. With
-    --budget, --max-bytes or --target-psnr it says in a sentence which configuration to use, and
-    nothing else. docs/guides/tables-and-figures.md, "Trade-off".
+    Draw and print Pareto fronts of PSNR, SSIM and LPIPS against training time, rendering rate, size
+    and memory; then print the PSNR of the probe views after given training times, and the times at
+    which they reach a given PSNR. CSV has all points. With --budget, --max-bytes or --target-psnr,
+    only the configuration to use is printed. docs/guides/tables-and-figures.md, "Trade-off".
     """
     records, failures = read_runs(folders)
     records = as_configurations(records)
@@ -91,7 +97,7 @@ def command(
         figure = (figures or folders[0] / FIGURES) / FIGURE
         with writing_to("--figures", figure):
             draw(points, figure, records)
-        tell_written(figure)
+        report_written(figure)
 
 
 def parse_size(text: str) -> float:
@@ -113,7 +119,7 @@ def parse_size(text: str) -> float:
 
 
 def _notes(records: Sequence[RunRecord], failures: Sequence[Failure]) -> list[str]:
-    """What a reader must know of the runs, and of widths that differ."""
+    """Return footnotes on the runs, and on widths that differ."""
     notes = footnotes(summarise(records).assign(tied=False), records, failures)
     if len(widths := sorted({run.max_width for run in records})) > 1:
         sizes = ", ".join(map(str, widths))
@@ -128,7 +134,7 @@ def _text(
     style: str,
     out: Path | None,
 ) -> str:
-    """Everything but the figure, in one of the formats."""
+    """Return everything but the figure, in one of the formats."""
     if style == "csv":
         rows = [list(asdict(point).values()) for point in points]
         return tables.csv_text([field.name for field in fields(FrontPoint)], rows)

@@ -12,7 +12,7 @@ import numpy as np
 from chronoscene.bench.use.changes import ChangeMap, changes_csv, changes_table, map_run
 from chronoscene.bench.use.trained_run import TrainedRun, open_run
 from chronoscene.cli.options import DEVICE, RUN, SCENE
-from chronoscene.cli.output import emit, tell_written, terminal_width
+from chronoscene.cli.output import emit, report_written, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
 from chronoscene.figures.canvas import rgb_of
@@ -38,8 +38,8 @@ _ALL_PAIRS = 4  # Periods of which all pairs are compared unless the user choose
     nargs=2,
     multiple=True,
     metavar="PERIOD PERIOD",
-    help="Compare these two, by number or label; may be repeated.  [default: all pairs of up to "
-    f"{_ALL_PAIRS} periods, of more each with the next]",
+    help="Compare these two periods (numbers or labels); may be repeated.  [default: all pairs of "
+    f"up to {_ALL_PAIRS} periods; of more, each with the next]",
 )
 @SCENE
 @DEVICE
@@ -48,9 +48,9 @@ def command(
 ) -> None:
     """Map what changes between the periods of a finished run.
 
-    OUT gets a point cloud in PLY format for each pair of periods, with scores and colours, a
-    picture of the pairs from above, and a table as CSV. Where gt/ of the scene has change masks,
-    the map is scored by them, beside differences of images. docs/guides/changes.md explains the
+    OUT gets a point cloud (PLY) with scores and colours for each pair of periods, a picture of all
+    pairs from above, and a table (CSV). If gt/ of the scene has change masks, the map is scored
+    with them and compared with differences of images. docs/guides/changes.md explains the
     scores.
     """
     run = open_run(folder, device=device)
@@ -71,7 +71,7 @@ def command(
         draw_changes(cloud_of(found), panels, staged / "changes.png")
     table = changes_table(maps, run.record.period_labels, run.record.label)
     emit(boxed_text(table, width=terminal_width(None)), None)
-    tell_written(out)
+    report_written(out)
     if not any(scores for _, scores in maps):
         click.echo(f"not scored: no change masks of test views in {found.root / 'gt'}", err=True)
 

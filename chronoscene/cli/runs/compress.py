@@ -1,4 +1,4 @@
-"""``chronoscene compress``: a finished run with its models in few bytes."""
+"""``chronoscene compress``: a finished run in few bytes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from chronoscene.bench.files.records import read_run
 from chronoscene.bench.use.compression import compress_run
 from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli.options import DEVICE, RUN, SCENE
-from chronoscene.cli.output import emit, tell_written
+from chronoscene.cli.output import emit, report_written
 from chronoscene.cli.progress import announce
 
 
@@ -21,16 +21,16 @@ from chronoscene.cli.progress import announce
     type=click.FloatRange(min=0, min_open=True),
     default=0.1,
     show_default=True,
-    help="How far the PSNR of training views may fall, in dB.",
+    help="Largest loss of PSNR on training views, in dB.",
 )
-@click.option("--plain", is_flag=True, help="Half floats and LZMA instead of rounding and coding.")
+@click.option("--plain", is_flag=True, help="Use half floats and LZMA only.")
 @SCENE
 @DEVICE
 def command(folder: Path, max_loss: float, plain: bool, scene: Path | None, device: str) -> None:
     """Compress the model of a finished run.
 
-    RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. The compressed model is a
-    run of its own beside it, with scores on the test views, and a row in chronoscene table.
+    RUN is the folder of the run, such as runs/plaza/chronogs-joint-balanced/seed0. The compressed
+    model becomes a run beside it, with its own scores and its own row in chronoscene table.
     """
     run = open_run(folder, device=device)
     announce("read the scene")
@@ -46,4 +46,4 @@ def command(folder: Path, max_loss: float, plain: bool, scene: Path | None, devi
         if name in after.aggregates["macro"]
     ]
     emit("\n".join(lines) + "\n", None)
-    tell_written(out)
+    report_written(out)

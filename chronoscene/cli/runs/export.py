@@ -1,4 +1,4 @@
-"""``chronoscene export``: a finished run as a file of Gaussians for other programs."""
+"""``chronoscene export``: Gaussians of a finished run in a file for other programs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 from chronoscene.bench.use.export import measure_loss
 from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli.options import DEVICE, RUN, SCENE, STAGE
-from chronoscene.cli.output import check_file, emit, tell_written
+from chronoscene.cli.output import check_file, emit, report_written
 from chronoscene.cli.progress import announce
 from chronoscene.formats.shared.gaussian_ply import write_gaussians
 from chronoscene.io.staging import check_outside
@@ -18,14 +18,12 @@ from chronoscene.io.wording import counted
 
 @click.command("export")
 @RUN
-@click.option(
-    "--period", required=True, help="The period to export, by its number, its label or a fraction."
-)
+@click.option("--period", required=True, help="Period to export: number, label or fraction.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
     required=True,
-    help="The PLY file to write.",
+    help="PLY file to write.",
 )
 @SCENE
 @STAGE
@@ -33,11 +31,11 @@ from chronoscene.io.wording import counted
 def command(
     folder: Path, period: str, out: Path, scene: Path | None, stage: int | None, device: str
 ) -> None:
-    """Write a period of a finished run as Gaussians.
+    """Export a period of a finished run as Gaussians.
 
-    RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. The file has the PLY format
-    of 3DGS, in the world of the scene. What changes with the direction is fitted to the training
-    views; the PSNR lost by that on the test views is printed.
+    RUN is the folder of the run, such as runs/plaza/chronogs-joint-balanced/seed0. The file is a
+    PLY file as 3DGS writes it, in the world frame of the scene. What depends on the direction of
+    view is fitted to the training views; the PSNR that this costs on the test views is printed.
     """
     run = open_run(folder, device=device, stage=stage)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
@@ -64,4 +62,4 @@ def command(
     if getattr(run.config, "antialiased", False):
         lines.append("Switch on the antialiasing (Mip-Splatting) of the viewer, as in training")
     emit("\n".join(lines) + "\n", None)
-    tell_written(out)
+    report_written(out)

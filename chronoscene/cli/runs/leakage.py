@@ -1,4 +1,4 @@
-"""``chronoscene leakage``: what the periods of a finished run have of each other."""
+"""``chronoscene leakage``: traces of other periods in the renders of a run."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ from chronoscene.io import tables
 def command(
     folder: Path, truth: Path | None, style: str, out: Path | None, scene: Path | None, device: str
 ) -> None:
-    """Measure what leaks between the periods of a finished run.
+    """Measure what leaks between the periods of a run.
 
-    Each test camera is rendered at every period and compared with the truth of a generated scene,
-    or with that in a folder: quality, changes that are missed, ghosts of other periods, depth.
+    Each test camera is rendered at every period and compared with ground truth, which generated
+    scenes have: quality, missed changes, ghosts of other periods, depth.
     docs/reference/scores.md defines the columns.
     """
     check_file("--out", out)

@@ -11,7 +11,7 @@ from chronoscene.bench.use.cameras import VIEWS, find_shots, with_periods
 from chronoscene.bench.use.rendering import check_shots, is_animation, render_shots, write_pictures
 from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli.options import DEVICE, RUN, SCENE, STAGE
-from chronoscene.cli.output import check_file, check_place, tell_written
+from chronoscene.cli.output import check_file, check_place, report_written
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
 from chronoscene.io.staging import check_outside
@@ -23,7 +23,7 @@ from chronoscene.io.staging import check_outside
     "--out",
     type=click.Path(path_type=Path),
     required=True,
-    help="New folder for PNG files, or a file that ends in .mp4 or .webp.",
+    help="New folder for PNG files, or an animation (.mp4 or .webp).",
 )
 @click.option(
     "--cameras",
@@ -35,23 +35,23 @@ from chronoscene.io.staging import check_outside
 )
 @click.option(
     "--period",
-    help="A period, by its number, its label or a fraction; or FROM:TO, a range that an orbit or "
-    "path goes through, and that every other camera shows.  [default: that of each camera]",
+    help="Period (number, label or fraction), or a range FROM:TO, through which an orbit or path "
+    "moves; any other camera shows all of it.  [default: the period of each camera]",
 )
-@click.option("--appearance-period", help="Show the geometry in the light of this period.")
+@click.option("--appearance-period", help="Show the geometry in the colours of this period.")
 @click.option(
     "--frames",
     type=click.IntRange(min=1),
     default=120,
     show_default=True,
-    help="Pictures of an orbit, or of a range of periods.",
+    help="Number of pictures of an orbit or a range of periods.",
 )
 @click.option(
     "--fps",
     type=click.FloatRange(min=0.1, max=240),
     default=24,
     show_default=True,
-    help="Pictures per second of a file.",
+    help="Pictures per second of an animation.",
 )
 @SCENE
 @STAGE
@@ -70,8 +70,8 @@ def command(
 ) -> None:
     """Render a finished run from any camera.
 
-    RUN is its folder, such as runs/plaza/chronogs-joint-balanced/seed0. An orbit goes around the
-    middle of the sparse points, at the height and distance of the cameras.
+    RUN is the folder of the run, such as runs/plaza/chronogs-joint-balanced/seed0. An orbit circles
+    the middle of the sparse points, at the height and distance of the cameras.
     """
     run = open_run(folder, device=device, stage=stage)
     check_outside(out, [Path(run.source.scene_root), *([scene] if scene else [])], option="--out")
@@ -93,4 +93,4 @@ def command(
     images = render_shots(run, shots, appearance_period=appearance)
     names = (shot.name for shot in shots)
     write_pictures(out, names, tracked(images, "render", total=len(shots)), fps=fps)
-    tell_written(out)
+    report_written(out)

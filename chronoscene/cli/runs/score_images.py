@@ -1,4 +1,4 @@
-"""``chronoscene score-images``: the images of another program as a run beside those of bench."""
+"""``chronoscene score-images``: images of another program as a run like those of bench."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from chronoscene.metrics.registry import make_scorers
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help="Which of several trainings of the program it was; tables show their mean and spread.",
+    help="Seed of the training; tables show mean and spread over several.",
 )
 @reading_options("the scene")
 @click.option(
@@ -57,11 +57,11 @@ def command(
     lpips_weights: Path | None,
     out: Path,
 ) -> None:
-    """Score images of the test views that another program made.
+    """Score test views that another program rendered.
 
-    FOLDER has a PNG file for each test view of SCENE, named like it: b/0007.png or b/0007.jpg.png
-    for b/0007.jpg. Images have the size of the evaluation, or that of the photos. The result
-    becomes a run beside those of bench; docs/guides/other-programs.md says more.
+    FOLDER has a PNG file for each test view of SCENE: b/0007.png or b/0007.jpg.png for b/0007.jpg.
+    Images have the size of the evaluation or of the photos. The result is a run like those of
+    bench; see docs/guides/other-programs.md.
     """
     check_outside(out, [scene], option="--out")
     check_place("--out", out)

@@ -39,10 +39,11 @@ def command(
     target: str,
     link: str | None,
 ) -> None:
-    """Write the scene SRC in another format to the new folder OUT.
+    """Convert a scene to another format.
 
-    SRC may have any supported format, and is not changed. OUT appears complete or not at all. Notes
-    say what the target format cannot hold. DATASET.md describes the formats.
+    SRC is a scene in any supported format; it is not changed. OUT is a new folder, which appears
+    complete or not at all. Notes list what the target format cannot hold. DATASET.md describes the
+    formats.
     """
     with progress_bar(f"read {source}") as bar:
         done = convert(

@@ -30,9 +30,9 @@ BY_HAND = 1  # Exit status when a host lets only people download
 def command(name: str | None, scenes: tuple[str, ...], out: Path | None) -> None:
     """Download the scenes of a public dataset.
 
-    Without SCENES all of them, and without NAME a list of what there is. A command that was ended
-    goes on where it stopped. All files are compared with the checksums of their host. The
-    environment variables of huggingface_hub hold, such as HF_ENDPOINT and HF_TOKEN.
+    Without SCENES, all scenes are downloaded; without NAME, the data sets are listed. The same
+    command continues an interrupted download. All files are compared with the checksums of their
+    host. Environment variables of huggingface_hub, such as HF_ENDPOINT and HF_TOKEN, are used.
     """
     if name is None:
         emit(plain_text(_table()), None)

@@ -126,12 +126,12 @@ def command(
     scene: Path | None,
     **settings: Any,
 ) -> None:
-    """Register photos of several dates in one frame as scene OUT.
+    """Register photos of several dates in one frame.
 
     CAPTURES is a folder with a subfolder of photos for each period; or a folder of photos, whose
-    periods are proposed from their dates; or a CSV of image and period. Masks are found in masks/
-    beside the folder of photos: masks/2016/x.jpg.png for 2016/x.jpg, 0 where the photo does not
-    count. A run that was stopped continues where it was when the same command is run again.
+    periods are proposed from their dates; or a CSV of image and period. OUT is the new scene.
+    Masks lie in masks/ beside the folder of photos: masks/2016/x.jpg.png for 2016/x.jpg, 0 where
+    the photo does not count. The same command continues a run that was stopped.
 
     Exit status: 0 if the verdict is pass or doubtful, 1 if it is fail (the scene is written
     nevertheless), 2 if the photos cannot be registered or the usage is wrong.

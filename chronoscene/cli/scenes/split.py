@@ -77,10 +77,11 @@ def command(
     period_by: str | None,
     **options: Any,
 ) -> None:
-    """Choose new test images of SCENE and write their names to OUT.
+    """Choose new test images of a scene.
 
-    OUT is a file, a test.txt as described in DATASET.md; a JSON file beside it records how it was
-    made. SCENE is not changed: --scene-out writes a copy with the new split.
+    Their names are written to the file OUT, a test.txt as described in DATASET.md; a JSON file
+    beside it records the settings. SCENE is not changed; --scene-out writes a copy with the new
+    split.
     """
     _check_targets(source, out, scene_out)
     announce(f"read {source}")

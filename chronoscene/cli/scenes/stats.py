@@ -1,4 +1,4 @@
-"""``chronoscene stats``: what is in scenes, by period: tables, figures and pages."""
+"""``chronoscene stats``: tables, figures and pages of scenes, by period."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from chronoscene.cli.output import (
     check_file,
     check_place,
     emit,
-    tell_written,
+    report_written,
     terminal_width,
     writing_to,
 )
@@ -52,7 +52,7 @@ SOME_FAILED, ALL_FAILED = 1, 2
 
 @dataclass(frozen=True, slots=True)
 class StatsRequest:
-    """What to do with each scene."""
+    """Work to do for each scene."""
 
     dataset_format: str | None
     period_by: str | None
@@ -64,11 +64,11 @@ class StatsRequest:
     pages: Path | None
 
     def figure(self, name: str) -> Path | None:
-        """Where the figure of a name goes, if figures are asked for."""
+        """Return the file of a figure; None if no figures are asked for."""
         return self.figures and self.figures / f"{name}.{self.figure_format}"
 
     def page(self, name: str) -> Path | None:
-        """Likewise for pages."""
+        """Return the file of a page; None if no pages are asked for."""
         return self.pages and self.pages / f"{name}.html"
 
 
@@ -122,24 +122,17 @@ def command(
     out: Path | None,
     **options: object,
 ) -> None:
-    """Print what a scene contains, by period.
+    """Print the contents of scenes, by period.
 
-    That is images, points, tracks, error, overlap and coverage. DIR is a scene or a folder of
-    scenes. Periods are numbered from 0; "-" means that there is nothing to measure.
+    DIR is a scene or a folder of scenes. The table has images, points, tracks, error, overlap and
+    coverage; docs/guides/statistics.md defines them. Periods are numbered from 0; "-" means that
+    there is nothing to measure.
 
-    All periods of a scene share one point cloud, and the paper does not say how its table splits
-    it. Since its periods add up to the total, each point is counted once, in the period with the
-    most observations of it, the earliest of several. With --count seen, a point counts in every
-    period that sees it, and the periods add up to more than the total.
+    All periods of a scene share one point cloud. Each point is counted once, in the period with the
+    most observations of it, the earliest of several; with --count seen, in every period that sees
+    it.
 
-    Tracks and observations of a period are those of its images. The error is the mean distance
-    between observation and projection. The baseline is the distance from a camera to the nearest
-    camera of its period, relative to the median depth of what it sees. The coverage is the share of
-    the occupied space in which a period sees points. "Also seen by" is the share of the points of a
-    period that another period sees, too; "In view of" is the share that lies in view of the cameras
-    of another period.
-
-    A scene that cannot be read is named and the others are reported. Exit status: 0 if all scenes
+    Scenes that cannot be read are named, the others are reported. Exit status: 0 if all scenes
     were read, 1 if some were, 2 if none was or the command is used wrongly.
     """
     request = StatsRequest(**options)  # type: ignore[arg-type]
@@ -168,7 +161,7 @@ def command(
         for (_, name), result in zip(items, results, strict=True):
             if not isinstance(result, Unreadable):
                 written += filter(None, (request.figure(f"{name}_points"), request.page(name)))
-        tell_written(*written)
+        report_written(*written)
     notes = (f"{s.name}: {n}" for s in counts for n in model_notes(Path(s.path), s.format))
     for remark in [*notes, *unseen(counts), *against_paper(counts)]:
         click.echo(printable(remark), err=True)
@@ -255,7 +248,7 @@ def _check_places(request: StatsRequest, out: Path | None, paths: Sequence[Path]
 
 
 def unseen(counts: Sequence[SceneCount]) -> Iterator[str]:
-    """What there is to say about points that no image sees."""
+    """Yield notes on points that no image sees."""
     for scene in counts:
         if scene.points_without_period:
             number = scene.points_without_period
@@ -266,7 +259,7 @@ def unseen(counts: Sequence[SceneCount]) -> Iterator[str]:
 
 
 def against_paper(counts: Sequence[SceneCount]) -> Iterator[str]:
-    """Whether scenes with names of the paper have its counts."""
+    """Yield notes on scenes with names of the paper: equal and different counts."""
     same = []
     for scene in counts:
         paper = published(scene.name)

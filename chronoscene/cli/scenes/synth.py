@@ -32,10 +32,10 @@ from chronoscene.synth.settings import KINDS
 @click.option("--off-centre/--centred", "off_centre", default=None,
               help="Principal point away from the image centre, or in it.")  # fmt: skip
 def command(out: Path, name: str, size: str | None, **changes: Any) -> None:
-    """Make a city photographed at several dates, in the folder OUT.
+    """Generate a city photographed at several dates.
 
-    The scene is in the ChronoScene format; OUT/gt holds depth, change masks and the test views
-    at every other date. The same options give the same bytes.
+    OUT is a new folder in the ChronoScene format; OUT/gt has depth, change masks and the test views
+    at every other date. Equal options give equal bytes.
     """
     given = {key: value for key, value in changes.items() if value is not None}
     if size is not None:

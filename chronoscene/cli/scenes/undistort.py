@@ -43,11 +43,12 @@ def command(
     dataset_format: str | None,
     period_by: str | None,
 ) -> None:
-    """Write SCENE with undistorted images to the new folder OUT.
+    """Undistort the images of a scene.
 
-    All its cameras become PINHOLE. Observations of points move with the images; poses, periods and
-    split do not change. Images of cameras without distortion are copied; others become 8-bit RGB,
-    and what was transparent becomes a mask. SCENE is not changed. OUT is in the ChronoScene format.
+    OUT is a new folder in the ChronoScene format; SCENE is not changed. All cameras become PINHOLE.
+    Observations of points move with the images; poses, periods and split do not change. Images of
+    cameras without distortion are copied; others become 8-bit RGB, and transparent pixels become a
+    mask.
     """
     check_outside(out, [source])
     with progress_bar(f"read {source}") as bar:

@@ -100,10 +100,10 @@ def command(
     decode: bool,
     fix: Path | None,
 ) -> None:
-    """Check a scene or a folder of scenes and report all problems.
+    """Check scenes and report all problems.
 
-    The scene itself is never changed. With --fix, the report and the exit status are those of the
-    corrected copy. --explain CS lists all rules.
+    DIR is a scene or a folder of scenes; it is never changed. With --fix, report and exit status
+    are those of the corrected copy. --explain CS lists all rules.
 
     Exit status: 0 if the scene is valid, 1 if there are errors (with --strict, also warnings), 2 if
     there is no scene or the command is used wrongly.

@@ -1,4 +1,4 @@
-"""What ChronoScene knows of the method without importing it. Nothing heavy is imported here."""
+"""Description of the method, which is read without importing it. Nothing heavy is imported here."""
 
 from chronoscene.methods import MethodSpec
 

@@ -41,7 +41,7 @@ class Model(GaussianModel):
 
 
 class TintedGaussians(GaussianMethod):
-    """What the harness drives; everything that is not here comes from `GaussianMethod`."""
+    """The method; everything that is not here comes from `GaussianMethod`."""
 
     name = "tinted-gaussians"
     config_class = Config
