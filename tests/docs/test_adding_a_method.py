@@ -1,4 +1,4 @@
-"""The guide to methods: its package works, its dataclasses and rules are those of the code."""
+"""The guide to methods: its packages work, its dataclasses and rules are those of the code."""
 
 import ast
 import dataclasses
@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from chronoscene import methods
 from chronoscene.bench.contract import CHECKS
 from chronoscene.scene.similarity import Sim3
@@ -15,29 +17,31 @@ from chronoscene.scene.similarity import Sim3
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/guides/adding-a-method.md").read_text(encoding="utf-8")
 EXAMPLE = ROOT / "chronoscene/cli/methods/skeleton"
+SHOWN = dict(re.findall(r"^`([\w./-]+)`:\n\n```\w+\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
+"""Content of each file that the page shows, by its path."""
 
 
-def shown_files():
-    """Content of each file that the page shows, by its path."""
-    return dict(re.findall(r"^`([\w./-]+)`:\n\n```\w+\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL))
+def test_the_page_shows_the_package_of_new_method():
+    shown = {name: text for name, text in SHOWN.items() if not name.startswith("voxel_field/")}
+    assert len(shown) == 3 and len(SHOWN) == 5
+    for name, text in shown.items():
+        assert text == (EXAMPLE / name).read_text(encoding="utf-8"), name
 
 
-def test_the_package_on_the_page_keeps_all_rules(tmp_path):
-    files = shown_files()
-    for name, text in files.items():
-        assert text == (EXAMPLE / name).read_text(encoding="utf-8"), f"{name} is not the example's"
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text(text)
-    assert len(files) == 3
+@pytest.mark.parametrize("package", ["voxel_field", "tinted_gaussians"])
+def test_the_packages_on_the_page_keep_all_rules(package, tmp_path):
+    (tmp_path / package).mkdir()
+    for name in (f"{package}/__init__.py", f"{package}/method.py"):
+        (tmp_path / name).write_text(SHOWN[name])
     done = subprocess.run(
-        [sys.executable, "-m", "chronoscene", "check-method", "tinted_gaussians:SPEC"],
+        [sys.executable, "-m", "chronoscene", "check-method", f"{package}:SPEC"],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert f"tinted_gaussians:SPEC: 0 of {len(CHECKS)} rules broken" in done.stdout
+    assert f"{package}:SPEC: 0 of {len(CHECKS)} rules broken" in done.stdout
 
 
 def test_the_dataclasses_on_the_page_have_all_fields():
@@ -57,4 +61,4 @@ def test_the_dataclasses_on_the_page_have_all_fields():
 
 def test_the_rules_on_the_page_are_those_that_are_checked():
     rules = [" ".join(check.__doc__.split("\n\n")[0].split()) for check in CHECKS]
-    assert re.findall(r"^- (.*)$", PAGE.partition("## 4. The rules")[2], re.MULTILINE) == rules
+    assert re.findall(r"^- (.*)$", PAGE.partition("## 5. The rules")[2], re.MULTILINE) == rules
