@@ -103,7 +103,7 @@ def test_what_a_page_names_exists(page: str) -> None:
                     wrong.append(span)
                 continue
         modules = rf"(?:{'|'.join(PACKAGES)})(?:\.\w+)+"
-        if match := re.match(rf"(?:python -m )?({modules})(?![\w/-])", span):
-            if match[1] not in GROUPS and not module_has(match[1]):
-                wrong.append(span)
+        match = re.match(rf"(?:python -m )?({modules})(?![\w/-])", span)
+        if match and match[1] not in GROUPS and not module_has(match[1]):
+            wrong.append(span)
     assert not wrong
