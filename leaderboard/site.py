@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from chronoscene.bench.report.summary import (
 )
 from chronoscene.bench.report.tables import period_title
 from chronoscene.bench.report.tradeoff import as_configurations
+from chronoscene.figures.canvas import period_colors
 from chronoscene.io.pages import render_page
 from chronoscene.io.staging import staged_folder
 from chronoscene.methods import MethodSpec, installed_methods, load_spec
@@ -84,6 +85,8 @@ class _Site:
         self.scene_of = {r.scene: names.get(r.scene.casefold(), r.scene) for r in self.records}
         scenes = dict.fromkeys([*self.scene_of.values(), *self.parts])
         self.scenes = _file_names(scenes)
+        measured = sorted({record.method for record in self.records})
+        self.colors = dict(zip(measured, period_colors(len(measured)), strict=True))
         methods = dict.fromkeys([*(r.method for r in self.records), *published.methods.values()])
         self.methods = _file_names(methods)
 
@@ -156,7 +159,7 @@ class _Site:
 
     def _scene_page(self, scene: str, file: str, pictures: dict[str, Any] | None) -> None:
         printed = self.printed[self.printed.scene == scene]
-        groups = [_group(*group, printed) for group in self._groups([scene])]
+        groups = [_group(*group, printed, self.colors) for group in self._groups([scene])]
         if not groups:
             columns = [(name, "macro", metric_info(name).title) for name in PAPER_METRICS]
             columns.append((SIZE, "", COSTS[SIZE]))
@@ -230,9 +233,16 @@ Column = tuple[str, str, str]
 
 
 def _group(
-    setting: Setting, runs: Sequence[RunRecord], part: DataFrame, printed: DataFrame
+    setting: Setting,
+    runs: Sequence[RunRecord],
+    part: DataFrame,
+    printed: DataFrame,
+    colors: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Table and plots of runs that may stand side by side."""
+    """Make the table and the plots of runs that may stand side by side.
+
+    ``colors``: by the name of a method.
+    """
     labels = runs[0].period_labels
     periods = sorted({i for run in runs for i in run.periods}, key=int)
     names = metric_names(runs)
@@ -243,20 +253,22 @@ def _group(
         *((name, "macro", metric_info(name).title) for name in others),
         *((name, "", title) for name, title in COSTS.items()),
     ]
-    means = part[(part.quantity == quality) & (part.column == "macro")].set_index("label")
+    table = _table(columns, part, printed)
+    legend = {i: (row["label"], colors[row["method"]]) for i, row in enumerate(table["rows"], 1)}
+    values = part[part.column.isin(("macro", ""))].set_index(["label", "quantity"])["mean"]
     plots = []
     for name, cost in (("seconds", "training time [s]"), (SIZE, "size of the model [MB]")):
-        costs = part[part.quantity == name].set_index("label")["mean"]
         points = [
-            Point(label.partition(" (")[0], float(in_unit(name, costs[label])), value)
-            for label, value in means["mean"].items()
-            if label in costs
+            Point(i, float(in_unit(name, values[label, name])), values[label, quality])
+            for i, (label, _) in legend.items()
+            if {(label, name), (label, quality)} <= {*values.index}
         ]
-        plots.append(plot(points, cost=cost, quality=metric_info(quality).title))
+        plots.append(plot(points, legend, cost=cost, metric=quality))
     return {
-        **_table(columns, part, printed),
+        **table,
         "setting": setting,
         "plots": [p for p in plots if p is not None],
+        "legend": legend,
         "devices": list(dict.fromkeys(run.device for run in runs)),
         "commits": list(dict.fromkeys(run.commit[:10] for run in runs)),
     }

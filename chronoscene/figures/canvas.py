@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 from warnings import catch_warnings, filterwarnings
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from chronoscene.io.staging import replacing
@@ -56,6 +59,37 @@ def save(figure: Any, path: Path) -> None:
     with rc_context(settings), replacing(path) as partial, catch_warnings():
         filterwarnings("ignore", "Glyph .* missing")  # no font here has it: boxes stand for it
         figure.savefig(partial, format=form, dpi=DPI, **by_format[form])
+
+
+def inline_svg(figure: Any, label: str, titles: Mapping[str, str]) -> Markup:
+    """Return a figure as an ``<svg>`` element for a page; equal figures give equal text.
+
+    Letters are text in the page, so that they can be selected and searched.
+
+    Args:
+        figure: The figure.
+        label: Description for readers who do not see it.
+        titles: What a browser shows while it points at an artist, by the gid of the artist.
+    """
+    from matplotlib import rc_context
+
+    text = StringIO()
+    with rc_context({"svg.hashsalt": "chronoscene", "svg.fonttype": "none"}):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    # What stands before the first group is for files. Names of groups would clash in a page.
+    body = text.getvalue()
+    body = re.sub(
+        '<g id="(.*?)">',
+        lambda found: (
+            Markup("<g><title>{}</title>").format(titles[found[1]]) if found[1] in titles else "<g>"
+        ),
+        body[body.index("<g ") :],
+    )
+    width, height = figure.get_size_inches() * 72
+    return Markup(
+        '<svg class="plot" viewBox="0 0 {:g} {:g}" role="img" stroke-linejoin="round" '
+        'aria-label="{}">\n{}'
+    ).format(width, height, label, Markup(body))
 
 
 def add_legend(figure: Any, entries: Sequence[tuple[str, str]], **place: Any) -> None:

@@ -9,9 +9,12 @@ from pathlib import Path
 from textwrap import fill, wrap
 from typing import Any
 
+from markupsafe import Markup
+
 from chronoscene.figures import canvas
 
 PANEL = (2.7, 2.3)  # Width and height in inches
+PAGE_PANEL = (3.4, 2.5)  # The same for panels in pages
 MAX_COLUMNS = 4
 """Panels side by side; what is more goes on below."""
 LEGEND_LINE, LEGEND_COLUMN = 0.155, 4.0  # Inches
@@ -92,6 +95,15 @@ def draw_fronts(
     canvas.save(figure, path)
 
 
+def panel_svg(panel: Panel, legend: Mapping[int, tuple[str, str]]) -> Markup:
+    """Draw one panel for a page; ``legend``: name and color of each number."""
+    figure = canvas.new_figure(*PAGE_PANEL)
+    figure.set_layout_engine("constrained")
+    _draw_panel(figure.add_subplot(), panel, {i: color for i, (_, color) in legend.items()})
+    titles = {f"mark-{i}": name for i, (name, _) in legend.items()}
+    return canvas.inline_svg(figure, f"{panel.y_label} by {panel.x_label}", titles)
+
+
 def _draw_panel(axes: Any, panel: Panel, colors: Mapping[int, str]) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
@@ -147,7 +159,9 @@ def _draw_mark(axes: Any, mark: Mark, color: str) -> None:
         zorder=level,
     )
     style = {"markerfacecolor": face, "markeredgecolor": color, "markeredgewidth": 0.9}
-    axes.plot(mark.x, mark.y, "o", markersize=DISC, zorder=level, **style)
+    axes.plot(
+        mark.x, mark.y, "o", markersize=DISC, zorder=level, gid=f"mark-{mark.number}", **style
+    )
     axes.annotate(
         str(mark.number),
         (mark.x, mark.y),

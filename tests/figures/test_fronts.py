@@ -1,11 +1,13 @@
 """Pareto fronts as panels: every configuration is there, the front is drawn as steps."""
 
+from xml.etree import ElementTree
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from chronoscene.figures.canvas import EIGHT
-from chronoscene.figures.fronts import Mark, Panel, _draw_panel, _limits, draw_fronts
+from chronoscene.figures.fronts import Mark, Panel, _draw_panel, _limits, draw_fronts, panel_svg
 
 MARKS = [Mark(1, 1.0, 20.0, 0.1, 0.5, True), Mark(2, 9.0, 25.0, 0.0, 0.0, True)]
 MARKS.append(Mark(3, 20.0, 19.0, 0.0, 0.0, False))
@@ -47,3 +49,12 @@ def test_costs_that_hardly_differ_are_not_spread():
     assert high / low == pytest.approx(2) and low * high == pytest.approx(90.02**2)
     low, high = _limits([Mark(1, 1.0, 1.0, 3.0, 0.0, True), Mark(2, 50.0, 1.0, 5.0, 0.0, True)])
     assert 0 < low < 0.5 and high > 55
+
+
+def test_a_panel_in_a_page_has_text_titles_and_equal_bytes():
+    panel = Panel("", "cost <s>", "quality", [Mark(1, 1.0, 2.0, 0.0, 0.0, True)], False)
+    svg, again = (panel_svg(panel, {1: ("<b>", "#aa0000")}) for _ in range(2))
+    assert svg == again and "cost &lt;s&gt;</text>" in svg and "<title>&lt;b&gt;</title>" in svg
+    root = ElementTree.fromstring(svg.replace("xlink:", ""))
+    assert root.get("aria-label") == "quality by cost <s>"
+    assert not [element for element in root.iter("g") if element.get("id")]

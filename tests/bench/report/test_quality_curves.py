@@ -1,10 +1,11 @@
-"""Curves lie where their values are, one per model."""
+"""Curves have the values of the probes, one line per model, and a legend that tells them apart."""
 
-import pytest
+import re
+
 from made_runs import record
 
 from chronoscene.bench.files.records import CURVE_FILE
-from chronoscene.bench.report.quality_curves import COLORS, DASHES, HEIGHT, LEFT, WIDTH, draw_curves
+from chronoscene.bench.report.quality_curves import STYLES, draw_curves
 
 HEADER = "seconds,iteration,primitives,psnr,parameters,model\n"
 
@@ -15,37 +16,31 @@ def run(folder, text, **changes):
     return record(folder=folder, **changes)
 
 
-def test_points_lie_on_the_scales_of_the_axes(tmp_path):
+def test_every_finite_probe_is_drawn_with_its_values(tmp_path):
     joint = run(tmp_path / "a", "5,1,1,20,1,all\n10,2,1,24,1,all\n", method="a")
     parts = "2,1,1,21,1,period-0\n4,1,1,nan,1,period-0\n3,1,1,inf,1,period-1\n3,1,1,22,1,period-2\n"
-    separate = run(tmp_path / "b", parts, method="b", strategy="separate")
+    separate = run(tmp_path / "b", parts, method="b<i>", strategy="separate")
     curves = draw_curves([joint, separate, record(folder=tmp_path)])
-    x, y = (
-        {float(text): place for place, text in ticks} for ticks in (curves.x_ticks, curves.y_ticks)
-    )
-    first, *others = curves.lines
-    assert [spot[:2] for spot in first.points] == [
-        (x[5] if 5 in x else pytest.approx((x[4] + x[6]) / 2), y[20]),
-        (x[10], y[24]),
+    assert re.findall("<title>(.*?)</title>", curves.svg) == [
+        "A (joint, fast): 20.00 dB at 5.0 s",
+        "A (joint, fast): 24.00 dB at 10.0 s",
+        "B&lt;I&gt; (separate, fast), period-0: 21.00 dB at 2.0 s",
+        "B&lt;I&gt; (separate, fast), period-2: 22.00 dB at 3.0 s",
     ]
-    assert first.points[0][2] == "A (joint, fast): 20.00 dB at 5.0 s"
-    assert [line.points[0][2] for line in others] == [
-        "B (separate, fast), period-0: 21.00 dB at 2.0 s",
-        "B (separate, fast), period-2: 22.00 dB at 3.0 s",
-    ]
-    assert len(others[0].points) == 1  # values that are not finite are nowhere
-    assert curves.methods == {
-        "A (joint, fast)": (COLORS[0], ""),
-        "B (separate, fast)": (COLORS[1], ""),
-    }
-    assert x[0] == LEFT and max(x.values()) < WIDTH and y[24] < y[20] < HEIGHT
+    assert [*curves.legend] == ["A (joint, fast)", "B<I> (separate, fast)"]
+    assert all(color in curves.svg for color, _ in curves.legend.values())
+    assert "training [s]</text>" in curves.svg and "PSNR [dB]</text>" in curves.svg
 
 
-def test_more_methods_than_colors_have_dashes(tmp_path):
-    names = [f"m{i}" for i in range(len(COLORS) + 1)]
-    found = [run(tmp_path / name, "5,1,1,20,1,all\n", method=name) for name in names]
-    keys = [*draw_curves(found).methods.values()]
-    assert len({*keys}) == len(keys) and keys[-1] == (COLORS[0], DASHES[1])
+def test_configurations_of_a_method_share_its_color_and_differ_in_style(tmp_path):
+    found = [
+        run(tmp_path / f"{method}{preset}", "5,1,1,20,1,all\n", method=method, preset=preset)
+        for method in ("a", "b")
+        for preset in ("fast", "paper")
+    ]
+    (a, b, c, d) = draw_curves(found).legend.values()
+    assert a[0] == b[0] != c[0] == d[0]
+    assert [style for _, style in (a, b, c, d)] == [*STYLES[:2], *STYLES[:2]]
 
 
 def test_runs_of_other_programs_have_none(tmp_path):
