@@ -32,7 +32,7 @@ from chronoscene.stats.counts import COUNT_RULES, CountRule
 from chronoscene.stats.measures import measure_scene
 from chronoscene.validation.rule import SceneReport
 from chronoscene.validation.rules import choose_rules
-from chronoscene.validation.run import Reading, find_folders, validate_scene
+from chronoscene.validation.run import ReadOptions, find_folders, validate_scene
 
 if TYPE_CHECKING:
     from pandas import DataFrame, Series
@@ -96,7 +96,7 @@ def validate(
             found=f"a folder of {len(found)} scenes",
             todo="validate them one by one",
         )
-    return validate_scene(path, rules=rules, decode=decode, reading=Reading(format, period_by))
+    return validate_scene(path, rules=rules, decode=decode, options=ReadOptions(format, period_by))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from chronoscene.checks import check_choice
-from chronoscene.formats import load_format, model_notes, read_scene, writable_formats
+from chronoscene.formats import detect, load_format, writable_formats
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.io.staging import check_outside
 from chronoscene.scene import Scene
@@ -56,9 +56,9 @@ def convert(
     """
     check_choice("--to", target, writable_formats())
     check_outside(out, [source])
-    scene = read_scene(source, format=source_format, period_by=period_by)
-    notes = model_notes(source, scene.format)
-    warnings = (*notes, *remarks_on(scene), *losses(scene, target), *obstacles(scene))
+    detected = detect(source, format=source_format, period_by=period_by)
+    scene = detected.read()
+    warnings = (*detected.notes, *remarks_on(scene), *losses(scene, target), *obstacles(scene))
     load_format(target).write(scene, out, image_source=image_source, progress=progress)
     return Conversion(scene, out, target, warnings)
 

@@ -6,22 +6,28 @@ A module has ``NAME``, ``MARKS``, ``matches(path)`` and ``read(path)``, and wher
   the scene the format cannot hold;
 - ``PERIOD_BY``, the values of ``read(path, period_by=...)``, where periods can be chosen;
 - ``assign(images, names, ...)``, which a format has whose periods follow from the image names of a
-  COLMAP model: so the validator can look at that model as it is;
+  COLMAP model: so the validator can look at that model as it is. Then `detect` looks for the model,
+  and the functions are ``matches(path, model)`` and ``read(path, model=..., ...)``;
 - ``remarks(path)``, which lists what of a folder does not become part of the scene.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from chronoscene.checks import check_choice
 from chronoscene.colmap.raw_model import find_model, find_stray_model
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Scene
+from chronoscene.scene.splits import SPLIT
+
+if TYPE_CHECKING:
+    from chronoscene.formats.shared.colmap_layout import Assigned  # it loads pycolmap
 
 FORMATS = {
     "chronoscene": "chronoscene.formats.chronoscene",
@@ -40,10 +46,10 @@ ENTRY_POINT_GROUP = "chronoscene.formats"
 USUAL = ("sparse/0", "sparse")  # Where everybody looks for a COLMAP model
 
 COLMAP = "colmap-folders"
-"""What a COLMAP project is read as where ``--period-by`` says what its periods are."""
+"""Format of a COLMAP project where ``--period-by`` says what its periods are."""
 
 FAR_UP = 4
-"""How far above a wrong folder the right one may be: ``dense/0/sparse/0`` has four folders."""
+"""Levels above a wrong folder at which the right one may be: ``dense/0/sparse/0`` has four."""
 
 
 @cache
@@ -58,7 +64,7 @@ def format_names() -> tuple[str, ...]:
 
 
 def load_format(name: str) -> Any:
-    """Module of a format.
+    """Load the module of a format.
 
     Raises:
         ConfigError: If the format is unknown; lists the known ones.
@@ -67,31 +73,104 @@ def load_format(name: str) -> Any:
     return import_module(installed_formats()[name])
 
 
-def detect_format(path: Path, *, period_by: str | None = None) -> str:
-    """Name of the one format whose marks a folder has.
+FoundModel = tuple[str, str]
+"""Folders of a COLMAP model and of its images, both below the scene folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class DetectedFormat:
+    """A scene folder with its format and the COLMAP model in it, ready to be read."""
+
+    path: Path
+    name: str
+    model: FoundModel | None = None
+    """None if there is none, or the format needs none."""
+    period_by: str | None = None
+    others: tuple[str, ...] = ()
+    """Further formats whose marks the folder has: a user must name one."""
+
+    @property
+    def options(self) -> dict[str, str]:
+        """Arguments on periods of ``read`` and ``assign``.
+
+        Raises:
+            ConfigError: If the format leaves no choice of periods.
+        """
+        if self.period_by is None:
+            return {}
+        if not hasattr(load_format(self.name), "PERIOD_BY"):
+            raise ConfigError(
+                "--period-by",
+                expected=f"no such option for {self.name}, which defines its own periods",
+                found=repr(self.period_by),
+                todo="leave it out, or name another --dataset-format",
+            )
+        return {"period_by": self.period_by}
+
+    @property
+    def is_by_names(self) -> bool:
+        """True if the periods follow from the image names of a COLMAP model."""
+        return hasattr(load_format(self.name), "assign")
+
+    @property
+    def notes(self) -> list[str]:
+        """Place of the model that is read, if it is an unusual one."""
+        if self.model is None or not self.is_by_names or self.model[0] in USUAL:
+            return []
+        folder, images = self.model
+        return [f"the model is read from {folder or 'the folder itself'}, the images from {images}"]
+
+    def check_single(self) -> None:
+        """Raise a `SceneError` if the folder has marks of several formats."""
+        if self.others:
+            raise SceneError(
+                self.path,
+                expected="a folder of one format",
+                found=f"marks of {' and '.join([self.name, *self.others])}",
+                todo="name one with --dataset-format, in chronoscene convert or in this command",
+            )
+
+    def assign(self, names: list[str]) -> Assigned:
+        """Assign periods to the images of the model with these names."""
+        images = self.path / (self.model[1] if self.model else "images")
+        assigned: Assigned = load_format(self.name).assign(images, names, **self.options)
+        return assigned
+
+    def read(self) -> Scene:
+        """Read the scene; see `read_scene`."""
+        self.check_single()
+        model = {"model": self.model} if self.is_by_names else {}
+        scene: Scene = load_format(self.name).read(self.path, **model, **self.options)
+        return scene
+
+
+def detect(
+    path: Path, *, format: str | None = None, period_by: str | None = None
+) -> DetectedFormat:
+    """Find the format of a scene folder and its COLMAP model, once.
 
     Args:
         path: Folder of one scene.
-        period_by: How images are to be grouped: then a COLMAP project needs no folders of periods.
+        format: Name of its format; None to find it by its marks.
+        period_by: Rule by which images are grouped: then a COLMAP project needs no folders of
+            periods.
 
     Raises:
-        SceneError: If no format matches; lists what was looked for.
+        SceneError: If no format matches, or several do; lists what was looked for.
+        ConfigError: If the format is unknown.
     """
+    if format is not None:
+        model = find_model(path) if hasattr(load_format(format), "assign") else None
+        return DetectedFormat(path, format, model, period_by)
     if not path.is_dir():
         found = "a file" if path.exists() else "nothing"
         raise SceneError(path, expected="a scene folder", found=found, todo="check the path")
-    matching = matching_formats(path, period_by)
-    if len(matching) == 1:
-        return matching[0]
-    if matching:
-        raise SceneError(
-            path,
-            expected="a folder of one format",
-            found=f"marks of {' and '.join(matching)}",
-            todo="name one with --dataset-format, in chronoscene convert or in this command",
-        )
-    if _is_colmap(path):
-        raise _no_periods(path)
+    detected, model = _match(path, period_by)
+    if detected is not None:
+        detected.check_single()
+        return detected
+    if _has_images(path, model):
+        raise _no_periods(path, model)
     if project := project_above(path):
         raise SceneError(
             path,
@@ -105,25 +184,40 @@ def detect_format(path: Path, *, period_by: str | None = None) -> str:
         path,
         expected=f"a scene of a known format ({looked_for})",
         found=", ".join(content[:8]) + (", ..." if len(content) > 8 else "") or "an empty folder",
-        todo=_advice(path),
+        todo=_advice(path, model),
     )
 
 
-def matching_formats(path: Path, period_by: str | None) -> list[str]:
-    """Names of the formats whose marks a folder has; see `detect_format`."""
-    matching = [name for name in format_names() if load_format(name).matches(path)]
-    return matching or ([COLMAP] if period_by is not None and _is_colmap(path) else [])
+def match_format(path: Path, *, period_by: str | None = None) -> DetectedFormat | None:
+    """Return the format whose marks a folder has, the first of several; None if there is none."""
+    return _match(path, period_by)[0]
 
 
-def _is_colmap(path: Path) -> bool:
-    """Whether a folder has a COLMAP model and the images that it is of."""
-    found = find_model(path)
-    return found is not None and (path / found[1]).is_dir()
+def _match(path: Path, period_by: str | None) -> tuple[DetectedFormat | None, FoundModel | None]:
+    """Match the marks of all formats; return the COLMAP model of the folder, too."""
+    # Beside split.txt, a model is of the ChronoScene format, which has it in one place only.
+    model = None if (path / SPLIT).exists() else find_model(path)
+    names = [name for name in format_names() if _has_marks(name, path, model)]
+    if not names and period_by is not None and _has_images(path, model):
+        names = [COLMAP]
+    if not names:
+        return None, model
+    return DetectedFormat(path, names[0], model, period_by, tuple(names[1:])), model
 
 
-def _advice(path: Path) -> str:
-    """What to do about a folder that no format matches."""
-    if model := find_model(path):
+def _has_marks(name: str, path: Path, model: FoundModel | None) -> bool:
+    module = load_format(name)
+    return bool(module.matches(path, model) if hasattr(module, "assign") else module.matches(path))
+
+
+def _has_images(path: Path, model: FoundModel | None) -> bool:
+    """Return True if a folder has the images of its COLMAP model."""
+    return model is not None and (path / model[1]).is_dir()
+
+
+def _advice(path: Path, model: FoundModel | None) -> str:
+    """Advice on a folder that no format matches."""
+    if model is not None:
         place = f"in {model[0]}" if model[0] else "here"
         return f"copy the images of the COLMAP model {place} to {model[1]}/ in this folder"
     advice = "give the folder of one scene; DATASET.md describes its files"
@@ -135,28 +229,20 @@ def _advice(path: Path) -> str:
     return advice
 
 
-def model_notes(path: Path, format: str) -> list[str]:
-    """Where the COLMAP model is that is read, if not where everybody would look for it."""
-    found = find_model(path) if hasattr(load_format(format), "assign") else None
-    if found is None or found[0] in USUAL:
-        return []
-    return [f"the model is read from {found[0] or 'the folder itself'}, the images from {found[1]}"]
-
-
 def project_above(path: Path) -> Path | None:
     """The COLMAP project that a folder is a part of."""
     above = path.resolve().parents[:FAR_UP]
-    return next((folder for folder in above if _is_colmap(folder)), None)
+    return next((folder for folder in above if _has_images(folder, find_model(folder))), None)
 
 
-def _no_periods(path: Path) -> SceneError:
+def _no_periods(path: Path, model: FoundModel | None) -> SceneError:
     from chronoscene.formats.shared.grouping import NAME_PERIODS  # it loads pycolmap
 
-    model, images = find_model(path) or ("", "")
+    folder, images = model or ("", "")
     return SceneError(
         path,
         expected=f"periods of the images: folders in {images}/, or sparse/split.txt",
-        found=f"neither beside the COLMAP model in {model or 'this folder'}",
+        found=f"neither beside the COLMAP model in {folder or 'this folder'}",
         todo=f"{NAME_PERIODS}, in chronoscene convert or in this command; or write "
         "sparse/split.txt as DATASET.md says",
     )
@@ -165,22 +251,22 @@ def _no_periods(path: Path) -> SceneError:
 def find_scenes(
     path: Path, *, format: str | None = None, period_by: str | None = None
 ) -> list[Path]:
-    """The scene folder itself, or the scenes directly inside a folder, sorted by name.
+    """Return the scene folder itself, or the scenes directly inside a folder, sorted by name.
 
     Raises:
         SceneError: If there is no scene; lists what was looked for.
     """
 
     def is_scene(folder: Path) -> bool:
-        matching = matching_formats(folder, period_by)
-        return bool(matching) if format is None else format in matching
+        found = match_format(folder, period_by=period_by)
+        return found is not None and format in (None, found.name, *found.others)
 
     if path.is_dir() and not is_scene(path):
         inside = sorted(child for child in path.iterdir() if child.is_dir() and is_scene(child))
         if inside:
             return inside
     if format is None:
-        detect_format(path, period_by=period_by)
+        detect(path, period_by=period_by)
     return [path]
 
 
@@ -191,35 +277,14 @@ def read_scene(
 
     Args:
         path: Folder of one scene.
-        format: Name of its format; None to find out.
-        period_by: How images are grouped into periods, where the format leaves a choice.
+        format: Name of its format; None to detect it.
+        period_by: Rule by which images are grouped into periods, where the format leaves a choice.
 
     Raises:
         SceneError: If the folder is of no known format, or damaged.
         ConfigError: If the format or the grouping is unknown.
     """
-    path = Path(path)
-    name = format if format is not None else detect_format(path, period_by=period_by)
-    scene: Scene = load_format(name).read(path, **period_options(name, period_by))
-    return scene
-
-
-def period_options(name: str, period_by: str | None) -> dict[str, str]:
-    """Arguments of ``read`` and ``assign`` of a format.
-
-    Raises:
-        ConfigError: If the format leaves no choice of periods.
-    """
-    if period_by is None:
-        return {}
-    if not hasattr(load_format(name), "PERIOD_BY"):
-        raise ConfigError(
-            "--period-by",
-            expected=f"no such option for {name}, which defines its own periods",
-            found=repr(period_by),
-            todo="leave it out, or name another --dataset-format",
-        )
-    return {"period_by": period_by}
+    return detect(Path(path), format=format, period_by=period_by).read()
 
 
 def writable_formats() -> tuple[str, ...]:

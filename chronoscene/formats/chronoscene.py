@@ -24,9 +24,7 @@ from chronoscene.io.staging import leads_out, staged_folder
 from chronoscene.scene import Frame, Period, Scene, WorldFrame, splits
 
 NAME = "chronoscene"
-MARKS = "sparse/split.txt"  # What `matches` looks for
-
-SPLIT = "sparse/split.txt"
+MARKS = SPLIT = splits.SPLIT
 TEST = "sparse/0/test.txt"
 MODEL = "sparse/0"
 PERIODS = "sparse/periods.json"

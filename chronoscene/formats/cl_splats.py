@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 
 from chronoscene.errors import SceneError
+from chronoscene.formats import FoundModel
 from chronoscene.formats.shared import colmap_layout, transforms
 from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
 from chronoscene.formats.shared.ply import read_points
@@ -45,31 +46,27 @@ POINTS = "points3d.ply"
 _DAY = re.compile(r"day_([0-9]{1,9})_")
 
 
-def matches(path: Path) -> bool:
-    """Whether a folder is a real scene or a rendered level."""
-    return _is_level(path) or _is_real(path)
+def matches(path: Path, model: FoundModel | None) -> bool:
+    """Return True if a folder is a real scene or a rendered level."""
+    if model is not None and any(map(_DAY.match, colmap_layout.scan(path / model[1])[1])):
+        return True
+    return _is_level(path)
 
 
 def _is_level(path: Path) -> bool:
     return (path / TRAIN).is_file() and any((path / c / TRAIN).is_file() for c in CHANGES)
 
 
-def _is_real(path: Path) -> bool:
-    found = colmap_layout.find_model(path)
-    return found is not None and any(map(_DAY.match, colmap_layout.scan(found[1])[1]))
-
-
-def read(path: Path, *, period_by: str = "step") -> Scene:
+def read(path: Path, *, period_by: str = "step", model: FoundModel | None = None) -> Scene:
     """Read a scene.
 
     Raises:
         SceneError: If it is damaged.
         ConfigError: If ``period_by`` is not in `PERIOD_BY`, or the change is not there.
     """
-    path = Path(path)
     if (path / TRAIN).exists():
         return _read_level(path, period_by)
-    return colmap_layout.read_scene(path, partial(assign, period_by=period_by), NAME)
+    return colmap_layout.read_scene(path, model, partial(assign, period_by=period_by), NAME)
 
 
 def assign(images: Path, names: list[str], *, period_by: str = "step") -> colmap_layout.Assigned:

@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from chronoscene.errors import SceneError
-from chronoscene.formats import nerfstudio, wat
+from chronoscene.formats import FoundModel, nerfstudio, wat
 from chronoscene.formats.shared import colmap_layout, grouping
 from chronoscene.images.exif import capture_times
 from chronoscene.images.store import ImageSource, Progress
@@ -30,26 +30,25 @@ PERIOD_BY = ("folder", *DATES, "table:FILE")
 and period."""
 
 
-def matches(path: Path) -> bool:
-    """Whether a folder has images in folders and a model, and is not clearly of WAT."""
-    found = colmap_layout.find_model(path)
-    if found is None or not colmap_layout.is_in_folders(found[1]):
+def matches(path: Path, model: FoundModel | None) -> bool:
+    """Return True if a folder has images in folders and a model, and is not clearly of WAT."""
+    if model is None or not colmap_layout.is_in_folders(path / model[1]):
         return False
-    if found[0] == path / nerfstudio.COLMAP and nerfstudio.matches(path):
+    if model[0] == nerfstudio.COLMAP and nerfstudio.matches(path):
         return False  # a model that nerfstudio made its file from
-    folders, _ = colmap_layout.scan(found[1])
+    folders, _ = colmap_layout.scan(path / model[1])
     # Where both formats put the folders in the same order, WAT wins; else one must be named.
-    return not (wat.matches(path) and folders == sorted(folders, key=grouping.natural_key))
+    return not (wat.matches(path, model) and folders == sorted(folders, key=grouping.natural_key))
 
 
-def read(path: Path, *, period_by: str = "folder") -> Scene:
+def read(path: Path, *, period_by: str = "folder", model: FoundModel | None = None) -> Scene:
     """Read a scene.
 
     Raises:
         SceneError: If it is damaged, or images are not in folders.
         ConfigError: If ``period_by`` is not in `PERIOD_BY`.
     """
-    return colmap_layout.read_scene(Path(path), partial(assign, period_by=period_by), NAME)
+    return colmap_layout.read_scene(path, model, partial(assign, period_by=period_by), NAME)
 
 
 def assign(images: Path, names: list[str], *, period_by: str = "folder") -> colmap_layout.Assigned:

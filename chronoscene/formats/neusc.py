@@ -23,6 +23,7 @@ from datetime import date
 from pathlib import Path, PurePosixPath
 
 from chronoscene.colmap.model import Model
+from chronoscene.colmap.raw_model import find_model
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared import colmap_layout
 from chronoscene.formats.shared.grouping import group_dates
@@ -43,11 +44,10 @@ LISTS = ("annots", "")
 
 
 def matches(path: Path) -> bool:
-    """Whether a folder has an undistorted model below ``dense/``."""
-    if colmap_layout.find_model(path / "dense") is None:
-        return False
+    """Return True if a folder has an undistorted model of dated images below ``dense/``."""
     _, images = colmap_layout.scan(path / "dense/images")
-    return any(re.match("[0-9]{4}-|none_", name, re.IGNORECASE) for name in images)
+    dated = any(re.match("[0-9]{4}-|none_", name, re.IGNORECASE) for name in images)
+    return dated and find_model(path / "dense") is not None
 
 
 def read(path: Path, *, period_by: str = "year") -> Scene:
@@ -58,7 +58,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
         ConfigError: If ``period_by`` is not in `PERIOD_BY`.
     """
     path = Path(path)
-    model, _ = colmap_layout.read_images(path / "dense")
+    model, _ = _read_images(path)
     used = _used_names(path, model)
     dates = {name: when for name in used if (when := _date(path, name)) is not None}
     if not dates:
@@ -82,7 +82,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
 
 def remarks(path: Path) -> list[str]:
     """What is there and not part of a scene."""
-    model, _ = colmap_layout.read_images(path / "dense")
+    model, _ = _read_images(path)
     left_out = len(model.images) - len([n for n in _used_names(path, model) if _date(path, n)])
     found = []
     if left_out:
@@ -101,6 +101,11 @@ def remarks(path: Path) -> list[str]:
     if (path / "semantic_maps").is_dir():
         found.append("semantic_maps/ (sky, people) is not read")
     return found
+
+
+def _read_images(path: Path) -> tuple[Model, Path]:
+    dense = path / "dense"
+    return colmap_layout.read_images(dense, find_model(dense))
 
 
 def _used_names(path: Path, model: Model) -> list[str]:

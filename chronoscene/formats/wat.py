@@ -21,6 +21,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from chronoscene.errors import SceneError
+from chronoscene.formats import FoundModel
 from chronoscene.formats.shared import colmap_layout
 from chronoscene.formats.shared.grouping import group_labels
 from chronoscene.images.store import ImageSource, Progress
@@ -42,20 +43,20 @@ SCENES = (
 """Names of the scenes; some are also there as ``<name>_resized``."""
 
 
-def matches(path: Path) -> bool:
-    """Whether a folder has the name of a scene of WAT, and its layout."""
-    name = path.resolve().name.lower().removesuffix("_resized")
-    found = colmap_layout.find_model(path) if name in SCENES else None
-    return found is not None and colmap_layout.is_in_folders(found[1])
+def matches(path: Path, model: FoundModel | None) -> bool:
+    """Return True if a folder has the name of a scene of WAT, and its layout."""
+    if model is None or path.resolve().name.lower().removesuffix("_resized") not in SCENES:
+        return False
+    return colmap_layout.is_in_folders(path / model[1])
 
 
-def read(path: Path) -> Scene:
+def read(path: Path, *, model: FoundModel | None = None) -> Scene:
     """Read a scene.
 
     Raises:
         SceneError: If it is damaged, or images are not in folders.
     """
-    return colmap_layout.read_scene(Path(path), assign, NAME)
+    return colmap_layout.read_scene(path, model, assign, NAME)
 
 
 def assign(images: Path, names: list[str]) -> colmap_layout.Assigned:

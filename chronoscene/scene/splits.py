@@ -16,6 +16,8 @@ from typing import Literal
 from chronoscene.errors import SceneError
 from chronoscene.scene import Scene, Split
 
+SPLIT = "sparse/split.txt"  # Place of the period table in a scene folder
+
 TEST_EVERY = 8  # The default split takes the images 0, 8, 16, ... of each period for testing.
 
 DEFAULT_RULE = "every 8th image of each period in name order (index 0, 8, ...)"

@@ -8,17 +8,16 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from chronoscene import formats
-from chronoscene.colmap.raw_model import find_model, model_files
+from chronoscene.colmap.raw_model import model_files
 from chronoscene.convert import remarks_on
 from chronoscene.errors import ChronoSceneError, SceneError
+from chronoscene.formats import DetectedFormat
 from chronoscene.formats import chronoscene as our_format
-from chronoscene.formats import load_format
 from chronoscene.images.masks import mask_place
 from chronoscene.images.store import place_image
 from chronoscene.io.wording import printable
@@ -45,16 +44,16 @@ RELEASED_CODE = "CS7"  # Codes of the rules on what the released ChronoGS code r
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
-    """What a user says of the scenes: how to read them."""
+class ReadOptions:
+    """Options of a user on how to read scenes."""
 
     format: str | None = None
-    """Name of the format; None to find out."""
+    """Name of the format; None to detect it."""
     period_by: str | None = None
-    """How images are grouped into periods, where the format leaves a choice."""
+    """Rule by which images are grouped into periods, where the format leaves a choice."""
 
 
-AS_DETECTED = Reading()
+DETECT = ReadOptions()
 
 UNKNOWN = Summary(None, None, None, None, 0, ())
 
@@ -98,49 +97,47 @@ def _looks_like_scene(path: Path) -> bool:
     return ours or other_format(path) is not None
 
 
-def other_format(path: Path, reading: Reading = AS_DETECTED) -> str | None:
-    """The format of a folder that is not in the ChronoScene format, not even with faults.
+def other_format(path: Path, options: ReadOptions = DETECT) -> DetectedFormat | None:
+    """Detect the format of a folder that is not in the ChronoScene format, not even with faults.
 
-    A ``split.txt`` in a wrong place says that it is meant to be. Of several formats the first: that
-    there are several is found when it is read.
+    A ``split.txt`` in a wrong place shows that it is meant to be. Of several formats the first is
+    returned: reading the scene reports that there are several.
     """
-    if reading.format is not None:
-        return None if reading.format == our_format.NAME else reading.format
+    if options.format is not None:
+        if options.format == our_format.NAME:
+            return None
+        return formats.detect(path, format=options.format, period_by=options.period_by)
     if our_format.matches(path) or any((path / place).is_file() for place in SPLIT_ELSEWHERE):
         return None
     try:
-        return next(iter(formats.matching_formats(path, reading.period_by)), None)
+        return formats.match_format(path, period_by=options.period_by)
     except OSError:
         return None
 
 
-def is_project(path: Path, format: str) -> bool:
-    """Whether a folder of another format is a COLMAP project that can be checked where it is."""
-    found = find_model(path)
-    return found is not None and found[1] == "images" and hasattr(load_format(format), "assign")
+def is_project(detected: DetectedFormat) -> bool:
+    """Return True if a scene is a COLMAP project that can be checked where it is."""
+    model = detected.model
+    return detected.is_by_names and model is not None and model[1] == "images"
 
 
-def _project(scene: RawScene, format: str, reading: Reading) -> Origin:
-    """A COLMAP project, with its periods as its format sees them."""
-    notes = formats.model_notes(scene.root, format)
-    read = partial(formats.read_scene, scene.root, format=format, period_by=reading.period_by)
-    options = formats.period_options(format, reading.period_by)
+def _read_project(scene: RawScene, detected: DetectedFormat) -> Origin:
+    """Assign periods to the images of a COLMAP project as its format defines them."""
     try:
-        if reading.format is None:
-            formats.detect_format(scene.root, period_by=reading.period_by)
-        assigned = load_format(format).assign(scene.root / "images", scene.names, **options)
+        detected.check_single()
+        assigned = detected.assign(scene.names)
     except SceneError as error:
-        return Origin(format, error, notes, read=read)
-    return Origin(format, None, notes, read=read, assigned=assigned if scene.names else None)
+        return Origin(detected, is_project=True, error=error)
+    return Origin(detected, is_project=True, assigned=assigned if scene.names else None)
 
 
 @contextmanager
-def in_our_format(path: Path, format: str, reading: Reading) -> Iterator[tuple[Path, Origin]]:
+def in_our_format(detected: DetectedFormat) -> Iterator[tuple[Path, Origin]]:
     """A temporary ChronoScene folder of the scene, or its own one if it cannot be read."""
     with tempfile.TemporaryDirectory(prefix="chronoscene-") as temporary:
         ours = Path(temporary) / "scene"
         try:
-            scene = formats.read_scene(path, format=reading.format, period_by=reading.period_by)
+            scene = detected.read()
             our_format.write(scene, ours, image_source="none")
             (ours / "images").mkdir(exist_ok=True)
             for frame in scene.frames:
@@ -149,11 +146,10 @@ def in_our_format(path: Path, format: str, reading: Reading) -> Iterator[tuple[P
                     place_image(source, ours / "images" / frame.name, "symlink")
             for name, mask in scene.masks.items():
                 place_image(mask, ours / mask_place(name), "symlink")
-            notes = formats.model_notes(path, format)
-            origin = Origin(format, None, notes, tuple(remarks_on(scene)))
+            origin = Origin(detected, remarks=tuple(remarks_on(scene)))
         except SceneError as error:
-            origin = Origin(format, error)
-        yield path if origin.error else ours, origin
+            origin = Origin(detected, error=error)
+        yield detected.path if origin.error else ours, origin
 
 
 def validate_scene(
@@ -162,7 +158,7 @@ def validate_scene(
     rules: Sequence[Rule] | None = None,
     decode: bool = False,
     track: Track = no_progress,
-    reading: Reading = AS_DETECTED,
+    options: ReadOptions = DETECT,
 ) -> SceneReport:
     """Run rules on one scene folder. Reads only; never raises for what is in the folder.
 
@@ -174,20 +170,23 @@ def validate_scene(
         rules: Rules to run (see `chronoscene.validation.rules.choose_rules`); None for all.
         decode: Whether to decode all images: slower, finds damaged pixels and copied images.
         track: Shows the progress of slow parts.
-        reading: What the user says of the format and the periods.
+        options: How to read the scene.
 
     Raises:
         ConfigError: If the format has no such periods.
     """
     path = Path(path)
     chosen = all_rules() if rules is None else rules
-    name = other_format(path, reading)
+    detected = other_format(path, options)
     with quiet_numbers():
-        if name is None or is_project(path, name):
-            scene = RawScene(path, decode=decode, track=track)
-            scene.origin = None if name is None else _project(scene, name, reading)
+        if detected is None:
+            return _validate(RawScene(path, decode=decode, track=track), chosen)
+        if is_project(detected):
+            project = Origin(detected, is_project=True)
+            scene = RawScene(path, decode=decode, track=track, origin=project)
+            scene.origin = _read_project(scene, detected)
             return _validate(scene, chosen)
-        with in_our_format(path, name, reading) as (root, origin):
+        with in_our_format(detected) as (root, origin):
             scene = RawScene(root, decode=decode, track=track, origin=origin)
             report = _validate(scene, chosen)
     return replace(report, name=printable(path.resolve().name), path=path)
@@ -231,9 +230,9 @@ def _reason_to_skip(rule: Rule, scene: RawScene, findings: Sequence[Finding]) ->
     origin = scene.origin
     if origin is not None and origin.is_project:
         if rule.code.startswith(RELEASED_CODE):
-            return f"the released code does not read {origin.format}"
+            return f"the released code does not read {origin.detected.name}"
     elif origin is not None and origin.error and rule.code not in RULES_ON_ORIGINS:
-        return f"the folder cannot be read as {origin.format}"
+        return f"the folder cannot be read as {origin.detected.name}"
     for attribute in rule.needs:
         if getattr(scene, attribute) is None:
             return scene.reason(attribute)

@@ -11,7 +11,7 @@ import pytest
 
 from chronoscene.colmap.model import PosedImage
 from chronoscene.errors import ChronoSceneError, ConfigError, SceneError
-from chronoscene.formats import detect_format, find_scenes, read_scene
+from chronoscene.formats import detect, find_scenes, read_scene
 from chronoscene.formats.chronoscene import check_image, read_periods, write
 from chronoscene.formats.shared.json_values import is_iso_date
 from chronoscene.scene import Camera, Period, WorldFrame
@@ -311,7 +311,7 @@ def test_errors_name_what_was_looked_for(make_scene_folder, tmp_path):
         read_scene(tmp_path / "nowhere")
     folder = make_scene_folder()
     with pytest.raises(SceneError, match="expected a scene folder, found a file"):
-        detect_format(folder / "sparse/split.txt")
+        detect(folder / "sparse/split.txt")
     with pytest.raises(ConfigError, match=r"expected one of .*chronoscene.*'chronoscnee'; did you"):
         read_scene(folder, format="chronoscnee")
     shutil.rmtree(folder / "sparse/0")

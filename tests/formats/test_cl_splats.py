@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from chronoscene.errors import ConfigError, ImageError, SceneError
-from chronoscene.formats import cl_splats, detect_format, read_scene
+from chronoscene.formats import cl_splats, detect, read_scene
 from chronoscene.formats.shared.ply import write_points
 from chronoscene.scene import Camera
 
@@ -90,7 +90,7 @@ def test_a_missing_image_whose_size_is_needed(level):
 def test_what_is_written_says_the_time_step_in_the_name(make_scene_folder, tmp_path, names):
     scene = read_scene(make_scene_folder({name: min(i, 1) for i, name in enumerate(names)}))
     out = cl_splats.write(scene, tmp_path / "out", image_source="symlink")
-    assert detect_format(out) == "cl-splats"
+    assert detect(out).name == "cl-splats"
     again = read_scene(out)
     sources = {again.image_path(f).resolve(): f for f in again.frames}
     for frame in scene.frames:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats import colmap_folders, detect_format, find_scenes, model_notes, read_scene
+from chronoscene.formats import colmap_folders, detect, find_scenes, read_scene
 from chronoscene.formats.shared.colmap_layout import period_folders
 from chronoscene.formats.shared.grouping import natural_key, read_table
 from chronoscene.scene import Period
@@ -40,7 +40,7 @@ def test_model_directly_in_sparse(colmap_folder):
     for file in (folder / "sparse/0").iterdir():
         file.rename(folder / "sparse" / file.name)
     (folder / "sparse/0").rmdir()
-    assert detect_format(folder) == "colmap-folders"
+    assert detect(folder).name == "colmap-folders"
     assert len(read_scene(folder).frames) == 4
 
 
@@ -228,13 +228,13 @@ def move_model(folder, place, images="images"):
 def test_models_are_found_where_programs_leave_them(colmap_folder, place, images):
     folder = colmap_folder(DATED)
     old = read_scene(folder)
-    assert model_notes(folder, old.format) == []
+    assert detect(folder, format=old.format).notes == []
     move_model(folder, place, images)
     scene = read_scene(folder)
     assert scene.format == "colmap-folders" and scene.periods == old.periods
     assert scene.image_path(scene.frames[0]).is_file()
     said = f"the model is read from {place}, the images from {images}"
-    assert model_notes(folder, scene.format) == [said]
+    assert detect(folder, format=scene.format).notes == [said]
     assert find_scenes(folder.parent) == [folder]
 
 
@@ -250,7 +250,7 @@ def test_the_usual_place_wins(colmap_folder):
 def test_a_model_of_nerfstudio_is_not_read_in_its_stead(nerfstudio_folder, colmap_folder):
     folder = nerfstudio_folder(DATED)
     shutil.copytree(colmap_folder(DATED) / "sparse", folder / "colmap/sparse")
-    assert detect_format(folder) == "nerfstudio"
+    assert detect(folder).name == "nerfstudio"
     assert read_scene(folder, format="colmap-folders").num_periods == 2
 
 

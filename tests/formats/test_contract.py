@@ -8,7 +8,14 @@ import pytest
 
 from chronoscene.convert import losses
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats import FORMATS, detect_format, load_format, read_scene, writable_formats
+from chronoscene.formats import (
+    FORMATS,
+    detect,
+    load_format,
+    match_format,
+    read_scene,
+    writable_formats,
+)
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import split_hash
@@ -56,12 +63,12 @@ def test_module_says_what_it_is(sample):
 
 def test_exactly_one_format_matches(sample):
     name, folder = sample
-    assert [n for n in FORMATS if load_format(n).matches(folder)] == [name]
-    assert detect_format(folder) == name
+    detected = detect(folder)
+    assert (detected.name, detected.others) == (name, ())
 
 
 def test_no_format_matches_an_empty_folder(tmp_path):
-    assert not any(load_format(n).matches(tmp_path) for n in FORMATS)
+    assert match_format(tmp_path) is None
 
 
 def test_frames(sample):

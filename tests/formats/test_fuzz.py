@@ -18,7 +18,7 @@ from PIL import Image
 from chronoscene.colmap.model import PosedImage
 from chronoscene.convert import convert
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats import FORMATS, detect_format, read_scene, writable_formats
+from chronoscene.formats import FORMATS, detect, read_scene, writable_formats
 from chronoscene.formats.chronoscene import check_image
 from chronoscene.formats.shared.ply import read_points
 from chronoscene.images.exif import capture_times
@@ -117,7 +117,7 @@ def use(rng, folder, name, out):
     beside = sorted(folder.parent.iterdir())
     try:
         if rng.random() < 0.2:
-            detect_format(folder)
+            detect(folder)
         scene = read_scene(folder, format=name)
         strategy = rng.choice(["stratified", "blocked", "date"])
         try:

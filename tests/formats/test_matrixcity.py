@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from chronoscene.errors import ConfigError, SceneError
-from chronoscene.formats import detect_format, matrixcity, read_scene
+from chronoscene.formats import detect, matrixcity, read_scene
 from chronoscene.scene.geometry import camera_centre
 
 EYE_FROM_NADIR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -61,7 +61,7 @@ def test_raw_poses_are_in_metres_with_scaled_rotation(raw_city):
 
 def test_a_block_alone_is_a_scene(raw_city):
     folder = raw_city(["block_A"]) / "block_A"
-    assert detect_format(folder) == "matrixcity"
+    assert detect(folder).name == "matrixcity"
     scene = read_scene(folder)
     assert [f.name for f in scene.frames] == ["0000.png", "0001.png", "0002.png"]
 
@@ -98,7 +98,7 @@ def test_train_dense_counts_where_it_is_alone(raw_city):
 
 
 def test_prepared_poses_are_in_units_of_100_m(prepared):
-    assert detect_format(prepared) == "matrixcity"
+    assert detect(prepared).name == "matrixcity"
     scene = read_scene(prepared)
     assert len(scene.frames) == 8 and scene.num_periods == 1
     assert len(scene.select(split="test")) == 2

@@ -4,7 +4,7 @@ import pytest
 from installed import install
 
 from chronoscene import formats
-from chronoscene.formats import detect_format, format_names, read_scene, writable_formats
+from chronoscene.formats import detect, format_names, read_scene, writable_formats
 
 PLUG_IN = """
 from pathlib import Path
@@ -45,5 +45,5 @@ def test_a_format_of_another_package(toy, tmp_path, make_scene_folder):
     folder = tmp_path / "toys"
     folder.mkdir()
     (folder / "toy.txt").write_text(str(scene))
-    assert detect_format(folder) == "toy"
+    assert detect(folder).name == "toy"
     assert read_scene(folder).num_periods == 2

@@ -5,7 +5,7 @@ import pytest
 
 from chronoscene.convert import convert
 from chronoscene.errors import SceneError
-from chronoscene.formats import detect_format, read_scene, writable_formats
+from chronoscene.formats import detect, read_scene, writable_formats
 
 READ = {
     "plaza": ("chronoscene", 108, 3),
@@ -74,7 +74,7 @@ def test_images_without_poses_are_refused(shared_data, name):
 def test_bare_models_are_refused_with_what_to_do(shared_data, name):
     folder = shared_data / "colmap_models" / name
     with pytest.raises(SceneError, match="copy the images of the COLMAP model here to images/"):
-        detect_format(folder)
+        detect(folder)
     with pytest.raises(SceneError, match=r"expected images/ and a COLMAP model.* no folder im"):
         read_scene(folder, format="colmap-folders")
 

@@ -7,7 +7,7 @@ import pytest
 
 from chronoscene.colmap.binary import read_cameras
 from chronoscene.errors import SceneError
-from chronoscene.formats import detect_format, read_scene, wat
+from chronoscene.formats import detect, read_scene, wat
 from chronoscene.scene import Camera, Period
 
 
@@ -49,7 +49,7 @@ def test_same_layout_with_another_name_is_plain_and_reads_the_same(colmap_folder
 def test_where_the_readings_differ_the_format_must_be_named(colmap_folder):
     folder = colmap_folder(names(["t2", "t10"], 1), name="street")
     with pytest.raises(SceneError, match=r"marks of colmap-folders and wat; .*--dataset-format"):
-        detect_format(folder)
+        detect(folder)
     orders = {
         name: [p.label for p in read_scene(folder, format=name).periods]
         for name in ("wat", "colmap-folders")

@@ -10,7 +10,7 @@ import click
 from chronoscene.cli.options import reading_options
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
-from chronoscene.cli.scenes.reading import LINKS, describe, describe_period, say_note
+from chronoscene.cli.scenes.reading import LINKS, describe, describe_period, show_note
 from chronoscene.convert import convert
 from chronoscene.formats import writable_formats
 from chronoscene.scene.splits import split_hash
@@ -61,4 +61,4 @@ def command(
     lines.append(f"split: {scene.split_rule}; hash {split_hash(scene)}")
     emit("\n".join(lines) + "\n", None)
     for warning in done.warnings:
-        say_note(warning)
+        show_note(warning)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.formats import model_notes, read_scene
+from chronoscene.formats import detect
 from chronoscene.images.store import ImageSource
 from chronoscene.scene import Scene
 
@@ -14,20 +14,21 @@ LINKS: dict[str | None, ImageSource] = {None: "copy", "hard": "link", "sym": "sy
 
 
 def read_and_note(source: Path, dataset_format: str | None, period_by: str | None) -> Scene:
-    """Read a scene; a model in an unusual place is said."""
-    scene = read_scene(source, format=dataset_format, period_by=period_by)
-    for note in model_notes(source, scene.format):
-        say_note(note)
+    """Read a scene, and report a model in an unusual place."""
+    detected = detect(source, format=dataset_format, period_by=period_by)
+    scene = detected.read()
+    for note in detected.notes:
+        show_note(note)
     return scene
 
 
-def say_note(note: str) -> None:
-    """One line on standard error."""
+def show_note(note: str) -> None:
+    """Print one line on standard error."""
     click.secho(f"note: {note}", fg="yellow", err=True)
 
 
 def describe(scene: Scene) -> str:
-    """Counts of a scene on one line."""
+    """Count the parts of a scene on one line."""
     cameras = len({frame.camera.camera_id for frame in scene.frames})
     counts = (
         (len(scene.frames), "image"),

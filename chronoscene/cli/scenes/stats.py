@@ -23,7 +23,7 @@ from chronoscene.cli.output import (
 )
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats import find_scenes, model_notes, read_scene
+from chronoscene.formats import detect, find_scenes, read_scene
 from chronoscene.io.processes import map_parallel
 from chronoscene.io.staging import check_outside
 from chronoscene.io.wording import printable
@@ -162,7 +162,7 @@ def command(
             if not isinstance(result, Unreadable):
                 written += filter(None, (request.figure(f"{name}_points"), request.page(name)))
         report_written(*written)
-    notes = (f"{s.name}: {n}" for s in counts for n in model_notes(Path(s.path), s.format))
+    notes = (f"{s.name}: {n}" for s in counts for n in detect(Path(s.path), format=s.format).notes)
     for remark in [*notes, *unseen(counts), *against_paper(counts)]:
         click.echo(printable(remark), err=True)
     for scene in unreadable:

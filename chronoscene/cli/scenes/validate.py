@@ -23,7 +23,7 @@ from chronoscene.validation.report.rule_list import describe_rule
 from chronoscene.validation.report.text import write_text
 from chronoscene.validation.rule import SceneReport, is_valid
 from chronoscene.validation.rules import choose_rules
-from chronoscene.validation.run import Reading, find_folders, lost_report, validate_scene
+from chronoscene.validation.run import ReadOptions, find_folders, lost_report, validate_scene
 
 WRITERS = {"text": write_text, "json": write_json, "sarif": write_sarif, "html": write_html}
 
@@ -108,8 +108,8 @@ def command(
     Exit status: 0 if the scene is valid, 1 if there are errors (with --strict, also warnings), 2 if
     there is no scene or the command is used wrongly.
     """
-    reading = Reading(dataset_format, period_by)
-    check = partial(_check, _codes(select), _codes(ignore), decode, reading)
+    read = ReadOptions(dataset_format, period_by)
+    check = partial(_check, _codes(select), _codes(ignore), decode, read)
     choose_rules(_codes(select), _codes(ignore))  # whatever is wrong with them is said first
     folders = find_folders(folder)
     for option, file in (("--out", out), ("--sarif", sarif), ("--html", html)):
@@ -119,7 +119,7 @@ def command(
     if fix is not None:
         check_outside(fix, folders, option="--fix")
         check_place("--fix", fix)
-        folders = _fix(folder, folders, fix, reading)
+        folders = _fix(folder, folders, fix, read)
     if len(folders) == 1:
         announce(f"check {folders[0]}")
         reports = [check(folders[0], track=tracked)]
@@ -138,7 +138,7 @@ def _check(
     select: list[str],
     ignore: list[str],
     decode: bool,
-    reading: Reading,
+    options: ReadOptions,
     path: Path,
     *,
     track: Track = no_progress,
@@ -146,16 +146,16 @@ def _check(
     """One scene, perhaps in a process of its own, which is given names of rules, not rules."""
     keep_freed_memory()  # arrays as large as the model come and go
     rules = choose_rules(select, ignore)
-    return validate_scene(path, rules=rules, decode=decode, track=track, reading=reading)
+    return validate_scene(path, rules=rules, decode=decode, track=track, options=options)
 
 
-def _fix(folder: Path, scenes: Sequence[Path], out: Path, reading: Reading) -> list[Path]:
+def _fix(folder: Path, scenes: Sequence[Path], out: Path, options: ReadOptions) -> list[Path]:
     """Corrected copies of the scenes; what was done goes to standard error."""
     copies = []
     for scene in scenes:
         copy = out if scene == folder else out / scene.name
         announce(f"correct {scene}")
-        repairs = fix_scene(scene, copy, reading)
+        repairs = fix_scene(scene, copy, options)
         click.echo(printable(f"{copy}: {counted(len(repairs), 'correction')}"), err=True)
         for repair in repairs:
             click.echo(printable(f"  {repair.code or 'also'}: {repair.text}"), err=True)

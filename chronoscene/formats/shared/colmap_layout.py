@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from chronoscene.colmap import raw_model
 from chronoscene.colmap.model import Model, read_model, write_model
 from chronoscene.errors import SceneError
+from chronoscene.formats import FoundModel
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared.grouping import Grouped, label_date, natural_key
 from chronoscene.images.masks import find_masks
@@ -36,12 +36,6 @@ class Assigned:
     """None where they are those of the ChronoScene format: a list in a file, or the default."""
     rule: str = ""
     """The rule that chose ``tests``, in words."""
-
-
-def find_model(path: Path) -> tuple[Path, Path] | None:
-    """Folders of the model and the images of a scene that is not in the ChronoScene format."""
-    found = None if (path / our_format.SPLIT).exists() else raw_model.find_model(path)
-    return None if found is None else (path / found[0], path / found[1])
 
 
 def scan(folder: Path) -> tuple[list[str], list[str]]:
@@ -68,33 +62,35 @@ def is_in_folders(images: Path) -> bool:
     return bool(folders) and not files
 
 
-def read_scene(path: Path, assign: Callable[[Path, list[str]], Assigned], format: str) -> Scene:
+def read_scene(
+    path: Path, model: FoundModel | None, assign: Callable[[Path, list[str]], Assigned], format: str
+) -> Scene:
     """Read a scene whose periods follow from the names of its images.
 
     Args:
         path: Folder of the scene.
+        model: Its COLMAP model, if there is one.
         assign: Periods and tests of the images with these names, which are in this folder.
         format: Name of the format.
 
     Raises:
         SceneError: If the model is missing or damaged.
     """
-    model, images = read_images(path)
-    names = [image.name for image in model.images]
+    posed, images = read_images(path, model)
+    names = [image.name for image in posed.images]
     assigned = assign(images, names)
     tests, rule = assigned.tests, assigned.rule
     if tests is None:
         tests, rule = our_format.read_tests(path, names, assigned.grouped[0])
-    return make_scene(path, images, model, assigned.grouped, tests, rule=rule, format=format)
+    return make_scene(path, images, posed, assigned.grouped, tests, rule=rule, format=format)
 
 
-def read_images(path: Path) -> tuple[Model, Path]:
+def read_images(path: Path, found: FoundModel | None) -> tuple[Model, Path]:
     """Read and check the model of a scene; also the folder of its images.
 
     Raises:
         SceneError: If it is missing or empty, or has an unusable name, pose or camera.
     """
-    found = raw_model.find_model(path)
     images = "images" if found is None else found[1]
     if found is None or not (path / images).is_dir():
         raise SceneError(

@@ -20,11 +20,12 @@ from chronoscene.colmap import raw_model
 from chronoscene.colmap.model import read_raw_model
 from chronoscene.colmap.raw_model import RawImages, RawModel, RawPoints
 from chronoscene.errors import ChronoSceneError
+from chronoscene.formats import DetectedFormat, FoundModel
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, read_periods
 from chronoscene.formats.shared.colmap_layout import Assigned
 from chronoscene.images.masks import MASKS, mask_name
 from chronoscene.io.documents import decode_text
-from chronoscene.scene import Camera, Period, Scene, splits
+from chronoscene.scene import Camera, Period, splits
 from chronoscene.scene.geometry import rotation_from_quaternion
 from chronoscene.scene.splits import NameEntry, Problem, SplitEntry
 from chronoscene.scene.tracks import seen_by_period
@@ -71,24 +72,17 @@ class TextFile:
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """The format of a scene that is not in ours: converted from it, or a COLMAP project."""
+    """Origin of a scene that is not in our format: converted from it, or a COLMAP project."""
 
-    format: str
-    """Name in `chronoscene.formats`."""
+    detected: DetectedFormat
+    is_project: bool = False
+    """True for a COLMAP project, which is checked where it is."""
     error: ChronoSceneError | None = None
-    """Why the scene, or of a project the periods, cannot be read."""
-    notes: list[str] = field(default_factory=list)
-    """Where its model was found, if not in the usual place."""
+    """Reason why the scene, or of a project the periods, cannot be read."""
     remarks: tuple[str, ...] = ()
-    """What the conversion leaves out."""
-    read: Callable[[], Scene] | None = None
-    """Reader of a COLMAP project, which is checked where it is; None for a converted scene."""
+    """Content of the folder that the conversion leaves out."""
     assigned: Assigned | None = None
     """Periods and tests of a COLMAP project."""
-
-    @property
-    def is_project(self) -> bool:
-        return self.read is not None
 
 
 @dataclass(eq=False)
@@ -146,7 +140,9 @@ class RawScene:
         return None if self._found is None else self._found[0]
 
     @cached_property
-    def _found(self) -> tuple[str, str] | None:
+    def _found(self) -> FoundModel | None:
+        if self.origin is not None and self.origin.is_project:
+            return self.origin.detected.model
         return raw_model.find_model(self.root)
 
     @property

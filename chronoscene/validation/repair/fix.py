@@ -25,16 +25,16 @@ from chronoscene.validation.repair import contents
 from chronoscene.validation.repair.contents import Repair
 from chronoscene.validation.rules.cs2_image_files import images_of_other_shape
 from chronoscene.validation.rules.cs3_split import SPLIT_ELSEWHERE, TEST_ELSEWHERE
-from chronoscene.validation.run import AS_DETECTED, Reading, is_project, other_format, quiet_numbers
+from chronoscene.validation.run import DETECT, ReadOptions, is_project, other_format, quiet_numbers
 
 
-def fix_scene(root: Path, out: Path, reading: Reading = AS_DETECTED) -> list[Repair]:
+def fix_scene(root: Path, out: Path, options: ReadOptions = DETECT) -> list[Repair]:
     """Write a corrected copy; the folder appears complete or not at all.
 
     Args:
         root: The scene.
         out: Folder that does not exist yet, or is empty, and is not inside the scene.
-        reading: What the user says of the format.
+        options: How to read the scene.
 
     Returns:
         The corrections.
@@ -44,12 +44,12 @@ def fix_scene(root: Path, out: Path, reading: Reading = AS_DETECTED) -> list[Rep
         SceneError: If ``out`` is in use or cannot be written.
     """
     check_outside(out, [root], option="--fix")
-    name = other_format(root, reading)
-    if name is not None and not is_project(root, name):
+    detected = other_format(root, options)
+    if detected is not None and not is_project(detected):
         raise ConfigError(
             f"--fix of {root}",
             expected="a scene in the ChronoScene format, or a COLMAP project",
-            found=f"one in {name}",
+            found=f"one in {detected.name}",
             todo="convert it with chronoscene convert, then correct the result",
         )
     with staged_folder(out) as staged, quiet_numbers():

@@ -101,10 +101,11 @@ def other_format(scene: RawScene) -> Iterator[Hit]:
     places refer to the converted scene. A COLMAP project is checked where it is."""
     origin = scene.origin
     if origin is not None and origin.error is None:
-        found = f"a scene in {origin.format}"
+        found = f"a scene in {origin.detected.name}"
         if origin.assigned is not None:
             found += f", with the periods {shown(p.label for p in origin.assigned.grouped[1])}"
-        yield Hit(".", "a scene in the ChronoScene format", "; ".join([found, *origin.notes]))
+        found = "; ".join([found, *origin.detected.notes])
+        yield Hit(".", "a scene in the ChronoScene format", found)
 
 
 @rule.error("CS007", bad="a `transforms.json` without poses", remedy="correct the file named here")
@@ -135,8 +136,8 @@ def other_format_left_out(scene: RawScene) -> Iterator[Hit]:
 def reader_refuses(scene: RawScene, model: RawModel, images: RawImages) -> Iterator[Hit]:
     """No other rule found an error, but the reader (or COLMAP itself) rejects the scene."""
     try:
-        if scene.origin is not None and scene.origin.read is not None:
-            scene.origin.read()
+        if scene.origin is not None and scene.origin.is_project:
+            scene.origin.detected.read()
         elif model_kind(model.folder) == "binary":  # the rules have checked points and tracks
             posed = read_poses(scene.root / our_format.MODEL, images)
             our_format.read(scene.root, model=Model(posed, Points.empty()))

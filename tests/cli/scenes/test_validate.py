@@ -212,10 +212,10 @@ def test_places_of_reports_are_tried_first(broken, option, tmp_path, monkeypatch
         run(broken, option, tmp_path / "absent/report")
 
 
-def die_on_b(select, ignore, decode, reading, path, **_):
+def die_on_b(select, ignore, decode, options, path, **_):
     if path.name == "b":
         os.kill(os.getpid(), signal.SIGKILL)  # as a system does that is out of memory
-    return _check(select, ignore, decode, reading, path)
+    return _check(select, ignore, decode, options, path)
 
 
 def test_a_check_that_dies_leaves_the_others(make_scene_folder, tmp_path, monkeypatch):

@@ -3,11 +3,14 @@ import shutil
 import pytest
 from PIL import Image
 
+from chronoscene import formats
+from chronoscene.colmap import raw_model
 from chronoscene.convert import convert
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats import chronoscene as our_format
+from chronoscene.formats import neusc
 from chronoscene.validation.repair.fix import fix_scene
-from chronoscene.validation.run import Reading, find_folders, other_format, validate_scene
+from chronoscene.validation.run import ReadOptions, find_folders, other_format, validate_scene
 
 ALONE = {"CS321", "CS706"}  # What is said of a scene without sparse/0/test.txt
 
@@ -165,7 +168,7 @@ def test_folders_of_other_formats_are_found(scene, studio, tmp_path):
 
 def test_a_list_of_periods_in_a_wrong_place_is_of_our_format(project):
     """Even where the folders of its images could be periods: the file is meant to count."""
-    assert other_format(project.root) == "colmap-folders"
+    assert other_format(project.root).name == "colmap-folders"
     project.write("split.txt", "")
     assert other_format(project.root) is None
     assert "CS301" in codes(project.validate())
@@ -274,7 +277,7 @@ def test_a_project_of_two_formats(project, tmp_path):
     (said,) = [f for f in validate_scene(street).findings if f.code in ("CS007", "CS301")]
     assert (said.code, said.found) == ("CS007", "marks of colmap-folders and wat")
     for format, labels in (("wat", "'t10', 't2'"), ("colmap-folders", "'t2', 't10'")):
-        report = validate_scene(street, reading=Reading(format))
+        report = validate_scene(street, options=ReadOptions(format))
         assert labels in next(f.found for f in report.findings if f.code == "CS006")
 
 
@@ -284,16 +287,16 @@ def test_what_the_user_says_of_a_project(scene, tmp_path):
     names = [p.name for p in scene.path("images").iterdir()]
     table = tmp_path / "periods.csv"
     table.write_text("file,period\n" + "".join(f"{n},{n[0]}\n" for n in names))
-    report = validate_scene(scene.root, reading=Reading(period_by=f"table:{table}"))
+    report = validate_scene(scene.root, options=ReadOptions(period_by=f"table:{table}"))
     assert codes(report) == {"CS006", "CS507"}
     table.write_text("file,period\na000.png,1\n")
-    report = validate_scene(scene.root, reading=Reading(period_by=f"table:{table}"))
+    report = validate_scene(scene.root, options=ReadOptions(period_by=f"table:{table}"))
     (said,) = [f for f in report.findings if f.severity == "error"]
     assert (said.code, said.place) == ("CS007", str(table))
     with pytest.raises(ConfigError, match="one of folder, year"):
-        validate_scene(scene.root, reading=Reading(period_by="decade"))
+        validate_scene(scene.root, options=ReadOptions(period_by="decade"))
     with pytest.raises(ConfigError, match="no such option for wat"):
-        validate_scene(scene.root, reading=Reading("wat", "year"))
+        validate_scene(scene.root, options=ReadOptions("wat", "year"))
 
 
 def test_projects_are_corrected(project, tmp_path):
@@ -301,10 +304,24 @@ def test_projects_are_corrected(project, tmp_path):
     repairs = fix_scene(project.root, tmp_path / "fixed")
     assert [r.code for r in repairs] == ["CS002", ""]
     copy = validate_scene(tmp_path / "fixed")
-    assert not copy.count("error") and other_format(copy.path) == "colmap-folders"
+    assert not copy.count("error") and other_format(copy.path).name == "colmap-folders"
 
 
 def test_other_formats_are_not_corrected(studio, tmp_path):
     with pytest.raises(ConfigError, match="found one in nerfstudio; convert it"):
         fix_scene(studio, tmp_path / "fixed")
     assert not (tmp_path / "fixed").exists()
+
+
+def test_the_model_of_a_project_is_looked_for_once(project, monkeypatch):
+    looked, find = [], raw_model.find_model
+
+    def find_model(folder):
+        looked.append(folder)
+        return find(folder)
+
+    for module in (raw_model, formats, our_format, neusc):
+        monkeypatch.setattr(module, "find_model", find_model)
+    report = project.validate()
+    assert not report.count("error") and "CS006" in codes(report)
+    assert looked == [project.root]
