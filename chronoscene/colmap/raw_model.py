@@ -34,6 +34,9 @@ PLACES = {
 
 The model is in the folder itself or in a numbered one inside of it, which comes first."""
 
+FoundModel = tuple[str, str]
+"""Folders of a model and of its images, both below the project."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawImages:
@@ -162,7 +165,7 @@ def model_kind(folder: Path) -> Literal["binary", "text"] | None:
     return "binary" if forms == {".bin"} else "text"
 
 
-def find_model(project: Path) -> tuple[str, str] | None:
+def find_model(project: Path) -> FoundModel | None:
     """The model of a project and the folder of its images, both below the project; None if none.
 
     Of several models the first in the order of `PLACES`, complete or not.

@@ -18,16 +18,13 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from chronoscene.checks import check_choice
-from chronoscene.colmap.raw_model import find_model, find_stray_model
+from chronoscene.colmap.raw_model import FoundModel, find_model, find_stray_model
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.scene import Scene
 from chronoscene.scene.splits import SPLIT
-
-if TYPE_CHECKING:
-    from chronoscene.formats.shared.colmap_layout import Assigned  # it loads pycolmap
 
 FORMATS = {
     "chronoscene": "chronoscene.formats.chronoscene",
@@ -71,10 +68,6 @@ def load_format(name: str) -> Any:
     """
     check_choice("dataset format", name, installed_formats())
     return import_module(installed_formats()[name])
-
-
-FoundModel = tuple[str, str]
-"""Folders of a COLMAP model and of its images, both below the scene folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,12 +122,6 @@ class DetectedFormat:
                 found=f"marks of {' and '.join([self.name, *self.others])}",
                 todo="name one with --dataset-format, in chronoscene convert or in this command",
             )
-
-    def assign(self, names: list[str]) -> Assigned:
-        """Assign periods to the images of the model with these names."""
-        images = self.path / (self.model[1] if self.model else "images")
-        assigned: Assigned = load_format(self.name).assign(images, names, **self.options)
-        return assigned
 
     def read(self) -> Scene:
         """Read the scene; see `read_scene`."""

@@ -18,8 +18,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
-from chronoscene.formats import FoundModel
 from chronoscene.formats.shared import colmap_layout, transforms
 from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
 from chronoscene.formats.shared.ply import read_points

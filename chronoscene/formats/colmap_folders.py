@@ -12,8 +12,9 @@ from datetime import date
 from functools import partial
 from pathlib import Path
 
+from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
-from chronoscene.formats import FoundModel, nerfstudio, wat
+from chronoscene.formats import nerfstudio, wat
 from chronoscene.formats.shared import colmap_layout, grouping
 from chronoscene.images.exif import capture_times
 from chronoscene.images.store import ImageSource, Progress

@@ -20,8 +20,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
-from chronoscene.formats import FoundModel
 from chronoscene.formats.shared import colmap_layout
 from chronoscene.formats.shared.grouping import group_labels
 from chronoscene.images.store import ImageSource, Progress

@@ -16,8 +16,9 @@ from chronoscene import formats
 from chronoscene.colmap.raw_model import model_files
 from chronoscene.convert import remarks_on
 from chronoscene.errors import ChronoSceneError, SceneError
-from chronoscene.formats import DetectedFormat
+from chronoscene.formats import DetectedFormat, load_format
 from chronoscene.formats import chronoscene as our_format
+from chronoscene.formats.shared.colmap_layout import Assigned
 from chronoscene.images.masks import mask_place
 from chronoscene.images.store import place_image
 from chronoscene.io.wording import printable
@@ -125,7 +126,8 @@ def _read_project(scene: RawScene, detected: DetectedFormat) -> Origin:
     """Assign periods to the images of a COLMAP project as its format defines them."""
     try:
         detected.check_single()
-        assigned = detected.assign(scene.names)
+        module, images = load_format(detected.name), scene.root / "images"
+        assigned: Assigned = module.assign(images, scene.names, **detected.options)
     except SceneError as error:
         return Origin(detected, is_project=True, error=error)
     return Origin(detected, is_project=True, assigned=assigned if scene.names else None)

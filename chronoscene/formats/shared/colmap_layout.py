@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from chronoscene.colmap.model import Model, read_model, write_model
+from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
-from chronoscene.formats import FoundModel
 from chronoscene.formats import chronoscene as our_format
 from chronoscene.formats.shared.grouping import Grouped, label_date, natural_key
 from chronoscene.images.masks import find_masks

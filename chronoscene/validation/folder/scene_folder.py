@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from chronoscene.colmap import raw_model
 from chronoscene.colmap.model import read_raw_model
-from chronoscene.colmap.raw_model import RawImages, RawModel, RawPoints
+from chronoscene.colmap.raw_model import FoundModel, RawImages, RawModel, RawPoints
 from chronoscene.errors import ChronoSceneError
-from chronoscene.formats import DetectedFormat, FoundModel
+from chronoscene.formats import DetectedFormat
 from chronoscene.formats.chronoscene import MODEL, SPLIT, TEST, read_periods
 from chronoscene.formats.shared.colmap_layout import Assigned
 from chronoscene.images.masks import MASKS, mask_name
