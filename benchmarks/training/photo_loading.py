@@ -163,7 +163,7 @@ def measure(scene_root: Path, runs: Path, memory: float, passes: int, step: floa
         overrides=fixed,
         photo_memory=round(memory * 1e9),
     )
-    (planned,) = plan_runs(settings, print)
+    (planned,) = plan_runs(settings, print).runs.values()
 
     def make() -> Method:
         if step is not None:

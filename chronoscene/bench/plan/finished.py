@@ -18,11 +18,9 @@ def is_finished(run: ResolvedRun, overwrite: bool = False) -> bool:
     Raises:
         ConfigError: If there is one made with other settings, unless it may be replaced.
     """
-    folder = run.job.folder
-    if not (folder / records.RUN_FILE).is_file():
+    if not (run.job.folder / records.RUN_FILE).is_file():
         return False
-    records.read_run(folder)
-    return _matches(folder, "a finished", run, overwrite)
+    return _matches(run, run.job.folder, "a finished", overwrite)
 
 
 def is_obsolete(run: ResolvedRun, overwrite: bool = False) -> bool:
@@ -31,13 +29,27 @@ def is_obsolete(run: ResolvedRun, overwrite: bool = False) -> bool:
     Raises:
         ConfigError: If there are such, and they may not be deleted.
     """
-    folder = run.job.training
-    if not (folder / records.CONFIG_FILE).is_file():
+    if not (run.job.training / records.CONFIG_FILE).is_file():
         return False
-    return not _matches(folder, "an unfinished", run, overwrite)
+    return not _matches(run, run.job.training, "an unfinished", overwrite)
 
 
-def _matches(folder: Path, kind: str, run: ResolvedRun, overwrite: bool) -> bool:
+def is_to_do(run: ResolvedRun, overwrite: bool) -> bool:
+    """Return True if a run is neither finished nor in conflict with what is there.
+
+    Raises:
+        ConfigError: If a result or checkpoints with other settings are there and may not be
+            replaced.
+    """
+    if is_finished(run, overwrite):
+        return False
+    is_obsolete(run, overwrite)
+    return True
+
+
+def _matches(run: ResolvedRun, folder: Path, kind: str, overwrite: bool) -> bool:
+    if folder == run.job.folder:
+        records.read_run(folder)  # raises if it is damaged
     stored = records.read_config(folder)
     if stored == run.document or overwrite:
         return bool(stored == run.document)

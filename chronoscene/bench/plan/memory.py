@@ -64,10 +64,14 @@ class PhotoNeeds:
         """What they take of what is allowed."""
         return min(self.allowed, self.total + self.decoders * self.decoding)
 
+    @property
+    def of_run(self) -> int:
+        """Memory that a run takes, with a model of half a million Gaussians."""
+        return self.in_memory + self.training + _MODEL
 
-def photo_needs(scene: Scene, settings: RunSettings) -> PhotoNeeds:
-    """Return what the photos of a run take."""
-    sizes = ImageStore(scene, max_width=settings.max_width)
+
+def photo_needs(scene: Scene, sizes: ImageStore, settings: RunSettings) -> PhotoNeeds:
+    """Return what the photos of a run take, in the sizes of a store of them."""
     frames = scene.select(split="train")
     photos = [sizes.bytes_of(frame) for frame in frames]
     total, largest = sum(photos), max(photos)
@@ -92,7 +96,8 @@ def photo_needs(scene: Scene, settings: RunSettings) -> PhotoNeeds:
 
 def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
     """Open the photos of a run, within its limits."""
-    needs = photo_needs(scene, settings)
+    sizes = ImageStore(scene, max_width=settings.max_width)
+    needs = photo_needs(scene, sizes, settings)
     disk = DiskCache(settings.runs / PHOTOS, settings.photo_disk) if needs.on_disk else None
     return ImageStore(
         scene,
@@ -110,20 +115,17 @@ def read_scene_of(job: Job) -> Scene:
     return read_scene(job.here(job.scene_root), format=job.scene_format, period_by=rule)
 
 
-def expected_memory(scene: Scene, settings: RunSettings) -> int:
-    """Bytes of memory that a run takes, with a model of half a million Gaussians."""
-    needs = photo_needs(scene, settings)
-    return needs.in_memory + needs.training + _MODEL
-
-
-def check_room(scene: Scene, settings: RunSettings, runs: int, *, here: bool = True) -> str:
+def check_room(
+    scene: Scene, needs: PhotoNeeds, folder: Path, runs: int, *, here: bool = True
+) -> str:
     """Check that memory and disk have room for the photos of a scene.
 
     Args:
         scene: What is trained on.
-        settings: Of its runs.
+        needs: Of its runs.
+        folder: Of all runs.
         runs: How many runs are to be done.
-        here: Whether this machine does them, so that its memory counts.
+        here: True if this machine does them, so that its memory counts.
 
     Returns:
         What they take, in a line for the user.
@@ -131,9 +133,8 @@ def check_room(scene: Scene, settings: RunSettings, runs: int, *, here: bool = T
     Raises:
         ConfigError: If they have not; the message says which setting would do.
     """
-    needs = photo_needs(scene, settings)
     _check_memory(scene, needs, machine_memory()[1] if here else None)
-    _check_disk(settings.runs, needs, (1 + runs) * needs.tests)
+    _check_disk(folder, needs, (1 + runs) * needs.tests)
     photos = f"{counted(needs.count, 'training photo')}, {_gb(needs.total)} when decoded"
     kept = f", {_gb(needs.on_disk)} on disk" if needs.on_disk else ""
     return (

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
-from itertools import product
+from dataclasses import dataclass, replace
+from itertools import chain, product
 from pathlib import Path
 
 from chronoscene.bench.files.ground_truth import freeze_ground_truth
 from chronoscene.bench.files.provenance import scene_hash
 from chronoscene.bench.files.strategies import STRATEGIES
 from chronoscene.bench.plan.checks import check_run
-from chronoscene.bench.plan.finished import continued, is_finished
+from chronoscene.bench.plan.finished import continued, is_to_do
 from chronoscene.bench.plan.job import Job
-from chronoscene.bench.plan.memory import check_room, expected_memory
+from chronoscene.bench.plan.memory import check_room, photo_needs
 from chronoscene.bench.plan.parts import check_scene, effective_strategy
 from chronoscene.bench.plan.resolve import ResolvedMethod, ResolvedRun, resolve_method
 from chronoscene.bench.plan.settings import SHARING, BenchSettings
@@ -28,7 +28,14 @@ from chronoscene.scene.splits import split_hash
 
 BUDGET_NOTICE = "--budget: schedules follow the clock, and equal seeds do not give equal models"
 
-Plan = list[ResolvedRun]
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Runs that were asked for, by their folders."""
+
+    runs: dict[Path, ResolvedRun]
+    todo: dict[Path, ResolvedRun]
+    """Those that had no result when the plan was made."""
 
 
 def plan_runs(settings: BenchSettings, log: Log) -> Plan:
@@ -36,25 +43,30 @@ def plan_runs(settings: BenchSettings, log: Log) -> Plan:
     specs = [(reference, load_spec(reference)) for reference in settings.methods]
     settings.check([spec.name for _, spec in specs])
     shared = settings.run.absolute()
-    methods = [resolve_method(reference, spec, shared) for reference, spec in specs]
     if shared.lpips_weights is not None:
         check_available(shared.lpips_weights)
-    plan: dict[Path, ResolvedRun] = {}
+    methods = [resolve_method(reference, spec, shared) for reference, spec in specs]
+    plan = Plan({}, {})
     notices: dict[str, None] = {}
     for scene in _read_scenes(settings, log):
         log(f"{scene.name}: fingerprint of {len(scene.frames)} images, ground truth of test views")
-        unfinished = 0
-        for run in _runs_of_scene(settings, scene, methods):
-            plan.setdefault(run.job.folder, run)
-            notices.update(dict.fromkeys(run.job.notices))
-            unfinished += run.spec.runner is None and not is_finished(run, settings.overwrite)
-        if unfinished:
-            log(check_room(scene, shared, unfinished, here=settings.ray is None))
         store = ImageStore(scene, max_width=shared.max_width, memory_limit=shared.photo_memory)
-        freeze_ground_truth(shared.runs, scene, run.job.scene_hash, store, shared.max_width)
+        needs = photo_needs(scene, store, shared)
+        memory = settings.job_memory or needs.of_run
+        runs = {run.job.folder: run for run in _runs_of_scene(settings, scene, methods, memory)}
+        todo = {k: run for k, run in runs.items() if is_to_do(run, settings.overwrite)}
+        trained = sum(run.spec.runner is None for run in todo.values())
+        if trained:
+            here = settings.ray is None
+            log(check_room(scene, needs, shared.runs, trained, here=here))
+        digest = next(iter(runs.values())).job.scene_hash
+        freeze_ground_truth(shared.runs, scene, digest, store, shared.max_width)
+        notices.update(dict.fromkeys(chain(*(run.job.notices for run in runs.values()))))
+        plan.runs.update(runs)
+        plan.todo.update(todo)
     for notice in notices:
         log(f"note: {notice}")
-    return list(plan.values())
+    return plan
 
 
 def _read_scenes(settings: BenchSettings, log: Log) -> Iterable[Scene]:
@@ -77,10 +89,10 @@ def _read_scenes(settings: BenchSettings, log: Log) -> Iterable[Scene]:
 
 
 def _runs_of_scene(
-    settings: BenchSettings, scene: Scene, methods: list[ResolvedMethod]
+    settings: BenchSettings, scene: Scene, methods: list[ResolvedMethod], memory: int
 ) -> Iterator[ResolvedRun]:
-    """Every method, strategy and seed on one scene, checked."""
-    digest, split, memory = scene_hash(scene), split_hash(scene), settings.job_memory
+    """Yield every method, strategy and seed on one scene, checked."""
+    digest, split = scene_hash(scene), split_hash(scene)
     for method, wanted, seed in product(methods, settings.strategies, settings.seeds):
         strategy, notices = _strategy(method, wanted)
         own = method.settings
@@ -105,7 +117,7 @@ def _runs_of_scene(
             settings=own,
             notices=notices,
             plugin_path=str(Path.cwd()) if ":" in method.reference else None,
-            memory=memory or expected_memory(scene, own),
+            memory=memory,
         )
         run = method.run(job)
         check_run(run)

@@ -73,18 +73,16 @@ def run_plan(
     """Run what is planned and not finished yet, as `run_bench` does.
 
     Args:
-        plan: All runs, each once, in one folder of runs.
+        plan: All runs, in one folder of runs.
         settings: Where that folder is, and whether runs may be replaced.
         log: Called with lines for the user.
         execute: As for `run_bench`; by default `run_in_process`.
         pool: Executes several at a time, if given.
     """
-    todo = [run for run in plan if not is_finished(run, settings.overwrite)]
-    if len(todo) < len(plan):
-        log(f"{len(plan) - len(todo)} of {len(plan)} runs are finished and kept")
-    for run in todo:
-        is_obsolete(run, settings.overwrite)  # raises before anything is trained
-    for run in plan:
+    todo = list(plan.todo.values())
+    if len(todo) < len(plan.runs):
+        log(f"{len(plan.runs) - len(todo)} of {len(plan.runs)} runs are finished and kept")
+    for run in plan.runs.values():
         if lock := _take(run.job):
             with lock:
                 settle_training(run.job)  # of a run that was killed between its end and this
@@ -113,13 +111,15 @@ def run_plan(
                 _run_in_pool(todo, log, pool, carry_out)
     finally:
         records.write_summary(settings.run.runs)
-    folders = [run.job.folder for run in plan]
-    finished = tuple(folder for folder in folders if (folder / records.RUN_FILE).is_file())
-    return BenchOutcome(finished, len(plan) - len(todo), tuple(failures))
+    finished = tuple(folder for folder in plan.runs if (folder / records.RUN_FILE).is_file())
+    return BenchOutcome(finished, len(plan.runs) - len(todo), tuple(failures))
 
 
 def _run_in_pool(
-    todo: Plan, log: Log, pool: Pool, carry_out: Callable[[ResolvedRun, Execute, Log], None]
+    todo: list[ResolvedRun],
+    log: Log,
+    pool: Pool,
+    carry_out: Callable[[ResolvedRun, Execute, Log], None],
 ) -> None:
     """Carry out several runs at a time, each in a thread of its own, which waits for it."""
     under_way: set[Future[None]] = set()
@@ -149,7 +149,7 @@ def _without_ended(under_way: set[Future[None]]) -> set[Future[None]]:
     return others
 
 
-def _in_turn(todo: Plan, log: Log) -> Iterator[tuple[ResolvedRun, Lock]]:
+def _in_turn(todo: list[ResolvedRun], log: Log) -> Iterator[tuple[ResolvedRun, Lock]]:
     """Yield each run with its lock once it is free; runs of another command come last."""
     waiting, announced = list(todo), False
     while waiting:

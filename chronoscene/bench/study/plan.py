@@ -164,10 +164,13 @@ def run_study(
             )
             asked = replace(settings, methods=(method,), strategies=(row.strategy,), run=changed)
             plans[row.label] = plan_runs(asked, once)
-        plan = {run.job.folder: run for run in chain(*plans.values())}
-        outcome = run_plan(list(plan.values()), settings, log, execute=execute, pool=pool)
+        plan = Plan({}, {})
+        for row_plan in plans.values():
+            plan.runs.update(row_plan.runs)
+            plan.todo.update(row_plan.todo)
+        outcome = run_plan(plan, settings, log, execute=execute, pool=pool)
     finished = {
-        label: [run.job.folder for run in rows if (run.job.folder / RUN_FILE).is_file()]
+        label: [folder for folder in rows.runs if (folder / RUN_FILE).is_file()]
         for label, rows in plans.items()
     }
     return outcome, finished

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from chronoscene.bench.plan import memory as planning
-from chronoscene.bench.plan.memory import check_room, expected_memory, open_store, photo_needs
+from chronoscene.bench.plan.memory import check_room, open_store, photo_needs
 from chronoscene.bench.plan.parts import make_parts
 from chronoscene.bench.plan.stop import StopRule
 from chronoscene.bench.train.checkpoints import Checkpoints
@@ -43,51 +43,59 @@ def free(monkeypatch):
     return free
 
 
+def needs_of(scene, settings):
+    return photo_needs(scene, ImageStore(scene, max_width=settings.max_width), settings)
+
+
+def room(scene, settings, runs, **options):
+    return check_room(scene, needs_of(scene, settings), settings.runs, runs, **options)
+
+
 def test_the_estimate_counts_photos_masks_and_decoding(make_scene, settings, tmp_path):
     scene = make_scene()
-    needs = photo_needs(scene, settings)
+    needs = needs_of(scene, settings)
     assert (needs.count, needs.total, needs.largest) == (5, 5 * PHOTO, PHOTO)
     assert (needs.decoding, needs.decoders) == (DECODING, 2)
     assert needs.in_memory == 5 * PHOTO + 2 * DECODING and needs.on_disk == 0
     masked = replace(scene, masks={"a/0.png": tmp_path / "m.png"})
-    assert photo_needs(masked, settings).total == 5 * PHOTO + PIXELS
+    assert needs_of(masked, settings).total == 5 * PHOTO + PIXELS
     settings.max_width = 12
-    assert photo_needs(scene, settings).largest == PHOTO // 4
+    assert needs_of(scene, settings).largest == PHOTO // 4
 
 
 def test_what_does_not_fit_goes_to_the_disk(make_scene, settings):
     settings.photo_memory = 5 * PHOTO + DECODING
-    needs = photo_needs(make_scene(), settings)
+    needs = needs_of(make_scene(), settings)
     assert needs.decoders == 1 and needs.on_disk == 0
     settings.photo_memory -= 1
-    needs = photo_needs(make_scene(), settings)
+    needs = needs_of(make_scene(), settings)
     assert needs.on_disk == 5 * PHOTO and needs.in_memory == settings.photo_memory
     settings.photo_disk = 100
-    assert photo_needs(make_scene(), settings).on_disk == 100
+    assert needs_of(make_scene(), settings).on_disk == 100
 
 
 def test_half_of_the_threads_decode_if_memory_allows_it(make_scene, settings):
     settings.threads = 12
-    assert photo_needs(make_scene(), settings).decoders == 6
+    assert needs_of(make_scene(), settings).decoders == 6
     settings.photo_memory = 8 * DECODING
-    assert photo_needs(make_scene(), settings).decoders == 4
+    assert needs_of(make_scene(), settings).decoders == 4
 
 
 def test_the_line_says_what_is_taken(make_scene, settings, free):
     free(2 * 10**9, 10**9)
-    line = check_room(make_scene(), settings, runs=1)
+    line = room(make_scene(), settings, runs=1)
     assert line.startswith("ring: 5 training photos, 0.00 GB when decoded: 0.00 GB in memory; a ")
     assert line.endswith("training takes 0.50 GB and its model besides")
     settings.photo_memory = LITTLE
-    assert "GB in memory, 0.00 GB on disk; a" in check_room(make_scene(), settings, runs=1)
+    assert "GB in memory, 0.00 GB on disk; a" in room(make_scene(), settings, runs=1)
 
 
 def test_memory_counts_where_the_run_will_be(make_scene, settings, free):
     free(10**6, 10**9)
     with pytest.raises(ConfigError, match=r"expected 0\.50 GB of memory"):
-        check_room(make_scene(), settings, runs=1)
-    check_room(make_scene(), settings, runs=1, here=False)
-    assert 1.50e9 < expected_memory(make_scene(), settings) < 1.51e9
+        room(make_scene(), settings, runs=1)
+    room(make_scene(), settings, runs=1, here=False)
+    assert 1.50e9 < needs_of(make_scene(), settings).of_run < 1.51e9
 
 
 def big(scene):
@@ -102,7 +110,7 @@ def big(scene):
 
 def refusal(scene, settings, runs=1):
     with pytest.raises(ConfigError) as caught:
-        check_room(scene, settings, runs)
+        room(scene, settings, runs)
     return str(caught.value)
 
 
@@ -114,14 +122,14 @@ def test_too_little_memory_for_one_photo_is_refused_with_what_is_enough(make_sce
         "found 0.00 GB; use --photo-memory 0.51"
     )
     settings.photo_memory = 510_000_000
-    check_room(scene, settings, runs=1)
+    room(scene, settings, runs=1)
 
 
 def test_more_than_is_free_is_refused_with_a_smaller_setting(make_scene, settings, free):
     scene = big(make_scene())
     settings.photo_memory, settings.max_width = 900_000_000, 6000
     free(7_400_000_000, 10**12)
-    check_room(scene, settings, runs=1)
+    room(scene, settings, runs=1)
     free(7_390_000_000, 10**12)
     assert refusal(scene, settings) == (
         "ring: expected 7.40 GB of memory, 0.90 GB of it for photos, found 7.39 GB free; "
@@ -138,7 +146,7 @@ def test_a_full_disk_is_refused_with_a_smaller_setting(make_scene, settings, fre
     settings.photo_memory, settings.photo_disk, settings.max_width = 900_000_000, 10**9, 6000
     decoded, images = 5 * 72_000_000, 3 * 3 * 12_000_000
     free(10**12, decoded + images)
-    check_room(scene, settings, runs=2)
+    room(scene, settings, runs=2)
     free(10**12, decoded + images - 10_000_000)
     message = refusal(scene, settings, runs=2)
     assert "expected room for 0.36 GB of decoded photos and at most 0.11 GB of test" in message
@@ -148,7 +156,7 @@ def test_a_full_disk_is_refused_with_a_smaller_setting(make_scene, settings, fre
     kept.mkdir(parents=True)
     (kept / "x.npz").write_bytes(b"")
     (kept / "x.npz").open("r+b").truncate(10_000_000)  # what is there already needs no room
-    check_room(scene, settings, runs=2)
+    room(scene, settings, runs=2)
 
 
 def test_bench_says_it_and_refuses_before_anything_is_written(bench, tmp_path):

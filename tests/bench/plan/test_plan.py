@@ -33,7 +33,7 @@ def test_planning_builds_each_configuration_once(scene_folder, tmp_path, monkeyp
     monkeypatch.setattr(resolve, "build_config", build_config)
     names = ("toy_methods:MEAN", "toy_methods:BLIND")
     settings = bench_settings((scene_folder,), names, tmp_path / "runs", seeds=(0, 1))
-    assert len(plan_runs(settings, lambda line: None)) == 4
+    assert len(plan_runs(settings, lambda line: None).runs) == 4
     assert sorted(built) == ["blind", "blind", "mean", "mean"]
 
 

@@ -64,7 +64,7 @@ def run_pool(monkeypatch):
                 other.set()
             assert other.wait(60)
             together.discard(job.seed)
-            seen.append((job.threads, job.reports))
+            seen.append((job.settings.threads, job.reports))
 
         monkeypatch.setattr(local_pool, "run_in_process", work)
         monkeypatch.setattr(local_pool, "machine_memory", lambda: (10**10, free))

@@ -138,17 +138,21 @@ def test_help_does_not_promise_equal_models_of_budgets(option):
 def test_defaults(settings):
     asked = settings("a", "--method", "chronogs")
     assert asked.scenes == (Path("a"),) and asked.methods == ("chronogs",)
-    assert asked.strategies == ("joint",) and asked.preset == "balanced"
-    assert asked.seeds == (0,) and asked.runs == Path("runs") and asked.max_width == 1600
-    assert asked.iterations is None and asked.budget_seconds is None and asked.threads is None
-    assert asked.device == "auto" and asked.lpips_weights is None and not asked.overwrite
+    assert asked.strategies == ("joint",) and asked.run.preset == "balanced"
+    assert asked.seeds == (0,) and asked.run.runs == Path("runs") and asked.run.max_width == 1600
+    assert (
+        asked.run.iterations is None
+        and asked.run.budget_seconds is None
+        and asked.run.threads is None
+    )
+    assert asked.run.device == "auto" and asked.run.lpips_weights is None and not asked.overwrite
     assert (asked.jobs, asked.job_memory, asked.ray) == (None, None, None)
 
 
 def test_devices_of_a_cluster_are_not_looked_for_here(settings, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     asked = settings("a", "--method", "3dgs", "--device", "cuda", "--ray", "auto")
-    assert (asked.ray, asked.device) == ("auto", "cuda")
+    assert (asked.ray, asked.run.device) == ("auto", "cuda")
 
 
 def test_every_option_arrives(settings, tmp_path):
@@ -163,13 +167,13 @@ def test_every_option_arrives(settings, tmp_path):
     )  # fmt: skip
     assert (asked.jobs, asked.job_memory, asked.ray) == (4, 1_500_000_000, None)
     assert asked.scenes == (Path("a"), Path("b")) and asked.methods == ("3dgs", "chronogs")
-    assert asked.strategies == ("joint", "separate") and asked.preset == "fast"
-    assert asked.budget_seconds == 90 and asked.iterations == 7 and asked.seeds == (5, 6)
-    assert asked.overrides == {"x": "1", "chronogs.y": "a=b"}
-    assert (asked.max_width, asked.threads, asked.device) == (320, 3, "cpu")
-    assert asked.separate_iterations == "each" and asked.overwrite
-    assert asked.dataset_format == "wat" and asked.period_by == "year"
-    assert asked.lpips_weights == tmp_path and asked.runs == Path("elsewhere")
+    assert asked.strategies == ("joint", "separate") and asked.run.preset == "fast"
+    assert asked.run.budget_seconds == 90 and asked.run.iterations == 7 and asked.seeds == (5, 6)
+    assert asked.run.overrides == {"x": "1", "chronogs.y": "a=b"}
+    assert (asked.run.max_width, asked.run.threads, asked.run.device) == (320, 3, "cpu")
+    assert asked.run.separate_iterations == "each" and asked.overwrite
+    assert asked.dataset_format == "wat" and asked.run.period_by == "year"
+    assert asked.run.lpips_weights == tmp_path and asked.run.runs == Path("elsewhere")
 
 
 @pytest.mark.parametrize(
