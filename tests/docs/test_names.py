@@ -54,12 +54,11 @@ def names_of(file: Path) -> frozenset[str]:
     found = set()
     for node in tree.body:
         found |= _names(node)
-        if isinstance(node, ast.ImportFrom):
-            found |= {alias.asname or alias.name for alias in node.names}
         if isinstance(node, ast.ClassDef):
             found |= {f"{node.name}.{name}" for item in node.body for name in _names(item)}
             found |= {f"{node.name}.{name}" for name in _own_attributes(node)}
-    return frozenset(found)
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    return frozenset(found | {a.asname or a.name for node in imports for a in node.names})
 
 
 def _names(node: ast.stmt) -> set[str]:
