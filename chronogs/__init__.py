@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from chronoscene.anchors import MAIN_OPTIONS
 from chronoscene.methods import MethodSpec
 
 _FULL: dict[str, Any] = {
@@ -72,4 +73,5 @@ SPEC = MethodSpec(
         "accurate": _SHORT | {"iterations": 8_000},
     },
     resumable=True,
+    main_options=(*MAIN_OPTIONS, "period_dim", "global_dim", "exposure"),
 )

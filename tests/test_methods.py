@@ -56,7 +56,7 @@ def test_tuples_are_written_as_in_python_or_json(value):
 
 @pytest.mark.parametrize("value", ["fast", "1.5", "true", "[1]"])
 def test_values_of_another_type_are_refused(value):
-    with pytest.raises(ConfigError, match="toy --set iterations: expected a value like 100"):
+    with pytest.raises(ConfigError, match="toy --set iterations: expected a valid integer, found"):
         build_config(SPEC, preset="fast", overrides={"iterations": value})
 
 

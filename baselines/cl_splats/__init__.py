@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from chronoscene.gaussians import MAIN_OPTIONS
 from chronoscene.methods import MethodSpec
 
 _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousands
@@ -36,4 +37,5 @@ SPEC = MethodSpec(
         "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000},
     },
     resumable=True,
+    main_options=(*MAIN_OPTIONS, "change_threshold", "dilation", "vote_share", "samples"),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from chronoscene.gaussians import MAIN_OPTIONS
 from chronoscene.methods import MethodSpec
 
 _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousands
@@ -42,4 +43,5 @@ SPEC = MethodSpec(
         | {"iterations": 1_000, "reference_size": 64, "width": 32, "reset_interval": 30_000},
     },
     resumable=True,
+    main_options=(*MAIN_OPTIONS, "reference", "encoder", "width", "visibility"),
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from chronoscene.gaussians import MAIN_OPTIONS
 from chronoscene.methods import MethodSpec
 
 # The published schedule squeezed into thousands of steps; the set grows as far as it wants to.
@@ -28,6 +29,13 @@ SPEC = MethodSpec(
         "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000},
     },
     resumable=True,
+    main_options=(
+        *MAIN_OPTIONS,
+        "sh_degree",
+        "densification",
+        "position_lr_initial",
+        "ssim_weight",
+    ),
 )
 
 PERIOD_SPEC = replace(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from chronoscene.gaussians import MAIN_OPTIONS
 from chronoscene.methods import MethodSpec
 
 _SHORT: dict[str, Any] = {  # for thousands of steps instead of tens of thousands
@@ -34,4 +35,5 @@ SPEC = MethodSpec(
         "fast": _SHORT | {"iterations": 1_000, "reset_interval": 30_000},
     },
     resumable=True,
+    main_options=(*MAIN_OPTIONS, "sh_degree", "start_times", "initial_time_scale", "wave_cycle"),
 )

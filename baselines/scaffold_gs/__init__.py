@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from chronoscene.anchors import MAIN_OPTIONS
 from chronoscene.methods import MethodSpec
 
 _SHORT: dict[str, Any] = {
@@ -34,6 +35,7 @@ SPEC = MethodSpec(
     config="baselines.scaffold_gs.config:ScaffoldGSConfig",
     presets=_PRESETS,
     resumable=True,
+    main_options=(*MAIN_OPTIONS, "appearance_dim", "scale_weight", "exposure"),
 )
 
 PERIOD_SPEC = replace(

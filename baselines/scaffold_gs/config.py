@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from pydantic import NonNegativeInt, PositiveInt
+
 from chronoscene.anchors.config import AnchorConfig
 
 
@@ -11,14 +13,14 @@ from chronoscene.anchors.config import AnchorConfig
 class ScaffoldGSConfig(AnchorConfig):
     """Options of Scaffold-GS beside those of all methods with anchors."""
 
-    iterations: int = 30_000
-    base_dim: int = 32
+    iterations: PositiveInt = 30_000
+    base_dim: NonNegativeInt = 32
     """Length of the feature of an anchor."""
     statistics_from: float = 500 / 30_000
     density_from: float = 1_500 / 30_000
-    appearance_dim: int = 0
+    appearance_dim: NonNegativeInt = 0
     """Length of the appearance vectors that the colour MLP sees; 0, none, in all published scripts.
     ``scaffold-gs`` has one per training image and renders with their mean,
     ``scaffold-gs-period`` one per period."""
     appearance_lr: tuple[float, float] = (0.05, 0.0005)
-    """Of the appearance vectors."""
+    """Learning rate of the appearance vectors."""

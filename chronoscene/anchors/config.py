@@ -7,50 +7,55 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Literal, Self
 
-from chronoscene.checks import check_at_least, check_choice
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveInt
+
 from chronoscene.errors import ConfigError
 from chronoscene.training.config import SplattingConfig
+
+Head = Literal["opacity", "covariance", "color"]
+HEADS: tuple[Head, ...] = ("opacity", "covariance", "color")  # The three MLPs
+_MAX_OFFSETS = 31  # Their use is stored in the bits of an int32
 
 
 @dataclass(frozen=True)
 class AnchorConfig(SplattingConfig):
     """Shared options. ``(a, b)`` is a learning rate that falls log-linearly from a to b."""
 
-    iterations: int = 40_000
+    iterations: PositiveInt = 40_000
     """Training steps; one image each."""
 
     # Anchors
-    offsets_per_anchor: int = 10
+    offsets_per_anchor: PositiveInt = 10
     """Gaussians per anchor (K, also k)."""
-    voxel_size: float = 0.001
+    voxel_size: NonNegativeFloat = 0.001
     """Edge of the cells in which anchors start, in `voxel_unit`; 0 takes the size from the
     cloud."""
-    voxel_unit: str = "world"
+    voxel_unit: Literal["world", "training", "spacing"] = "world"
     """``world``: scene units (official code); ``training``: units of the normalised frame;
     ``spacing``: multiples of the median distance of neighbouring sparse points."""
-    voxel_origin: str = "zero"
+    voxel_origin: Literal["zero", "box"] = "zero"
     """``zero``: cells centred on multiples of the size (code); ``box``: counted from the lower
     corner of the bounding box (paper)."""
-    max_initial_anchors: int = 0
+    max_initial_anchors: NonNegativeInt = 0
     """Coarsen the voxel until there are at most so many anchors; 0: no limit."""
-    max_anchors: int = 0
+    max_anchors: NonNegativeInt = 0
     """Growth stops at so many anchors; 0: no limit."""
-    base_dim: int = 16
+    base_dim: NonNegativeInt = 16
     """Length of the feature that all periods share (d_b)."""
-    hidden_dim: int = 0
+    hidden_dim: NonNegativeInt = 0
     """Hidden units per MLP; 0: the length of the feature of an anchor in one period (code)."""
-    feature_init: str = "zero"
+    feature_init: Literal["zero", "uniform", "gaussian"] = "zero"
     """``zero`` | ``uniform`` | ``gaussian``: start of the anchor features."""
     feature_init_scale: float = 0.1
     """Half width of the uniform, or standard deviation of the Gaussian start."""
 
     # Forward pass
-    direction: str = "unit"
+    direction: Literal["unit", "full"] = "unit"
     """``unit``: viewing direction of length one (code); ``full``: anchor minus camera centre
     (paper)."""
-    visibility: str = "radius"
+    visibility: Literal["radius", "frustum"] = "radius"
     """Anchors decoded per view. ``radius``: projected footprint touches the image (code);
     ``frustum``: centre inside the image (paper)."""
 
@@ -61,18 +66,18 @@ class AnchorConfig(SplattingConfig):
 
     # Learning rates
     offset_lr: tuple[float, float] = (0.01, 0.0001)
-    """Multiplied by the extent of the cameras, in `length_unit`."""
+    """Learning rate of the offsets, multiplied by the extent of the cameras in `length_unit`."""
     feature_lr: tuple[float, float] = (0.0075, 0.0075)
-    """Of the features of anchors."""
+    """Learning rate of the features of anchors."""
     scaling_lr: tuple[float, float] = (0.007, 0.007)
-    """Of the logarithms of the scales of anchors."""
+    """Learning rate of the logarithms of the scales of anchors."""
     opacity_lr: tuple[float, float] = (0.002, 0.00002)
-    """Of the MLP that gives opacities."""
+    """Learning rate of the MLP that gives opacities."""
     covariance_lr: tuple[float, float] = (0.004, 0.004)
-    """Of the MLP that gives scales and rotations."""
+    """Learning rate of the MLP that gives scales and rotations."""
     color_lr: tuple[float, float] = (0.008, 0.00005)
-    """Of the MLP that gives colours."""
-    cooldown: float = 0.0
+    """Learning rate of the MLP that gives colours."""
+    cooldown: NonNegativeFloat = 0.0
     """Share of the training, its last, in which all learning rates fall further, to a tenth of what
     they would be: the model settles. Not in the papers."""
 
@@ -83,9 +88,9 @@ class AnchorConfig(SplattingConfig):
     """Share after which anchors grow and are pruned."""
     density_until: float = 0.5
     """Share at which the set of anchors is final."""
-    density_interval: int = 100
+    density_interval: PositiveInt = 100
     """Steps from one round to the next."""
-    first_round: str = "after"
+    first_round: Literal["after", "at"] = "after"
     """``after``: the first round is the first multiple of the interval after `density_from`
     (code: 1600); ``at``: the multiple at `density_from` counts too (paper: 1500)."""
     grad_threshold: float = 0.0002
@@ -95,19 +100,19 @@ class AnchorConfig(SplattingConfig):
     """Share of the interval in which an anchor must be visible to be judged."""
     min_opacity: float = 0.005
     """Anchors whose summed opacity per visit is below this are pruned."""
-    prune_by: str = "opacity"
+    prune_by: Literal["opacity", "gradient", "both"] = "opacity"
     """``opacity`` (code); ``gradient`` (main text of the paper); ``both``."""
     prune_gradient: float = 1e-6
     """Summed gradient per visit below which ``gradient`` prunes; the paper gives no value."""
-    unused_share: float = 0.0
-    """Once growth is over, the anchors are dropped that add least to the training views, as many as
-    add no more than this share of the light of any period, and single offsets likewise. 0: none.
-    Not in the papers."""
-    growth_levels: int = 3
+    unused_share: NonNegativeFloat = 0.0
+    """Share of the light of any period that may be lost when, once growth is over, the anchors that
+    add least to the training views are dropped, and single offsets likewise. 0: none. Not in the
+    papers."""
+    growth_levels: NonNegativeInt = 3
     """Cell sizes that are tried, coarse to fine."""
-    coarsest_cell: int = 16
+    coarsest_cell: PositiveInt = 16
     """Edge of the coarsest growth cell in voxels."""
-    cell_refinement: int = 4
+    cell_refinement: PositiveInt = 4
     """Ratio of the edges of successive growth cells."""
     chained_levels: bool = True
     """Finer levels are skipped in a round in which the coarser ones added nothing (code)."""
@@ -120,10 +125,6 @@ class AnchorConfig(SplattingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, known in _CHOICES.items():
-            check_choice(name, getattr(self, name), known)
-        for name, low in _LOWER_BOUNDS.items():
-            check_at_least(name, getattr(self, name), low)
         if self.unused_share and self.offsets_per_anchor > _MAX_OFFSETS:
             raise ConfigError(
                 "offsets_per_anchor",
@@ -133,7 +134,7 @@ class AnchorConfig(SplattingConfig):
             )
 
     def in_training_frame(self, training_from_world: float) -> Self:
-        """As for every method; also bound and volume of scales, and the learning rate of offsets.
+        """Convert as for every method, and bound and volume of scales and the rate of offsets.
 
         Offsets that are multiples of an anchor's scale have no unit, but the official code
         multiplies their learning rate by the extent of the cameras, which has one.
@@ -148,34 +149,3 @@ class AnchorConfig(SplattingConfig):
             scale_weight=self.scale_weight / training_from_world**3,
             offset_lr=(self.offset_lr[0] * factor, self.offset_lr[1] * factor),
         )
-
-
-HEADS = ("opacity", "covariance", "color")  # The three MLPs
-
-_CHOICES: dict[str, tuple[str, ...]] = {
-    "voxel_unit": ("world", "training", "spacing"),
-    "voxel_origin": ("zero", "box"),
-    "feature_init": ("zero", "uniform", "gaussian"),
-    "direction": ("unit", "full"),
-    "visibility": ("radius", "frustum"),
-    "first_round": ("after", "at"),
-    "prune_by": ("opacity", "gradient", "both"),
-}
-
-_MAX_OFFSETS = 31  # Their use is stored in the bits of an int32
-
-_LOWER_BOUNDS: dict[str, float] = {
-    "iterations": 1,
-    "offsets_per_anchor": 1,
-    "voxel_size": 0.0,
-    "max_initial_anchors": 0,
-    "max_anchors": 0,
-    "base_dim": 0,
-    "hidden_dim": 0,
-    "density_interval": 1,
-    "cooldown": 0.0,
-    "growth_levels": 0,
-    "coarsest_cell": 1,
-    "cell_refinement": 1,
-    "unused_share": 0.0,
-}

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Literal, Self
 
-from chronoscene.checks import check_at_least, check_choice
+from pydantic import NonNegativeFloat
+
+from chronoscene.methods import check_options
 from chronoscene.rasterizer import NEAR_PLANE
-from chronoscene.training.exposure import KINDS
+from chronoscene.training.exposure import ExposureKind
 
 
 @dataclass(frozen=True)
 class SplattingConfig:
-    """Options of all methods that splat Gaussians."""
+    """Options of all methods that splat Gaussians; a subclass has a field ``iterations``."""
 
-    length_unit: str = "world"
+    length_unit: Literal["world", "training"] = "world"
     """Unit of the options that are lengths. ``world``: that of the scene, as in released code;
     ``training``: that of the training frame, in which the farthest camera is at distance 1, so
     that the unit of the scene does not matter."""
-    near_plane: float = NEAR_PLANE
+    near_plane: NonNegativeFloat = NEAR_PLANE
     """Nearest depth that is drawn, in `length_unit`. The default is common to all methods here; the
     official rasterizer of 3DGS has 0.2."""
     antialiased: bool = False
@@ -34,17 +36,15 @@ class SplattingConfig:
     random_background: bool = False
     """Train with another colour behind everything in each step, so that no Gaussian is missing
     where a photo shows that colour. Images are rendered with the usual background."""
-    exposure: str = "none"
+    exposure: ExposureKind = "none"
     """``image`` | ``period``: learn an affine transform of the colours for each training image, or
     for each period. A rendered view has that of its period: `chronoscene.training.exposure`."""
 
     def __post_init__(self) -> None:
-        check_choice("exposure", self.exposure, KINDS)
-        check_choice("length_unit", self.length_unit, ("world", "training"))
-        check_at_least("near_plane", self.near_plane, 0.0)
+        check_options(self)
 
     def in_training_frame(self, training_from_world: float) -> Self:
-        """The same options with all lengths in units of the training frame.
+        """Return the same options with all lengths in units of the training frame.
 
         Args:
             training_from_world: Scale of the training frame: its units per unit of the world.

@@ -12,7 +12,7 @@ images differs (the identity, or a fit to half of each).
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from chronoscene.training.periods import period_weights
 from chronoscene.training.schedules import log_linear
 from chronoscene.training.spherical_harmonics import C0
 
-KINDS = ("none", "image", "period")
+ExposureKind = Literal["none", "image", "period"]
 """``none``: no transforms; else what has one of its own."""
 
 LEARNING_RATE = (0.01, 0.001)
@@ -39,7 +39,7 @@ class Exposure:
     """The transforms of a training.
 
     Args:
-        kind: One of `KINDS`.
+        kind: What has a transform of its own.
         train: What is trained on.
         device: Of the tensors.
     """

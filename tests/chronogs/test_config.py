@@ -44,16 +44,31 @@ def test_reading_the_specs_imports_nothing_heavy() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"fusion": "product"}, "fusion: expected one of concat, sum"),
-        ({"voxel_unit": "mile"}, "voxel_unit: expected one of spacing, training, world"),
+        ({"fusion": "product"}, "fusion: expected 'concat' or 'sum', found 'product'"),
+        (
+            {"voxel_unit": "mile"},
+            "voxel_unit: expected 'world', 'training' or 'spacing', found 'mile'",
+        ),
         ({"global_heads": ("colour",)}, "global_heads: .*did you mean 'color'"),
-        ({"period_dim": -1}, "period_dim: expected at least 0, found -1"),
-        ({"merge_share": -1.0}, "merge_share: expected at least 0, found -1.0"),
+        ({"color_lr": (0.1, 0.1, 0.1)}, "color_lr: expected fewer values"),
+        ({"period_dim": 1.5}, "period_dim: expected a valid integer, found 1.5"),
+        ({"color_lr": (0.1,)}, "color_lr: expected more values"),
+        ({"period_dim": -1}, "period_dim: expected a value greater than or equal to 0, found -1"),
+        (
+            {"merge_share": -1.0},
+            "merge_share: expected a value greater than or equal to 0, found -1.0",
+        ),
         ({"trim_global": True, "fusion": "sum"}, "trim_global: expected False with fusion=sum"),
-        ({"iterations": 0}, "iterations: expected at least 1, found 0"),
-        ({"voxel_size": -1.0}, "voxel_size: expected at least 0.0, found -1.0"),
-        ({"near_plane": -1.0}, "near_plane: expected at least 0.0, found -1.0"),
-        ({"density_interval": 0}, "density_interval: expected at least 1"),
+        ({"iterations": 0}, "iterations: expected a value greater than 0, found 0"),
+        (
+            {"voxel_size": -1.0},
+            "voxel_size: expected a value greater than or equal to 0, found -1.0",
+        ),
+        (
+            {"near_plane": -1.0},
+            "near_plane: expected a value greater than or equal to 0, found -1.0",
+        ),
+        ({"density_interval": 0}, "density_interval: expected a value greater than 0, found 0"),
     ],
 )
 def test_impossible_options_are_refused(values: dict[str, Any], message: str) -> None:

@@ -33,17 +33,18 @@ from chronoscene.methods import (
     show_default=True,
     help="Folder of finished runs, which say what the method NAME costs.",
 )
-def command(name: str | None, runs: Path) -> None:
+@click.option("--all", "everything", is_flag=True, help="Show all options of the method NAME.")
+def command(name: str | None, runs: Path, everything: bool) -> None:
     """List the installed methods, or describe one.
 
-    For the method NAME (or module:SPEC), print all options with their defaults, meaning and values
-    in the presets, and the costs of finished runs.
+    For the method NAME (or module:SPEC), print the main options with their defaults, meaning and
+    values in the presets, and the costs of finished runs.
     """
     if name is None:
         list_methods()
         return
     look_here_for([name])
-    emit("\n".join(describe(load_spec(name), runs)) + "\n", None)
+    emit("\n".join(describe(load_spec(name), runs, everything=everything)) + "\n", None)
 
 
 def list_methods() -> None:
@@ -72,7 +73,7 @@ def _program_table(names: tuple[str, ...]) -> Table:
     return table
 
 
-def describe(spec: MethodSpec, runs: Path) -> Iterator[str]:
+def describe(spec: MethodSpec, runs: Path, *, everything: bool = True) -> Iterator[str]:
     """Yield the description of a method, line by line."""
     yield f"{spec.title} ({spec.name})"
     yield f"paper: {spec.paper}"
@@ -85,9 +86,13 @@ def describe(spec: MethodSpec, runs: Path) -> Iterator[str]:
         yield f"external program, installed apart from ChronoScene; {spec.runner.tested}; commands:"
         for words in (spec.runner.train, *spec.runner.render):
             yield indent(click.wrap_text(shlex.join(words), width=90), "    ")
+    options = options_of(spec)
+    shown = options if everything else options[: len(spec.main_options) or None]
     yield "\nOptions, with their defaults; --set NAME=VALUE changes one:\n"
-    for option in options_of(spec):
+    for option in shown:
         yield describe_option(option)
+    if hidden := len(options) - len(shown):
+        yield f"\n{hidden} more options: chronoscene methods {spec.name} --all"
     yield f"\nCost:\n\n{describe_cost(spec, runs)}"
 
 

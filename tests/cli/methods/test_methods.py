@@ -32,8 +32,18 @@ def test_a_description_has_defaults_presets_and_meanings(tmp_path):
     text = methods("3dgs", "--runs", tmp_path)
     assert text.startswith("3DGS (3dgs)\npaper: Kerbl et al., ")
     assert "\niterations=30000; accurate: 8000; balanced: 3000; fast: 1000\n    Training st" in text
-    assert "\nstretch=false; accurate, balanced, fast: true\n    False: moment i is step i" in text
+    assert "\nstretch=" not in text and "more options: chronoscene methods 3dgs --all\n" in text
     assert f"No run of it in {tmp_path}." in text
+    text = methods("3dgs", "--all", "--runs", tmp_path)
+    assert "\nstretch=false; accurate, balanced, fast: true\n    False: moment i is step i" in text
+    assert "--all" not in text
+
+
+@pytest.mark.parametrize("name", method_names())
+def test_ten_options_come_first(name):
+    spec = load_spec(name)
+    first = [option.name for option in options_of(spec)][: len(spec.main_options)]
+    assert first == list(spec.main_options) and len(first) == 10 and first[0] == "iterations"
 
 
 def test_finished_runs_say_what_a_method_costs(monkeypatch, tmp_path, make_scene_folder):

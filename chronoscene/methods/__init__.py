@@ -1,0 +1,69 @@
+"""What a method is: data that describes it, and the interface that the harness drives.
+
+A method is a plug-in. Its `MethodSpec` is pure data, found through the entry-point group
+``chronoscene.methods``; listing methods imports nothing heavy. Its class fulfils `Method`. The
+harness owns the loop, the clock, the seeds and the files; a method sees a `TrainingSet` in the
+normalised training frame and never a dataset folder.
+
+A method may instead be another program, which trains itself in an environment of its own: then its
+spec has a `Runner` and no class, and its entry point is in the group ``chronoscene.programs``.
+
+A method that splats Gaussians need not implement all of `Method`: `GaussianMethod` in
+`chronoscene.gaussians` and `AnchorMethod` in `chronoscene.anchors` do it, and say what to override.
+"""
+
+from __future__ import annotations
+
+from chronoscene.methods.interface import Method, MethodSize, Prediction, Skipped, StepReport
+from chronoscene.methods.options import (
+    MethodConfig,
+    Option,
+    as_typed,
+    build_config,
+    check_options,
+    config_from_values,
+    options_of,
+)
+from chronoscene.methods.spec import (
+    ENTRY_POINT_GROUP,
+    PROGRAM_GROUP,
+    MethodSpec,
+    PeriodInput,
+    ProgramConfig,
+    Runner,
+    import_object,
+    installed_methods,
+    load_spec,
+    method_names,
+)
+from chronoscene.methods.views import TrainingSet, TrainingView, View, no_mask, nothing_ahead
+
+__all__ = [
+    "ENTRY_POINT_GROUP",
+    "PROGRAM_GROUP",
+    "Method",
+    "MethodConfig",
+    "MethodSize",
+    "MethodSpec",
+    "Option",
+    "PeriodInput",
+    "Prediction",
+    "ProgramConfig",
+    "Runner",
+    "Skipped",
+    "StepReport",
+    "TrainingSet",
+    "TrainingView",
+    "View",
+    "as_typed",
+    "build_config",
+    "check_options",
+    "config_from_values",
+    "import_object",
+    "installed_methods",
+    "load_spec",
+    "method_names",
+    "no_mask",
+    "nothing_ahead",
+    "options_of",
+]

@@ -1,0 +1,144 @@
+"""The interface of a method, and what it hands to the harness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chronoscene.methods.views import TrainingSet, View
+from chronoscene.scene.gaussian_cloud import GaussianCloud
+
+Skipped = Literal["empty", "not finite"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """A rendered view."""
+
+    rgb: NDArray[np.float32]
+    """0..1. [H, W, 3]"""
+    alpha: NDArray[np.float32] | None = None
+    """[H, W]"""
+    depth: NDArray[np.float32] | None = None
+    """Expected z-depth in units of the training frame; 0 where alpha is 0. [H, W]"""
+    drawn: int | None = None
+    """Gaussians, or whatever the method draws, that touch the image."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepReport:
+    """What one training step tells the harness."""
+
+    loss: float
+    primitives: int
+    """Gaussians or anchors held now."""
+    skipped: Skipped | None = None
+    """Why nothing was learned, so that no parameter and no moment of the optimiser changed:
+    ``empty``, the view shows no primitive, or its mask ignores all of the image; ``not finite``,
+    the loss or a gradient was not."""
+
+
+@dataclass(frozen=True, slots=True)
+class MethodSize:
+    """How big a trained model is."""
+
+    primitives: int
+    parameters: int
+    """Numbers stored in the checkpoint."""
+    unit: str = "primitives"
+    """What the primitives are: ``Gaussians``, ``anchors``."""
+
+
+class Method(Protocol):
+    """The interface of a method. ``method(config)`` makes one, `setup` or `load` fills it."""
+
+    def __init__(self, config: Any) -> None: ...
+
+    def setup(self, train: TrainingSet, *, seed: int, device: str) -> None:
+        """Build the initial model. Nothing else draws from the global random state."""
+
+    def step(self, index: int, progress: float) -> StepReport:
+        """Do one training step.
+
+        Args:
+            index: Number of steps done before, from 0.
+            progress: Share of the training that is over, 0..1. Every schedule (learning rates,
+                densification) follows it, so that a run that ends by the clock goes through the
+                same phases as one that ends after a number of iterations.
+        """
+
+    def render(self, view: View, period: float) -> Prediction:
+        """Render a view as of a period; fractional only where the spec says ``continuous``."""
+
+    def save(self, folder: Path) -> None:
+        """Write ``model.safetensors`` and ``model.json`` into an existing empty folder."""
+
+    def load(self, folder: Path, *, device: str) -> None:
+        """Read what `save` wrote; `render` then gives the same pixels."""
+
+    def size(self) -> MethodSize: ...
+
+    def render_split(
+        self, view: View, *, geometry_period: float, appearance_period: float
+    ) -> Prediction:
+        """Render the geometry of one period in the colours of another.
+
+        Only where a method keeps them apart; one that does not has no such function.
+        """
+
+    def to_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
+        """The model as of a period as Gaussians with spherical harmonics, for other programs.
+
+        Only where a method draws Gaussians; one that does not has no such function.
+
+        Args:
+            period: As for `render`.
+            views: Those of the training. What spherical harmonics cannot hold, such as an opacity
+                that depends on the direction, is to be right in these.
+
+        Returns:
+            In the training frame, in float32.
+        """
+
+    def render_gaussians(self, gaussians: GaussianCloud, view: View) -> Prediction:
+        """Render what `to_gaussians` gave."""
+
+    def permute(self, order: NDArray[np.int64]) -> None:
+        """Put the anchors or Gaussians of a loaded model into another order. [N]
+
+        Only where the model is a set of these, whose positions are the tensor ``anchors`` or
+        ``means``; a method without it has no such function.
+        """
+
+    def save_training(self, folder: Path) -> None:
+        """Write everything that the steps to come depend on into an existing empty folder.
+
+        That is the model as the optimiser has it, moments, statistics for densification, generators
+        of random numbers and places in schedules; no step may notice that it was asked for. Only
+        where the spec says ``resumable``.
+
+        Raises:
+            OSError, DiskFullError: If the disk refuses.
+        """
+
+    def load_training(self, folder: Path) -> None:
+        """Go on from what `save_training` wrote; `setup` or `extend` was called as before it.
+
+        On a CPU the steps to come then give the same bits as without the interruption.
+        """
+
+    def extend(self, train: TrainingSet) -> None:
+        """Go on from the model at the end of a training, with the views of the next period.
+
+        Called instead of `setup` under the strategy ``sequential``; seed and device are those of
+        `setup`, and steps and progress count from 0 again. Only where a method can; one that cannot
+        has no such function.
+
+        Args:
+            train: Its views are of the new period alone, its periods are those so far.
+        """

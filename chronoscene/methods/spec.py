@@ -1,0 +1,143 @@
+"""Descriptions of methods: pure data, found by entry points, which import nothing heavy."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Literal
+
+from chronoscene.checks import check_choice
+from chronoscene.errors import ConfigError
+
+PeriodInput = Literal["none", "label", "continuous"]
+ENTRY_POINT_GROUP = "chronoscene.methods"
+PROGRAM_GROUP = "chronoscene.programs"
+
+
+@dataclass(frozen=True, slots=True)
+class Runner:
+    """How another program is trained, and asked for the test views.
+
+    A command is a tuple of words. In them, and in the option ``prefix``, these stand for values:
+    ``{data}``, the folder of the exported training set; ``{output}``, an empty folder, the current
+    one of every command; ``{work}``, the folder that holds both; ``{iterations}``; ``{seconds}``,
+    of ``--budget``, 0 without; ``{seed}``; and the options of the config.
+
+    The training set has the test views, too, for the program's own command that renders them, but
+    their photos are black, and no point has an observation in them.
+    """
+
+    exports: str
+    """Format of the training set, one that ``chronoscene convert --to`` writes."""
+    train: tuple[str, ...]
+    """The command that trains. Its time is the training time."""
+    render: tuple[tuple[str, ...], ...]
+    """Commands that follow it, and end with an image of each test view."""
+    images: str
+    """Place of these images below ``{output}``, with ``{name}``, the file name of the view in the
+    training set without its extension, or ``{index}``, its number among the test views by name."""
+    model: str
+    """Files of the trained model below ``{output}``, as a glob pattern."""
+    primitives: str | None = None
+    """PLY file below ``{output}`` with a vertex for each Gaussian, or whatever is drawn."""
+    unit: str = "primitives"
+    """What these are: ``Gaussians``, ``anchors``."""
+    prepare: str | None = None
+    """``module:function``, called with ``{data}``, ``{output}`` and the config before the training:
+    it writes there what the export lacks for this program, and returns notices for the user, which
+    go on after the title of the method: ``ignores principal points``."""
+    version: tuple[str, ...] = ()
+    """Command whose last line of output is the version of the program."""
+    tested: str = "untested"
+    """How far this recipe was tried, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProgramConfig:
+    """Options of another program. A class of its own with more fields is possible."""
+
+    iterations: int = 30_000
+    """Training steps."""
+    prefix: str = ""
+    """Words before each command: ``conda run -n ENVIRONMENT``, or ``docker run ... IMAGE``."""
+    source: str = ""
+    """Folder with the source code of the program, where its commands are files in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class MethodSpec:
+    """What the harness knows of a method without importing it."""
+
+    name: str
+    """Name on the command line."""
+    title: str
+    """Name in tables."""
+    paper: str
+    licence: str
+    """Licence of this implementation, and of the official code where it differs."""
+    period_input: PeriodInput
+    """``none``: hidden from it; ``label``: an integer; ``continuous``: may be fractional."""
+    outputs: tuple[str, ...]
+    """Subset of ``rgb, alpha, depth``."""
+    devices: tuple[str, ...]
+    """Subset of ``cpu, cuda``."""
+    method: str
+    """``module:Class`` that fulfils `Method`; empty where there is a `runner`."""
+    config: str
+    """``module:Class``, a frozen dataclass with a field ``iterations``. With a `runner`, it
+    is a `ProgramConfig`."""
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Preset name to the values that differ from the defaults of the config class."""
+    resumable: bool = False
+    """True if it has `Method.save_training` and `Method.load_training`."""
+    main_options: tuple[str, ...] = ()
+    """Options that people change first, in the order of ``chronoscene methods NAME``, which shows
+    these alone unless asked for all. Empty: all options."""
+    runner: Runner | None = None
+    """How it is run, if it is another program."""
+
+
+def import_object(reference: str) -> Any:
+    """Import ``module:Name``."""
+    module, _, name = reference.partition(":")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(
+            reference,
+            expected="an importable module:Name",
+            found=f"{type(error).__name__}: {error}",
+            todo="check the spelling, and that its package is installed",
+        ) from error
+
+
+def method_names(group: str = ENTRY_POINT_GROUP) -> tuple[str, ...]:
+    """Names of the installed methods of an entry-point group, sorted; imports none of them."""
+    return tuple(sorted({entry.name for entry in entry_points(group=group)}))
+
+
+def installed_methods() -> dict[str, EntryPoint]:
+    """Entry points of all methods by their names, other programs among them."""
+    groups = (PROGRAM_GROUP, ENTRY_POINT_GROUP)
+    return {entry.name: entry for group in groups for entry in entry_points(group=group)}
+
+
+def load_spec(name: str) -> MethodSpec:
+    """Find a method by its name, or by ``module:SPEC`` while it is being developed.
+
+    Raises:
+        ConfigError: If there is no such method; the message lists the known ones.
+    """
+    if ":" in name:
+        spec = import_object(name)
+    else:
+        installed = installed_methods()
+        check_choice("--method", name, installed)
+        spec = installed[name].load()
+    if not isinstance(spec, MethodSpec):
+        raise ConfigError(
+            name, expected="a MethodSpec", found=type(spec).__name__, todo="name its SPEC object"
+        )
+    return spec
