@@ -1,4 +1,4 @@
-"""Reading COLMAP's database, and files of image pairs. Worker process only."""
+"""COLMAP's database of features and matches, and files of image pairs. Worker process only."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from chronoscene.io.pycolmap import pycolmap
 from chronoscene.io.staging import write_text_atomic
 
 SEED = 0
+
+Features = tuple[np.ndarray, np.ndarray]
+"""Keypoints [K, 6], float32: x and y in pixels of the photo, and the 2 x 2 matrix of scale and
+rotation by rows; descriptors [K, 128], uint8."""
 
 
 def quiet() -> None:
@@ -28,6 +32,19 @@ def read_pairs(path: Path) -> list[tuple[str, str]]:
 def write_pairs(path: Path, pairs: Sequence[tuple[str, str]]) -> None:
     """Write pairs of names, one per line. COLMAP splits at blanks, so names must have none."""
     write_text_atomic(path, "".join(f"{a} {b}\n" for a, b in pairs))
+
+
+def store_features(database: str, name: str, features: Features) -> None:
+    """Store the features of an image; the keypoints last, by which it counts as done."""
+    keypoints, descriptors = features
+    with pycolmap.Database.open(database) as opened:
+        image = opened.read_image_with_name(name)
+        assert image is not None
+        if not opened.exists_descriptors(image.image_id):
+            kind = pycolmap.FeatureExtractorType.SIFT
+            found = pycolmap.FeatureDescriptors(kind, descriptors)
+            opened.write_descriptors(image.image_id, found)
+        opened.write_keypoints(image.image_id, keypoints)
 
 
 def verified_matches(

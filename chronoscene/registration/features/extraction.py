@@ -1,14 +1,16 @@
-"""First step: images and their SIFT features in COLMAP's database. Worker process only.
+"""First step: images and their features in COLMAP's database. Worker process only.
 
-Images enter the database in the order of the photos, so ids are the same in every run. What is
-stored is not done again. Features of the same photos in an earlier database are copied; see
-`feature_reuse`.
+Images enter the database in the order of the photos, so ids are the same in every run. Features
+that are stored are not computed again, and those of the same photos in an earlier database are
+copied (`feature_reuse`). Another kind of features needs three things: an `Extractor`, here; a
+`matching.Matcher` of its descriptors; and another name (`features.METHOD`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +19,14 @@ import cv2
 from chronoscene.images.masks import find_masks
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features import feature_reuse
-from chronoscene.registration.features.database import quiet
-from chronoscene.registration.features.sift import Features, photos_at_once, sift_features
+from chronoscene.registration.features.database import Features, quiet, store_features
+from chronoscene.registration.features.feature_reuse import record_of, renew
+from chronoscene.registration.features.sift import photos_at_once, sift_features
 
 BATCH = 64  # Photos
+
+Extractor = Callable[[Path, Path | None], Features]
+"""Compute the features of a photo, given its mask or None; called by several threads."""
 
 
 def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
@@ -36,23 +41,27 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
         known beforehand; ``carried``: number of photos with features from an earlier database.
     """
     quiet()
-    database, photos = arguments["database"], arguments["photos"]
-    feature_reuse.renew(Path(database), feature_reuse.record_of(arguments))
-    _import(database, photos, arguments["groups"])
-    reused = feature_reuse.reuse_features(Path(database))
-    names = sorted(name for group in arguments["groups"] for name in group["names"])
-    left = [name for name, count in keypoint_counts(database).items() if count == 0]
-    left = sorted(set(left) & set(names))
-    options = (arguments[k] for k in ("max_image_size", "max_features", "threads"))
-    masks = find_masks(Path(photos).parent, left)
-    found = _features([(Path(photos, name), masks.get(name)) for name in left], *options)
+    database, photos, groups = (arguments[k] for k in ("database", "photos", "groups"))
+    create = partial(_import, database, photos, groups)
+    reused = renew(Path(database), record_of(arguments), create)
+    size = arguments["max_image_size"]
+    extractor: Extractor = partial(
+        sift_features, max_image_size=size, max_features=arguments["max_features"]
+    )
+    names = sorted(name for group in groups for name in group["names"])
+    left = _without_features(database, names)
+    threads = photos_at_once(size, arguments["threads"])
+    found = _features(extractor, Path(photos), left, threads)
     for done, (name, features) in enumerate(zip(left, found, strict=True), len(names) - len(left)):
         report("features", done, len(names))
-        _store(database, name, features)
+        store_features(database, name, features)
     report("features", len(names), len(names))
     with pycolmap.Database.open(database) as opened:
         known = {c.camera_id: bool(c.has_prior_focal_length) for c in opened.read_all_cameras()}
-    counts = keypoint_counts(database)
+        counts = {
+            str(image.name): int(opened.num_keypoints_for_image(image.image_id))
+            for image in opened.read_all_images()
+        }
     return {
         "keypoints": {name: counts[name] for name in names},
         "focal_known": known,
@@ -60,50 +69,29 @@ def extract(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     }
 
 
-def _store(database: str, name: str, features: Features) -> None:
-    """Store the features of an image; the keypoints last, by which it counts as done."""
-    keypoints, descriptors = features
-    with pycolmap.Database.open(database) as opened:
-        image = opened.read_image_with_name(name)
-        assert image is not None
-        image_id = image.image_id
-        if not opened.exists_descriptors(image_id):
-            kind = pycolmap.FeatureExtractorType.SIFT
-            opened.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, descriptors))
-        if not opened.exists_keypoints(image_id):
-            opened.write_keypoints(image_id, keypoints)
-
-
 def _features(
-    files: Sequence[tuple[Path, Path | None]], max_image_size: int, max_features: int, threads: int
+    extractor: Extractor, folder: Path, names: Sequence[str], threads: int
 ) -> Iterator[Features]:
-    """Features of photos with masks, in their order; threads are never far ahead of the caller."""
+    """Features of photos, in their order; threads are never far ahead of the caller."""
     cv2.setNumThreads(1)  # each photo is the work of one thread
-
-    def compute(file: tuple[Path, Path | None]) -> Features:
-        return sift_features(file[0], max_image_size, max_features, file[1])
-
-    with ThreadPoolExecutor(photos_at_once(max_image_size, threads)) as pool:
-        for first in range(0, len(files), BATCH):
-            yield from pool.map(compute, files[first : first + BATCH])
+    masks = find_masks(folder.parent, names)
+    with ThreadPoolExecutor(threads) as pool:
+        for first in range(0, len(names), BATCH):
+            batch = names[first : first + BATCH]
+            yield from pool.map(extractor, map(folder.joinpath, batch), map(masks.get, batch))
 
 
-def keypoint_counts(database: str | Path) -> dict[str, int]:
-    """Number of keypoints of each image."""
-    with pycolmap.Database.open(str(database)) as opened:
-        return {
-            str(image.name): int(opened.num_keypoints_for_image(image.image_id))
-            for image in opened.read_all_images()
-        }
+def _without_features(database: str, names: Sequence[str]) -> list[str]:
+    """Photos whose features are not stored; a photo in which none were found is done."""
+    with pycolmap.Database.open(database) as opened:
+        ids = {str(image.name): image.image_id for image in opened.read_all_images()}
+        return [name for name in names if not opened.exists_keypoints(ids[name])]
 
 
 def _import(database: str, photos: str, groups: Sequence[Mapping[str, Any]]) -> None:
-    """Add the images of each group, with one camera for all of them, unless they are there."""
-    with pycolmap.Database.open(database) as opened:
-        present = {str(image.name) for image in opened.read_all_images()}
+    """Add the images of each group, with one camera for all of them, to a new database."""
+    pycolmap.Database.open(database).close()
     for group in groups:
-        if present.issuperset(group["names"]):
-            continue
         options = pycolmap.ImageReaderOptions(camera_model=group["model"])
         if group["params"] is not None:
             options.camera_params = ",".join(repr(float(p)) for p in group["params"])

@@ -1,12 +1,12 @@
 """Second step: pairs of photos, their verified matches, and what of them is held out. Worker only.
 
-Matches are ours (`nearest`); COLMAP verifies them by geometry. What is stored is not done again.
-Matches of the same photos in an earlier database are copied; see `feature_reuse`.
+A `Matcher` gives the matches (`nearest.mutual_matches`), and COLMAP verifies them by geometry.
+Matches that are in the database already are verified as they are; verified pairs are kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 
 from chronoscene.io.processes import Report
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features import feature_reuse
 from chronoscene.registration.features.database import SEED, quiet, read_pairs, write_pairs
 from chronoscene.registration.features.holdout import hold_out
 from chronoscene.registration.features.nearest import Descriptors, mutual_matches
 from chronoscene.registration.features.pairs import choose_pairs
 
 BATCH = 64  # Pairs
+
+Matcher = Callable[[Descriptors, Descriptors], NDArray[np.uint32]]
+"""Match the descriptors of two images; indices [M, 2], sorted. Called by several threads."""
 
 INLIER_SHARES = ((45, 1 / 4), (30, 1 / 3), (20, 1 / 2), (0, 3 / 4))
 """From so many matches on, the share that must be inliers for COLMAP to draw enough samples. A pair
@@ -48,14 +50,13 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
     Returns:
         Number of ``pairs``, of those ``verified``, of their ``inliers``, and of the pairs
-        ``carried`` over from an earlier database.
+        ``carried`` over from an earlier run.
     """
     quiet()
     database = arguments["database"]
     pairs = read_pairs(Path(arguments["pairs"]))
     _drop_others(database, pairs)
-    reused = feature_reuse.reuse_matches(Path(database), pairs)
-    left = _unmatched(database, pairs)
+    left = _unverified(database, pairs)
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu = False
     options.num_threads = threads = arguments["threads"]
@@ -64,7 +65,7 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     listed = Path(arguments["scratch"]) / "batch.txt"
     for first in range(0, len(left), BATCH):
         report("pairs", len(pairs) - len(left) + first, len(pairs))
-        found = _match_descriptors(database, left[first : first + BATCH], threads)
+        found = _store_matches(database, left[first : first + BATCH], mutual_matches, threads)
         for least, share in INLIER_SHARES:
             write_pairs(listed, [pair for pair, count in found.items() if count >= least])
             found = {pair: count for pair, count in found.items() if count < least}
@@ -76,34 +77,33 @@ def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
     report("pairs", len(pairs), len(pairs))
     with pycolmap.Database.open(database) as opened:
         counts = [int(n) for n in opened.read_two_view_geometry_num_inliers()[1]]
-    feature_reuse.forget(Path(database))
     return {
         "pairs": len(pairs),
         "verified": sum(n > 0 for n in counts),
         "inliers": sum(counts),
-        "carried": reused,
+        "carried": len(pairs) - len(left),
     }
 
 
-def _match_descriptors(
-    database: str, pairs: Sequence[tuple[str, str]], threads: int
+def _store_matches(
+    database: str, pairs: Sequence[tuple[str, str]], matcher: Matcher, threads: int
 ) -> dict[tuple[str, str], int]:
-    """Store matches of pairs of images, in the order of their ids; the number of each pair."""
+    """Store matches of pairs of images, in the order of their ids, unless they are stored.
+
+    Returns:
+        Number of matches of each pair.
+    """
     with pycolmap.Database.open(database) as opened:
         ids = {str(image.name): int(image.image_id) for image in opened.read_all_images()}
-        wanted = [(min(ids[a], ids[b]), max(ids[a], ids[b])) for a, b in pairs]
-        used = sorted({i for pair in wanted for i in pair})
+        ordered = {pair: sorted((ids[pair[0]], ids[pair[1]])) for pair in pairs}
+        new = [pair for pair in pairs if not opened.exists_matches(*ordered[pair])]
+        used = sorted({i for pair in new for i in ordered[pair]})
         descriptors = {i: Descriptors.of(opened.read_descriptors(i).data) for i in used}
-
-        def matches_of(pair: tuple[int, int]) -> NDArray[np.uint32]:
-            return mutual_matches(descriptors[pair[0]], descriptors[pair[1]])
-
-        counts = []
+        first, second = ([descriptors[ordered[pair][k]] for pair in new] for k in (0, 1))
         with ThreadPoolExecutor(threads) as pool:
-            for pair, found in zip(wanted, pool.map(matches_of, wanted), strict=True):
-                opened.write_matches(*pair, found)
-                counts.append(len(found))
-    return dict(zip(pairs, counts, strict=True))
+            for pair, matches in zip(new, pool.map(matcher, first, second), strict=True):
+                opened.write_matches(*ordered[pair], matches)
+        return {pair: len(opened.read_matches(*ordered[pair])) for pair in pairs}
 
 
 def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:
@@ -117,15 +117,8 @@ def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:
             opened.delete_two_view_geometry(a, b)
 
 
-def _unmatched(database: str, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Pairs without a geometry. If such a pair has matches, a killed run left them: COLMAP would
-    verify them and then fail to store them a second time, so they are dropped."""
-    left = []
+def _unverified(database: str, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Pairs without a geometry; COLMAP stores one for each pair that it has verified."""
     with pycolmap.Database.open(database) as opened:
         ids = {str(image.name): image.image_id for image in opened.read_all_images()}
-        for a, b in pairs:
-            if not opened.exists_two_view_geometry(ids[a], ids[b]):
-                if opened.exists_matches(ids[a], ids[b]):
-                    opened.delete_matches(ids[a], ids[b])
-                left.append((a, b))
-    return left
+        return [(a, b) for a, b in pairs if not opened.exists_two_view_geometry(ids[a], ids[b])]

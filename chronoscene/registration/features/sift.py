@@ -20,6 +20,7 @@ from PIL import Image
 
 from chronoscene.images.decoding import load_mask
 from chronoscene.images.masks import resize_mask
+from chronoscene.registration.features.database import Features
 
 CONTRAST_THRESHOLD = 0.004
 """A fifth of COLMAP's: what dark photos have in common with others lies below that."""
@@ -37,10 +38,6 @@ octave, and a third more for the smaller octaves."""
 
 MEMORY = 8 << 30  # Bytes that photos may take at the same time; a single one may take more
 
-Features = tuple[NDArray[np.float32], NDArray[np.uint8]]
-"""Keypoints [K, 6]: x and y in pixels of the photo, and the 2 x 2 matrix of scale and rotation by
-rows; descriptors [K, 128]."""
-
 
 def photos_at_once(max_image_size: int, threads: int) -> int:
     """Number of photos that threads and memory allow at a time."""
@@ -48,15 +45,15 @@ def photos_at_once(max_image_size: int, threads: int) -> int:
 
 
 def sift_features(
-    path: Path, max_image_size: int, max_features: int, mask_path: Path | None = None
+    path: Path, mask_path: Path | None = None, *, max_image_size: int, max_features: int
 ) -> Features:
     """Detect and describe features: strong ones before faint ones, each by decreasing size.
 
     Args:
         path: Photo. Orientation tags are not applied.
+        mask_path: Mask of the photo, if there is one: no features are found where it is 0.
         max_image_size: Pixels; a photo with a longer side is scaled down to it.
         max_features: Number of features to keep, in this order.
-        mask_path: Mask of the photo, if there is one: no features are found where it is 0.
     """
     with Image.open(path) as image:
         image.draft("L", image.size)  # of a JPEG, colours need not be decoded

@@ -5,13 +5,16 @@ from __future__ import annotations
 from itertools import combinations, pairwise
 from pathlib import Path
 
+import numpy as np
+
 import chronoscene.colmap.model  # noqa: F401  # loads pycolmap safely
 from chronoscene.io.pycolmap import pycolmap
-from chronoscene.registration.features.matching import INLIER_SHARES, _unmatched
+from chronoscene.registration.features.database import write_pairs
+from chronoscene.registration.features.matching import INLIER_SHARES, match
 
 
-def test_matches_that_a_killed_run_left_are_dropped(tmp_path: Path) -> None:
-    """COLMAP aborts when it stores the matches of a pair a second time."""
+def test_matches_that_are_stored_are_verified_and_not_computed_again(tmp_path: Path) -> None:
+    """A killed run may have left them, or another program may have written them."""
     path = str(tmp_path / "features.db")
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 3
@@ -20,12 +23,23 @@ def test_matches_that_a_killed_run_left_are_dropped(tmp_path: Path) -> None:
         ids = {str(image.name): image.image_id for image in database.read_all_images()}
         pairs = list(combinations(sorted(ids), 2))
         assert all(database.exists_matches(ids[a], ids[b]) for a, b in pairs)
-        broken = pairs[1]
-        database.delete_two_view_geometry(*(ids[name] for name in broken))
-    assert _unmatched(path, pairs) == [broken]
+        broken = tuple(ids[name] for name in pairs[1])
+        before = database.read_two_view_geometry(*broken).inlier_matches
+        stored = database.read_matches(*broken)
+        database.delete_two_view_geometry(*broken)
+    write_pairs(tmp_path / "pairs.txt", pairs)
+    arguments = {
+        "database": path,
+        "pairs": str(tmp_path / "pairs.txt"),
+        "scratch": str(tmp_path),
+        "threads": 1,
+    }
+    found = match(arguments, lambda *progress: None)
+    assert (found["pairs"], found["verified"], found["carried"]) == (3, 3, 2)
     with pycolmap.Database.open(path) as database:
-        left = [pair for pair in pairs if database.exists_matches(*(ids[n] for n in pair))]
-    assert left == [pair for pair in pairs if pair != broken]
+        np.testing.assert_array_equal(database.read_matches(*broken), stored)
+        after = database.read_two_view_geometry(*broken).inlier_matches
+    assert len(after) > 0.9 * len(before) > 0
 
 
 def test_no_pair_that_could_be_verified_gets_too_few_samples() -> None:

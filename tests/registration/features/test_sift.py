@@ -58,7 +58,7 @@ def texture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_positions_are_those_of_the_photo_from_the_corner_of_its_first_pixel(
     max_image_size: int, photo: Path, blobs: np.ndarray
 ) -> None:
-    keypoints, _ = sift_features(photo, max_image_size, 4096)
+    keypoints, _ = sift_features(photo, max_image_size=max_image_size, max_features=4096)
     apart = np.linalg.norm(keypoints[None, :, :2] - blobs[:, None, :2], axis=2)
     nearest = apart.argmin(axis=1)
     found = apart.min(axis=1) < 1.0  # a few fall between two scales, where OpenCV drops them
@@ -80,7 +80,7 @@ def test_features_are_as_those_of_colmap(texture: Path, tmp_path: Path) -> None:
     with pycolmap.Database.open(database) as opened:
         theirs = np.asarray(opened.read_keypoints(1))
         their_descriptors = np.asarray(opened.read_descriptors(1).data).astype(float)
-    ours, descriptors = sift_features(texture, 1600, 4096)
+    ours, descriptors = sift_features(texture, max_image_size=1600, max_features=4096)
     assert ours.shape[1] == theirs.shape[1]
     assert len(ours) > 2 * len(theirs)  # fainter ones too
     apart = np.linalg.norm((ours[:, None] - theirs[None])[..., [0, 1, 2, 4]], axis=2)
@@ -95,7 +95,7 @@ def test_features_are_as_those_of_colmap(texture: Path, tmp_path: Path) -> None:
 
 
 def test_descriptors_are_roots_of_shares(texture: Path) -> None:
-    descriptors = sift_features(texture, 1600, 4096)[1]
+    descriptors = sift_features(texture, max_image_size=1600, max_features=4096)[1]
     lengths = np.linalg.norm(descriptors.astype(float), axis=1)
     assert np.abs(lengths - 512).max() < 4  # bytes are rounded
     histogram = np.zeros((2, 128), np.float32)
@@ -111,7 +111,7 @@ def test_strong_features_come_first_and_of_each_kind_the_largest(tmp_path: Path)
     grain = np.kron(rng.normal(size=(60, 80)), np.ones((4, 4)))
     grain[:, 160:] *= 0.1  # the right half is faint
     Image.fromarray((128 + 30 * grain).clip(0, 255).astype(np.uint8)).save(tmp_path / "half.png")
-    keypoints, _ = sift_features(tmp_path / "half.png", 1600, 4096)
+    keypoints, _ = sift_features(tmp_path / "half.png", max_image_size=1600, max_features=4096)
     sizes = np.hypot(keypoints[:, 2], keypoints[:, 4])
     (end,) = np.flatnonzero(np.diff(sizes) > 1e-4) + 1
     assert (keypoints[:end, 0] < 170).mean() > 0.8
@@ -119,8 +119,8 @@ def test_strong_features_come_first_and_of_each_kind_the_largest(tmp_path: Path)
 
 
 def test_the_first_are_kept(texture: Path) -> None:
-    every, descriptors = sift_features(texture, 1600, 4096)
-    few, fewer_descriptors = sift_features(texture, 1600, 50)
+    every, descriptors = sift_features(texture, max_image_size=1600, max_features=4096)
+    few, fewer_descriptors = sift_features(texture, max_image_size=1600, max_features=50)
     assert len(every) > len(few) == 50
     np.testing.assert_array_equal(few, every[:50])
     # Without small ones, OpenCV does not enlarge the photo, so the last bits may differ.
@@ -135,8 +135,10 @@ def test_there_are_no_features_where_the_mask_is_0(
     mask = np.full((240, 320), 255, np.uint8)
     mask[:, :100] = 0
     Image.fromarray(mask).save(tmp_path / "mask.png")
-    whole = sift_features(texture, max_image_size, 4096)[0]
-    kept = sift_features(texture, max_image_size, 4096, tmp_path / "mask.png")[0]
+    whole = sift_features(texture, max_image_size=max_image_size, max_features=4096)[0]
+    kept = sift_features(
+        texture, tmp_path / "mask.png", max_image_size=max_image_size, max_features=4096
+    )[0]
     assert kept[:, 0].min() > 99 > np.quantile(whole[:, 0], 0.2)
     assert len(kept) > 0.6 * (whole[:, 0] > 102).sum()
 
@@ -144,7 +146,9 @@ def test_there_are_no_features_where_the_mask_is_0(
 @pytest.mark.parametrize("mode", ["L", "RGB"])
 def test_a_photo_without_texture_has_no_features(mode: str, tmp_path: Path) -> None:
     Image.new(mode, (200, 100), "grey").save(tmp_path / "grey.jpg")
-    keypoints, descriptors = sift_features(tmp_path / "grey.jpg", 1600, 4096)
+    keypoints, descriptors = sift_features(
+        tmp_path / "grey.jpg", max_image_size=1600, max_features=4096
+    )
     assert (keypoints.shape, keypoints.dtype) == ((0, 6), np.float32)
     assert (descriptors.shape, descriptors.dtype) == ((0, 128), np.uint8)
 
@@ -154,8 +158,10 @@ def test_orientation_tags_are_not_applied(texture: Path, tmp_path: Path) -> None
     exif[0x0112] = 6
     with Image.open(texture) as image:
         image.save(tmp_path / "turned.png", exif=exif)
-    turned = sift_features(tmp_path / "turned.png", 1600, 4096)[0]
-    np.testing.assert_array_equal(turned, sift_features(texture, 1600, 4096)[0])
+    turned = sift_features(tmp_path / "turned.png", max_image_size=1600, max_features=4096)[0]
+    np.testing.assert_array_equal(
+        turned, sift_features(texture, max_image_size=1600, max_features=4096)[0]
+    )
 
 
 def test_large_photos_are_fewer_at_a_time() -> None:
