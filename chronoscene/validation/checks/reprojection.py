@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.validation.folder.grouping import grouped
 from chronoscene.validation.folder.scene_folder import RawScene, derived
 
 MIN_OBSERVATIONS = 10  # Observations of an image from which the median of its errors is meaningful
@@ -14,7 +13,7 @@ MAX_ERROR_SHARE, MIN_LIMIT = 0.01, 4.0
 """Median reprojection error of an image, as a share of its diagonal and in pixels, beyond which its
 pose does not fit. COLMAP itself drops observations beyond 4 pixels."""
 
-MAX_DEPTHS = 500  # Depths sampled from an image: enough for a percentile over a period
+MAX_DEPTHS = 500  # Depths sampled from an image: enough for a median over the scene
 MIN_IMAGES = 3  # Images with an error from which the median of a period is meaningful
 
 WORSE = 3.0
@@ -63,26 +62,12 @@ def period_errors(scene: RawScene) -> dict[int, float]:
 
 
 @derived
-def _depths(scene: RawScene) -> dict[int, NDArray[np.float64]]:
-    """Samples of the depths in front of the cameras by index of the period, -1 for none."""
-    samples = (
-        (int(scene.image_periods[seen.image]), seen.depth[:: len(seen.depth) // MAX_DEPTHS + 1])
-        for seen in scene.reprojections or ()
-    )
-    front = ((period, depth[(depth > 0) & np.isfinite(depth)]) for period, depth in samples)
-    by_period = grouped((period, depth) for period, depth in front if len(depth))
-    return {period: np.concatenate(depths) for period, depths in by_period.items()}
-
-
-def depth_percentiles(scene: RawScene, percent: float) -> dict[int, float]:
-    """Percentile of the depths by index of the period, of the periods that have any."""
-    return {period: float(np.percentile(d, percent)) for period, d in _depths(scene).items()}
-
-
 def typical_depth(scene: RawScene) -> float:
     """Median distance of the points from the cameras that see them; 0 if unknown."""
-    every = np.concatenate([np.zeros(0), *_depths(scene).values()])
-    return float(np.median(every)) if len(every) else 0.0
+    samples = (s.depth[:: len(s.depth) // MAX_DEPTHS + 1] for s in scene.reprojections or ())
+    depths = np.concatenate([np.zeros(0), *samples])
+    front = depths[(depths > 0) & np.isfinite(depths)]
+    return float(np.median(front)) if len(front) else 0.0
 
 
 def outlier_limit(usual: float) -> float:

@@ -90,8 +90,6 @@ class Reprojection(NamedTuple):
     """World units along the optical axis. [m]"""
     error: NDArray[np.float64]
     """Distance in pixels between projection and observation; NaN behind the camera. [m]"""
-    outside: int
-    """Number of observations outside the image."""
 
 
 def good_poses(images: RawImages) -> NDArray[np.bool_]:
@@ -124,11 +122,9 @@ def reproject(
             depth, error = local[2], np.sqrt((x - u) ** 2 + (y - v) ** 2)
         # Points and keypoints that are not finite have their own rules.
         known = np.isfinite(place).all(axis=0) & np.isfinite(u) & np.isfinite(v)
-        inside = (u >= 0) & (u <= camera.width) & (v >= 0) & (v <= camera.height)
-        outside = int(np.count_nonzero(known & ~inside))
         if not known.all():
             rows, depth, error = rows[known], depth[known], error[known]
-        yield Reprojection(image, rows, depth, error, outside)
+        yield Reprojection(image, rows, depth, error)
 
 
 def _transform(rotation: Array, translation: Array, x: Array, y: Array, z: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What rules read of image files: headers, digests of bytes and pixels, thumbnails."""
+"""Headers of image files, digests of their bytes and pixels, and thumbnails."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ PADDING = 64  # Number of equal bytes that compressed data never ends in
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """What the header of an image file says."""
+    """Content of the header of an image file."""
 
     problem: str | None
-    """Why it is not a readable image; then the rest is meaningless."""
+    """Reason why it is not a readable image; then the rest is meaningless."""
     size: tuple[int, int] = (0, 0)
     """Width and height as stored."""
     mode: str = ""
@@ -63,11 +63,11 @@ class Header:
     kind: str = ""
     """Pillow's name of the file format."""
     deep: bool = False
-    """Whether it has more than 8 bits per channel."""
+    """True if it has more than 8 bits per channel."""
     transparent: bool = False
-    """Whether it may have transparent pixels."""
+    """True if it may have transparent pixels."""
     truncated: bool = False
-    """Whether the file ends before its image does."""
+    """True if the file ends before its image does."""
     exif: ExifData = field(default_factory=ExifData)
 
 
@@ -76,7 +76,7 @@ class Pixels:
     """Digests and thumbnails of a decoded image."""
 
     problem: str | None
-    """Why it cannot be decoded; then the rest is None."""
+    """Reason why it cannot be decoded; then the rest is None."""
     digest: bytes | None = None
     """SHA-256 of size and RGB bytes."""
     thumbnail: NDArray[np.float32] | None = None
@@ -86,7 +86,7 @@ class Pixels:
 
 
 def read_headers(folder: Path, names: Sequence[str]) -> dict[str, Header]:
-    """Headers of some images below a folder, in several threads: a disk may be slow."""
+    """Read the headers of images below a folder, in several threads: a disk may be slow."""
     paths = [folder / name for name in names]
     with warnings.catch_warnings(action="ignore"):  # on large images and odd metadata
         if len(paths) < _MIN_THREADED:
@@ -96,7 +96,7 @@ def read_headers(folder: Path, names: Sequence[str]) -> dict[str, Header]:
 
 
 def read_header(path: Path) -> Header:
-    """Header of one image; never raises for what is in the file."""
+    """Read the header of one image; never raises for what is in the file."""
     try:
         with path.open("rb") as file:
             if os.fstat(file.fileno()).st_size == 0:
@@ -124,7 +124,7 @@ def _header(path: Path, file: BinaryIO, image: Image.Image) -> Header:
 
 
 def _is_deep(image: Image.Image) -> bool:
-    """Whether there are more than 8 bits per channel in the file."""
+    """Return True if the file has more than 8 bits per channel."""
     if image.mode in ("F", "I") or image.mode.startswith("I;"):
         return True
     tiles = getattr(image, "tile", None) or ((),)
@@ -132,15 +132,13 @@ def _is_deep(image: Image.Image) -> bool:
 
 
 def _is_truncated(path: Path, file: BinaryIO, image: Image.Image) -> bool:
-    """Whether a file ends before its image does.
+    """Return True if a file ends before its image does.
 
     A file that does not end in its marker may still be complete: phones append other data. Only
     such files are read completely and, if the marker is really missing, decoded.
     """
     kind = image.format or ""
     size = file.seek(0, os.SEEK_END)
-    if kind == "TIFF":
-        return _tiff_end(image) > size
     mark = END_MARKS.get(kind)
     if mark is None:
         return False
@@ -149,16 +147,13 @@ def _is_truncated(path: Path, file: BinaryIO, image: Image.Image) -> bool:
         return False
     if kind in JPEG:
         file.seek(0)
-        data = file.read()
-        if has_end(data):
+        if has_end(file.read()):
             return False
-        if jpeg_damage(data) is not None:
-            return True
     return read_pixels_of(path).problem is not None
 
 
 def jpeg_damage(data: bytes) -> str | None:
-    """Damage to the compressed data of a JPEG file that decoders silently accept, if it shows.
+    """Describe damage to the compressed data of a JPEG file that decoders silently accept.
 
     libjpeg decodes almost anything: parts that a broken transfer filled with zeros become grey or
     stripes, without an error. The structure of the file reveals them.
@@ -193,13 +188,13 @@ def jpeg_damage(data: bytes) -> str | None:
 
 
 def has_end(data: bytes) -> bool:
-    """Whether the marker that ends an image follows the beginning of the compressed data."""
+    """Return True if the marker that ends an image follows the beginning of the compressed data."""
     at, _ = _first_scan(data)
     return at is not None and data.find(bytes((0xFF, _END)), at) >= 0
 
 
 def _first_scan(data: bytes) -> tuple[int | None, bool]:
-    """Where compressed data begins, and whether it contains restart markers."""
+    """Find the start of the compressed data; return True, too, if it contains restart markers."""
     at, restarts = len(_START), False
     while data.startswith(_START) and at + 4 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
@@ -213,18 +208,8 @@ def _first_scan(data: bytes) -> tuple[int | None, bool]:
     return None, restarts
 
 
-def _tiff_end(image: Image.Image) -> int:
-    """Where the last strip or tile of a TIFF file should end; 0 if its tags do not tell."""
-    tags = getattr(image, "tag_v2", {})
-    ends = [0]
-    for offsets, lengths in ((273, 279), (324, 325)):
-        pairs = zip(tags.get(offsets, ()), tags.get(lengths, ()), strict=False)
-        ends += [int(offset) + int(length) for offset, length in pairs]
-    return max(ends)
-
-
 def hash_files(folder: Path, names: Sequence[str], track: Track) -> dict[str, str]:
-    """SHA-256 of the files that have the same size as another one."""
+    """Compute the SHA-256 of the files that have the same size as another one."""
     by_size = grouped((_size(folder / name), name) for name in names)
     same = [name for group in by_size.values() if len(group) > 1 for name in group]
     digests = {name: _digest(folder / name) for name in track(same, "equal files")}

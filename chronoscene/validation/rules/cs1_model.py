@@ -9,11 +9,10 @@ import numpy as np
 
 from chronoscene.colmap.raw_model import MODEL_FILES, RawImages, RawModel, find_stray_model
 from chronoscene.formats.chronoscene import MODEL
-from chronoscene.io.wording import quote, shown
+from chronoscene.io.wording import quote
 from chronoscene.scene import Camera
 from chronoscene.validation import rule
-from chronoscene.validation.folder.grouping import grouped
-from chronoscene.validation.folder.names import is_safe, spelling
+from chronoscene.validation.folder.names import is_safe
 from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import Hit
 
@@ -149,17 +148,3 @@ def name_not_text(scene: RawScene, images: RawImages) -> Iterator[Hit]:
         if any(ord(c) < 32 or ord(c) == 127 or 0xD800 <= ord(c) < 0xE000 for c in name):
             place = scene.model_file("images")
             yield Hit(place, "UTF-8 names without control characters", quote(name))
-
-
-@rule.warning(
-    "CS113",
-    bad="`IMG_1.jpg` and `img_1.JPG`; `é` as one character and as two",
-    remedy="rename one of the files, in images/ and in the model",
-)
-def name_case_collision(scene: RawScene, names: list[str]) -> Iterator[Hit]:
-    """Image names differ only by case or by Unicode normalisation: they are the same file on
-    Windows and macOS, so that copying or checking out the scene loses an image."""
-    for group in grouped((spelling(name), name) for name in names).values():
-        if len(group) > 1:
-            place = scene.model_file("images")
-            yield Hit(place, "names that differ by more than case", shown(sorted(group)))

@@ -6,8 +6,6 @@ import os
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 
-import numpy as np
-
 from chronoscene.colmap.raw_model import RawImages
 from chronoscene.images.masks import MASKS, MODES, mask_name, mask_place
 from chronoscene.io.wording import counted, quote, shown
@@ -28,8 +26,6 @@ KINDS = {
     ".webp": ("WEBP",),
 }
 """Extension to Pillow's names of the formats found in such files. Cameras put MPO into ``.jpg``."""
-
-BLANK = 2.0  # Grey levels between the means of the darkest and the brightest part of an image
 
 
 @rule.error(
@@ -235,21 +231,6 @@ def image_misnamed(readable: dict[str, Header]) -> Iterator[Hit]:
         known = KINDS.get(PurePosixPath(name).suffix.lower())
         if known is not None and header.kind not in known:
             yield Hit(f"images/{name}", f"a {known[0]} file", f"a {header.kind} file")
-
-
-@rule.warning(
-    "CS216",
-    bad="a black frame of a video; a photo with the lens cap on",
-    remedy="remove the image from the model: there is nothing in it to train or test on",
-)
-def image_blank(pixels: dict[str, Pixels]) -> Iterator[Hit]:
-    """An image consists of a single colour (needs `--decode`)."""
-    for name, decoded in pixels.items():
-        thumbnail = decoded.thumbnail
-        if thumbnail is not None and np.ptp(thumbnail, axis=(0, 1)).max() <= BLANK:
-            red, green, blue = (round(float(c)) for c in thumbnail.mean(axis=(0, 1)))
-            found = f"a single colour, #{red:02x}{green:02x}{blue:02x}"
-            yield Hit(f"images/{name}", "an image with content", found)
 
 
 @rule.error(

@@ -1,4 +1,4 @@
-"""CS506 to CS508, CS519, CS520: how the periods relate to each other, and the scene to metres."""
+"""CS506 to CS508, CS520: how the periods relate to each other, and the scene to metres."""
 
 from __future__ import annotations
 
@@ -11,20 +11,14 @@ from chronoscene.errors import ChronoSceneError
 from chronoscene.formats.chronoscene import WORLD, read_world
 from chronoscene.validation import rule
 from chronoscene.validation.checks.photo_metadata import fit_gps
-from chronoscene.validation.checks.reprojection import depth_percentiles
-from chronoscene.validation.folder.scene_folder import RawScene, derived
+from chronoscene.validation.folder.scene_folder import RawScene
 from chronoscene.validation.rule import NOTHING, Hit
 
 MIN_SHARED = 10  # Shared points from which a similarity between two periods can be told from chance
 MAX_BLOCK = 10_000_000  # Points times periods that are counted at a time
 
-DEPTH_RATIO = 10.0
-"""Between the median depths of two periods without shared points: nothing else indicates scale."""
-
 UNIT_TOLERANCE = 0.1
 """Relative difference between the unit and the metre by GPS that its noise can explain."""
-
-NEAREST, FARTHEST = 0.01, 50_000.0  # Plausible range of metres between cameras and points
 
 
 @rule.warning(
@@ -97,60 +91,23 @@ def connected(common: Ints, minimum: int) -> list[Ints]:
 
 
 @rule.warning(
-    "CS519",
-    bad="period 1 was reconstructed separately and scaled to metres; the other periods were not",
-    remedy="transform its poses into the frame of the others, or register all periods together",
-    needs=("reprojections", "point_periods"),
-)
-def period_frame(scene: RawScene) -> Iterator[Hit]:
-    """A period without points in common with the others is in a frame of another scale."""
-    for index, ratio in _other_depths(scene).items():
-        found = f"points {ratio:.3g} times as far from the cameras, and none shared"
-        place = f"period {scene.period_ids[index]}"
-        yield Hit(place, "a frame with the scale of the other periods", found)
-
-
-@derived
-def _other_depths(scene: RawScene) -> dict[int, float]:
-    """Ratio of the median depths, by index, of periods without shared points to those of the rest,
-    where it is of another order."""
-    ratios = {}
-    seen = scene.point_periods
-    assert seen is not None
-    shared = seen[seen.sum(axis=1) > 1].any(axis=0)
-    medians = depth_percentiles(scene, 50)
-    for index in range(len(scene.period_ids)):
-        others = [d for i, d in medians.items() if i != index]
-        if shared[index] or index not in medians or not others:
-            continue
-        ratio = medians[index] / float(np.median(others))
-        if not 1 / DEPTH_RATIO <= ratio <= DEPTH_RATIO:
-            ratios[index] = ratio
-    return ratios
-
-
-@rule.warning(
     "CS520",
     bad='`{"unit": "metre"}` with a model straight from COLMAP\'s mapper',
     remedy="scale the model, or correct the unit in sparse/world.json",
     needs=("cameras", "images"),
 )
 def frame_scale(scene: RawScene) -> Iterator[Hit]:
-    """`sparse/world.json` says metres, but the world is not in metres."""
+    """`sparse/world.json` says metres, but the GPS positions of the photos give another unit."""
     try:
         if read_world(scene.root).unit != "metre":
             return
     except ChronoSceneError:
         return  # has its own rule
     fit = fit_gps(scene)
-    if fit is not None:
-        scale = fit.metres_from_world.scale
-        tolerance = max(UNIT_TOLERANCE, 3 * fit.sigma / (fit.spread * len(fit.images) ** 0.5))
-        if abs(np.log(scale)) > np.log1p(tolerance):
-            found = f"{scale:.4g} m per unit, by the GPS positions of {len(fit.images)} photos"
-            yield Hit(WORLD, "a world in metres", found)
+    if fit is None:
         return
-    for index, depth in depth_percentiles(scene, 50).items():
-        if index >= 0 and not NEAREST <= depth <= FARTHEST:
-            place = f"period {scene.period_ids[index]}"
-            yield Hit(place, "a world in metres", f"points {depth:.3g} m from the cameras (median)")
+    scale = fit.metres_from_world.scale
+    tolerance = max(UNIT_TOLERANCE, 3 * fit.sigma / (fit.spread * len(fit.images) ** 0.5))
+    if abs(np.log(scale)) > np.log1p(tolerance):
+        found = f"{scale:.4g} m per unit, by the GPS positions of {len(fit.images)} photos"
+        yield Hit(WORLD, "a world in metres", found)

@@ -1,8 +1,7 @@
-"""CS511 to CS513, CS515, CS516: whether points, poses and cameras fit each other."""
+"""CS512, CS513, CS515, CS516: whether points, poses and cameras fit each other."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -17,32 +16,8 @@ from chronoscene.validation.folder.scene_folder import RawScene, derived
 from chronoscene.validation.rule import Hit
 from chronoscene.validation.rules.cs1_poses import other_convention
 
-MAX_OUTSIDE = 0.05  # Share of observations outside the image; undistortion leaves a few there
 MAX_BEHIND = 0.5  # Share of observations behind their camera. A consistent model has none.
 MAX_WRONG = 0.5  # Share of the images of a period beyond which one finding reports all of them
-
-
-@rule.warning(
-    "CS511",
-    what=f"More than {MAX_OUTSIDE:.0%} of a camera's observations are outside its image.",
-    bad="a camera scaled to half the size, with keypoints still at full size",
-    remedy="give the camera the size at which the keypoints were found",
-)
-def observations_outside(
-    scene: RawScene, images: RawImages, reprojections: list[Reprojection]
-) -> Iterator[Hit]:
-    total: Counter[int] = Counter()
-    outside: Counter[int] = Counter()
-    for seen in reprojections:
-        camera_id = int(images.camera_ids[seen.image])
-        total[camera_id] += len(seen.rows)
-        outside[camera_id] += seen.outside
-    for camera_id, number in outside.items():
-        if number > MAX_OUTSIDE * total[camera_id]:
-            camera = scene.usable_cameras[camera_id]
-            expected = f"observations within {camera.width} x {camera.height}"
-            found = f"{number} of {total[camera_id]} outside"
-            yield Hit(scene.camera_place(camera), expected, found, count=number)
 
 
 @rule.error(

@@ -36,13 +36,6 @@ FEATURELESS = 4.0  # Standard deviation of a thumbnail below which it looks like
 ROUNDING = 1.01  # Margin by which pairs pass to the exact comparison
 MAX_TRIED = 8  # Images compared pixel by pixel with one that looks like all of them
 
-MIN_CORRELATION = 0.997
-"""Correlation of grey thumbnails beyond which two photos are one. Measured: a photo made darker,
-brighter, warmer or with more contrast 0.9985 and more; neighbouring frames of a video 0.989 and
-less, aerial photos of one flight 0.9 and less."""
-
-PLAIN = 8.0  # Standard deviation of a grey thumbnail, in grey levels, below which rounding matters
-
 _BLOCK = 8
 _ROWS = 256
 
@@ -100,19 +93,15 @@ def near_leak(
     `--decode`)."""
     role = {n: (period, n in tests) for n, period in periods.items()}
     pixels = {n: p for n, p in pixels.items() if n in role}
-    differences = near_pairs(pixels, role)
-    near = {(a, b): f"{number:.2g} grey levels from that" for a, b, number in differences}
-    for a, b, alike in relit_pairs(pixels, role):
-        if pixels[a].digest != pixels[b].digest:
-            near.setdefault((a, b), f"that, up to brightness, agrees to {alike:.2%} with that")
-    for (a, b), how in near.items():
+    for a, b, number in near_pairs(pixels, role):
         place, other = (b, a) if role[b][1] and not role[a][1] else (a, b)
-        found = f"a thumbnail {how} of {shown([other])}{_apart(scene, a, b)}"
+        distance = f"{number:.2g} grey levels from that of {shown([other])}"
+        found = f"a thumbnail {distance}{_apart(scene, a, b)}"
         yield Hit(f"images/{place}", "a distinct image", found, also=(other,))
 
 
 def _apart(scene: RawScene, a: str, b: str) -> str:
-    """What the poses of two images say about their likeness."""
+    """Describe the distance between the cameras of two images, where it is known."""
     names = scene.images.names if scene.images else ()
     if a not in names or b not in names:
         return ""
@@ -182,29 +171,6 @@ def near_pairs(
                 if distance < MAX_DIFFERENCE and pixels[names[a]].digest != pixels[names[b]].digest:
                     yield names[a], names[b], distance
                     break
-
-
-def relit_pairs(
-    pixels: Mapping[str, Pixels], role: Mapping[str, object]
-) -> Iterator[tuple[str, str, float]]:
-    """Pairs of images of different roles whose grey thumbnails correlate, and by how much.
-
-    For each image, the later image that is most alike.
-    """
-    grey = {n: p.thumbnail.mean(axis=2) for n, p in pixels.items() if p.thumbnail is not None}
-    names = [n for n, thumbnail in grey.items() if thumbnail.std() >= PLAIN]
-    if len(names) < 2:
-        return
-    table = np.stack([np.ravel(grey[n] - grey[n].mean()) for n in names])
-    table /= np.linalg.norm(table, axis=1, keepdims=True)
-    _, group = np.unique([repr(role[n]) for n in names], return_inverse=True)
-    for first in range(0, len(names), _ROWS):
-        alike = table[first : first + _ROWS] @ table[first:].T
-        alike[group[first : first + _ROWS, None] == group[first:]] = -1.0
-        alike = np.triu(alike, 1)
-        best = alike.argmax(axis=1)
-        for i in np.flatnonzero(alike[np.arange(len(best)), best] >= MIN_CORRELATION).tolist():
-            yield names[first + i], names[first + best[i]], float(alike[i, best[i]])
 
 
 def twins(

@@ -214,14 +214,3 @@ def rename(scene, old, new):
     for place in (IMAGES, "sparse/split.txt"):
         scene.replace(place, old, new)
     os.rename(scene.path(f"images/{old}"), scene.path(f"images/{new}"))
-
-
-def test_names_that_differ_by_case(scene):
-    rename(scene, "a001.png", "A000.PNG")
-    scene.expect("CS113", place=IMAGES, found="'A000.PNG', 'a000.png'")
-
-
-def test_names_that_differ_by_unicode_form(scene):
-    rename(scene, "a000.png", "\u00e9.png")
-    rename(scene, "a001.png", "e\u0301.png")
-    scene.expect("CS113", place=IMAGES, found="e\u0301.png")

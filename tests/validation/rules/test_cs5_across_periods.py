@@ -95,29 +95,9 @@ def test_absurd_numbers_in_a_period_of_another_frame(scene, what, number):
     assert "CS513" in codes and "CS000" not in codes
 
 
-def test_scale_of_a_period_without_shared_points(scene):
-    separate(scene, scale=30.0)
-    found = "times as far from the cameras, and none shared"
-    scene.expect("CS519", place="period 1", found=found, also={"CS508"}, times=2)
-
-
 def test_separate_points_in_one_frame_need_a_match_only(scene):
     separate(scene)
     scene.expect("CS508")
-
-
-@pytest.mark.parametrize("scale", [1e-4, 1e6])
-def test_absurd_metres(scene, scale):
-    scene.change_poses(lambda r, t: (r, t * scale), range(18))
-    lines = scene.lines(POINTS)
-    for row, line in enumerate(lines):
-        words = line.split()
-        words[1:4] = [f"{float(x) * scale:.17g}" for x in words[1:4]]
-        lines[row] = " ".join(words)
-    scene.write(POINTS, lines)
-    scene.write(WORLD, '{"unit": "metre"}')
-    also = {"CS707"} if scale < 1 else ()
-    scene.expect("CS520", place="period 0", found="m from the cameras", also=also, times=2)
 
 
 def test_period_without_points(scene):
