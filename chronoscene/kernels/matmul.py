@@ -24,14 +24,12 @@ from chronoscene.kernels.vectors import (
     emit_lanes,
     emit_multiply_add,
     emit_splat,
-    intrinsic,
+    emitted,
 )
 
 ROW_TILE = 8 if MANY_REGISTERS else 4
 """Rows of the result held in registers, by one or two vectors of columns."""
 PADDING = max(ROW_TILE, LANES)
-
-_INDEX = types.intp
 
 
 class _Matrix:
@@ -51,47 +49,46 @@ class _Matrix:
 def _make_tile(vectors: int, multiply_add: Any, relu: bool) -> Any:
     """Make the inner loop of `product` for ROW_TILE rows and some vectors of columns."""
 
-    def tile(
-        typing: Any, left: Any, right: Any, first: Any, out: Any, row: Any, column: Any, depth: Any
-    ) -> Any:
-        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            a, b, first, c = (
-                _Matrix(context, builder, kind, value)
-                for kind, value in zip(signature.args[:4], args[:4], strict=True)
-            )
-            top, left_column, depth = args[4:]
-            index = top.type
-            rows = [builder.add(top, index(i)) for i in range(ROW_TILE)]
-            columns = [builder.add(left_column, index(i * LANES)) for i in range(vectors)]
-            # LLVM turns these variables into registers.
-            sums = [
-                [
-                    cgutils.alloca_once_value(builder, emit_load(builder, first.at(m, n)))
-                    for n in columns
-                ]
-                for m in rows
+    @emitted(
+        lambda left, right, first, out, row, column, depth: types.void(
+            left, right, first, out, types.intp, types.intp, types.intp
+        )
+    )
+    def tile(context: Any, builder: Any, signature: Any, args: Any) -> None:
+        a, b, first, c = (
+            _Matrix(context, builder, kind, value)
+            for kind, value in zip(signature.args[:4], args[:4], strict=True)
+        )
+        top, left_column, depth = args[4:]
+        index = top.type
+        rows = [builder.add(top, index(i)) for i in range(ROW_TILE)]
+        columns = [builder.add(left_column, index(i * LANES)) for i in range(vectors)]
+        # LLVM turns these variables into registers.
+        sums = [
+            [
+                cgutils.alloca_once_value(builder, emit_load(builder, first.at(m, n)))
+                for n in columns
             ]
-            with cgutils.for_range(builder, depth) as loop:
-                vectors_b = [emit_load(builder, b.at(loop.index, n)) for n in columns]
-                for m, row_sums in zip(rows, sums, strict=True):
-                    factor = emit_splat(builder, builder.load(a.at(m, loop.index)), LANES)
-                    for total, vector in zip(row_sums, vectors_b, strict=True):
-                        new = multiply_add(builder, factor, vector, builder.load(total))
-                        builder.store(new, total)
-            zero = emit_lanes([0.0] * LANES, FLOAT)
+            for m in rows
+        ]
+        with cgutils.for_range(builder, depth) as loop:
+            vectors_b = [emit_load(builder, b.at(loop.index, n)) for n in columns]
             for m, row_sums in zip(rows, sums, strict=True):
-                for total, n in zip(row_sums, columns, strict=True):
-                    value = builder.load(total)
-                    if relu:
-                        # Not a maximum: that would turn what is not a number into 0.
-                        negative = builder.fcmp_ordered("<", value, zero)
-                        value = builder.select(negative, zero, value)
-                    emit_store(builder, value, c.at(m, n))
-            return context.get_dummy_value()
+                factor = emit_splat(builder, builder.load(a.at(m, loop.index)), LANES)
+                for total, vector in zip(row_sums, vectors_b, strict=True):
+                    new = multiply_add(builder, factor, vector, builder.load(total))
+                    builder.store(new, total)
+        zero = emit_lanes([0.0] * LANES, FLOAT)
+        for m, row_sums in zip(rows, sums, strict=True):
+            for total, n in zip(row_sums, columns, strict=True):
+                value = builder.load(total)
+                if relu:
+                    # Not a maximum: that would turn what is not a number into 0.
+                    negative = builder.fcmp_ordered("<", value, zero)
+                    value = builder.select(negative, zero, value)
+                emit_store(builder, value, c.at(m, n))
 
-        return types.void(left, right, first, out, _INDEX, _INDEX, _INDEX), generate
-
-    return intrinsic(tile)
+    return tile
 
 
 def _make_product(multiply_add: Any = emit_multiply_add, relu: bool = False) -> Any:

@@ -26,7 +26,7 @@ from chronoscene.kernels.vectors import (
     emit_lanes,
     emit_shuffle,
     emit_splat,
-    intrinsic,
+    emitted,
     splat,
 )
 
@@ -58,28 +58,18 @@ def emit_store(builder: Any, value: Any, address: Any) -> None:
 
 
 def _make_read(number: types.Type, element: ir.Type) -> Callable:
-    @intrinsic
-    def read(typingctx: Any, memory: Any, index: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            memory, index = args
-            return builder.load(emit_address(context, builder, sig.args[0], memory, index, element))
-
-        return number(memory, types.intp), codegen
+    @emitted(lambda memory, index: number(memory, types.intp))
+    def read(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.load(emit_address(context, builder, sig.args[0], *args, element))
 
     return read
 
 
 def _make_write(number: types.Type, element: ir.Type) -> Callable:
-    @intrinsic
-    def write(typingctx: Any, memory: Any, index: Any, value: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            memory, index, value = args
-            builder.store(
-                value, emit_address(context, builder, sig.args[0], memory, index, element)
-            )
-            return context.get_dummy_value()
-
-        return types.void(memory, types.intp, number), codegen
+    @emitted(lambda memory, index, value: types.void(memory, types.intp, number))
+    def write(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        address = emit_address(context, builder, sig.args[0], *args[:2], element)
+        builder.store(args[2], address)
 
     return write
 
@@ -90,45 +80,32 @@ read_index, write_index = _make_read(types.int64, _I64), _make_write(types.int64
 """One int64 of those at an address."""
 
 
-@intrinsic
-def fetch_add(typingctx: Any, array: Any, offset: Any, amount: Any) -> Any:
+@emitted(lambda array, offset, amount: types.int64(array, types.intp, types.int64))
+def fetch_add(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Add to an element of an int64 array as one atomic step; what it was before.
 
     What this thread wrote before is seen by a thread that sees the sum.
     """
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = emit_address(context, builder, sig.args[0], *args[:2])
-        return builder.atomic_rmw("add", address, args[2], "acq_rel")
-
-    return types.int64(array, types.intp, types.int64), codegen
+    address = emit_address(context, builder, sig.args[0], *args[:2])
+    return builder.atomic_rmw("add", address, args[2], "acq_rel")
 
 
-@intrinsic
-def load_shared(typingctx: Any, array: Any, offset: Any) -> Any:
+@emitted(lambda array, offset: types.int64(array, types.intp))
+def load_shared(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """An element of an int64 array that other threads change, as it is now."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load_atomic(emit_address(context, builder, sig.args[0], *args), "acquire", 8)
-
-    return types.int64(array, types.intp), codegen
+    return builder.load_atomic(emit_address(context, builder, sig.args[0], *args), "acquire", 8)
 
 
 def _make_prefetch(write: int) -> Callable:
-    @intrinsic
-    def prefetch(typingctx: Any, memory: Any, index: Any) -> Any:
+    @emitted(lambda memory, index: types.void(memory, types.intp))
+    def prefetch(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         """Ask for the cache line around ``index``; harmless where nothing is."""
-
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            pointer = emit_address(context, builder, sig.args[0], *args)
-            pointer = builder.bitcast(pointer, ir.IntType(8).as_pointer())
-            kind = ir.FunctionType(ir.VoidType(), [pointer.type, I32, I32, I32])
-            function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
-            # Write or read, keep in all caches, data.
-            builder.call(function, [pointer, I32(write), I32(3), I32(1)])
-            return context.get_dummy_value()
-
-        return types.void(memory, types.intp), codegen
+        pointer = emit_address(context, builder, sig.args[0], *args)
+        pointer = builder.bitcast(pointer, ir.IntType(8).as_pointer())
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, I32, I32, I32])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        # Write or read, keep in all caches, data.
+        builder.call(function, [pointer, I32(write), I32(3), I32(1)])
 
     return prefetch
 
@@ -140,17 +117,16 @@ prefetch, prefetch_write = _make_prefetch(0), _make_prefetch(1)
 
 
 def make_load(lanes: int) -> Callable:
-    """Function that reads vectors with this number of lanes."""
+    """Make a function that reads vectors with this number of lanes."""
 
-    @intrinsic
-    def load(typingctx: Any, memory: Any, index: Any) -> Any:
-        """Vector of consecutive numbers from ``index`` on."""
-
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return emit_load(builder, emit_address(context, builder, sig.args[0], *args), lanes)
-
+    def loaded(memory: Any, index: Any) -> Any:
         integers = getattr(memory, "dtype", types.float32) == types.int32
-        return Vector("i32" if integers else "f32", lanes)(memory, types.intp), codegen
+        return Vector("i32" if integers else "f32", lanes)(memory, types.intp)
+
+    @emitted(loaded)
+    def load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        """Vector of consecutive numbers from ``index`` on."""
+        return emit_load(builder, emit_address(context, builder, sig.args[0], *args), lanes)
 
     return load
 
@@ -158,28 +134,18 @@ def make_load(lanes: int) -> Callable:
 load = make_load(LANES)
 
 
-@intrinsic
-def store(typingctx: Any, memory: Any, index: Any, value: Any) -> Any:
+@emitted(lambda memory, index, value: types.void(memory, types.intp, value))
+def store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Write a vector to consecutive numbers from ``index`` on."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        emit_store(builder, args[2], emit_address(context, builder, sig.args[0], *args[:2]))
-        return context.get_dummy_value()
-
-    return types.void(memory, types.intp, value), codegen
+    emit_store(builder, args[2], emit_address(context, builder, sig.args[0], *args[:2]))
 
 
-@intrinsic
-def store_where(typingctx: Any, array: Any, offset: Any, mask: Any, value: Any) -> Any:
+@emitted(lambda array, offset, mask, value: types.void(array, types.intp, mask, value))
+def store_where(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Write the lanes of a vector whose mask is set. The others are written too, as they were."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = emit_address(context, builder, sig.args[0], *args[:2])
-        old = emit_load(builder, address, sig.args[3].lanes)
-        emit_store(builder, builder.select(args[2], args[3], old), address)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, mask, value), codegen
+    address = emit_address(context, builder, sig.args[0], *args[:2])
+    old = emit_load(builder, address, sig.args[3].lanes)
+    emit_store(builder, builder.select(args[2], args[3], old), address)
 
 
 def _emit_first_lanes(builder: Any, count: Any, lanes: int) -> Any:
@@ -197,67 +163,48 @@ def _emit_masked(builder: Any, name: str, result: ir.Type, args: list[Any], lane
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, full), args)
 
 
-@intrinsic
-def load_first(typingctx: Any, memory: Any, index: Any, count: Any) -> Any:
+@emitted(lambda memory, index, count: Vector("f32", LANES)(memory, types.intp, types.intp))
+def load_first(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Read the first ``count`` of LANES lanes, and nothing beyond; the others are 0."""
-    result = Vector("f32", LANES)
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = emit_address(context, builder, sig.args[0], *args[:2])
-        pointer = builder.bitcast(address, result.llvm.as_pointer())
-        mask = _emit_first_lanes(builder, args[2], LANES)
-        zeros = emit_lanes([0.0] * LANES, FLOAT)
-        return _emit_masked(builder, "load", result.llvm, [pointer, I32(4), mask, zeros], LANES)
-
-    return result(memory, types.intp, types.intp), codegen
+    result = sig.return_type.llvm
+    address = emit_address(context, builder, sig.args[0], *args[:2])
+    pointer = builder.bitcast(address, result.as_pointer())
+    mask = _emit_first_lanes(builder, args[2], LANES)
+    zeros = emit_lanes([0.0] * LANES, FLOAT)
+    return _emit_masked(builder, "load", result, [pointer, I32(4), mask, zeros], LANES)
 
 
-@intrinsic
-def store_first(typingctx: Any, memory: Any, index: Any, value: Any, count: Any) -> Any:
+@emitted(lambda memory, index, value, count: types.void(memory, types.intp, value, types.intp))
+def store_first(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Write the first ``count`` lanes and nothing beyond."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        address = emit_address(context, builder, sig.args[0], *args[:2])
-        pointer = builder.bitcast(address, args[2].type.as_pointer())
-        mask = _emit_first_lanes(builder, args[3], value.lanes)
-        operands = [args[2], pointer, I32(4), mask]
-        _emit_masked(builder, "store", ir.VoidType(), operands, value.lanes)
-        return context.get_dummy_value()
-
-    return types.void(memory, types.intp, value, types.intp), codegen
+    lanes = sig.args[2].lanes
+    address = emit_address(context, builder, sig.args[0], *args[:2])
+    pointer = builder.bitcast(address, args[2].type.as_pointer())
+    mask = _emit_first_lanes(builder, args[3], lanes)
+    _emit_masked(builder, "store", ir.VoidType(), [args[2], pointer, I32(4), mask], lanes)
 
 
-@intrinsic
-def copy_quad(typingctx: Any, out: Any, start: Any, memory: Any, index: Any) -> Any:
+@emitted(lambda out, start, memory, index: types.void(out, types.intp, memory, types.intp))
+def copy_quad(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Copy four float32 from ``index`` of one memory to ``start`` of another."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        source = emit_address(context, builder, sig.args[2], *args[2:])
-        target = emit_address(context, builder, sig.args[0], *args[:2])
-        emit_store(builder, emit_load(builder, source, 4), target)
-        return context.get_dummy_value()
-
-    return types.void(out, types.intp, memory, types.intp), codegen
+    source = emit_address(context, builder, sig.args[2], *args[2:])
+    target = emit_address(context, builder, sig.args[0], *args[:2])
+    emit_store(builder, emit_load(builder, source, 4), target)
 
 
-@intrinsic
-def store_cycle(typingctx: Any, out: Any, start: Any, memory: Any, index: Any) -> Any:
+@emitted(lambda out, start, memory, index: types.void(out, types.intp, memory, types.intp))
+def store_cycle(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Write three numbers over and over, 3 LANES in all.
 
     Reads LANES numbers from ``index`` on, so those must exist.
     """
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        out, start, memory, index = args
-        value = emit_load(builder, emit_address(context, builder, sig.args[2], memory, index))
-        for part in range(3):
-            order = [(part * LANES + i) % 3 for i in range(LANES)]
-            at = builder.add(start, start.type(part * LANES))
-            target = emit_address(context, builder, sig.args[0], out, at)
-            emit_store(builder, emit_shuffle(builder, value, value, order), target)
-        return context.get_dummy_value()
-
-    return types.void(out, types.intp, memory, types.intp), codegen
+    out, start, memory, index = args
+    value = emit_load(builder, emit_address(context, builder, sig.args[2], memory, index))
+    for part in range(3):
+        order = [(part * LANES + i) % 3 for i in range(LANES)]
+        at = builder.add(start, start.type(part * LANES))
+        target = emit_address(context, builder, sig.args[0], out, at)
+        emit_store(builder, emit_shuffle(builder, value, value, order), target)
 
 
 @inner

@@ -15,7 +15,7 @@ from numba.core import cgutils
 
 from chronoscene.kernels.compilation import FAST_MATH
 from chronoscene.kernels.memory import emit_address, emit_load, emit_store
-from chronoscene.kernels.vectors import Vector, emit_shuffle, intrinsic
+from chronoscene.kernels.vectors import Vector, emit_shuffle, emitted
 
 
 class _Rows:
@@ -60,41 +60,37 @@ def _emit_pick(builder: Any, sources: list[Any], lanes: list[tuple[int, int]]) -
 
 
 def make_load_columns(count: int, lanes: int) -> Callable:
-    """Function that reads the columns of a matrix that has this many."""
+    """Make a function that reads the columns of a matrix that has this many."""
 
-    @intrinsic
-    def load_columns(typingctx: Any, array: Any, offset: Any) -> Any:
+    @emitted(lambda array, offset: _vectors(count, lanes)(array, types.intp))
+    def load_columns(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         """Columns of ``lanes`` consecutive rows of a matrix, one vector each."""
-
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            memory = _Rows(context, builder, sig, args)
-            parts = [memory.load(i * lanes, lanes) for i in range(count)]
-            columns = []
-            for c in range(count):
-                flat = [count * i + c for i in range(lanes)]
-                columns.append(_emit_pick(builder, parts, [divmod(k, lanes) for k in flat]))
-            return context.make_tuple(builder, sig.return_type, columns)
-
-        return types.UniTuple(Vector("f32", lanes), count)(array, types.intp), codegen
+        memory = _Rows(context, builder, sig, args)
+        parts = [memory.load(i * lanes, lanes) for i in range(count)]
+        columns = []
+        for c in range(count):
+            flat = [count * i + c for i in range(lanes)]
+            columns.append(_emit_pick(builder, parts, [divmod(k, lanes) for k in flat]))
+        return context.make_tuple(builder, sig.return_type, columns)
 
     return load_columns
 
 
-@intrinsic
-def store_columns(typingctx: Any, array: Any, offset: Any, columns: Any) -> Any:
+def _vectors(count: int, lanes: int) -> Any:
+    """Type of a tuple of vectors."""
+    return types.UniTuple(Vector("f32", lanes), count)
+
+
+@emitted(lambda array, offset, columns: types.void(array, types.intp, columns))
+def store_columns(context: Any, builder: Any, sig: Any, args: Any) -> None:
     """Write vectors as the columns of consecutive rows of a matrix."""
-    count, lanes = len(columns), columns[0].lanes
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        memory = _Rows(context, builder, sig, args)
-        vectors = cgutils.unpack_tuple(builder, args[2], count)
-        for i in range(count):
-            flat = range(i * lanes, (i + 1) * lanes)
-            row = _emit_pick(builder, vectors, [(k % count, k // count) for k in flat])
-            memory.store(i * lanes, row)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, columns), codegen
+    count, lanes = len(sig.args[2]), sig.args[2][0].lanes
+    memory = _Rows(context, builder, sig, args)
+    vectors = cgutils.unpack_tuple(builder, args[2], count)
+    for i in range(count):
+        flat = range(i * lanes, (i + 1) * lanes)
+        row = _emit_pick(builder, vectors, [(k % count, k // count) for k in flat])
+        memory.store(i * lanes, row)
 
 
 def _emit_transpose(builder: Any, vectors: list[Any]) -> list[Any]:
@@ -108,38 +104,29 @@ def _emit_transpose(builder: Any, vectors: list[Any]) -> list[Any]:
     return vectors
 
 
-@intrinsic
-def store_records(typingctx: Any, array: Any, offset: Any, fields: Any) -> Any:
+@emitted(lambda array, offset, fields: types.void(array, types.intp, fields))
+def store_records(context: Any, builder: Any, sig: Any, args: Any) -> None:
     """Write 16 vectors as records of 16 numbers."""
-    lanes = fields[0].lanes
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        memory = _Rows(context, builder, sig, args)
-        vectors = cgutils.unpack_tuple(builder, args[2], 16)
-        for part in range(0, 16, lanes):
-            for i, row in enumerate(_emit_transpose(builder, vectors[part : part + lanes])):
-                memory.store(16 * i + part, row)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, fields), codegen
+    lanes = sig.args[2][0].lanes
+    memory = _Rows(context, builder, sig, args)
+    vectors = cgutils.unpack_tuple(builder, args[2], 16)
+    for part in range(0, 16, lanes):
+        for i, row in enumerate(_emit_transpose(builder, vectors[part : part + lanes])):
+            memory.store(16 * i + part, row)
 
 
 def make_load_records(lanes: int) -> Callable:
-    """Function that reads the 16 fields of as many records as a vector has lanes."""
+    """Make a function that reads the 16 fields of as many records as a vector has lanes."""
 
-    @intrinsic
-    def load_records(typingctx: Any, array: Any, offset: Any) -> Any:
+    @emitted(lambda array, offset: _vectors(16, lanes)(array, types.intp))
+    def load_records(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         """The 16 fields of ``lanes`` records of 16 numbers, one vector each."""
-
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            memory = _Rows(context, builder, sig, args)
-            fields = []
-            for part in range(0, 16, lanes):
-                rows = [memory.load(16 * i + part, lanes) for i in range(lanes)]
-                fields += _emit_transpose(builder, rows)
-            return context.make_tuple(builder, sig.return_type, fields)
-
-        return types.UniTuple(Vector("f32", lanes), 16)(array, types.intp), codegen
+        memory = _Rows(context, builder, sig, args)
+        fields = []
+        for part in range(0, 16, lanes):
+            rows = [memory.load(16 * i + part, lanes) for i in range(lanes)]
+            fields += _emit_transpose(builder, rows)
+        return context.make_tuple(builder, sig.return_type, fields)
 
     return load_records
 
@@ -184,65 +171,52 @@ def _emit_sums(builder: Any, vectors: list[Any]) -> Any:
     return vectors
 
 
-@intrinsic
-def store_sums(typingctx: Any, array: Any, offset: Any, vectors: Any) -> Any:
+@emitted(lambda array, offset, vectors: types.void(array, types.intp, vectors))
+def store_sums(context: Any, builder: Any, sig: Any, args: Any) -> None:
     """Write the sum over the lanes of each vector as one row of 16 numbers; the rest is 0."""
-    count = len(vectors)
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        memory = _Rows(context, builder, sig, args)
-        given = cgutils.unpack_tuple(builder, args[2], count)
-        for part, sums in enumerate(_emit_sums(builder, given + [None] * (16 - count))):
-            row = ir.Constant(vectors[0].llvm, None) if sums is None else sums
-            memory.store(part * vectors[0].lanes, row)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vectors), codegen
+    count, kind = len(sig.args[2]), sig.args[2][0]
+    memory = _Rows(context, builder, sig, args)
+    given = cgutils.unpack_tuple(builder, args[2], count)
+    for part, sums in enumerate(_emit_sums(builder, given + [None] * (16 - count))):
+        row = ir.Constant(kind.llvm, None) if sums is None else sums
+        memory.store(part * kind.lanes, row)
 
 
-@intrinsic
-def store_pixels(typingctx: Any, array: Any, offset: Any, stride: Any, channels: Any) -> Any:
+@emitted(
+    lambda array, offset, stride, channels: types.void(array, types.intp, types.intp, channels)
+)
+def store_pixels(context: Any, builder: Any, sig: Any, args: Any) -> None:
     """Write rows of four pixels, ``stride`` numbers apart, with interleaved channels."""
-    count, rows = len(channels), channels[0].lanes // 4
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        memory = _Rows(context, builder, sig, args)
-        vectors = cgutils.unpack_tuple(builder, args[3], count)
-        at = memory.index(0)
-        for row in range(rows):
-            for first in range(0, count, 2):
-                flat = range(4 * first, 4 * min(first + 2, count))
-                picks = [(k % count, 4 * row + k // count) for k in flat]
-                place = builder.add(at, memory.index(4 * first))
-                memory.store(place, _emit_pick(builder, vectors, picks))
-            at = builder.add(at, args[2])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, types.intp, channels), codegen
+    count, rows = len(sig.args[3]), sig.args[3][0].lanes // 4
+    memory = _Rows(context, builder, sig, args)
+    vectors = cgutils.unpack_tuple(builder, args[3], count)
+    at = memory.index(0)
+    for row in range(rows):
+        for first in range(0, count, 2):
+            flat = range(4 * first, 4 * min(first + 2, count))
+            picks = [(k % count, 4 * row + k // count) for k in flat]
+            place = builder.add(at, memory.index(4 * first))
+            memory.store(place, _emit_pick(builder, vectors, picks))
+        at = builder.add(at, args[2])
 
 
 def make_load_pixels(channels: int, lanes: int) -> Callable:
-    """Function that reads this many channels of blocks of pixels."""
+    """Make a function that reads this many channels of blocks of pixels."""
 
-    @intrinsic
-    def load_pixels(typingctx: Any, array: Any, offset: Any, stride: Any) -> Any:
+    @emitted(lambda array, offset, stride: _vectors(channels, lanes)(array, types.intp, types.intp))
+    def load_pixels(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         """Interleaved channels of rows of four pixels, ``stride`` numbers apart."""
-
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            memory = _Rows(context, builder, sig, args)
-            at, parts = memory.index(0), []
-            for _ in range(lanes // 4):
-                starts = [builder.add(at, memory.index(4 * first)) for first in range(channels)]
-                parts += [memory.load(start, 4) for start in starts]
-                at = builder.add(at, args[2])
-            vectors = []
-            for c in range(channels):
-                flat = [(lane // 4, channels * (lane % 4) + c) for lane in range(lanes)]
-                picks = [(channels * row + k // 4, k % 4) for row, k in flat]
-                vectors.append(_emit_pick(builder, parts, picks))
-            return context.make_tuple(builder, sig.return_type, vectors)
-
-        kinds = (array, types.intp, types.intp)
-        return types.UniTuple(Vector("f32", lanes), channels)(*kinds), codegen
+        memory = _Rows(context, builder, sig, args)
+        at, parts = memory.index(0), []
+        for _ in range(lanes // 4):
+            starts = [builder.add(at, memory.index(4 * first)) for first in range(channels)]
+            parts += [memory.load(start, 4) for start in starts]
+            at = builder.add(at, args[2])
+        vectors = []
+        for c in range(channels):
+            flat = [(lane // 4, channels * (lane % 4) + c) for lane in range(lanes)]
+            picks = [(channels * row + k // 4, k % 4) for row, k in flat]
+            vectors.append(_emit_pick(builder, parts, picks))
+        return context.make_tuple(builder, sig.return_type, vectors)
 
     return load_pixels

@@ -15,7 +15,7 @@ from chronoscene.kernels.vectors import (
     as_float,
     as_int,
     emit_shuffle,
-    intrinsic,
+    emitted,
     multiply_add,
     select,
     to_float,
@@ -38,45 +38,35 @@ TANH_SERIES_END = float32(0.35)
 ZERO, ONE, TWO = float32(0), float32(1), float32(2)
 
 
-@intrinsic
-def lane_sum(typingctx: Any, value: Any) -> Any:
+@emitted(lambda value: types.float32(value))
+def lane_sum(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Sum of all lanes, halves added to halves: the order is fixed."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        total, half = args[0], value.lanes // 2
-        while half:
-            order = [(i + half) % value.lanes for i in range(value.lanes)]
-            total = builder.fadd(total, emit_shuffle(builder, total, total, order))
-            half //= 2
-        return builder.extract_element(total, I32(0))
-
-    return types.float32(value), codegen
+    total, lanes = args[0], sig.args[0].lanes
+    half = lanes // 2
+    while half:
+        order = [(i + half) % lanes for i in range(lanes)]
+        total = builder.fadd(total, emit_shuffle(builder, total, total, order))
+        half //= 2
+    return builder.extract_element(total, I32(0))
 
 
-@intrinsic
-def quad_sum(typingctx: Any, value: Any) -> Any:
+@emitted(lambda value: value(value))
+def quad_sum(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Sum of each four neighbouring lanes, in all four of them."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        total = args[0]
-        for distance in (1, 2):
-            order = [i ^ distance for i in range(value.lanes)]
-            total = builder.fadd(total, emit_shuffle(builder, total, total, order))
-        return total
-
-    return value(value), codegen
+    total = args[0]
+    for distance in (1, 2):
+        order = [i ^ distance for i in range(sig.args[0].lanes)]
+        total = builder.fadd(total, emit_shuffle(builder, total, total, order))
+    return total
 
 
 def _make_permutation(source: Callable[[int, int], int]) -> Callable:
-    """Function that moves lanes: ``source`` says where a lane, of so many, comes from."""
+    """Make a function that moves lanes; ``source(i, lanes)`` is where lane i comes from."""
 
-    @intrinsic
-    def permute(typingctx: Any, value: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            order = [source(i, value.lanes) for i in range(value.lanes)]
-            return emit_shuffle(builder, args[0], args[0], order)
-
-        return value(value), codegen
+    @emitted(lambda value: value(value))
+    def permute(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        lanes = sig.args[0].lanes
+        return emit_shuffle(builder, args[0], args[0], [source(i, lanes) for i in range(lanes)])
 
     return permute
 

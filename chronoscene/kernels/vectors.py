@@ -18,6 +18,8 @@ from __future__ import annotations
 import operator
 import platform
 from collections.abc import Callable, Sequence
+from inspect import Parameter, Signature
+from inspect import signature as pysignature
 from typing import Any
 
 import numba.extending
@@ -30,6 +32,32 @@ from chronoscene.kernels.compilation import FAST_MATH
 
 # The declared type of an intrinsic has the typing context as an argument that callers leave out.
 intrinsic: Any = numba.extending.intrinsic
+
+
+def emitted(signature: Callable[..., Any]) -> Callable[[Callable[..., Any]], Any]:
+    """Make a function of kernels from one that writes LLVM code.
+
+    Args:
+        signature: Returns the Numba signature for the types of the arguments. What is decorated is
+            called with Numba's context, the IR builder, that signature, and the values; it returns
+            a value, or None where the signature says void.
+    """
+
+    def define(emit: Callable[..., Any]) -> Any:
+        def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            value = emit(context, builder, sig, args)
+            return context.get_dummy_value() if value is None else value
+
+        def typed(typingctx: Any, *kinds: Any) -> Any:
+            return signature(*kinds), lower
+
+        first = Parameter("typingctx", Parameter.POSITIONAL_OR_KEYWORD)
+        parameters = [first, *pysignature(signature).parameters.values()]
+        typed.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+        typed.__name__, typed.__doc__ = emit.__name__, emit.__doc__
+        return intrinsic(typed)
+
+    return define
 
 
 def _register_lanes() -> int:
@@ -197,16 +225,11 @@ for _name in (*_COMPARISONS, *_ARITHMETIC, *_BITWISE):
 
 
 def make_splat(kind: str, lanes: int) -> Callable:
-    """Function that makes a vector of a number."""
+    """Make a function that puts one number into every lane of a vector."""
 
-    @intrinsic
-    def splat(typingctx: Any, value: Any) -> Any:
-        """Vector with one number in every lane."""
-
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return emit_splat(builder, args[0], lanes)
-
-        return Vector(kind, lanes)(_SCALARS[kind]), codegen
+    @emitted(lambda value: Vector(kind, lanes)(_SCALARS[kind]))
+    def splat(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return emit_splat(builder, args[0], lanes)
 
     return splat
 
@@ -215,26 +238,20 @@ splat = make_splat("f32", LANES)
 
 
 def make_constant(values: Sequence[float]) -> Callable:
-    """Function of no arguments that gives these lanes."""
+    """Make a function of no arguments that gives these lanes."""
     kind = "i32" if all(isinstance(v, int) for v in values) else "f32"
 
-    @intrinsic
-    def constant(typingctx: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return emit_lanes(values, _ELEMENTS[kind])
-
-        return Vector(kind, len(values))(), codegen
+    @emitted(lambda: Vector(kind, len(values))())
+    def constant(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return emit_lanes(values, _ELEMENTS[kind])
 
     return constant
 
 
 def _make_function(name: str) -> Callable:
-    @intrinsic
-    def function(typingctx: Any, a: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return emit_call(builder, name, args[0], flags=FAST_MATH)
-
-        return a(a), codegen
+    @emitted(lambda a: a(a))
+    def function(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return emit_call(builder, name, args[0], flags=FAST_MATH)
 
     return function
 
@@ -247,12 +264,9 @@ absolute = _make_function("fabs")
 
 
 def _make_conversion(instruction: str, kind: str) -> Callable:
-    @intrinsic
-    def convert(typingctx: Any, a: Any) -> Any:
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return getattr(builder, instruction)(args[0], sig.return_type.llvm)
-
-        return a.with_kind(kind)(a), codegen
+    @emitted(lambda a: a.with_kind(kind)(a))
+    def convert(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return getattr(builder, instruction)(args[0], sig.return_type.llvm)
 
     return convert
 
@@ -267,38 +281,26 @@ as_float = _make_conversion("bitcast", "f32")
 """Float lanes of these bits."""
 
 
-@intrinsic
-def multiply_add(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
+@emitted(lambda a, b, c: _like(a, b, c)(a, b, c))
+def multiply_add(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """a * b + c, rounded once where the processor can."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        _, args = _promote(context, builder, sig.args, args)
-        return emit_multiply_add(builder, *args)
-
-    return _like(a, b, c)(a, b, c), codegen
+    _, args = _promote(context, builder, sig.args, args)
+    return emit_multiply_add(builder, *args)
 
 
-@intrinsic
-def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
+@emitted(lambda mask, a, b: _like(a, b)(mask, a, b))
+def select(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Lanes of ``a`` where the mask is set, of ``b`` elsewhere."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        _, chosen = _promote(context, builder, sig.args[1:], args[1:])
-        return builder.select(args[0], *chosen)
-
-    return _like(a, b)(mask, a, b), codegen
+    _, chosen = _promote(context, builder, sig.args[1:], args[1:])
+    return builder.select(args[0], *chosen)
 
 
 def _make_extremum(comparison: str) -> Callable:
-    @intrinsic
-    def extremum(typingctx: Any, a: Any, b: Any) -> Any:
+    @emitted(lambda a, b: _like(a, b)(a, b))
+    def extremum(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         """The smaller (larger) of two per lane; the second if one is nan."""
-
-        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            like, (x, y) = _promote(context, builder, sig.args, args)
-            return builder.select(_emit_operator(builder, like.kind, comparison, x, y), x, y)
-
-        return _like(a, b)(a, b), codegen
+        like, (x, y) = _promote(context, builder, sig.args, args)
+        return builder.select(_emit_operator(builder, like.kind, comparison, x, y), x, y)
 
     return extremum
 
@@ -307,33 +309,21 @@ minimum = _make_extremum("lt")
 maximum = _make_extremum("gt")
 
 
-@intrinsic
-def any_lane(typingctx: Any, mask: Any) -> Any:
+@emitted(lambda mask: types.boolean(mask))
+def any_lane(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Return True if any lane of the mask is set."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        bits = builder.bitcast(args[0], ir.IntType(sig.args[0].lanes))
-        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
-
-    return types.boolean(mask), codegen
+    bits = builder.bitcast(args[0], ir.IntType(sig.args[0].lanes))
+    return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
-@intrinsic
-def pack_bytes(typingctx: Any, a: Any) -> Any:
+@emitted(lambda a: types.uint64(a))
+def pack_bytes(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """The low bytes of eight integer lanes as one 64-bit number, lane 0 lowest."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        low = builder.trunc(args[0], ir.VectorType(ir.IntType(8), 8))
-        return builder.bitcast(low, ir.IntType(64))
-
-    return types.uint64(a), codegen
+    low = builder.trunc(args[0], ir.VectorType(ir.IntType(8), 8))
+    return builder.bitcast(low, ir.IntType(64))
 
 
-@intrinsic
-def trailing_zeros(typingctx: Any, bits: Any) -> Any:
+@emitted(lambda bits: types.intp(types.uint64))
+def trailing_zeros(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Number of the lowest set bit of a nonzero 64-bit number."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.intp(types.uint64), codegen
+    return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
