@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from chronoscene.arrays import Array
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.synth.render.mesh import MISS
-from chronoscene.synth.render.noise import fbm, rng_for, smooth
+from chronoscene.synth.render.noise import dot, fbm, mix, plus, rng_for, scaled, smooth, times
 
 Color = tuple[float, float, float]
 
@@ -128,31 +128,25 @@ def sky_args(light: Light) -> SkyArgs:
 
 
 @inner
-def sky_radiance(dx, dy, dz, a, detail):  # type: ignore[no-untyped-def]
+def sky_radiance(d, a, detail):  # type: ignore[no-untyped-def]
     """Radiance of the sky in a unit direction; without ``detail``, clouds are an even veil."""
-    up = max(dz, 0.0)
-    t = 1.0 - math.exp(-4.5 * up)
-    r = a.horizon[0] + (a.zenith[0] - a.horizon[0]) * t
-    g = a.horizon[1] + (a.zenith[1] - a.horizon[1]) * t
-    b = a.horizon[2] + (a.zenith[2] - a.horizon[2]) * t
-    towards = max(0.0, dx * a.direction[0] + dy * a.direction[1] + dz * a.direction[2])
+    up = max(d[2], 0.0)
+    color = mix(a.horizon, a.zenith, 1.0 - math.exp(-4.5 * up))
+    towards = max(0.0, dot(d, a.direction))
     sharp = towards * towards * towards
     sharp *= sharp
     wide, sharp = 0.10 * sharp, 0.30 * sharp**8
-    glow = wide + sharp
-    r, g, b = r + glow * a.sun[0], g + glow * a.sun[1], b + glow * a.sun[2]
+    color = plus(color, scaled(a.sun, wide + sharp))
     # Under an overcast sky little of the blue is left.
     cover, white = 0.6 * a.cloud * a.cloud, 0.62
     if detail and up > 0.01:
-        px, py = dx / (up + 0.12), dy / (up + 0.12)
+        px, py = d[0] / (up + 0.12), d[1] / (up + 0.12)
         n = fbm(px, py, 1.1, 6, a.sky_seed, 0.004) + 0.3 * fbm(px, py, 3.3, 2, a.sky_seed + 7, 0.01)
         edge = 0.42 - 0.95 * a.cloud
         cover = smooth(edge, edge + 0.45, n) * smooth(0.01, 0.10, up) * 0.9
         white = 0.80 - 0.45 * smooth(edge + 0.2, edge + 0.8, n)
-    cr = white * (0.36 * a.sun[0] + 0.75 * a.horizon[0])
-    cg = white * (0.36 * a.sun[1] + 0.75 * a.horizon[1])
-    cb = white * (0.36 * a.sun[2] + 0.75 * a.horizon[2])
-    return r + (cr - r) * cover, g + (cg - g) * cover, b + (cb - b) * cover
+    cloud = scaled(plus(scaled(a.sun, 0.36), scaled(a.horizon, 0.75)), white)
+    return mix(color, cloud, cover)
 
 
 class Probes(NamedTuple):
@@ -168,27 +162,26 @@ class Probes(NamedTuple):
 
 
 @inner
-def probe_light(probes, x, y, z, dx, dy, dz, slope):  # type: ignore[no-untyped-def]
+def probe_light(probes, p, d, slope):  # type: ignore[no-untyped-def]
     """Indirect radiance at a point from a direction; ``slope`` 2/3 gives irradiance / pi."""
     nx, ny, nz = probes.valid.shape
-    fx = min(max((x - probes.origin[0]) / probes.step[0], 0.0), nx - 1.001)
-    fy = min(max((y - probes.origin[1]) / probes.step[1], 0.0), ny - 1.001)
-    fz = min(max((z - probes.origin[2]) / probes.step[2], 0.0), nz - 1.001)
+    fx = min(max((p[0] - probes.origin[0]) / probes.step[0], 0.0), nx - 1.001)
+    fy = min(max((p[1] - probes.origin[1]) / probes.step[1], 0.0), ny - 1.001)
+    fz = min(max((p[2] - probes.origin[2]) / probes.step[2], 0.0), nz - 1.001)
     ix, iy, iz = int(fx), int(fy), int(fz)
-    r, g, b, total = 0.0, 0.0, 0.0, 0.0
+    color, total = (0.0, 0.0, 0.0), 0.0
     for corner in range(8):
         i, j, k = corner & 1, (corner >> 1) & 1, corner >> 2
         wx = fx - ix if i else 1.0 - fx + ix
         wy = fy - iy if j else 1.0 - fy + iy
         wz = fz - iz if k else 1.0 - fz + iz
         w = (wx * wy * wz + 1e-4) * probes.valid[ix + i, iy + j, iz + k]
-        p = probes.values[ix + i, iy + j, iz + k]
-        r += w * max(0.0, p[0, 0] + slope * (p[1, 0] * dx + p[2, 0] * dy + p[3, 0] * dz))
-        g += w * max(0.0, p[0, 1] + slope * (p[1, 1] * dx + p[2, 1] * dy + p[3, 1] * dz))
-        b += w * max(0.0, p[0, 2] + slope * (p[1, 2] * dx + p[2, 2] * dy + p[3, 2] * dz))
+        v = probes.values[ix + i, iy + j, iz + k]
+        slopes = plus(plus(scaled(v[1], d[0]), scaled(v[2], d[1])), scaled(v[3], d[2]))
+        c = plus(v[0], scaled(slopes, slope))
+        color = plus(color, scaled((max(0.0, c[0]), max(0.0, c[1]), max(0.0, c[2])), w))
         total += w
-    inverse = 1.0 / max(total, 1e-9)
-    return r * inverse, g * inverse, b * inverse
+    return scaled(color, 1.0 / max(total, 1e-9))
 
 
 @kernel(parallel=True)
@@ -211,30 +204,22 @@ def probe_values(  # type: ignore[no-untyped-def]
         acc = np.zeros((4, 3))
         backs = 0
         for i in range(p * count, (p + 1) * count):
-            dx, dy, dz = float(rays[i, 3]), float(rays[i, 4]), float(rays[i, 5])
+            d = (float(rays[i, 3]), float(rays[i, 4]), float(rays[i, 5]))
             if tri[i] == MISS:
-                c = sky_radiance(dx, dy, dz, sky, False)
+                c = sky_radiance(d, sky, False)
             else:
                 n = tables.normals[tri[i], 0]
                 style = tables.patch_style[tables.tri_patch[tri[i]]]
                 solid = tables.styles[style, 22] <= 0.0
-                if solid and n[0] * dx + n[1] * dy + n[2] * dz > 0.0:
+                if solid and dot(n, d) > 0.0:
                     backs += 1
                     continue
-                d = sky.direction
-                facing = max(0.0, n[0] * d[0] + n[1] * d[1] + n[2] * d[2])
-                sun = facing if lit[i] else 0.0
-                m = mean_albedo[style]
-                c = (
-                    m[0] * (sun * sky.sun[0] + 0.4 * sky.horizon[0]),
-                    m[1] * (sun * sky.sun[1] + 0.4 * sky.horizon[1]),
-                    m[2] * (sun * sky.sun[2] + 0.4 * sky.horizon[2]),
-                )
+                sun = max(0.0, dot(n, sky.direction)) if lit[i] else 0.0
+                c = times(mean_albedo[style], plus(scaled(sky.sun, sun), scaled(sky.horizon, 0.4)))
             for k in range(3):
                 acc[0, k] += c[k]
-                acc[1, k] += 3.0 * dx * c[k]
-                acc[2, k] += 3.0 * dy * c[k]
-                acc[3, k] += 3.0 * dz * c[k]
+                for j in range(3):
+                    acc[j + 1, k] += 3.0 * d[j] * c[k]
         seen = max(1, count - backs)
         if backs > 0.25 * count:
             valid[p] = 0.0

@@ -7,7 +7,6 @@ to patches, patches to styles; both are plain tables, which the compiled shader 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from chronoscene.arrays import Array
 from chronoscene.kernels.compilation import inner
+from chronoscene.synth.render.noise import dot, plus, scaled, unit
 
 Color = tuple[float, float, float]
 TextureFrame = tuple[ArrayLike, ArrayLike, ArrayLike]
@@ -266,21 +266,12 @@ MISS = 0xFFFFFFFF  # Primitive id that the ray caster gives to rays that hit not
 
 
 @inner
-def hit_normals(tables, tri, u, v, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Flat and smooth unit normals of a hit, both turned towards the viewer."""
+def hit_normals(tables, tri, u, v, d):  # type: ignore[no-untyped-def]
+    """Flat and smooth unit normals of a hit; the flat one is turned towards the viewer."""
     a, b, c = tables.vertices[tri, 0], tables.vertices[tri, 1], tables.vertices[tri, 2]
     e0, e1, e2 = float(b[0] - a[0]), float(b[1] - a[1]), float(b[2] - a[2])
     f0, f1, f2 = float(c[0] - a[0]), float(c[1] - a[1]), float(c[2] - a[2])
-    gx, gy, gz = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
-    scale = 1.0 / max(1e-12, math.sqrt(gx * gx + gy * gy + gz * gz))
-    gx, gy, gz = gx * scale, gy * scale, gz * scale
+    flat = unit((e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0))
     n = tables.normals[tri]
-    w = 1.0 - u - v
-    sx = w * n[0, 0] + u * n[1, 0] + v * n[2, 0]
-    sy = w * n[0, 1] + u * n[1, 1] + v * n[2, 1]
-    sz = w * n[0, 2] + u * n[1, 2] + v * n[2, 2]
-    scale = 1.0 / max(1e-12, math.sqrt(sx * sx + sy * sy + sz * sz))
-    sx, sy, sz = sx * scale, sy * scale, sz * scale
-    if gx * dx + gy * dy + gz * dz > 0.0:
-        gx, gy, gz = -gx, -gy, -gz
-    return gx, gy, gz, sx, sy, sz
+    smooth = unit(plus(plus(scaled(n[0], 1.0 - u - v), scaled(n[1], u)), scaled(n[2], v)))
+    return (scaled(flat, -1.0) if dot(flat, d) > 0.0 else flat), smooth

@@ -121,8 +121,30 @@ def mix(a, b, t):  # type: ignore[no-untyped-def]
 
 @inner
 def scaled(a, f):  # type: ignore[no-untyped-def]
-    """Colour times a factor."""
+    """Colour or vector times a factor."""
     return (a[0] * f, a[1] * f, a[2] * f)
+
+
+@inner
+def plus(a, b):  # type: ignore[no-untyped-def]
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+@inner
+def times(a, b):  # type: ignore[no-untyped-def]
+    """Products of two colours, channel by channel."""
+    return (a[0] * b[0], a[1] * b[1], a[2] * b[2])
+
+
+@inner
+def dot(a, b):  # type: ignore[no-untyped-def]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inner
+def unit(a):  # type: ignore[no-untyped-def]
+    """A vector scaled to length 1."""
+    return scaled(a, 1.0 / max(1e-12, math.sqrt(dot(a, a))))
 
 
 @inner

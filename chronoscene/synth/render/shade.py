@@ -14,7 +14,7 @@ from numba import prange
 from chronoscene.kernels.compilation import inner, kernel
 from chronoscene.synth.render.light import probe_light, sky_radiance
 from chronoscene.synth.render.mesh import MISS, hit_normals
-from chronoscene.synth.render.noise import mix
+from chronoscene.synth.render.noise import dot, mix, plus, scaled, times
 from chronoscene.synth.render.textures import albedo
 
 
@@ -53,7 +53,7 @@ def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ig
         if tri[i] == MISS:
             continue
         r = rays[i]
-        gx, gy, gz, _, _, _ = hit_normals(tables, tri[i], uv[i, 0], uv[i, 1], r[3], r[4], r[5])
+        normal, _ = hit_normals(tables, tri[i], uv[i, 0], uv[i, 1], r[3:])
         turn = 2.399963 * (i % count)
         radius = spread * math.sqrt((i % count + 0.5) / count)
         # Two axes across the sun's direction; the sun is never in the zenith.
@@ -65,16 +65,15 @@ def shadow_rays(rays, t, tri, uv, tables, direction, spread, count):  # type: ig
         lx = direction[0] + ca * ax + sa * bx
         ly = direction[1] + ca * ay + sa * by
         lz = direction[2] + sa * bz
-        facing = gx * lx + gy * ly + gz * lz
+        facing = dot(normal, (lx, ly, lz))
         style = tables.styles[tables.patch_style[tables.tri_patch[tri[i]]]]
         if facing <= 0.0 and style[22] <= 0.0:
             continue
         need[i] = True
         eps = 2e-3 + 2e-5 * t[i]
         side = eps if facing > 0.0 else -eps
-        out[i, 0] = r[0] + t[i] * r[3] + side * gx
-        out[i, 1] = r[1] + t[i] * r[4] + side * gy
-        out[i, 2] = r[2] + t[i] * r[5] + side * gz
+        for axis in range(3):
+            out[i, axis] = r[axis] + t[i] * r[3 + axis] + side * normal[axis]
         out[i, 3], out[i, 4], out[i, 5] = lx, ly, lz
     return out, need
 
@@ -92,72 +91,72 @@ def surface_albedo(tables, tri, x, y, z, fw):  # type: ignore[no-untyped-def]
 
 
 @inner
-def _reflected(x, y, z, n, d, style, facing, lit, sky, probes):  # type: ignore[no-untyped-def]
+def _reflected(p, n, d, style, facing, lit, sky, probes):  # type: ignore[no-untyped-def]
     """Specular reflection of sky and surroundings, and the sun's highlight."""
-    k = 2.0 * (d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
-    mx, my, mz = d[0] - k * n[0], d[1] - k * n[1], d[2] - k * n[2]
+    k = 2.0 * dot(d, n)
+    m = (d[0] - k * n[0], d[1] - k * n[1], d[2] - k * n[2])
     grazing = (1.0 - min(1.0, abs(0.5 * k))) ** 5
     strength = style[20] + (1.0 - style[20]) * grazing * 0.6 * style[21]
-    r, g, b = probe_light(probes, x, y, z, mx, my, mz, 1.0)
-    if mz > 0.0:
-        sr, sg, sb = sky_radiance(mx, my, mz, sky, False)
-        r, g, b = 0.5 * (r + sr), 0.5 * (g + sg), 0.5 * (b + sb)
-    towards = mx * sky.direction[0] + my * sky.direction[1] + mz * sky.direction[2]
+    color = probe_light(probes, p, m, 1.0)
+    if m[2] > 0.0:
+        color = scaled(plus(color, sky_radiance(m, sky, False)), 0.5)
+    towards = dot(m, sky.direction)
     if facing > 0.0 and towards > 0.0:
         spot = lit * 3.0 * towards ** (20.0 + 180.0 * style[21])
-        r, g, b = r + spot * sky.sun[0], g + spot * sky.sun[1], b + spot * sky.sun[2]
-    return strength * r, strength * g, strength * b, strength
+        color = plus(color, scaled(sky.sun, spot))
+    return scaled(color, strength), strength
+
+
+@inner
+def _direction(ray):  # type: ignore[no-untyped-def]
+    """Direction of a ray as float64, and its length."""
+    d = (float(ray[3]), float(ray[4]), float(ray[5]))
+    return d, math.sqrt(dot(d, d))
 
 
 @inner
 def _base(ray, t, tri, u, v, tables, fw_unit):  # type: ignore[no-untyped-def]
     """Albedo of a hit for samples of the given width at unit distance."""
-    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    gx, gy, gz, _, _, _ = hit_normals(tables, tri, u, v, dx, dy, dz)
-    slant = max(0.25, abs(gx * dx + gy * dy + gz * dz) / length)
+    d, length = _direction(ray)
+    normal, _ = hit_normals(tables, tri, u, v, d)
+    slant = max(0.25, abs(dot(normal, d)) / length)
     fw = max(1e-4, fw_unit * t * length / math.sqrt(slant))
-    return surface_albedo(tables, tri, ray[0] + t * dx, ray[1] + t * dy, ray[2] + t * dz, fw)
+    x, y, z = plus(ray, scaled(d, t))
+    return surface_albedo(tables, tri, x, y, z, fw)
 
 
 @inner
 def _radiance(ray, t, tri, u, v, lit, base, tables, sky, probes):  # type: ignore[no-untyped-def]
     """Radiance along a ray that hit a surface of albedo ``base``; ``lit`` is 0..1."""
-    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    d = (dx / length, dy / length, dz / length)
-    x, y, z = ray[0] + t * dx, ray[1] + t * dy, ray[2] + t * dz
-    gx, gy, gz, sx, sy, sz = hit_normals(tables, tri, u, v, dx, dy, dz)
+    step, length = _direction(ray)
+    d = (step[0] / length, step[1] / length, step[2] / length)
+    g, s = hit_normals(tables, tri, u, v, step)
     style = tables.styles[tables.patch_style[tables.tri_patch[tri]]]
     through = style[22]
-    if through <= 0.0 and sx * gx + sy * gy + sz * gz < 0.0:
-        sx, sy, sz = -sx, -sy, -sz  # the back of an open sheet
-    facing = sx * sky.direction[0] + sy * sky.direction[1] + sz * sky.direction[2]
-    flat = gx * sky.direction[0] + gy * sky.direction[1] + gz * sky.direction[2]
+    if through <= 0.0 and dot(s, g) < 0.0:
+        s = scaled(s, -1.0)  # the back of an open sheet
+    facing, flat = dot(s, sky.direction), dot(g, sky.direction)
     if through > 0.0:
         # Leaves scatter forward as well: light wraps around the crown.
         direct = lit * max(0.0, (facing + through) / (1.0 + through))
     else:
         direct = lit * max(0.0, facing) if flat > 0.0 else 0.0
-    ox, oy, oz = x + 0.8 * gx, y + 0.8 * gy, z + 0.8 * gz
-    er, eg, eb = probe_light(probes, ox, oy, oz, sx, sy, sz, 2.0 / 3.0)
-    r = base[0] * (direct * sky.sun[0] + er)
-    g = base[1] * (direct * sky.sun[1] + eg)
-    b = base[2] * (direct * sky.sun[2] + eb)
+    outside = plus(plus(ray, scaled(step, t)), scaled(g, 0.8))
+    indirect = probe_light(probes, outside, s, 2.0 / 3.0)
+    color = times(base, plus(scaled(sky.sun, direct), indirect))
     if style[20] > 0.0:
-        mr, mg, mb, s = _reflected(ox, oy, oz, (gx, gy, gz), d, style, flat, lit, sky, probes)
-        r, g, b = r * (1.0 - s) + mr, g * (1.0 - s) + mg, b * (1.0 - s) + mb
+        mirrored, share = _reflected(outside, g, d, style, flat, lit, sky, probes)
+        color = plus(scaled(color, 1.0 - share), mirrored)
     air = math.exp(-sky.haze * t * length)
-    hr, hg, hb = sky_radiance(d[0], d[1], 0.02, sky, False)
-    return r * air + hr * (1.0 - air), g * air + hg * (1.0 - air), b * air + hb * (1.0 - air)
+    haze = sky_radiance((d[0], d[1], 0.02), sky, False)
+    return plus(scaled(color, air), scaled(haze, 1.0 - air))
 
 
 @inner
 def _sky(ray, sky):  # type: ignore[no-untyped-def]
     """Radiance of the sky along a ray."""
-    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    return sky_radiance(dx / length, dy / length, dz / length, sky, True)
+    d, length = _direction(ray)
+    return sky_radiance((d[0] / length, d[1] / length, d[2] / length), sky, True)
 
 
 @inner
@@ -210,7 +209,7 @@ def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # ty
     """
     out = np.empty((len(t) // per_pixel, 3), np.uint8)
     for pixel in prange(len(out)):
-        r, g, b = 0.0, 0.0, 0.0
+        color = (0.0, 0.0, 0.0)
         first, count, stride, wide = pixel * per_pixel, per_pixel, 1, fw_unit
         uniform = per_pixel > 1 and _uniform(tri, first, first + per_pixel, tables)
         old = (0.0, 0.0, 0.0)
@@ -233,12 +232,10 @@ def shade(rays, t, tri, uv, lit, tables, sky, probes, per_pixel, fw_unit):  # ty
                 c = _radiance(rays[i], float(t[i]), tri[i], u, v, sun, base, tables, sky, probes)
             # The cap keeps a single bright sample from whitening an edge.
             weight = per_pixel if uniform else 1
-            r, g = r + weight * min(c[0], 6.0), g + weight * min(c[1], 6.0)
-            b += weight * min(c[2], 6.0)
+            color = plus(color, scaled((min(c[0], 6.0), min(c[1], 6.0), min(c[2], 6.0)), weight))
         gain = sky.exposure / per_pixel
-        out[pixel, 0] = int(255.0 * _tone(r * gain * sky.white[0]) + 0.5)
-        out[pixel, 1] = int(255.0 * _tone(g * gain * sky.white[1]) + 0.5)
-        out[pixel, 2] = int(255.0 * _tone(b * gain * sky.white[2]) + 0.5)
+        for k in range(3):
+            out[pixel, k] = int(255.0 * _tone(color[k] * gain * sky.white[k]) + 0.5)
     return out
 
 
@@ -249,6 +246,5 @@ def albedo_at(points, tri, tables, fw):  # type: ignore[no-untyped-def]
     for i in prange(len(points)):
         if tri[i] != MISS:
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            c = surface_albedo(tables, tri[i], x, y, z, max(1e-4, fw[i]))
-            out[i, 0], out[i, 1], out[i, 2] = c[0], c[1], c[2]
+            out[i] = surface_albedo(tables, tri[i], x, y, z, max(1e-4, fw[i]))
     return out
