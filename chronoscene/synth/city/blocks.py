@@ -10,8 +10,9 @@ import numpy as np
 
 from chronoscene.arrays import Array
 from chronoscene.synth.city import furniture as fur
-from chronoscene.synth.city.buildings import SLAB, Building, finished, foundation, frame, rubble
-from chronoscene.synth.city.placing import Block, Rect, floor
+from chronoscene.synth.city.buildings import Building, finished, foundation, frame, rubble
+from chronoscene.synth.city.ground import SLAB, Rect, floor
+from chronoscene.synth.city.placing import Block
 from chronoscene.synth.city.world import renewal_stages, site_stages, visits
 from chronoscene.synth.render.mesh import Mesh
 from chronoscene.synth.render.noise import rng_for
@@ -30,9 +31,8 @@ def square(block: Block) -> None:
     else:
         world.always(f"{name}/statue", "monument", lambda: fur.statue(name, mid))
     for i, (fx, fy) in enumerate(((0.17, 0.17), (0.83, 0.17), (0.83, 0.83), (0.17, 0.83))):
-        c = inner.at(fx, fy)
-        w = 0.11 * min(inner.size)
-        bed = Rect(c[0] - w, c[1] - w, c[0] + w, c[1] + w)
+        c, w = inner.at(fx, fy), 0.11 * min(inner.size)
+        bed = Rect.around(c, w)
         block.lawn(bed, f"bed_{i}", "mown", SLAB + 0.03)
         for j in range(1 if w < 2.5 else 3):
             at = bed.at(*rng.uniform(0.2, 0.8, 2)) if w >= 2.5 else bed.at(0.5, 0.5)
@@ -93,9 +93,10 @@ def houses(block: Block) -> None:
         shops = bool(rng.random() < 0.6)
         for i in range(count):
             spec = Building(
-                block.named(f"house_{r}{i}"), cuts[i], y0, cuts[i + 1], y1,
-                int(rng.integers(2, 6)), str(rng.choice(["gable", "gable", "hip", "flat"])),
-                str(rng.choice(["plaster", "plaster", "brick"])),
+                block.named(f"house_{r}{i}"), Rect(cuts[i], y0, cuts[i + 1], y1),
+                storeys=int(rng.integers(2, 6)),
+                roof=str(rng.choice(["gable", "gable", "hip", "flat"])),
+                wall=str(rng.choice(["plaster", "plaster", "brick"])),
                 blank=(False, i < count - 1, False, i > 0),
                 shops=(shops and street == 0, False, shops and street == 2, False),
                 balconies=bool(rng.random() < 0.3),
@@ -114,7 +115,8 @@ def houses(block: Block) -> None:
 
 def _fit_roof(spec: Building) -> Building:
     """Terraced houses need their ridge along the street, so narrow ones get a flat roof."""
-    narrow = spec.x1 - spec.x0 <= spec.y1 - spec.y0
+    width, depth = spec.rect.size
+    narrow = width <= depth
     attached = spec.blank[1] or spec.blank[3]
     if attached and (narrow or spec.roof == "hip"):
         return replace(spec, roof="flat" if narrow else "gable")
@@ -129,9 +131,11 @@ def slabs(block: Block) -> None:
     lower = Rect(inner.x0, inner.y0, inner.x1, middle)
     block.lawn(upper, "north")
     wall = str(rng.choice(["panel", "concrete", "brick", "panel"]))
+    deep = min(12.0, upper.size[1] - 3)
     spec = Building(
-        block.named("slab"), upper.x0 + 2, upper.y0 + 1.0, upper.x1 - 2,
-        upper.y0 + 1.0 + min(12.0, upper.size[1] - 3), int(rng.integers(4, 8)), "flat", wall,
+        block.named("slab"),
+        Rect(upper.x0 + 2, upper.y0 + 1.0, upper.x1 - 2, upper.y0 + 1.0 + deep),
+        storeys=int(rng.integers(4, 8)), roof="flat", wall=wall,
         balconies=bool(rng.random() < 0.7),
     )  # fmt: skip
     block.house(spec, chance=0.5)
@@ -156,14 +160,15 @@ def tower(block: Block) -> None:
     w = min(16.0, 0.5 * min(inner.size))
     x0, y0 = inner.at(*rng.uniform(0.08, 0.3, 2))[:2]
     spec = Building(
-        block.named("tower"), x0, y0, x0 + w, y0 + w, int(rng.integers(8, 11)), "flat",
-        str(rng.choice(["panel", "concrete"])),
+        block.named("tower"), Rect(x0, y0, x0 + w, y0 + w), storeys=int(rng.integers(8, 11)),
+        roof="flat", wall=str(rng.choice(["panel", "concrete"])),
     )  # fmt: skip
     block.house(spec, chance=0.6)
     if inner.x1 - (x0 + w) > 7:
         wing = Building(
-            block.named("wing"), x0 + w, y0 + 0.2 * w, inner.x1 - 1.5, y0 + 0.85 * w, 2, "flat",
-            "panel", blank=(False, False, False, True), shops=(True, False, True, False),
+            block.named("wing"), Rect(x0 + w, y0 + 0.2 * w, inner.x1 - 1.5, y0 + 0.85 * w),
+            storeys=2, roof="flat", wall="panel",
+            blank=(False, False, False, True), shops=(True, False, True, False),
         )  # fmt: skip
         block.house(wing, chance=0.5)
     free = Rect(inner.x0 + 1.5, y0 + w + 2.5, inner.x1 - 1.5, inner.y1 - 1.5)
@@ -179,8 +184,9 @@ def site(block: Block) -> None:
     steps = site_stages(world.periods)
     low, (dx, dy) = inner.at(0.12, 0.16), inner.size
     spec = Building(
-        block.named("hall"), low[0], low[1], low[0] + 0.7 * dx, low[1] + 0.62 * dy,
-        int(rng.integers(4, 7)), "flat", str(rng.choice(["panel", "brick", "plaster"])),
+        block.named("hall"), Rect(low[0], low[1], low[0] + 0.7 * dx, low[1] + 0.62 * dy),
+        storeys=int(rng.integers(4, 7)), roof="flat",
+        wall=str(rng.choice(["panel", "brick", "plaster"])),
         shops=(True, False, False, False), storey=3.3,
     )  # fmt: skip
     surfaces = [
@@ -217,7 +223,7 @@ def _site_gear(block: Block, steps: Sequence[str], spec: Building) -> None:
     for i in range(2):
         at = inner.at(0.25 + 0.4 * i, 0.9)
         block.put(f"container_{i}", "container", fur.container, at, 0.0, seed, present=busy)
-    at = np.array([spec.x1 + 0.08 * inner.size[0], (spec.y0 + spec.y1) / 2, SLAB])
+    at = np.array([spec.rect.x1 + 0.08 * inner.size[0], spec.rect.center[1], SLAB])
     turn = float(rng_for(seed, block.name, "crane").uniform(2.0, 4.2))
     block.put("crane", "crane", fur.crane, at, turn, spec.wall_height + 9.0, present=high)
     block.put("digger", "digger", fur.digger, inner.at(0.86, 0.12), 2.3, present=early)
@@ -230,10 +236,9 @@ def renewal(block: Block) -> None:
     left = Rect(inner.x0, inner.y0, inner.x0 + 0.6 * dx, inner.y1)
     right = Rect(left.x1, inner.y0, inner.x1, inner.y1)
     steps = renewal_stages(world.periods)
-    spec = Building(
-        block.named("old"), left.x0 + 1.5, left.y0 + 0.1 * dy, left.x1 - 1.5, left.y0 + 0.72 * dy,
-        int(rng.integers(3, 5)), "gable", "brick",
-    )  # fmt: skip
+    old = Rect(left.x0 + 1.5, left.y0 + 0.1 * dy, left.x1 - 1.5, left.y0 + 0.72 * dy)
+    storeys = int(rng.integers(3, 5))
+    spec = Building(block.named("old"), old, storeys=storeys, roof="gable", wall="brick")
 
     def make(stage: str) -> Mesh:
         return finished(spec, world.seed) if stage == "house" else rubble(spec, world.seed)
@@ -247,10 +252,9 @@ def renewal(block: Block) -> None:
         at = np.array([left.x0 + 1.35 + 2.6 * k, left.y0 + 2.5, SLAB])
         block.car(f"visitor_{k}", at, np.pi / 2, here)
     block.lawn(right)
-    beside = Building(
-        block.named("house"), right.x0 + 1.0, right.y0 + 0.3 * dy, right.x1 - 0.5, right.y1 - 1.0,
-        int(rng.integers(2, 5)), "hip", "plaster",
-    )  # fmt: skip
+    new = Rect(right.x0 + 1.0, right.y0 + 0.3 * dy, right.x1 - 0.5, right.y1 - 1.0)
+    storeys = int(rng.integers(2, 5))
+    beside = Building(block.named("house"), new, storeys=storeys, roof="hip", wall="plaster")
     block.house(beside, chance=0.7)
     garden = Rect(right.x0 + 1, right.y0 + 1, right.x1 - 1, right.y0 + 0.25 * dy)
     block.scatter_trees(garden, 2)
@@ -269,9 +273,9 @@ def suburb(block: Block) -> None:
             w, d = rng.uniform(0.42, 0.62, 2) * plot.size
             x, y = plot.at(*rng.uniform(0.1, 0.3, 2))[:2]
             spec = Building(
-                block.named(f"villa_{i}{j}"), x, y, x + w, y + d, int(rng.integers(1, 4)),
-                str(rng.choice(["gable", "hip"])), str(rng.choice(["plaster", "brick"])),
-                ground=3.0, simple=not world.near,
+                block.named(f"villa_{i}{j}"), Rect(x, y, x + w, y + d),
+                storeys=int(rng.integers(1, 4)), roof=str(rng.choice(["gable", "hip"])),
+                wall=str(rng.choice(["plaster", "brick"])), ground=3.0, simple=not world.near,
             )  # fmt: skip
             world.always(spec.name, "building", partial(finished, spec, world.seed))
             at = plot.at(0.86, float(rng.uniform(0.2, 0.8)))

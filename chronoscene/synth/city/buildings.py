@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -10,12 +10,12 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.facades import Front, Wall
+from chronoscene.synth.city.ground import SLAB, Rect
 from chronoscene.synth.city.roofs import add_roof
 from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
 from chronoscene.synth.render.noise import key_number, rng_for
 
 X, Y, Z = np.eye(3)
-SLAB = 0.15  # Height of pavements above the road
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +23,8 @@ class Building:
     """A rectangular building aligned with the world axes. Lengths are metres."""
 
     name: str
-    x0: float
-    y0: float
-    x1: float
-    y1: float
+    rect: Rect
+    _: KW_ONLY
     storeys: int
     roof: str
     """``flat``, ``gable`` or ``hip``."""
@@ -51,11 +49,9 @@ class Building:
     @property
     def sides(self) -> list[tuple[Array, Array, float]]:
         """Lower left corner seen from outside, direction along the wall, and width of each side."""
-        a = np.array([self.x0, self.y0, SLAB])
-        b = np.array([self.x1, self.y0, SLAB])
-        c = np.array([self.x1, self.y1, SLAB])
-        d = np.array([self.x0, self.y1, SLAB])
-        dx, dy = self.x1 - self.x0, self.y1 - self.y0
+        r, (dx, dy) = self.rect, self.rect.size
+        corners = np.array([(r.x0, r.y0), (r.x1, r.y0), (r.x1, r.y1), (r.x0, r.y1)])
+        a, b, c, d = np.insert(corners, 2, SLAB, axis=1)
         return [(a, X, dx), (b, Y, dy), (c, -X, dx), (d, -Y, dy)]
 
 
@@ -73,9 +69,8 @@ def finished(spec: Building, seed: int) -> Mesh:
         )  # fmt: skip
     # The roof keeps its own random numbers: a new look of the walls must not move its parts.
     roof_rng = rng_for(seed, spec.name, "roof")
-    top = np.array([spec.x0, spec.y0, SLAB + spec.wall_height])
-    size = (spec.x1 - spec.x0, spec.y1 - spec.y0)
-    add_roof(b, spec.roof, top, size, front.wall, roof_rng, plain=spec.simple)
+    top = spec.rect.at(0, 0, SLAB + spec.wall_height)
+    add_roof(b, spec.roof, top, spec.rect.size, front.wall, roof_rng, plain=spec.simple)
     return b.build()
 
 
@@ -84,18 +79,18 @@ def frame(spec: Building, storeys: int, seed: int) -> Mesh:
     b = MeshBuilder(key_number(spec.name, "frame"))
     rng = rng_for(seed, spec.name, "frame")
     concrete = pal.wall_style(b, "concrete", rng, spec.storey)
-    dx, dy = spec.x1 - spec.x0, spec.y1 - spec.y0
+    r, (dx, dy) = spec.rect, spec.rect.size
     levels = SLAB + spec.ground + spec.storey * np.arange(-1, storeys)
     levels[0] = SLAB
-    corners = np.stack([np.full(len(levels), spec.x0), np.full(len(levels), spec.y0), levels], 1)
+    corners = np.stack([np.full(len(levels), r.x0), np.full(len(levels), r.y0), levels], 1)
     b.boxes(corners - 0.28 * Z * (levels > 1)[:, None], [dx, 0, 0], [0, dy, 0], 0.28 * Z, concrete)
-    xs = np.linspace(spec.x0 + 0.4, spec.x1 - 0.8, max(3, round(dx / 5)))
-    ys = np.linspace(spec.y0 + 0.4, spec.y1 - 0.8, max(3, round(dy / 5)))
+    xs = np.linspace(r.x0 + 0.4, r.x1 - 0.8, max(3, round(dx / 5)))
+    ys = np.linspace(r.y0 + 0.4, r.y1 - 0.8, max(3, round(dy / 5)))
     grid = np.stack(np.meshgrid(xs, ys, indexing="ij"), -1).reshape(-1, 2)
     for low, high in pairwise(levels):
         base = np.column_stack([grid, np.full(len(grid), low + 0.02)])
         b.boxes(base, [0.4, 0, 0], [0, 0.4, 0], (high - low - 0.32) * Z, concrete)
-    core = [spec.x0 + 0.42 * dx, spec.y0 + 0.38 * dy, SLAB + 0.3]
+    core = [r.x0 + 0.42 * dx, r.y0 + 0.38 * dy, SLAB + 0.3]
     b.boxes(core, [0.2 * dx, 0, 0], [0, 0.25 * dy, 0], (levels[-1] + 1.6) * Z, concrete)
     _rods(b, spec, grid, float(levels[-1]))
     _scaffold(b, spec, float(levels[-1]))
@@ -104,14 +99,14 @@ def frame(spec: Building, storeys: int, seed: int) -> Mesh:
 
 def _rods(b: MeshBuilder, spec: Building, grid: Array, top: float) -> None:
     """Starter bars for the next storey, and pallets on the top slab."""
-    steel = pal.plain_style(b, srgb(122, 78, 52))
+    r, steel = spec.rect, pal.plain_style(b, srgb(122, 78, 52))
     base = np.column_stack([grid + 0.1, np.full(len(grid), top)])
     b.boxes(base, [0.16, 0, 0], [0, 0.16, 0], 1.1 * Z, steel)
     rng = rng_for(key_number(spec.name), "pallets")
     wood = pal.wood_style(b, srgb(176, 138, 90))
     n = 7
-    x = rng.uniform(spec.x0 + 1, spec.x1 - 3, n)
-    y = rng.uniform(spec.y0 + 1, spec.y1 - 3, n)
+    x = rng.uniform(r.x0 + 1, r.x1 - 3, n)
+    y = rng.uniform(r.y0 + 1, r.y1 - 3, n)
     size = rng.uniform(0.7, 1.6, (n, 3))
     base = np.column_stack([x, y, np.full(n, top)])
     b.boxes(base, size[:, :1] * X, size[:, 1:2] * Y, size[:, 2:] * Z, wood, bottom=False)
@@ -119,15 +114,15 @@ def _rods(b: MeshBuilder, spec: Building, grid: Array, top: float) -> None:
 
 def _scaffold(b: MeshBuilder, spec: Building, top: float) -> None:
     """Poles and boards along the south side."""
-    pole = pal.metal_style(b, srgb(176, 150, 60))
+    r, pole = spec.rect, pal.metal_style(b, srgb(176, 150, 60))
     board = pal.wood_style(b, srgb(184, 150, 100))
-    xs = np.arange(spec.x0, spec.x1 - 0.1, 2.5)
-    for y in (spec.y0 - 1.5, spec.y0 - 0.5):
+    xs = np.arange(r.x0, r.x1 - 0.1, 2.5)
+    for y in (r.y0 - 1.5, r.y0 - 0.5):
         base = np.column_stack([xs, np.full(len(xs), y), np.full(len(xs), SLAB)])
         b.boxes(base, [0.14, 0, 0], [0, 0.14, 0], (top - SLAB) * Z, pole)
     zs = np.arange(SLAB + 2.0, top, 2.1)
-    base = np.column_stack([np.full(len(zs), spec.x0), np.full(len(zs), spec.y0 - 1.4), zs])
-    b.boxes(base, [spec.x1 - spec.x0, 0, 0], [0, 0.9, 0], 0.08 * Z, board)
+    base = np.column_stack([np.full(len(zs), r.x0), np.full(len(zs), r.y0 - 1.4), zs])
+    b.boxes(base, [r.x1 - r.x0, 0, 0], [0, 0.9, 0], 0.08 * Z, board)
 
 
 def foundation(spec: Building, seed: int) -> Mesh:
@@ -135,12 +130,12 @@ def foundation(spec: Building, seed: int) -> Mesh:
     b = MeshBuilder(key_number(spec.name, "foundation"))
     rng = rng_for(seed, spec.name, "foundation")
     concrete = pal.wall_style(b, "concrete", rng, spec.storey)
-    dx, dy = spec.x1 - spec.x0, spec.y1 - spec.y0
-    b.boxes([spec.x0, spec.y0, SLAB], [dx, 0, 0], [0, dy, 0], 0.5 * Z, concrete, bottom=False)
+    r, (dx, dy) = spec.rect, spec.rect.size
+    b.boxes([r.x0, r.y0, SLAB], [dx, 0, 0], [0, dy, 0], 0.5 * Z, concrete, bottom=False)
     for f in (0.0, 0.33, 0.66):
-        low = [spec.x0 + f * dx, spec.y0 + 0.5, SLAB + 0.5]
+        low = [r.x0 + f * dx, r.y0 + 0.5, SLAB + 0.5]
         b.boxes(low, [0.3, 0, 0], [0, dy - 1.0, 0], (0.8 + f) * Z, concrete, bottom=False)
-    _rods(b, spec, np.array([[spec.x0 + 1.5, spec.y0 + 1.5]]), SLAB + 0.5)
+    _rods(b, spec, np.array([[r.x0 + 1.5, r.y0 + 1.5]]), SLAB + 0.5)
     return b.build()
 
 
@@ -149,8 +144,8 @@ def rubble(spec: Building, seed: int) -> Mesh:
     b = MeshBuilder(key_number(spec.name, "rubble"))
     rng = rng_for(seed, spec.name, "rubble")
     n = 160
-    center = np.array([spec.x0 + spec.x1, spec.y0 + spec.y1]) / 2
-    half = np.array([spec.x1 - spec.x0, spec.y1 - spec.y0]) / 2
+    r = spec.rect
+    center, half = np.array(r.center), np.array(r.size) / 2
     place = rng.uniform(-0.85, 0.85, (n, 2))
     height = 1.9 * np.exp(-3.0 * (place**2).sum(1)) * rng.uniform(0.2, 1.0, n)
     for kind in range(3):
@@ -167,6 +162,6 @@ def rubble(spec: Building, seed: int) -> Mesh:
         style = pal.plain_style(b, c, 0.4, 0.4)
         b.boxes(at, a * size[:, :1], side * size[:, 1:2], up * size[:, 2:], style)
     wall = pal.wall_style(b, "brick", rng, spec.storey)
-    low = [spec.x0, spec.y0, SLAB]
+    low = [r.x0, r.y0, SLAB]
     b.boxes(low, [0.4, 0, 0], [0, 0.6 * 2 * half[1], 0], 1.4 * Z, wall, bottom=False)
     return b.build()

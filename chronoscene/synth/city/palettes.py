@@ -153,11 +153,9 @@ def soil_style(b: MeshBuilder, stones: float, ruts: float) -> int:
     return b.style(tex.SOIL, *SOILS, (stones, ruts))
 
 
-def metal_style(b: MeshBuilder, color: Color, stripe: float = 0.0, dust: float = 0.15) -> int:
+def metal_style(b: MeshBuilder, color: Color, dust: float = 0.15) -> int:
     """Style of painted metal."""
-    return b.style(
-        tex.PAINT, color, WHITE, srgb(130, 118, 100), (dust, stripe), reflect=0.04, sharp=0.6
-    )
+    return b.style(tex.PAINT, color, WHITE, srgb(130, 118, 100), (dust,), reflect=0.04, sharp=0.6)
 
 
 def plain_style(b: MeshBuilder, color: Color, strength: float = 0.25, size: float = 0.6) -> int:

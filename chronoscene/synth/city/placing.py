@@ -1,4 +1,4 @@
-"""Placing objects on blocks and along kerbs: ground, cars, lamps, trees and houses."""
+"""Placing of objects on blocks and along kerbs: ground, cars, lamps, trees and buildings."""
 
 from __future__ import annotations
 
@@ -13,106 +13,16 @@ import numpy as np
 from chronoscene.arrays import Array
 from chronoscene.synth.city import furniture as fur
 from chronoscene.synth.city import palettes as pal
-from chronoscene.synth.city.buildings import SLAB, Building, finished
+from chronoscene.synth.city.buildings import Building, finished
+from chronoscene.synth.city.ground import SLAB, Rect, floor, pavement
 from chronoscene.synth.city.vegetation import hedge, tree
 from chronoscene.synth.city.world import World, looks, tree_heights
-from chronoscene.synth.render.mesh import Mesh, MeshBuilder, srgb
+from chronoscene.synth.render.mesh import Mesh, MeshBuilder
 from chronoscene.synth.render.noise import key_number, rng_for
-from chronoscene.synth.render.textures import PAVING
 
 X, Y, Z = np.eye(3)
 PARKING = 2.0  # Width of the parking lane at each side of a road, metres
 RING = 3.0  # Width of pavements, metres
-
-
-@dataclass(frozen=True, slots=True)
-class Rect:
-    """Axis-aligned rectangle in metres."""
-
-    x0: float
-    y0: float
-    x1: float
-    y1: float
-
-    def inset(self, d: float) -> Rect:
-        return Rect(self.x0 + d, self.y0 + d, self.x1 - d, self.y1 - d)
-
-    @property
-    def size(self) -> tuple[float, float]:
-        return self.x1 - self.x0, self.y1 - self.y0
-
-    @property
-    def center(self) -> tuple[float, float]:
-        return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
-
-    def at(self, fx: float, fy: float, z: float = SLAB) -> Array:
-        """Point at fractions of the width and depth. [3]"""
-        dx, dy = self.size
-        return np.array([self.x0 + fx * dx, self.y0 + fy * dy, z])
-
-
-def floor(name: str, rect: Rect, surface: str, z: float = SLAB) -> Mesh:
-    """A rectangle of ground.
-
-    Args:
-        name: Name of the block or object, which determines the texture.
-        rect: The rectangle.
-        surface: ``lawn SEASON``, ``mown SEASON``, ``soil``, ``car_park``, ``rings``, ``bands`` or
-            ``slabs``.
-        z: Height in metres.
-    """
-    b = MeshBuilder(key_number(name, "floor"))
-    kind, _, season = surface.partition(" ")
-    dx, dy = rect.size
-    if kind == "lawn":
-        style = pal.grass_style(b, season, 0.22)
-    elif kind == "mown":
-        style = pal.grass_style(b, season, 0.10, 0.22)
-    elif kind == "soil":
-        style = pal.soil_style(b, 0.10, 0.8)
-    elif kind == "car_park":
-        style = pal.asphalt_style(b, 3)
-    elif kind == "rings":
-        style = b.style(
-            PAVING, srgb(184, 160, 132), srgb(132, 92, 74), srgb(96, 84, 72),
-            (0.8, 0.8, 0.5, 2.0, 4.4),
-        )  # fmt: skip
-    elif kind == "bands":
-        style = b.style(
-            PAVING, srgb(176, 168, 154), srgb(118, 112, 108), srgb(84, 80, 76),
-            (0.6, 0.6, 0.0, 1.0, 4.8),
-        )  # fmt: skip
-    else:
-        style = b.style(
-            PAVING, srgb(168, 150, 128), srgb(150, 140, 128), srgb(92, 84, 74),
-            (0.4, 0.2, 0.5, 0.0, 1.0),
-        )  # fmt: skip
-    b.quads([rect.x0, rect.y0, z], dx * X, dy * Y, style)
-    return b.build()
-
-
-def pavement(name: str, low: Array, high: Array, ring: float, seed: int) -> Mesh:
-    """Kerb and paving slabs around a block, without its inside."""
-    b = MeshBuilder(key_number(name, "pavement"))
-    rng = rng_for(seed, name, "pavement")
-    grey = pal.tint(rng, srgb(158, 154, 146))
-    light = pal.tint(rng, srgb(182, 174, 160))
-    slabs = b.style(PAVING, grey, light, srgb(88, 84, 78), (0.6, 0.4, 0.5, 0.0, 1.0))
-    kerb = b.style(PAVING, srgb(170, 168, 162), None, srgb(90, 88, 84), (1.0, 0.3, 0.0, 0, 1))
-    dx, dy = high - low
-    edge = 0.18
-    up = SLAB * Z
-    o = np.array([low[0], low[1], 0.0])
-    for corner, along in ((o, dx * X), (o + dx * X, dy * Y), (o + dx * X + dy * Y, -dx * X),
-                          (o + dy * Y, -dy * Y)):  # fmt: skip
-        u = along / np.linalg.norm(along)
-        inwards = np.cross(Z, u)
-        b.quads(corner, along, up, kerb)
-        b.quads(corner + up + edge * u, along - 2 * edge * u, edge * inwards, kerb)
-        b.quads(corner + up, edge * u, edge * inwards, kerb)
-        inner = corner + up + edge * inwards + edge * u
-        b.quads(inner, along - (edge + ring) * u, (ring - edge) * inwards, slabs)
-    return b.build()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,8 +38,7 @@ class Block:
     @classmethod
     def paved(cls, world: World, name: str, rect: Rect, ring: float = RING) -> Block:
         """A block with a pavement around it."""
-        low, high = np.array([rect.x0, rect.y0]), np.array([rect.x1, rect.y1])
-        make = partial(pavement, name, low, high, ring, world.seed)
+        make = partial(pavement, name, rect, ring, world.seed)
         world.always(f"{name}/pavement", "ground", make)
         return cls(world, name, rect.inset(ring), rng_for(world.seed, name))
 
@@ -200,7 +109,7 @@ class Block:
 
         def make(name: str) -> Mesh:
             b = MeshBuilder(key_number(name))
-            style = pal.soil_style(b, 0.05, 0.0)
+            style = pal.soil_style(b, stones=0.05, ruts=0.0)
             left = np.column_stack([points + side, height])
             right = np.column_stack([points - side, height])
             frame = (np.zeros(3), X, Y)
@@ -282,7 +191,6 @@ def _avenue(block: Block) -> None:
         for i in range(int((length - 10) // 9.5)):
             at = a + (8.0 + 9.5 * i + rng.uniform(-0.5, 0.5)) / length * (b - a)
             label = f"avenue_{side}{i}"
-            pit = Rect(at[0] - 0.6, at[1] - 0.6, at[0] + 0.6, at[1] + 0.6)
-            make = partial(floor, block.named(label), pit, "soil", SLAB + 0.015)
+            make = partial(floor, block.named(label), Rect.around(at, 0.6), "soil", SLAB + 0.015)
             block.world.always(block.named(f"{label}/pit"), "ground", make)
             block.plant(label, at, 5.6, broad=True)

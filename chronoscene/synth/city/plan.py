@@ -12,7 +12,8 @@ from chronoscene.arrays import Array
 from chronoscene.synth.city import palettes as pal
 from chronoscene.synth.city.blocks import FILLERS
 from chronoscene.synth.city.buildings import Building, finished
-from chronoscene.synth.city.placing import PARKING, RING, Block, Rect, curb_side
+from chronoscene.synth.city.ground import Rect
+from chronoscene.synth.city.placing import PARKING, RING, Block, curb_side
 from chronoscene.synth.city.vegetation import tree
 from chronoscene.synth.city.world import World
 from chronoscene.synth.render.light import make_lights
@@ -69,8 +70,6 @@ def make_world(settings: SynthSettings) -> World:
         rect = plan.rect(column, row)
         _fill(world, settings, name, rect, role)
         if role != "suburb":
-            x, y = rect.center
-            world.focus.append(np.array([x, y, 3.0]))
             curb_side(world, name, rect)
     _add_surroundings(world, plan)
     return world
@@ -175,8 +174,9 @@ def _add_surroundings(world: World, plan: Plan) -> None:
 def _farm(world: World, name: str, at: Array, z: float, rng: np.random.Generator) -> None:
     w, d = rng.uniform(8, 16, 2)
     spec = Building(
-        name, at[0] - w / 2, at[1] - d / 2, at[0] + w / 2, at[1] + d / 2, int(rng.integers(1, 4)),
-        str(rng.choice(["gable", "hip"])), str(rng.choice(["plaster", "brick"])), simple=True,
+        name, Rect(at[0] - w / 2, at[1] - d / 2, at[0] + w / 2, at[1] + d / 2),
+        storeys=int(rng.integers(1, 4)), roof=str(rng.choice(["gable", "hip"])),
+        wall=str(rng.choice(["plaster", "brick"])), simple=True,
     )  # fmt: skip
     mesh = finished(spec, world.seed)
     mesh.vertices[..., 2] += np.float32(z - 0.8)

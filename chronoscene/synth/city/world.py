@@ -64,8 +64,6 @@ class World:
     """True if cameras come close to the suburbs, which then need more detail."""
     roads: list[tuple[Array, Array]] = field(default_factory=list)
     """Start and end of the centre lines of the core's roads, for walks. [2] each"""
-    focus: list[Array] = field(default_factory=list)
-    """Places that cameras look at. [3] each"""
     elements: list[Element] = field(default_factory=list)
     edits: list[Edit] = field(default_factory=list)
     lifetime: frozenset[int] | None = None

@@ -77,14 +77,11 @@ class MeshBuilder:
 
     def __init__(self, seed: int = 0) -> None:
         self._seed = seed
-        self._vertices: list[Array] = []
-        self._normals: list[Array] = []
-        self._tri_patch: list[NDArray[np.int64]] = []
-        self._patches: list[Array] = []
-        self._patch_style: list[NDArray[np.int64]] = []
-        self._patch_seed: list[NDArray[np.int64]] = []
-        self._styles: list[Array] = []
-        self._style_index: dict[bytes, int] = {}
+        self._triangles: list[tuple[Array, Array, NDArray[np.int64]]] = []
+        """Vertices, normals and patches."""
+        self._patches: list[tuple[Array, NDArray[np.int64], NDArray[np.int64]]] = []
+        """Rows, styles and seeds."""
+        self._styles: dict[bytes, int] = {}
         self._num_patches = 0
 
     def style(
@@ -105,11 +102,7 @@ class MeshBuilder:
         row[1:10] = [*c0, *(c1 or c0), *(c2 or c0)]
         row[10 : 10 + len(numbers)] = numbers
         row[20:23] = reflect, sharp, translucent
-        key = row.tobytes()
-        if key not in self._style_index:
-            self._style_index[key] = len(self._styles)
-            self._styles.append(row)
-        return self._style_index[key]
+        return self._styles.setdefault(row.tobytes(), len(self._styles))
 
     def quads(
         self,
@@ -141,13 +134,13 @@ class MeshBuilder:
         normal = cross(u, v)
         normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
         tris = quad[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3, 3)
-        self._append(tris, np.repeat(normal, 2, axis=0)[:, None].repeat(3, axis=1))
+        normals = np.repeat(normal, 2, axis=0)[:, None].repeat(3, axis=1)
         if frame is None:
             lengths = np.sqrt(np.stack([(u * u).sum(axis=1), (v * v).sum(axis=1)], axis=1))
             axes = np.concatenate([o, u / lengths[:, :1], v / lengths[:, 1:], lengths], axis=1)
-            self._add_patches(axes, style, seed, per_patch=2, own_texture=True)
+            self._add(tris, normals, axes, style, seed, own_texture=True)
         else:
-            self._add_patches(_frame_row(frame, quad), style, seed, per_patch=2 * len(o))
+            self._add(tris, normals, _frame_row(frame, quad), style, seed)
 
     def boxes(
         self,
@@ -190,11 +183,11 @@ class MeshBuilder:
         tris = np.stack([np.stack([p[0], p[i], p[i + 1]]) for i in range(1, len(p) - 1)])
         normal = cross(p[1] - p[0], p[2] - p[0])
         normal /= np.linalg.norm(normal)
-        self._append(tris, np.broadcast_to(normal, tris.shape))
         if frame is None:
             u = (p[1] - p[0]) / np.linalg.norm(p[1] - p[0])
             frame = (p[0], u, cross(normal, u))
-        self._add_patches(_frame_row(frame, p), style, seed, per_patch=len(tris))
+        normals = np.broadcast_to(normal, tris.shape)
+        self._add(tris, normals, _frame_row(frame, p), style, seed)
 
     def triangles(
         self, vertices: Array, normals: Array, style: int, *, origin: ArrayLike, seed: int = 0
@@ -208,40 +201,37 @@ class MeshBuilder:
             origin: Origin of the texture. [3]
             seed: Varies the texture.
         """
-        self._append(vertices, normals)
         frame = (origin, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-        row = _frame_row(frame, vertices.reshape(-1, 3))
-        self._add_patches(row, style, seed, per_patch=len(vertices))
+        self._add(vertices, normals, _frame_row(frame, vertices), style, seed)
 
     def build(self) -> Mesh:
         """The collected geometry."""
+        vertices, normals, tri_patch = map(np.concatenate, zip(*self._triangles, strict=True))
+        patches, patch_style, patch_seed = map(np.concatenate, zip(*self._patches, strict=True))
         return Mesh(
-            vertices=np.concatenate(self._vertices).astype(np.float32),
-            normals=np.concatenate(self._normals).astype(np.float32),
-            tri_patch=np.concatenate(self._tri_patch).astype(np.int32),
-            patches=np.concatenate(self._patches),
-            patch_style=np.concatenate(self._patch_style).astype(np.int32),
-            patch_seed=np.concatenate(self._patch_seed).astype(np.int32),
-            styles=np.stack(self._styles),
+            vertices.astype(np.float32),
+            normals.astype(np.float32),
+            tri_patch.astype(np.int32),
+            patches,
+            patch_style.astype(np.int32),
+            patch_seed.astype(np.int32),
+            np.stack([np.frombuffer(row) for row in self._styles]),
         )
 
-    def _append(self, vertices: Array, normals: Array) -> None:
-        self._vertices.append(vertices)
-        self._normals.append(np.asarray(normals))
-
-    def _add_patches(
-        self, rows: Array, style: int, seed: int, per_patch: int, own_texture: bool = False
-    ) -> None:
-        table = np.zeros((len(rows), PATCH_WIDTH))
+    def _add(
+        self, tris: Array, normals: Array, rows: Array, style: int, seed: int,
+        *, own_texture: bool = False,
+    ) -> None:  # fmt: skip
+        """Add triangles of patches that have as many triangles each."""
+        count, numbers = len(rows), self._num_patches + np.arange(len(rows))
+        table = np.zeros((count, PATCH_WIDTH))
         table[:, : rows.shape[1]] = rows
-        self._patches.append(table)
-        self._patch_style.append(np.full(len(rows), style))
-        numbers = np.arange(self._num_patches, self._num_patches + len(rows))
         # Pieces that share a frame are one texture, so they must share the seed as well.
         vary = 31 * numbers if own_texture else 0 * numbers
-        self._patch_seed.append((self._seed + 7919 * (seed + 1) + vary) % 1_000_003)
-        self._tri_patch.append(np.repeat(numbers, per_patch))
-        self._num_patches += len(rows)
+        seeds = (self._seed + 7919 * (seed + 1) + vary) % 1_000_003
+        self._patches.append((table, np.full(count, style), seeds))
+        self._triangles.append((tris, normals, np.repeat(numbers, len(tris) // count)))
+        self._num_patches += count
 
 
 def _frame_row(frame: TextureFrame, points: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,15 +34,14 @@ class PixelMaps:
     """Linear. [H, W, 3]"""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Hits:
+class Hits(NamedTuple):
     """First hits of rays."""
 
     t: NDArray[np.float32]
     """Parameter along the ray; infinite for a miss. [n]"""
     tri: NDArray[np.uint32]
     uv: NDArray[np.float32]
-    """[n, 2]"""
+    """Barycentric coordinates. [n, 2]"""
 
 
 class PeriodRenderer:
@@ -81,9 +80,7 @@ class PeriodRenderer:
     def cast(self, rays: NDArray[np.float32]) -> Hits:
         """First hits of rays (origin, direction). [n, 6]"""
         found = self._scene.cast_rays(_tensor(rays))
-        return Hits(
-            found["t_hit"].numpy(), found["primitive_ids"].numpy(), found["primitive_uvs"].numpy()
-        )
+        return Hits(*(found[k].numpy() for k in ("t_hit", "primitive_ids", "primitive_uvs")))
 
     def occluded(self, rays: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Mask of the rays that hit anything. [n]"""
@@ -181,14 +178,12 @@ class PeriodRenderer:
         hits = self.cast(rays)
         lit = self._lit(rays, hits, 1)
         means = _mean_albedo(self.tables.styles)
-        return probe_values(
-            rays, hits.t, hits.tri, hits.uv, lit, self.tables, means, self._sky, PROBE_RAYS
-        )
+        return probe_values(rays, *hits, lit, self.tables, means, self._sky, PROBE_RAYS)
 
     def _lit(self, rays: NDArray[np.float32], hits: Hits, count: int) -> NDArray[np.bool_]:
         """Mask of the hits that the sun reaches. [n]"""
         towards, need = shadow_rays(
-            rays, hits.t, hits.tri, hits.uv, self.tables, self._sky.direction, SUN_SPREAD, count
+            rays, *hits, self.tables, self._sky.direction, SUN_SPREAD, count
         )
         lit = np.zeros(len(need), np.bool_)
         lit[need] = ~self.occluded(np.ascontiguousarray(towards[need]))
@@ -199,10 +194,7 @@ class PeriodRenderer:
     ) -> NDArray[np.uint8]:
         hits = self.cast(rays)
         lit = self._lit(rays, hits, per_pixel)
-        return shade(
-            rays, hits.t, hits.tri, hits.uv, lit, self.tables, self._sky, self.probes, per_pixel,
-            fw_unit,
-        )  # fmt: skip
+        return shade(rays, *hits, lit, self.tables, self._sky, self.probes, per_pixel, fw_unit)
 
 
 @cache

@@ -22,7 +22,6 @@ from chronoscene.synth.render.noise import (
     pulse,
     scaled,
     smooth,
-    span,
     value_noise_3d,
 )
 
@@ -61,12 +60,10 @@ def _wood(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
 
 @inner
 def _paint(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
-    """Smooth paint with darker edges and dust; c1 is a stripe. Numbers: dust, stripe share."""
-    c0, c1, c2 = colors(s)
+    """Smooth paint with darker edges and dust (c2). Numbers: dust."""
+    c0, _, c2 = colors(s)
     edge = min(min(u, su - u), min(v, sv - v))
     color = scaled(c0, 0.8 + 0.2 * smooth(0.0, 0.12, edge))
-    if s[11] > 0.0:
-        color = mix(color, c1, span(v / sv, 0.5 - 0.5 * s[11], 0.5 + 0.5 * s[11], fw / sv))
     dust = s[10] * (0.5 + 0.6 * fbm(u, v, 0.8, 4, seed, fw))
     return mix(color, c2, min(1.0, max(0.0, dust)))
 
