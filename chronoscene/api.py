@@ -17,7 +17,7 @@ from chronoscene.bench.plan.settings import BenchSettings, RunSettings
 from chronoscene.bench.plan.stop import parse_duration
 from chronoscene.bench.report.summary import ENTRY_COLUMNS, read_with_rows, summarise
 from chronoscene.bench.run.runner import run_bench
-from chronoscene.bench.score.views import ScoredView
+from chronoscene.bench.score.views import PredictedView
 from chronoscene.bench.use.trained_run import TrainedRun, open_run
 from chronoscene.checks import check_choice
 from chronoscene.errors import ChronoSceneError, SceneError
@@ -43,9 +43,9 @@ __all__ = [
     "ChronoSceneError",
     "Frame",
     "GaussianCloud",
+    "PredictedView",
     "Scene",
     "SceneReport",
-    "ScoredView",
     "Statistics",
     "TrainedRun",
     "benchmark",

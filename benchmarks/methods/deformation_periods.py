@@ -22,8 +22,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from chronoscene.bench.use.cameras import find_shots
-from chronoscene.bench.use.rendering import render_shots
+from chronoscene.bench.use.cameras import find_viewpoints
+from chronoscene.bench.use.rendering import render_viewpoints
 from chronoscene.bench.use.trained_run import open_run
 from chronoscene.metrics.psnr_ssim import psnr
 
@@ -33,8 +33,12 @@ CELL = 2.0  # Inches per image
 def renders(folder: Path, view: str, periods: int) -> list[np.ndarray]:
     """Render a test view of a run at each period."""
     run = open_run(folder)
-    (shot,) = (s for s in find_shots("test", run, None, 0).shots if s.name == f"{view}.png")
-    return list(render_shots(run, [replace(shot, period=float(p)) for p in range(periods)]))
+    (viewpoint,) = (
+        s for s in find_viewpoints("test", run, None, 0).viewpoints if s.name == f"{view}.png"
+    )
+    return list(
+        render_viewpoints(run, [replace(viewpoint, period=float(p)) for p in range(periods)])
+    )
 
 
 def main() -> None:

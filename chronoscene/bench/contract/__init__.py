@@ -1,8 +1,7 @@
-"""What every method must do, so that the harness need not know which one it drives.
+"""Rules that every method keeps, so that the harness can drive it like any other.
 
-`CHECKS` has one function for each rule; ``chronoscene check-method`` calls all of them, and so do
-our tests for the methods that come with ChronoScene. Methods are trained on painted balls,
-`chronoscene.bench.contract.tiny_training`, on a CPU.
+`CHECKS` has a function for each rule; ``chronoscene check-method`` and the tests of the methods of
+ChronoScene call all of them. Methods are trained on painted balls, on a CPU.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from chronoscene.bench.contract.subject import NotApplicableError, Subject, dema
 from chronoscene.errors import ChronoSceneError
 
 Check = Callable[[Subject], None]
-"""The first sentence of its docstring is the rule. Raises an error if the method breaks it."""
+"""Raise an error if a method breaks the rule, the first sentence of the docstring."""
 
 CHECKS: tuple[Check, ...] = (
     *description.CHECKS,
@@ -29,18 +28,18 @@ CHECKS: tuple[Check, ...] = (
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """What a check found."""
+class RuleResult:
+    """Result of a check."""
 
     rule: str
     problem: str | None = None
-    """Why the method fails; None if it passes, or was not checked."""
+    """Reason why the method fails; None if it passes, or was not checked."""
     left_out: str | None = None
-    """Why the rule says nothing of the method."""
+    """Reason why the rule does not apply to the method."""
 
 
-def check_method(name: str, checks: Sequence[Check] = CHECKS) -> Iterator[Finding]:
-    """Check a method; yields what each check found, as soon as it is known.
+def check_method(name: str, checks: Sequence[Check] = CHECKS) -> Iterator[RuleResult]:
+    """Check a method; yield the verdicts one by one.
 
     Raises:
         ConfigError: If there is no such method.
@@ -54,10 +53,10 @@ def check_method(name: str, checks: Sequence[Check] = CHECKS) -> Iterator[Findin
             rule = " ".join(rule.split()).rstrip(".")
             try:
                 function(subject)
-                yield Finding(rule)
+                yield RuleResult(rule)
             except NotApplicableError as reason:
-                yield Finding(rule, left_out=str(reason))
+                yield RuleResult(rule, left_out=str(reason))
             except ChronoSceneError as error:
-                yield Finding(rule, str(error))
+                yield RuleResult(rule, str(error))
             except Exception as error:  # of the method; the other rules may still say something
-                yield Finding(rule, f"{type(error).__name__}: {error}")
+                yield RuleResult(rule, f"{type(error).__name__}: {error}")

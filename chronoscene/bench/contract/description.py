@@ -1,4 +1,4 @@
-"""Rules for what describes a method: its spec, presets and config."""
+"""Rules for the description of a method: its spec, presets and config."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def a_further_period_is_learned(subject: Subject) -> None:
 
 
 def _begun(subject: Subject, train: TrainingSet) -> Method:
-    """A method before its first step, if it can be extended."""
+    """Return a method before its first step, if it can be extended."""
     method = subject.fresh()
     if not hasattr(method, "extend"):
         raise NotApplicableError("the method has no extend")
@@ -72,7 +72,7 @@ def _begun(subject: Subject, train: TrainingSet) -> Method:
 
 
 def _images(method: Method, train: TrainingSet) -> NDArray[np.float32]:
-    """A view at all periods so far. [T, H, W, 3]"""
+    """Render a view at all periods so far. [T, H, W, 3]"""
     return np.stack([method.render(train.views[0], float(i)).rgb for i in range(train.num_periods)])
 
 

@@ -1,4 +1,4 @@
-"""A method that is checked, and what checks share."""
+"""The method that is checked, and functions that checks share."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ PAUSE = 63
 
 
 class NotApplicableError(Exception):
-    """A check that says nothing of this method, and why."""
+    """A check that does not apply to a method, with the reason."""
 
 
 @dataclass
 class Subject:
-    """A method that is checked: trained once, and kept with what it saved."""
+    """A method that is checked: trained once, and kept with its saved model."""
 
     name: str
-    """What `load_spec` takes."""
+    """Name, or ``module:SPEC``."""
     scratch: Path
-    """Folder for what checks write."""
+    """Folder for files of the checks."""
 
     @cached_property
     def spec(self) -> MethodSpec:
@@ -58,12 +58,12 @@ class Subject:
 
     @property
     def method(self) -> Method:
-        """After the training; not to be trained further."""
+        """The trained method; not to be trained further."""
         return self._trained[0]
 
     @property
     def reports(self) -> list[StepReport]:
-        """What its steps returned."""
+        """Reports of its training steps."""
         return self._trained[1]
 
     @cached_property
@@ -83,28 +83,28 @@ class Subject:
         return folder
 
     def folder(self) -> Path:
-        """A new empty folder."""
+        """Make an empty folder."""
         return Path(mkdtemp(dir=self.scratch))
 
     def fresh(self) -> Method:
-        """A method that knows nothing yet."""
+        """Return a method without a model."""
         method: Method = import_object(self.spec.method)(tiny_training.small_config(self.spec))
         return method
 
     def begun(self) -> Method:
-        """A method before its first step."""
+        """Return a method before its first step."""
         method = self.fresh()
         method.setup(self.data, seed=0, device="cpu")
         return method
 
     def loaded(self) -> Method:
-        """A new method that has read the saved model."""
+        """Return a new method with the saved model."""
         method = self.fresh()
         method.load(self.model, device="cpu")
         return method
 
     def resumed(self, folder: Path) -> Method:
-        """A new method that has read the training in a folder."""
+        """Return a new method with the training in a folder."""
         method = self.begun()
         method.load_training(folder)
         return method
@@ -117,17 +117,17 @@ class Subject:
 
 
 def go_on(method: Method, start: int, stop: int = tiny_training.STEPS) -> list[StepReport]:
-    """Some steps of the training on painted balls."""
+    """Do some steps of the training on painted balls."""
     return [method.step(i, i / tiny_training.STEPS) for i in range(start, stop)]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files below a folder."""
+    """Read all files below a folder."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def resized(view: View, width: int, height: int) -> View:
-    """The same view at another size."""
+    """Return the view at another size."""
     scale = np.diag([width / view.width, height / view.height, 1.0])
     return View(scale @ view.K, width, height, view.cam_from_world)
 
@@ -146,7 +146,7 @@ def same_files(one: Path, other: Path, place: str, expected: str) -> None:
 
 
 def tensors_of(folder: Path) -> dict[str, NDArray[Any]]:
-    """Tensors of a saved model, by name."""
+    """Read the tensors of a saved model, by name."""
     with safe_open(folder / "model.safetensors", framework="numpy") as tensors:
         return {key: tensors.get_tensor(key) for key in tensors.keys()}  # noqa: SIM118
 
@@ -154,7 +154,7 @@ def tensors_of(folder: Path) -> dict[str, NDArray[Any]]:
 def python(
     *arguments: str, cwd: Path | None = None, **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    """Another interpreter that finds the same modules."""
+    """Run another interpreter that finds the same modules."""
     return subprocess.run(
         [sys.executable, *arguments],
         cwd=cwd,

@@ -148,13 +148,13 @@ def one_period_is_enough(subject: Subject) -> None:
 
 
 def masked_pixels_change_nothing(subject: Subject) -> None:
-    """What TrainingSet.load_mask ignores does not change the model, and empty views are skipped."""
+    """Pixels that TrainingSet.load_mask ignores change nothing, and empty views are skipped."""
     models, reports = [], []
     for seed in (0, 1):
         data = hidden(subject.data, seed)
-        method, told = tiny_training.train(subject.spec, data)
+        method, steps = tiny_training.train(subject.spec, data)
         models.append(subject.save(method))
-        reports.append(told)
+        reports.append(steps)
     same_files(models[0], models[1], "masks", "a model that does not depend on ignored pixels")
     demand(reports[0] == reports[1], "masks", "losses that do not depend on ignored pixels")
     empty = sum(report.skipped == "empty" for report in reports[0])
@@ -173,8 +173,8 @@ def masked_pixels_change_nothing(subject: Subject) -> None:
 
 
 def hidden(data: TrainingSet, seed: int) -> TrainingSet:
-    """The set with a rectangle of noise in every photo, which the masks ignore as they ignore one
-    photo altogether."""
+    """Return the set with a rectangle of noise in every photo, which masks ignore; they also ignore
+    the whole last photo."""
     mask = np.ones((tiny_training.HEIGHT, tiny_training.WIDTH), bool)
     mask[8:20, 5:18] = False
     rng = np.random.default_rng(seed)
@@ -188,7 +188,7 @@ def hidden(data: TrainingSet, seed: int) -> TrainingSet:
 
 
 def _squared_error(method: Method, masked: TrainingSet, clean: TrainingSet, index: int) -> Any:
-    """Of a training view, where its mask lets it count."""
+    """Mean squared error of a training view, within its mask."""
     view = clean.views[index]
     image = method.render(view, float(view.period)).rgb
     difference = image - clean.load_image(index) / 255.0

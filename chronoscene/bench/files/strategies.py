@@ -18,8 +18,8 @@ class Strategy:
     in_order: bool = False
     """Whether one model learns the periods one after the other, in stages."""
 
-    def tells(self, spec: MethodSpec) -> bool:
-        """Whether the models of a method are told the period."""
+    def period_is_input(self, spec: MethodSpec) -> bool:
+        """Return True if the period is an input of the models of a method."""
         return self.tells_period and spec.period_input != "none"
 
 

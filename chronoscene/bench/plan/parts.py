@@ -63,7 +63,7 @@ def effective_strategy(spec: MethodSpec, strategy: str) -> tuple[str, str | None
     """The strategy that a method can follow, and a notice where it is not the one asked for."""
     check_choice("--strategy", strategy, STRATEGIES)
     kind = STRATEGIES[strategy]
-    if kind.tells_period and not kind.tells(spec) and not kind.in_order:
+    if kind.tells_period and not kind.period_is_input(spec) and not kind.in_order:
         notice = f"{spec.name} takes no period: {strategy} is run and recorded as pooled"
         return "pooled", notice
     return strategy, None

@@ -1,4 +1,4 @@
-"""What each stage of the strategy ``sequential`` does to the periods before and after it.
+"""Effect of each stage of the strategy ``sequential`` on the periods before and after it.
 
 R[k, i] is the mean of a metric over the test views of period i, rendered after stage k, of T. Where
 less is better, as for LPIPS, its sign is changed in all of these:
@@ -31,7 +31,7 @@ Stages = Mapping[str, Mapping[str, Values]]
 
 
 def stage_matrix(stages: Stages, metric: str) -> NDArray[np.float64]:
-    """Row 0 is b, row k + 1 is R[k]; NaN where nothing was rendered. [T + 1, T]"""
+    """Return b as row 0 and R[k] as row k + 1; NaN where nothing was rendered. [T + 1, T]"""
     periods = range(len(stages) - 1)
     names = [UNTRAINED, *map(period_part, periods)]
     values = [[stages[n].get(str(i), {}).get(metric, math.nan) for i in periods] for n in names]
@@ -39,7 +39,7 @@ def stage_matrix(stages: Stages, metric: str) -> NDArray[np.float64]:
 
 
 def transfer(stages: Stages) -> dict[str, Values]:
-    """Forgetting and transfers of each metric, as far as there are values.
+    """Compute forgetting and transfers of each metric, as far as there are values.
 
     Returns:
         ``forgetting``, ``backward_transfer`` and ``forward_transfer``, each metric to value.

@@ -1,6 +1,6 @@
-"""Images of the test views that another program made: found by their names, checked, scored.
+"""Images of the test views by another program: found by their names, checked, scored.
 
-They become a run beside those of bench, with the same scores; what nobody measured is absent.
+They become a run like those of bench, with the same scores; costs are absent.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from chronoscene.scene import Frame, Scene
 from chronoscene.scene.splits import NameIndex, split_hash
 
 STRATEGY, PRESET = "external", "images"
-"""What stands for strategy and preset in the name of such a run."""
+"""Strategy and preset in the name of such a run."""
 
 
 def find_images(folder: Path, scene: Scene, table: Path | None = None) -> dict[str, Path]:
-    """The image of each test view, by the name of the view.
+    """Return the image of each test view, by the name of the view.
 
     Args:
-        folder: PNG files named like the test views, with or without their own extension, in folders
-            where those are needed to tell the views apart.
-        scene: The views.
-        table: CSV file with the columns ``file``, below the folder, and ``view``. It names all that
-            is used; other files may lie in the folder.
+        folder: PNG files named like the test views, with or without their own extension, in
+            subfolders if the names need them.
+        scene: The scene with the views.
+        table: CSV file with the columns ``file``, below the folder, and ``view``, for files with
+            other names.
 
     Raises:
         ImageError: If a view has no image, or several, or an image belongs to no test view.
@@ -83,10 +83,10 @@ def find_images(folder: Path, scene: Scene, table: Path | None = None) -> dict[s
 def add_images(
     writer: ImageWriter, frames: Sequence[Frame], images: Mapping[str, Path], store: ImageStore
 ) -> int:
-    """Put images into a folder of predictions; returns how many were resized.
+    """Put images into a folder of predictions; return the number of resized ones.
 
-    They have the size of the evaluation, or the full size of their camera; then the rule resizes
-    them by which the photos were resized.
+    They have the size of the evaluation, or the full size of their camera; then they are resized
+    like the photos.
 
     Raises:
         ImageError: If an image has another size, or cannot be decoded.
@@ -112,11 +112,11 @@ def add_images(
 
 
 def foreign_record(scene: Scene, reason: str, **known: Any) -> records.RunRecord:
-    """The record of a run of another program: what of its cost is not given is absent.
+    """Return the record of a run of another program, in which unknown costs are absent.
 
     Args:
-        scene: What the program was trained on.
-        reason: Why costs are absent.
+        scene: The scene that the program was trained on.
+        reason: Reason for absent costs.
         known: Fields of the record.
     """
     costs = (
@@ -153,17 +153,17 @@ def score_images(
     seed: int = 0,
     max_width: int,
 ) -> Path:
-    """Score the images of another program; returns the folder of the run.
+    """Score the images of another program; return the folder of the run.
 
     Args:
-        scene: With the test views.
-        folder: Of the images; see `find_images`.
-        name: Of the program, as tables show it.
+        scene: The scene with the test views.
+        folder: Folder of the images, as for `find_images`.
+        name: Name of the program in tables.
         runs: Folder of all runs.
         scorers: The metrics.
-        table: Which file shows which view.
-        seed: Which of several trainings of the program it was.
-        max_width: Of the evaluation, in pixels.
+        table: Table of files and views, as for `find_images`.
+        seed: Seed of the training.
+        max_width: Largest width of the evaluation, in pixels.
 
     Raises:
         SceneError: If there are no test views.

@@ -1,7 +1,7 @@
-"""Parts of test views that are scored apart: what changes between periods, and what does not.
+"""Regions of test views that are scored apart: changed between periods, and invariant.
 
-The masks are frozen beside the photos of the ground truth, so runs are scored by regions whether
-they were trained before or after that.
+The masks are frozen beside the photos of the ground truth, so that earlier and later runs are
+scored by the same regions.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ALL, CHANGED, INVARIANT = REGIONS = ("all", "changed", "invariant")
 
 
 def regions_of(folder: Path, entry: ImageEntry) -> Iterator[tuple[str, NDArray[np.bool_] | None]]:
-    """Names and masks of the regions of a view in the ground truth; None for all pixels. [H, W]
+    """Yield names and masks of the regions of a view; None for all pixels. [H, W]
 
     A pixel is *changed* if it differs from at least one other period, and *invariant* if it is the
     same in all of them. Pixels that the mask of the photo ignores are in no region.
@@ -59,8 +59,8 @@ def freeze_change_masks(runs: Path, truth: Path) -> None:
 
     Args:
         runs: Folder that bench wrote.
-        truth: Laid out like ``gt/`` of a generated scene; or a folder of scenes that have such a
-            folder each, of which others are left as they are.
+        truth: Folder laid out like ``gt/`` of a generated scene; or a folder of scenes, each with
+            such a folder.
 
     Raises:
         ConfigError: If no test view has masks.
@@ -88,7 +88,7 @@ def freeze_change_masks(runs: Path, truth: Path) -> None:
 
 
 def _freeze(frozen: Path, truth: Path, periods: list[int]) -> bool:
-    """Freeze the masks of one scene; returns whether there are any."""
+    """Freeze the masks of one scene; return True if there are any."""
     manifest, entries = read_manifest(frozen), []
     for entry in manifest.images:
         others = [period for period in periods if period != entry.camera_period]

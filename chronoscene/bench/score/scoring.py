@@ -1,4 +1,4 @@
-"""Scores of a run, made from its prediction folder and the frozen ground truth alone."""
+"""Scores of a run, from its predictions and the frozen ground truth alone."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Scores:
     skipped: dict[str, str]
     """Metric to the reason for its absence."""
     unscored: tuple[str, ...] = ()
-    """Views whose masks ignore every pixel: they have no values."""
+    """Views without values, as their masks ignore every pixel."""
     change_masks: str | None = None
-    """Fingerprint of the masks that say what the regions are."""
+    """Fingerprint of the masks of the regions."""
 
 
 def score_folder(
@@ -55,10 +55,10 @@ def score_folder(
     """Score every predicted view that shows the period of its photo.
 
     Args:
-        predictions: Of a run, or of one of its stages.
+        predictions: Predictions of a run, or of one of its stages.
         ground_truth: The frozen photos.
         scorers: The metrics.
-        stage: Whether some views may be missing, and others show the last period that is known.
+        stage: Accept missing views, and views that show the last known period.
 
     Raises:
         CheckpointError: If a manifest or an image is damaged, or the two do not belong together.
@@ -103,7 +103,7 @@ def put_scores(record: RunRecord, scores: Scores) -> None:
 
 
 def score_run(staging: Path, record: RunRecord, truth: Path, scorers: Scorers) -> None:
-    """Score the predictions in the folder of a run, and write its record with the scores."""
+    """Score the predictions in the folder of a run, and write its record."""
     scores = score_folder(staging / PREDICTIONS, truth, scorers)
     put_scores(record, scores)
     score_stages(staging, record, truth, scorers)
@@ -116,9 +116,9 @@ def score_run(staging: Path, record: RunRecord, truth: Path, scorers: Scorers) -
 
 
 def score_stages(folder: Path, record: RunRecord, truth: Path, scorers: Scorers) -> None:
-    """Score the stages of a run, if it has any; its record has the scores of the last one.
+    """Score the stages of a run, if it has any; earlier values of other metrics are kept.
 
-    Earlier values of metrics that are not computed now are kept.
+    The record has the scores of the last stage already.
     """
     stages: dict[str, dict[str, Values]] = {}
     *names, last = UNTRAINED, *map(period_part, range(len(record.period_labels)))
@@ -133,7 +133,7 @@ def score_stages(folder: Path, record: RunRecord, truth: Path, scorers: Scorers)
 
 
 def score_job(job: Job, record: RunRecord) -> None:
-    """`score_run` of a job, by all metrics that can be computed here."""
+    """Score the run of a job with all metrics that are available."""
     weights = job.settings.lpips_weights
     weights = Path(job.here(str(weights))) if weights else None
     truth = ground_truth_folder(job.settings.runs, job.scene)
@@ -146,14 +146,14 @@ def score_pair(
     scorers: Scorers,
     mask: NDArray[np.bool_] | None = None,
 ) -> tuple[Values, dict[str, str]]:
-    """Values of one view, and the reasons for those that its size or mask does not allow.
+    """Compute the values of one view, and reasons where its size or mask does not allow them.
 
     Args:
         image: The prediction. [H, W, 3]
         reference: The photo. [H, W, 3]
         scorers: The metrics.
-        mask: Pixels that count. The others of the prediction become those of the photo, so that
-            windows that reach there see no difference. [H, W]
+        mask: Pixels that count. The other pixels are taken from the photo, so that windows that
+            reach there see no difference. [H, W]
     """
     values, refused = {}, {}
     if mask is not None:
@@ -197,7 +197,7 @@ def _mismatch(folder: Path, expected: str, found: str) -> CheckpointError:
 def aggregate(
     rows: Iterable[ViewScore], region: str = ALL
 ) -> tuple[dict[str, Values], dict[str, Values]]:
-    """Means of the rows of a region.
+    """Compute the means of the rows of a region.
 
     Returns:
         aggregates: ``macro`` (mean over periods of their means), ``micro`` (mean over views) and
@@ -222,7 +222,7 @@ def aggregate(
 
 
 def changes(before: Mapping[str, Values], after: Mapping[str, Values]) -> list[str]:
-    """What differs between two sets of aggregates, in words, one line per metric."""
+    """Describe differences between two sets of aggregates, one line per metric."""
     old, new = before.get("macro", {}), after.get("macro", {})
     lines = []
     for name in dict.fromkeys([*old, *new]):
@@ -237,7 +237,7 @@ def changes(before: Mapping[str, Values], after: Mapping[str, Values]) -> list[s
 
 @dataclass(frozen=True, slots=True)
 class Rescored:
-    """What scoring a run again gave."""
+    """Result of scoring a run again."""
 
     folder: Path
     changes: list[str]
@@ -245,13 +245,13 @@ class Rescored:
     kept: list[str]
     """Metrics that could not be computed now and keep their earlier values."""
     error: str | None = None
-    """Why the run could not be scored; it is left as it was."""
+    """Reason why the run could not be scored; it is left as it was."""
 
 
 def rescore(
     runs: Path, scorers: Scorers, *, progress: Callable[[int, int], None] | None = None
 ) -> list[Rescored]:
-    """Score every finished run below a folder again and write what changed.
+    """Score every finished run below a folder again.
 
     Args:
         runs: Folder that bench wrote.
@@ -287,20 +287,20 @@ def _rescore_one(runs: Path, folder: Path, scorers: Scorers) -> Rescored:
     except ChronoSceneError as error:
         return Rescored(folder, [], [], str(error))
     write_run(folder, record, scores.rows)
-    told = changes(before, record.aggregates)
+    lines = changes(before, record.aggregates)
     for region, part in record.regions.items():
         old = parts.get(region, {}).get("aggregates", {})
-        told += [f"{region}: {line}" for line in changes(old, part["aggregates"])]
-    return Rescored(folder, told, kept)
+        lines += [f"{region}: {line}" for line in changes(old, part["aggregates"])]
+    return Rescored(folder, lines, kept)
 
 
 def keep_earlier(
     folder: Path, record: RunRecord, scores: Scores, unasked: Set[str]
 ) -> tuple[list[str], Scores]:
-    """Keep earlier values of metrics that this machine cannot compute, or was not asked for.
+    """Keep earlier values of metrics that are not available here, or were not asked for.
 
-    Hashes prove that the images are the same, so the values of a machine with the weights hold.
-    Values of regions hold if the change masks are the same.
+    They hold, as hashes prove that the images are the same; values of regions hold if the change
+    masks are the same.
 
     Returns:
         Names of the kept metrics that cannot be computed, and all scores.

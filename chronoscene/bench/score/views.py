@@ -14,7 +14,7 @@ from chronoscene.bench.score.scoring import match_views
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ScoredView:
+class PredictedView:
     """A test view: prediction and photo of equal size, RGB in 0..1, read from 8-bit files."""
 
     name: str
@@ -30,7 +30,7 @@ class ScoredView:
 
 def read_views(
     predictions: Path, ground_truth: Path, *, stage: bool = False
-) -> Iterator[ScoredView]:
+) -> Iterator[PredictedView]:
     """Yield the predicted views that show the period of their photo.
 
     Args:
@@ -47,4 +47,4 @@ def read_views(
             prediction = load_image(predictions, entry).astype(np.float32) / 255
             photo = load_image(ground_truth, target).astype(np.float32) / 255
             mask = load_mask(ground_truth, target)
-            yield ScoredView(entry.view, entry.camera_period, prediction, photo, mask)
+            yield PredictedView(entry.view, entry.camera_period, prediction, photo, mask)

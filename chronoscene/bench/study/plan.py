@@ -1,4 +1,4 @@
-"""Studies: a question about a method, and the rows of the table that answers it, as a TOML file."""
+"""Studies: TOML files with a question about a method and the rows of the table that answers it."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ class StudyRow(BaseModel):
 
     label: str
     method: str = ""
-    """As for `Study`, whose method it is if empty."""
+    """Name, or ``module:SPEC``; empty for the method of the study."""
     strategy: str = "joint"
     separate_iterations: str = "total"
     options: Mapping[str, Any] = Field(default={}, alias="set")
-    """Of the method, beside those of the preset."""
+    """Options of the method, beside those of the preset."""
     published: Mapping[str, Mapping[str, float]] = {}
-    """Scene to metric, or cost in the unit of `RunRecord`, to what was printed."""
+    """Scene to metric, or cost in the unit of `RunRecord`, to the published figure."""
 
 
 class Study(BaseModel):
-    """What a study file says."""
+    """Content of a study file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -59,11 +59,11 @@ class Study(BaseModel):
     """Publication of the published figures."""
     notes: tuple[str, ...] = ()
     rows: tuple[StudyRow, ...] = Field(min_length=2)
-    """The first one is that which the others are compared with."""
+    """The other rows are compared with the first one."""
 
 
 def installed_studies() -> dict[str, Path]:
-    """Files of all studies that come with an installed method, by name."""
+    """Return the files of all studies of installed methods, by name."""
     found: dict[str, Path] = {}
     for package in dict.fromkeys(entry.module for entry in installed_methods().values()):
         spec = find_spec(package)
@@ -73,10 +73,10 @@ def installed_studies() -> dict[str, Path]:
 
 
 def find_study(name: str) -> Path:
-    """The file of a study: of an installed method, or one of the user's.
+    """Return the file of a study.
 
     Args:
-        name: Name of the former; path of the latter, which ends with ``.toml``.
+        name: Name of a study of an installed method, or a path that ends with ``.toml``.
 
     Raises:
         ConfigError: If there is no such study.
@@ -92,7 +92,7 @@ def read_study(path: Path) -> Study:
     """Read a study file.
 
     Raises:
-        ConfigError: If it is missing or says anything that a study has not.
+        ConfigError: If it is missing or damaged, or has an unknown key or value.
     """
     try:
         study = Study.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
@@ -127,17 +127,17 @@ def _wrong(path: Path, found: str) -> ConfigError:
 def run_study(
     study: Study, settings: BenchSettings, log: Log, *, execute: Execute | None = None
 ) -> tuple[BenchOutcome, dict[str, list[Path]]]:
-    """Run all rows of a study that are not finished; those of every row are checked before.
+    """Check all rows of a study, then run those that are not finished.
 
     Args:
-        study: What to run.
-        settings: Scenes, preset, seeds, machine; `overrides` hold for all rows that do not set the
-            option themselves. Methods and strategies are those of the study.
-        log: Called with lines for the user, each once.
+        study: The study.
+        settings: Scenes, preset, seeds, machine; overrides hold for rows that do not set the option
+            themselves. Methods and strategies are those of the study.
+        log: Called with lines for the user, without repetitions.
         execute: As for `run_bench`.
 
     Returns:
-        What was done, and the folders of the finished runs of each row by its label.
+        The outcome, and the folders of the finished runs of each row by its label.
 
     Raises:
         ChronoSceneError: If a row cannot be run; nothing is trained then.

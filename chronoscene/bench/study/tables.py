@@ -1,5 +1,4 @@
-"""The table of a study: what was measured beside what was published, and whether they point the
-same way."""
+"""The table of a study: measured beside published figures, and their agreement."""
 
 from __future__ import annotations
 
@@ -30,25 +29,23 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 COLUMNS = ("row", *ENTRY_COLUMNS)
-"""Of CSV and JSON: ``row`` is the label in the study, and differences are those to its first row.
-Published figures are rows of their own, whose ``source`` is the publication and whose ``scene`` is
-the published one."""
+"""Columns of CSV and JSON: ``row`` is the label in the study, and differences are to its first row.
+Published figures are rows of their own, with the publication as ``source`` and its ``scene``."""
 
 AGREES = "agrees with the published one"
 DISAGREES = "disagrees with the published one"
-UNTOLD = "cannot be told"
+UNDECIDED = "cannot be determined"
 
 
 def study_entries(study: Study, runs: Mapping[str, Sequence[RunRecord]]) -> DataFrame:
-    """Macro means and costs of each row of a study, and what was published, with differences to
-    the first row of the same scene.
+    """Summarise the rows of a study: measured macro means and costs, and published figures.
 
     Args:
         study: The study.
         runs: Finished runs, with the values of their views, by the label of their row.
 
     Returns:
-        `COLUMNS` and what `summarise` adds.
+        `COLUMNS` and the columns that `summarise` adds.
     """
     import pandas as pd
 
@@ -64,7 +61,7 @@ def study_entries(study: Study, runs: Mapping[str, Sequence[RunRecord]]) -> Data
 
 
 def _published(study: Study) -> DataFrame:
-    """Entries of the published figures."""
+    """Return entries of the published figures."""
     import pandas as pd
 
     known = study.rows[0].published
@@ -90,7 +87,7 @@ def _published(study: Study) -> DataFrame:
 
 
 def _quantities(study: Study, entries: DataFrame) -> list[str]:
-    """What the table shows: the metrics of papers, the size, and what else was published."""
+    """Return the quantities of the table: metrics of papers, size, other published ones."""
     there = set(entries[entries.source == MEASURED].quantity)
     printed = {name for row in study.rows for figures in row.published.values() for name in figures}
     wanted = {*PAPER_METRICS, SIZE, *printed}
@@ -98,12 +95,11 @@ def _quantities(study: Study, entries: DataFrame) -> list[str]:
 
 
 def study_table(study: Study, entries: DataFrame) -> Table:
-    """Scenes and rows by quantities: the mean, the difference to the first row with its interval,
-    and what was published, with the difference there.
+    """Return a table of means, differences to the first row with intervals, and published figures.
 
     Args:
         study: The study.
-        entries: What `study_entries` returns.
+        entries: Result of `study_entries`.
     """
     measured = entries[entries.source == MEASURED]
     by_key = {
@@ -147,7 +143,7 @@ def _printed(entry: Mapping[Any, Any] | None) -> str:
 
 
 def _signed(entry: Mapping[Any, Any]) -> str:
-    """A difference with its sign, if there is one."""
+    """Return a difference with its sign, or an empty text."""
     if not entry["difference"] or math.isnan(entry["difference"]):
         return ""
     sign = "+" if entry["difference"] > 0 else "\N{MINUS SIGN}"
@@ -155,8 +151,7 @@ def _signed(entry: Mapping[Any, Any]) -> str:
 
 
 def directions(study: Study, entries: DataFrame) -> list[str]:
-    """A sentence for each scene and row but the first: whether the difference to the first row has
-    the sign of the published one."""
+    """Return a sentence for each scene and row but the first, by `direction`."""
     is_measured = entries.source == MEASURED
     metrics = [name for name in _quantities(study, entries) if name in all_metrics()]
     sentences = []
@@ -169,7 +164,7 @@ def directions(study: Study, entries: DataFrame) -> list[str]:
                 printed = entries[mine & ~is_measured].difference.dropna().tolist()
                 found = entries[mine & here].to_dict("records")
                 if printed:
-                    verdict = direction(found[0], printed) if found else f"{UNTOLD} (no result)"
+                    verdict = direction(found[0], printed) if found else f"{UNDECIDED} (no result)"
                     verdicts.setdefault(verdict, []).append(metric_info(metric).title)
             said = [f"in {', '.join(t)} the direction {v}" for v, t in verdicts.items()]
             text = "; ".join(said) or "nothing is published to compare with"
@@ -178,21 +173,21 @@ def directions(study: Study, entries: DataFrame) -> list[str]:
 
 
 def direction(entry: Mapping[Any, Any], published: Sequence[float]) -> str:
-    """Whether a measured difference has the sign of the published ones.
+    """Compare the sign of a measured difference with the published ones.
 
     Args:
-        entry: The measured one, with its interval.
-        published: Differences in the same quantity on the published scenes.
+        entry: The measured difference, with its interval.
+        published: Published differences of the same quantity.
     """
     low, high = entry["difference_low"], entry["difference_high"]
     if not (min(published) > 0 or max(published) < 0):
-        return f"{UNTOLD} (the published scenes do not agree)"
+        return f"{UNDECIDED} (the published scenes do not agree)"
     if math.isnan(low):
-        return f"{UNTOLD} (there is no interval)"
+        return f"{UNDECIDED} (there is no interval)"
     if low <= 0 <= high:
-        return f"{UNTOLD} (the interval contains 0)"
+        return f"{UNDECIDED} (the interval contains 0)"
     if entry["tied"]:
-        return f"{UNTOLD} (the seeds differ as much)"
+        return f"{UNDECIDED} (the seeds differ as much)"
     return AGREES if (entry["difference"] > 0) == (published[0] > 0) else DISAGREES
 
 
@@ -203,13 +198,13 @@ def study_texts(
     *,
     width: int | None = None,
 ) -> dict[str, str]:
-    """The outcome of a study in every format.
+    """Format the outcome of a study in every format.
 
     Args:
         study: The study.
         finished: Folders of its finished runs by the label of their row; one at least.
         failures: Runs that failed.
-        width: Of the terminal.
+        width: Width of the terminal.
 
     Returns:
         ``table`` (for a terminal), ``markdown``, ``csv`` and ``json``.

@@ -1,9 +1,9 @@
-"""Checkpoints of a training that is under way, from which a run that was killed goes on.
+"""Checkpoints of a training, from which a run that was killed continues.
 
-Those of one model lie in ``<root>/<model>/<iterations>/``: what the method saved, and ``loop.json``
-with the state of the loop and the digests of the other files, by which damage is noticed. One is
-written under another name, flushed to the disk and renamed, and the one before is kept. The
-settings of the run are in ``<root>/config.json``. Nothing is pickled.
+A checkpoint of a model is the folder ``<root>/<model>/<iterations>/``: the files of the method, and
+``loop.json`` with the state of the loop and the digests of these files, which reveal damage. It is
+written under another name, flushed to the disk and renamed; the one before is kept. The settings of
+the run are in ``<root>/config.json``. Nothing is pickled.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import os
 import random
 import shutil
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from json import dumps
 from pathlib import Path
@@ -24,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from chronoscene.bench.files.provenance import peak_memory_bytes
 from chronoscene.bench.files.records import CONFIG_FILE, CurvePoint
 from chronoscene.errors import CheckpointError, DiskFullError
+from chronoscene.io.log import Log
 from chronoscene.io.staging import partial_name, remove_abandoned, sha256_of, write_text_atomic
 from chronoscene.methods import Method
 
@@ -31,7 +31,7 @@ LOOP_FILE = "loop.json"
 
 
 class LoopState(BaseModel):
-    """Where the training of a model is, apart from what the method knows."""
+    """State of the training of a model, apart from the state of the method."""
 
     model_config = ConfigDict(extra="forbid", ser_json_inf_nan="strings")
 
@@ -39,27 +39,27 @@ class LoopState(BaseModel):
     iterations: int = 0
     """Steps done."""
     seconds: float = 0.0
-    """On the training clock."""
+    """Time on the training clock."""
     setup_seconds: float = 0.0
     waited_seconds: float = 0.0
-    """For photos; not on the training clock."""
+    """Time spent waiting for photos; not on the training clock."""
     empty_steps: int = 0
-    """Whose view showed no primitive."""
+    """Steps whose view showed no primitive."""
     skipped_steps: int = 0
-    """Whose loss or gradients were not finite."""
+    """Steps whose loss or gradients were not finite."""
     first_loss: float | None = None
-    """Of the first step that had a finite one."""
+    """Loss of the first step with a finite one."""
     curve: list[CurvePoint] = []
     resumed: int = 0
-    """How often the training went on from a checkpoint."""
+    """Number of times that the training continued from a checkpoint."""
     commits: list[str] = []
-    """Code that trained up to a checkpoint, each once."""
+    """Commits of the code that trained up to a checkpoint, without repetitions."""
     peak_memory_bytes: int = 0
-    """Of the processes so far; 0 where the system does not tell."""
+    """Peak of the processes so far; 0 if the system does not report it."""
     random_state: dict[str, Any] = {}
-    """Of the global generators."""
+    """State of the global generators."""
     files: dict[str, str] = {}
-    """SHA-256 of what the method saved, by the names of the files."""
+    """SHA-256 of the files of the method by their names."""
 
 
 @dataclass
@@ -67,28 +67,27 @@ class Checkpoints:
     """The checkpoints of one model of a run."""
 
     folder: Path
-    """For this model alone; made when it is needed."""
+    """Folder of this model alone; created at need."""
     settings: dict[str, Any]
-    """Of the run, written beside the folder."""
+    """Settings of the run, written beside the folder."""
     commit: str
-    """Code that trains now."""
+    """Commit of the code that trains now."""
     every: float
-    """Seconds from one checkpoint to the next."""
+    """Seconds between checkpoints."""
     keep_last: bool
-    """Whether the end of the training is a checkpoint, then the only one that is kept."""
+    """True if the end of the training is a checkpoint, then the only one that is kept."""
     start: Path | None
     """Folder with checkpoints of a shorter training of the same model, to begin with."""
-    say: Callable[[str], None]
-    """Takes a line for the user."""
+    log: Log
 
     def __post_init__(self) -> None:
         self._latest = time.monotonic()
 
     def restore(self, method: Method) -> LoopState | None:
-        """Load the newest checkpoint that is whole; None if there is none, whole or not.
+        """Load the newest intact checkpoint; return None if there are no checkpoints.
 
         Args:
-            method: Is set up already.
+            method: A method that is set up.
 
         Raises:
             CheckpointError: If there are some, but all are damaged, or if `start` has none.
@@ -106,8 +105,8 @@ class Checkpoints:
             _set_random_state(state.random_state)
             state.resumed += 1
             for problem in problems:
-                self.say(f"note: a checkpoint is not used: {problem}")
-            self.say(f"going on from iteration {state.iterations}")
+                self.log(f"note: a checkpoint is not used: {problem}")
+            self.log(f"going on from iteration {state.iterations}")
             return state
         if problems or self.start is not None:
             raise CheckpointError(
@@ -120,11 +119,11 @@ class Checkpoints:
 
     @property
     def is_due(self) -> bool:
-        """Whether enough time has passed since the last attempt to write one."""
+        """True if enough time has passed since the last attempt to write one."""
         return time.monotonic() - self._latest >= self.every
 
     def finish(self, method: Method, state: LoopState) -> None:
-        """The end of the training."""
+        """Write the last checkpoint, if it is kept."""
         if self.keep_last:
             self.write(method, state, keep=1)
 
@@ -151,7 +150,7 @@ class Checkpoints:
             _flush(self.folder)
         except (OSError, DiskFullError) as error:
             shutil.rmtree(partial, ignore_errors=True)
-            self.say(f"note: no checkpoint of iteration {state.iterations}: {error}")
+            self.log(f"note: no checkpoint of iteration {state.iterations}: {error}")
         else:
             for old in _checkpoints(self.folder)[keep:]:
                 shutil.rmtree(old, ignore_errors=True)
@@ -159,13 +158,13 @@ class Checkpoints:
 
 
 def _checkpoints(folder: Path) -> list[Path]:
-    """Folders of the checkpoints of a model, the newest first."""
+    """Return the checkpoints of a model, the newest first."""
     found = [path for path in folder.glob("*") if path.name.isdigit()]
     return sorted(found, key=lambda path: -int(path.name))
 
 
 def _read(folder: Path) -> LoopState:
-    """The state of the loop, if the checkpoint is whole."""
+    """Read the state of the loop and check the files of a checkpoint."""
     path = folder / LOOP_FILE
     try:
         state = LoopState.model_validate_json(path.read_bytes())

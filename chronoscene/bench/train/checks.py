@@ -1,4 +1,4 @@
-"""What a method returns, checked as it comes, with messages that name the field."""
+"""Checks of the values that a method returns, with messages that name the field."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from chronoscene.methods import MethodSize, Prediction, StepReport, View
 
 
 class MethodError(ChronoSceneError):
-    """A method that does not do what `chronoscene.methods.Method` asks for."""
+    """A method that breaks the contract of `chronoscene.methods.Method`."""
 
 
 def refuse(place: str, expected: str, found: object) -> MethodError:
-    """The error of a method at a place, ``StepReport.loss`` say."""
+    """Return the error of a method at a place, such as ``StepReport.loss``."""
     return MethodError(
         place,
         expected=expected,
@@ -26,11 +26,7 @@ def refuse(place: str, expected: str, found: object) -> MethodError:
 
 
 def check_step(report: StepReport, place: str) -> None:
-    """Check what ``step`` returned; the loss may be infinite or NaN.
-
-    Raises:
-        MethodError: If a field is not what it should be.
-    """
+    """Check the result of ``step``; the loss may be infinite or NaN."""
     _check_type(report, StepReport, place)
     _check_number(report.loss, Real, f"{place}: StepReport.loss", "a number")
     _check_number(report.primitives, Integral, f"{place}: StepReport.primitives", "an integer")
@@ -41,22 +37,14 @@ def check_step(report: StepReport, place: str) -> None:
 
 
 def check_size(size: MethodSize, place: str) -> None:
-    """Check what ``size`` returned.
-
-    Raises:
-        MethodError: If a field is not what it should be.
-    """
+    """Check the result of ``size``."""
     _check_type(size, MethodSize, place)
     for name in ("primitives", "parameters"):
         _check_number(getattr(size, name), Integral, f"{place}: MethodSize.{name}", "an integer")
 
 
 def check_prediction(prediction: Prediction, view: View, place: str) -> None:
-    """Check what ``render`` returned.
-
-    Raises:
-        MethodError: If a field is not what it should be.
-    """
+    """Check the result of ``render``."""
     _check_type(prediction, Prediction, place)
     size = (view.height, view.width)
     for name, shape in (("rgb", (*size, 3)), ("alpha", size), ("depth", size)):

@@ -1,8 +1,8 @@
 """Runs of methods that are other programs: export, training, images, score.
 
-The program gets a folder of its own that holds the training set and nothing else: no photo of a
-test view, and no point that only test views see. What it leaves there but its model and the images
-of the test views is deleted; what it printed is kept in ``program.log``.
+The program gets a folder with the training set and nothing else: no photo of a test view, and no
+point that only test views see. Its model, its images of the test views and its output
+(``program.log``) are kept; everything else that it writes there is deleted.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ WORK = "work"
 
 @dataclass(frozen=True, slots=True)
 class Trained:
-    """What training one model took, and how big it is."""
+    """Cost and size of one trained model."""
 
     seconds: float
     peak_memory_bytes: int
-    """0 where the system does not tell."""
+    """0 if the system does not report it."""
     primitives: int | None
     version: str
     notices: list[str]
@@ -158,15 +158,15 @@ def _run_part(
 
 
 def export_part(scene: Scene, part: Part, out: Path, format: str) -> dict[str, str]:
-    """Write what a model may be trained on as a scene; returns the new name of each view.
+    """Write the training set of a model as a scene; return the new name of each view.
 
     Images have the size of the evaluation, and plain names in the order of the old ones: programs
-    cut names at dots, or drop folders. Test views are there with their cameras and black photos, as
-    commands that render them want files; no point has an observation in them.
+    cut names at dots, or drop folders. Test views have black photos, as commands that render them
+    want files; no point has an observation in them.
 
     Args:
-        scene: Where the points are.
-        part: Views of the model.
+        scene: The scene, with its points.
+        part: Training and test views of the model.
         out: New folder.
         format: Name of the format to write.
     """
@@ -207,9 +207,9 @@ def export_part(scene: Scene, part: Part, out: Path, format: str) -> dict[str, s
 def _write_photos(
     frames: list[Frame], trained: set[str], store: ImageStore, folder: Path
 ) -> dict[str, Path]:
-    """Write numbered photos, black ones for those not trained on; returns masks by name of frame.
+    """Write numbered photos, black ones for test views; return masks by name of frame.
 
-    There is a mask for all of them or for none, as some programs want it.
+    All photos have a mask or none has, as some programs want it.
     """
     folder.mkdir()
     masks: dict[str, Path] = {}
@@ -236,7 +236,7 @@ def _find_images(
     names: Mapping[str, str],
     values: Mapping[str, Any],
 ) -> dict[str, Path]:
-    """The image that the program made of each test view."""
+    """Return the image of each test view in the output of the program."""
     found = {}
     for index, frame in enumerate(tests):
         name = Path(names[frame.name]).stem
@@ -254,7 +254,7 @@ def _find_images(
 def _keep_model(
     job: Job, runner: Runner, output: Path, part: Part, values: Mapping[str, Any]
 ) -> int | None:
-    """Move the model to where checkpoints are; returns the number of primitives."""
+    """Move the model to the checkpoints of the run; return the number of primitives."""
     files = [p for p in sorted(output.glob(runner.model.format(**values))) if p.is_file()]
     if not files:
         raise ProgramError(

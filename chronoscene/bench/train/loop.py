@@ -1,4 +1,4 @@
-"""The training loop, owned by the harness: seeds, clock, stop, probes."""
+"""The training loop of the harness: seeds, clock, stop, probes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import random
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +18,9 @@ from chronoscene.bench.plan.stop import StopRule
 from chronoscene.bench.train.checkpoints import Checkpoints, LoopState
 from chronoscene.bench.train.checks import check_prediction, check_size, check_step
 from chronoscene.errors import ChronoSceneError
-from chronoscene.methods import (
-    Method,
-    MethodSpec,
-    Prediction,
-    StepReport,
-    TrainingSet,
-    TrainingView,
-    import_object,
-)
+from chronoscene.methods import Method, Prediction, StepReport
 from chronoscene.metrics.psnr_ssim import psnr
 from chronoscene.scene import Frame
-from chronoscene.scene.geometry import camera_centre
-from chronoscene.scene.similarity import Sim3
 
 PROBE_SHARES = (0.05, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
 """Shares of the training at which the probe views are rendered."""
@@ -42,7 +30,7 @@ NOT_FINITE_LIMIT = 50
 """Steps in a row without a finite loss and finite gradients that end a training."""
 
 Clock = Callable[[], float]
-"""Seconds from some moment on."""
+"""Return seconds, from any start."""
 
 
 class TrainingError(ChronoSceneError):
@@ -54,7 +42,7 @@ class DivergedError(TrainingError):
 
 
 class Stopwatch:
-    """Adds up the time spent inside ``with``: training runs inside, evaluation outside."""
+    """Sum of the time inside ``with``: training runs inside, evaluation outside."""
 
     def __init__(self, now: Clock = time.perf_counter) -> None:
         self.seconds = 0.0
@@ -70,12 +58,12 @@ class Stopwatch:
 
 
 Truth = Mapping[str, tuple[NDArray[np.uint8], NDArray[np.bool_] | None]]
-"""Photos by name with what counts of them, None for everything; those of which nothing counts are
-left out. [H, W, 3], [H, W]"""
+"""Photos by name [H, W, 3], with masks that are true where they count [H, W], or None. Photos that
+count nowhere are left out."""
 
 Observer = Callable[[int, float, StepReport, float | None], None]
-"""Called after each step with the number of iterations done, the seconds on the training clock,
-the step's report and the latest probe PSNR."""
+"""Called after each step with the iterations done, the seconds on the training clock, the report of
+the step and the latest probe PSNR."""
 
 
 def seed_everything(seed: int) -> None:
@@ -88,7 +76,7 @@ def seed_everything(seed: int) -> None:
 
 
 def probe_frames(part: Part) -> tuple[Frame, ...]:
-    """The probe views of a model: the middle test view of each of its periods, in name order."""
+    """Return the probe views of a model: the middle test view of each period, in name order."""
     by_period: dict[int, list[Frame]] = {}
     for frame in part.test:
         by_period.setdefault(frame.period, []).append(frame)
@@ -107,27 +95,28 @@ def train(
     now: Clock = time.perf_counter,
     checkpoints: Checkpoints | None = None,
 ) -> LoopState:
-    """Train a model, or a stage of it. Probes, checkpoints, the observer and waits for photos are
-    off the clock.
+    """Train a model, or a stage of it.
+
+    Probes, checkpoints, the observer and waits for photos are off the clock.
 
     Args:
-        method: An empty method; at a later stage, that of the stage before.
-        part: What to train on and what to probe.
-        stop: When to end.
+        method: An empty method; at a later stage, the method of the stage before.
+        part: Training set and test views.
+        stop: End of the training.
         truth: Ground truth of the probe views.
-        seed: For the global generators and the method.
+        seed: Seed of the global generators and of the method.
         device: ``cpu`` or ``cuda``.
         observer: Shows the progress.
         now: The clock.
-        checkpoints: Where to go on from, and to keep what is done; None for a method that cannot
-            be resumed.
+        checkpoints: Checkpoints to continue from and to write; None for a method that cannot be
+            resumed.
 
     Raises:
         DivergedError: If the method skipped too many steps in a row.
-        TrainingError: If it took as many with a loss that is not finite, or if no view shows
-            anything of the model any more.
+        TrainingError: If it took as many steps with a loss that is not finite, or no view shows
+            the model any more.
         CheckpointError: If all checkpoints are damaged.
-        MethodError: If the method returns something that it should not.
+        MethodError: If the method returns a wrong type or value.
     """
     seed_everything(seed)
     clock, waiting = Stopwatch(now), Stopwatch(lambda: part.store.waited)
@@ -179,7 +168,7 @@ def train(
 
 
 def _was_finite(report: StepReport, state: LoopState) -> bool:
-    """Count a step that taught nothing; whether it was finite."""
+    """Count skipped steps; return True if the step was finite."""
     if report.skipped == "not finite" or not math.isfinite(report.loss):
         state.skipped_steps += 1
         return False
@@ -202,10 +191,10 @@ def _diverged(report: StepReport, part: Part, last_good: int) -> TrainingError:
 
 
 def _is_lost(unseen: deque[float], state: LoopState) -> bool:
-    """Whether all views are empty, with a larger loss than the first step had.
+    """Return True if all views are empty, with a larger loss than the first step.
 
-    Nothing is learned from empty views, so that such a model stays as it is. Photos of nothing but
-    the background, or behind masks, need no primitives: their loss is small.
+    Nothing is learned from empty views, so such a model stays as it is. Photos of the background
+    alone, or behind masks, need no primitives: their loss is small.
     """
     if len(unseen) != unseen.maxlen or state.first_loss is None:
         return False
@@ -243,77 +232,6 @@ def render_bytes(method: Method, part: Part, frame: Frame) -> NDArray[np.uint8]:
 
 
 def checked_bytes(prediction: Prediction, part: Part, frame: Frame) -> NDArray[np.uint8]:
-    """The image of a prediction, quantised to 8 bits; errors as in `render_bytes`. [H, W, 3]"""
+    """Quantise the image of a prediction to 8 bits; errors as in `render_bytes`. [H, W, 3]"""
     check_prediction(prediction, part.view(frame), f"model {part.name}, view {frame.name}")
     return to_bytes(prediction.rgb)
-
-
-WARM_UP_SIZE = 32  # Pixels per axis of the made-up images
-WARM_UP_STEPS = 120  # Enough for the first rounds of densification of the methods here
-WARM_UP_SECONDS = 3.0  # Limit on the time for the steps after the first three
-
-
-def warm_up(
-    spec: MethodSpec, config: Any, *, num_periods: int, device: str, now: Clock = time.perf_counter
-) -> str | None:
-    """Train a few steps and render once on made-up images; returns what went wrong, if anything.
-
-    Kernels are compiled, or loaded from their cache, at first use. On the training clock that
-    would charge the first run of a method more than the next, and shorten a time budget.
-    """
-    try:
-        seed_everything(0)
-        method: Method = import_object(spec.method)(config)
-        train = made_up_set(num_periods)
-        method.setup(train, seed=0, device=device)
-        started = now()
-        for index in range(WARM_UP_STEPS):
-            method.step(index, index / WARM_UP_STEPS)
-            if index < 2:
-                started = now()
-            elif now() - started > WARM_UP_SECONDS:
-                break
-        method.render(train.views[0], 0.0)
-    except Exception as error:  # the run itself will report it; here it only costs time
-        return f"warm-up failed ({type(error).__name__}), compilation is on the training clock"
-    return None
-
-
-def made_up_set(num_periods: int) -> TrainingSet:
-    """Noise seen by three cameras per period around a cloud of points."""
-    rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, (3 * num_periods, WARM_UP_SIZE, WARM_UP_SIZE, 3), dtype=np.uint8)
-    views = tuple(_made_up_view(i, i // 3) for i in range(len(images)))
-    centres = camera_centre(np.stack([v.cam_from_world for v in views]))
-    radius = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-    count = 200
-    return TrainingSet(
-        views=views,
-        num_periods=num_periods,
-        points=rng.uniform(-0.5, 0.5, (count, 3)).astype(np.float32),
-        colors=rng.integers(0, 256, (count, 3), dtype=np.uint8),
-        point_periods=np.ones((count, num_periods), bool),
-        training_from_world=Sim3.identity(),
-        camera_extent=1.1 * radius,
-        background=np.zeros(3, np.float32),
-        load_image=lambda i: images[i],
-    )
-
-
-def _made_up_view(number: int, period: int) -> TrainingView:
-    """A camera one and a half units from the origin, looking at it."""
-    angle = 0.4 * number
-    cosine, sine = np.cos(angle), np.sin(angle)
-    pose = np.eye(4)
-    pose[:3, :3] = [[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]]
-    pose[2, 3] = 1.5
-    K = np.array([[30.0, 0.0, WARM_UP_SIZE / 2], [0.0, 30.0, WARM_UP_SIZE / 2], [0.0, 0.0, 1.0]])
-    return TrainingView(K, WARM_UP_SIZE, WARM_UP_SIZE, pose, f"{number}.png", period)
-
-
-def forget_peak_memory() -> None:
-    """Reset the peak of resident memory where the system can: compilers need much."""
-    try:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    except OSError:
-        return

@@ -16,21 +16,20 @@ from chronoscene.methods import StepReport
 REFRESH = 0.1  # Seconds between two updates of the bar
 
 
-REPORTING = 1.0  # The same of one that other processes report to
+REPORTING = 1.0  # Seconds between two reports to another process
 
 
 SMOOTHING = 0.95  # Weight of the past in the loss that is shown
 
 
 class ProgressDisplay:
-    """Shows iteration, loss, probe PSNR, speed and time left of one model after another.
+    """Display of iteration, loss, probe PSNR, speed and time left of one model after another.
 
     Args:
-        label: The run in words.
-        console: Where to show it.
-        report: Called with thousandths of the run instead, and with notes, as `RunsDisplay` takes
-            them.
-        models: How many there will be.
+        label: Name of the run.
+        console: Terminal; None for standard error.
+        report: Called with thousandths of the run and with notes, instead of the terminal.
+        models: Number of models of the run.
     """
 
     def __init__(
@@ -69,7 +68,7 @@ class ProgressDisplay:
         self._bar.stop()
 
     def wait(self, step: str) -> None:
-        """Show what the run does before and after its trainings."""
+        """Show a step of the run before or after its trainings."""
         if self._task is not None:
             self._bar.remove_task(self._task)
         self._task = self._bar.add_task(step, total=None, status="")
@@ -89,7 +88,7 @@ class ProgressDisplay:
         if not self._live:
             self._print(f"{self._name}: training")
 
-    def say(self, line: str) -> None:
+    def log(self, line: str) -> None:
         """Print a line above the bar."""
         if self._report is not None:
             self._report(f"{self._name}: {line}", 0, 0)
@@ -98,7 +97,7 @@ class ProgressDisplay:
     def update(
         self, iteration: int, seconds: float, report: StepReport, psnr: float | None
     ) -> None:
-        """Show one step; the observer of `training_loop.train`."""
+        """Show one step, as the observer of `loop.train`."""
         if report.skipped is None and math.isfinite(report.loss):
             past = report.loss if self._loss is None else self._loss
             self._loss = SMOOTHING * past + (1 - SMOOTHING) * report.loss
@@ -120,7 +119,7 @@ class ProgressDisplay:
         self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def status(self, iteration: int, seconds: float, psnr: float | None) -> str:
-        """The state of the training in one line."""
+        """Return the state of the training in one line."""
         left = self._stop.seconds_left(iteration, seconds)
         pieces = [f"iteration {iteration}"]
         if self._loss is not None:

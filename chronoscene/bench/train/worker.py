@@ -42,13 +42,12 @@ from chronoscene.bench.train.loop import (
     DivergedError,
     Truth,
     checked_bytes,
-    forget_peak_memory,
     probe_frames,
     seed_everything,
     train,
-    warm_up,
 )
 from chronoscene.bench.train.progress import ProgressDisplay
+from chronoscene.bench.train.warm_up import forget_peak_memory, warm_up
 from chronoscene.errors import BackendError, ChronoSceneError, DiskFullError
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import needing_space, write_text_atomic
@@ -246,7 +245,7 @@ def _checkpoints(run: ResolvedRun, part: Part, parts: int, display: ProgressDisp
         # With several models, those that are done must not be trained again.
         keep_last=job.settings.keep_training or parts > 1,
         start=Path(start) / records.TRAINING / part.name if start else None,
-        say=display.say,
+        log=display.log,
     )
 
 

@@ -1,4 +1,4 @@
-"""Cameras to render a finished run from: those of its scene, of files, or around it."""
+"""Cameras to render a finished run from: of its scene, of files, or on an orbit."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from chronoscene.scene.orbit import orbit
 from chronoscene.scene.similarity import Sim3
 
 VIEWS = ("test", "all", "orbit")
-"""Cameras that follow from the scene; others are in a file or a folder."""
+"""Cameras that follow from the scene."""
 
 NORMALISED = "dataparser_transforms.json"
-"""What nerfstudio writes beside a model, whose frame is moved, turned and scaled."""
+"""File of nerfstudio with the transform from the world to the frame of a model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shot:
-    """One picture to take."""
+class Viewpoint:
+    """A camera with its pose, and the period to show."""
 
     name: str
     """File name of the picture, with its folders and extension."""
@@ -41,25 +41,27 @@ class Shot:
     cam_from_world: NDArray[np.float64]
     """In the world of the scene. [4, 4]"""
     period: float | None
-    """None where the source of the camera does not say."""
+    """None if the source of the camera has none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shots:
-    """Cameras in their order."""
+class CameraSequence:
+    """Viewpoints in their order."""
 
-    shots: tuple[Shot, ...]
+    viewpoints: tuple[Viewpoint, ...]
     is_path: bool
-    """Whether one camera moves; else each stands for itself."""
+    """True if they are a moving camera."""
 
 
-def find_shots(source: str, run: TrainedRun, scene_root: Path | None, frames: int) -> Shots:
-    """The cameras that ``--cameras`` names.
+def find_viewpoints(
+    source: str, run: TrainedRun, scene_root: Path | None, frames: int
+) -> CameraSequence:
+    """Return the cameras that ``--cameras`` names.
 
     Args:
         source: One of `VIEWS`, the folder of a COLMAP model, or a camera path of nerfstudio.
-        run: Says which scene, and the largest width of images.
-        scene_root: Where the scene is now; None where it was.
+        run: Run whose scene and largest image width are used.
+        scene_root: Folder of the scene; None if it has not moved.
         frames: Number of pictures of an orbit.
 
     Raises:
@@ -90,14 +92,14 @@ def find_shots(source: str, run: TrainedRun, scene_root: Path | None, frames: in
 
 
 def with_periods(
-    shots: Shots, run: TrainedRun, periods: tuple[float, ...], frames: int
-) -> tuple[Shot, ...]:
-    """The same cameras at the periods asked for.
+    cameras: CameraSequence, run: TrainedRun, periods: tuple[float, ...], frames: int
+) -> tuple[Viewpoint, ...]:
+    """Return the cameras at the periods asked for.
 
     Args:
-        shots: Those of a path go through a range of periods on their way; each of the others shows
-            the whole range.
-        run: Says whether there is something between two periods.
+        cameras: A moving camera passes through a range of periods on its way; any other camera
+            shows the whole range.
+        run: The run to render.
         periods: Empty, so that each camera shows its own; one; or both ends of a range.
         frames: Number of pictures of a range.
 
@@ -105,29 +107,32 @@ def with_periods(
         ConfigError: If no period is given and a camera has none.
     """
     if not periods:
-        if any(shot.period is None for shot in shots.shots):
+        if any(viewpoint.period is None for viewpoint in cameras.viewpoints):
             raise ConfigError(
                 "--period",
                 expected="a period, or a range FROM:TO, as these cameras have none",
                 found="none",
                 todo="add it",
             )
-        return shots.shots
-    if shots.is_path:
-        along = _range(run, periods, len(shots.shots))
-        return tuple(replace(shot, period=p) for shot, p in zip(shots.shots, along, strict=True))
+        return cameras.viewpoints
+    if cameras.is_path:
+        along = _range(run, periods, len(cameras.viewpoints))
+        return tuple(
+            replace(viewpoint, period=p)
+            for viewpoint, p in zip(cameras.viewpoints, along, strict=True)
+        )
     if len(periods) == 1:
-        return tuple(replace(shot, period=periods[0]) for shot in shots.shots)
+        return tuple(replace(viewpoint, period=periods[0]) for viewpoint in cameras.viewpoints)
     along = _range(run, periods, frames)
     return tuple(
-        replace(shot, name=f"{Path(shot.name).with_suffix('')}/{i:04}.png", period=period)
-        for shot in shots.shots
+        replace(viewpoint, name=f"{Path(viewpoint.name).with_suffix('')}/{i:04}.png", period=period)
+        for viewpoint in cameras.viewpoints
         for i, period in enumerate(along)
     )
 
 
 def _range(run: TrainedRun, periods: tuple[float, ...], count: int) -> Iterable[float]:
-    """Periods from the first to the last; each has an equal share where nothing is between."""
+    """Return periods from the first to the last; whole ones if nothing is between."""
     start, end = periods[0], periods[-1]
     if run.is_continuous:
         return np.linspace(start, end, count).tolist()
@@ -136,38 +141,41 @@ def _range(run: TrainedRun, periods: tuple[float, ...], count: int) -> Iterable[
     return whole[np.arange(count) * len(whole) // count].tolist()
 
 
-def _of_scene(run: TrainedRun, scene: Scene, split: str) -> Shots:
+def _of_scene(run: TrainedRun, scene: Scene, split: str) -> CameraSequence:
     store = ImageStore(scene, max_width=run.record.max_width)
     frames = scene.frames if split == "all" else scene.select(split="test")
-    shots = (
-        Shot(image_file(f.name), store.camera(f), f.cam_from_world, float(f.period)) for f in frames
+    viewpoints = (
+        Viewpoint(image_file(f.name), store.camera(f), f.cam_from_world, float(f.period))
+        for f in frames
     )
-    return Shots(tuple(shots), is_path=False)
+    return CameraSequence(tuple(viewpoints), is_path=False)
 
 
-def _around(run: TrainedRun, scene: Scene, frames: int) -> Shots:
+def _around(run: TrainedRun, scene: Scene, frames: int) -> CameraSequence:
     poses = np.stack([frame.cam_from_world for frame in scene.frames])
     camera = ImageStore(scene, max_width=run.record.max_width).camera(scene.frames[0])
     path = orbit(poses, scene.points.xyz, frames)
-    return Shots(tuple(Shot(_numbered(i), camera, p, None) for i, p in enumerate(path)), True)
+    return CameraSequence(
+        tuple(Viewpoint(_numbered(i), camera, p, None) for i, p in enumerate(path)), True
+    )
 
 
 def _numbered(i: int) -> str:
     return f"{i:04}.png"
 
 
-def _of_model(run: TrainedRun, folder: Path) -> Shots:
-    shots = []
+def _of_model(run: TrainedRun, folder: Path) -> CameraSequence:
+    viewpoints = []
     for image in read_model(folder).images:
         camera = image.camera if image.camera.is_pinhole else undistorted_camera(image.camera)
         size = evaluation_size(*camera.size, run.record.max_width)
         camera = resize_camera(camera, *size)
-        shots.append(Shot(image_file(image.name), camera, image.cam_from_world, None))
-    return Shots(tuple(shots), is_path=False)
+        viewpoints.append(Viewpoint(image_file(image.name), camera, image.cam_from_world, None))
+    return CameraSequence(tuple(viewpoints), is_path=False)
 
 
-def _of_path(run: TrainedRun, path: Path) -> Shots:
-    """A camera path as nerfstudio's viewer exports it."""
+def _of_path(run: TrainedRun, path: Path) -> CameraSequence:
+    """Read a camera path that nerfstudio's viewer exported."""
     data = read_json_document(path)
     kind = data.get("camera_type", "perspective")
     if kind != "perspective":
@@ -177,7 +185,7 @@ def _of_path(run: TrainedRun, path: Path) -> Shots:
         raise json_error(path, "a list of cameras as camera_path", "none")
     size = _side(path, data, "render_width"), _side(path, data, "render_height")
     world_from_file = _world_from_file(path.with_name(NORMALISED))
-    shots = []
+    viewpoints = []
     for i, item in enumerate(listed):
         place = f"{path}: camera_path[{i}]"
         camera = _camera(place, item, *size)
@@ -187,8 +195,10 @@ def _of_path(run: TrainedRun, path: Path) -> Shots:
         pose = transforms.pose_from_opengl(place, transforms.matrix(place, values))
         time = number(place, item, "render_time")
         period = None if time is None else time * (run.num_periods - 1)
-        shots.append(Shot(_numbered(i), camera, world_from_file.apply_to_pose(pose), period))
-    return Shots(tuple(shots), is_path=True)
+        viewpoints.append(
+            Viewpoint(_numbered(i), camera, world_from_file.apply_to_pose(pose), period)
+        )
+    return CameraSequence(tuple(viewpoints), is_path=True)
 
 
 def _side(path: Path, data: Mapping[str, Any], key: str) -> int:
@@ -199,7 +209,7 @@ def _side(path: Path, data: Mapping[str, Any], key: str) -> int:
 
 
 def _camera(place: str, item: Mapping[str, Any], width: int, height: int) -> Camera:
-    """The camera of a vertical field of view, which is in degrees."""
+    """Return the camera of a vertical field of view in degrees."""
     fov = number(place, item, "fov")
     if fov is None or not 0 < fov < 180:
         raise json_error(place, "a fov between 0 and 180 degrees", repr(item.get("fov"))[:40])
@@ -208,9 +218,9 @@ def _camera(place: str, item: Mapping[str, Any], width: int, height: int) -> Cam
 
 
 def _world_from_file(path: Path) -> Sim3:
-    """From the frame of a model of nerfstudio to the world; the same where no file tells it."""
+    """Return the transform from the frame of a nerfstudio model; identity without a file."""
     if not path.is_file():
-        return Sim3(1.0, np.eye(3), np.zeros(3))
+        return Sim3.identity()
     data = read_json_document(path)
     matrix = transforms.matrix(f"{path}: transform", data.get("transform"), (3, 4))
     scale = number(path, data, "scale")

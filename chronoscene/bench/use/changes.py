@@ -1,4 +1,4 @@
-"""Where the periods of a finished run differ: places on its surfaces, with scores.
+"""Change maps between the periods of a finished run: places on its surfaces, with scores.
 
 Colours change with the light, depth does not. A place on a surface of one period is gone at another
 one if cameras that see it see farther there:
@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from chronoscene.arrays import Array
 from chronoscene.bench.files.predictions import to_bytes
-from chronoscene.bench.use.cameras import Shot
+from chronoscene.bench.use.cameras import Viewpoint
 from chronoscene.bench.use.trained_run import TrainedRun
 from chronoscene.errors import ConfigError
 from chronoscene.images.store import ImageStore
@@ -40,7 +40,7 @@ from chronoscene.scene.cameras import project_points, unproject_pixels
 
 Mask = NDArray[np.bool_]
 Render = Callable[[Camera, Array, float], Prediction]
-"""As `TrainedRun.render`: camera, pose, period."""
+"""Render a camera with a pose at a period, as `TrainedRun.render`."""
 
 MAX_WIDTH = 640
 """Pixels: places lie farther apart than those of wider images."""
@@ -57,8 +57,8 @@ APPEARANCE = 0.08
 """Distance of colours, whose channels sum to 1, from which appearance has changed."""
 
 CLASSES = ("unchanged", "unknown", "appearance", "gone", "new")
-"""What `ChangeMap.classes` numbers. Gone are places on surfaces of the first period, new are those
-on surfaces of the second."""
+"""Classes by their number in `ChangeMap.classes`. Gone are places on surfaces of the first period,
+new are places on surfaces of the second."""
 _DARK = 0.05  # Added to colours before their brightness is divided out: black has no hue
 _ROUNDS = 10  # Of reweighted least squares
 
@@ -71,22 +71,22 @@ class ChangeMap:
     xyz: Array
     """In the world. [N, 3]"""
     later: Mask
-    """Whether a place is on a surface of the second period, not of the first. [N]"""
+    """True for places on a surface of the second period, not of the first. [N]"""
     known: Mask
-    """Whether a training camera of the other period sees the place. [N]"""
+    """True for places that a training camera of the other period sees. [N]"""
     geometry: Array
     """Score of change, 0 or more; 0 where unknown. [N]"""
     appearance: Array
-    """Likewise; 0 where geometry has changed. [N]"""
+    """Score of change, 0 or more; 0 where unknown or where geometry has changed. [N]"""
 
     @cached_property
     def classes(self) -> NDArray[np.int64]:
-        """Of `CLASSES`. [N]"""
+        """Index into `CLASSES`. [N]"""
         kinds = [~self.known, self.geometry >= GEOMETRY, self.appearance >= APPEARANCE]
         return np.select(kinds, [1, np.where(self.later, 4, 3), 2], 0)
 
     def shares(self) -> dict[str, float]:
-        """Share of each class but the first; gone and new are shares of their period's places."""
+        """Return shares of all classes but the first; gone and new are shares of their period."""
         whole = (1, 1, np.mean(~self.later), np.mean(self.later))
         shares = [np.mean(self.classes == i) / part for i, part in enumerate(whole, start=1)]
         return dict(zip(CLASSES[1:], map(float, shares), strict=True))
@@ -97,45 +97,47 @@ class ChangeMap:
         scores = np.stack([self.geometry, self.appearance], axis=1)
         return [(cKDTree(self.xyz[rows]), scores[rows]) for rows in (~self.later, self.later)]
 
-    def view_scores(self, shot: Shot, shown: Sequence[Prediction]) -> Array:
-        """Scores of geometry and appearance in a view: the larger of those of both surfaces.
+    def view_scores(self, viewpoint: Viewpoint, shown: Sequence[Prediction]) -> Array:
+        """Return scores of geometry and appearance in a view: the larger of both surfaces.
 
         Args:
-            shot: The camera.
-            shown: What it shows at the first and at the second period.
+            viewpoint: The camera.
+            shown: Its pictures at the first and at the second period.
 
         Returns:
             [H, W, 2]
         """
-        width, height = shot.camera.size
+        width, height = viewpoint.camera.size
         values = np.zeros((height, width, 2))
         for (tree, scores), prediction in zip(self._sides, shown, strict=True):
             depth = surface_depth(prediction)
             near = range(1, 1 + min(NEIGHBOURS, tree.n))
-            _, places = tree.query(back_project(depth, shot), near)
+            _, places = tree.query(back_project(depth, viewpoint), near)
             at = np.isfinite(depth)
             values[at] = np.maximum(values[at], scores[places].mean(axis=1))
         return values
 
 
-def map_changes(render: Render, shots: Sequence[Shot], periods: tuple[int, int]) -> ChangeMap:
+def map_changes(
+    render: Render, viewpoints: Sequence[Viewpoint], periods: tuple[int, int]
+) -> ChangeMap:
     """Compare two periods.
 
     Args:
-        render: Of the model, with depth in units of the world.
-        shots: Training cameras of the two periods.
-        periods: In their order.
+        render: Renders the model, with depth in units of the world.
+        viewpoints: Training cameras of the two periods.
+        periods: The two periods in their order.
 
     Raises:
         ConfigError: If one of them shows nothing.
     """
     found: dict[int, list[Array]] = {period: [np.zeros((0, 3))] for period in periods}
     depths = []
-    for shot in shots:
-        assert shot.period is not None
-        depth = surface_depth(render(shot.camera, shot.cam_from_world, shot.period))
-        step = max(1, round(shot.camera.width / COLUMNS))
-        found[int(shot.period)].append(back_project(depth, shot, step))
+    for viewpoint in viewpoints:
+        assert viewpoint.period is not None
+        depth = surface_depth(render(viewpoint.camera, viewpoint.cam_from_world, viewpoint.period))
+        step = max(1, round(viewpoint.camera.width / COLUMNS))
+        found[int(viewpoint.period)].append(back_project(depth, viewpoint, step))
         depths.append(depth[::step, ::step].ravel())
     places = {period: np.concatenate(parts) for period, parts in found.items()}
     for period, xyz in places.items():
@@ -149,10 +151,10 @@ def map_changes(render: Render, shots: Sequence[Shot], periods: tuple[int, int])
     depth = np.concatenate(depths)
     distance = float(np.median(depth[np.isfinite(depth)]))
     surfaces = [_Surface(_thinned(xyz, CELL * distance)) for xyz in places.values()]
-    for shot in shots:
-        seen = [render(shot.camera, shot.cam_from_world, period) for period in periods]
+    for viewpoint in viewpoints:
+        seen = [render(viewpoint.camera, viewpoint.cam_from_world, period) for period in periods]
         for surface, period, shown in zip(surfaces, periods, (seen, seen[::-1]), strict=True):
-            surface.look(shot, *shown, is_other=shot.period != period)
+            surface.look(viewpoint, *shown, is_other=viewpoint.period != period)
     known = np.concatenate([surface.other_views > 0 for surface in surfaces])
     geometry = np.concatenate([distance * surface.score() for surface in surfaces])
     (earlier, later), (later_own, earlier_other) = (surface.mean_colors() for surface in surfaces)
@@ -171,7 +173,7 @@ def map_changes(render: Render, shots: Sequence[Shot], periods: tuple[int, int])
 
 
 class _Surface:
-    """Places on the surfaces of a period, and what the views say of them."""
+    """Places on the surfaces of a period, and sums over the views that see them."""
 
     def __init__(self, xyz: Array) -> None:
         self.xyz = xyz
@@ -179,20 +181,22 @@ class _Surface:
         self.other_views = np.zeros(len(xyz))
         self.colors = np.zeros((2, len(xyz), 3))
 
-    def look(self, shot: Shot, own: Prediction, other: Prediction, *, is_other: bool) -> None:
-        """Compare what a camera shows at the period of the surface with what it shows at the other.
+    def look(
+        self, viewpoint: Viewpoint, own: Prediction, other: Prediction, *, is_other: bool
+    ) -> None:
+        """Compare two pictures of a camera.
 
         Args:
-            shot: The camera.
-            own: At the period of the surface.
-            other: At the other one.
-            is_other: Whether the camera is one of the other period.
+            viewpoint: The camera.
+            own: Picture at the period of the surface.
+            other: Picture at the other period.
+            is_other: True for a camera of the other period.
         """
-        pose = shot.cam_from_world
+        pose = viewpoint.cam_from_world
         local = self.xyz @ pose[:3, :3].T + pose[:3, 3]
-        xy = project_points(shot.camera, local)
+        xy = project_points(viewpoint.camera, local)
         with np.errstate(invalid="ignore"):
-            places = np.flatnonzero(((xy >= 0) & (xy < shot.camera.size)).all(axis=1))
+            places = np.flatnonzero(((xy >= 0) & (xy < viewpoint.camera.size)).all(axis=1))
         column, row = xy[places].astype(int).T
         z, near, far = local[places, 2], *(surface_depth(p)[row, column] for p in (own, other))
         seen = (np.abs(near - z) < SAME * z) & (far >= (1 - HIDDEN) * near)
@@ -204,11 +208,11 @@ class _Surface:
             total[places] += shown.rgb[row, column]
 
     def score(self) -> Array:
-        """Of geometry, per unit of the usual distance. [N]"""
+        """Score of geometry, per unit of the usual distance. [N]"""
         return self.parallax / (self.views + UNCHANGED_VIEWS)
 
     def mean_colors(self) -> Array:
-        """At the period of the surface, and at the other one. [2, N, 3]"""
+        """Mean colours at the period of the surface and at the other one. [2, N, 3]"""
         return self.colors / np.maximum(self.views, 1)[:, None]
 
 
@@ -218,33 +222,33 @@ def surface_depth(prediction: Prediction) -> Array:
     return np.where(prediction.depth > 0, prediction.depth, np.inf).astype(np.float64)
 
 
-def back_project(depth: Array, shot: Shot, step: int = 1) -> Array:
-    """Places in the world that the pixels of every ``step``-th row and column show. [n, 3]"""
+def back_project(depth: Array, viewpoint: Viewpoint, step: int = 1) -> Array:
+    """Return places in the world at the pixels of every ``step``-th row and column. [n, 3]"""
     rows, columns = np.indices(depth.shape)[:, ::step, ::step].reshape(2, -1)
     z = depth[rows, columns]
     kept = np.isfinite(z)
     xy = np.stack([columns[kept], rows[kept]], axis=1).astype(np.float64) + 0.5
-    rays = unproject_pixels(shot.camera, xy)
+    rays = unproject_pixels(viewpoint.camera, xy)
     local = np.concatenate([rays, np.ones((len(rays), 1))], axis=1) * z[kept, None]
-    pose = shot.cam_from_world
+    pose = viewpoint.cam_from_world
     return np.asarray((local - pose[:3, 3]) @ pose[:3, :3])
 
 
 def _thinned(xyz: Array, cell: float) -> Array:
-    """One place in each cell of a grid."""
+    """Keep one place in each cell of a grid."""
     _, first = np.unique(np.floor(xyz / cell), axis=0, return_index=True)
     return xyz[np.sort(first)]
 
 
 def unexplained(first: Array, second: Array, counted: Mask) -> Array:
-    """What one affine map does not explain of how colours change, brightness aside.
+    """Return changes of colours, brightness aside, that one affine map does not explain.
 
-    It is fitted so that the distances are small in most places, few may be large.
+    The map is fitted robustly: distances are small in most places, a few may be large.
 
     Args:
         first: RGB at the first period. [N, 3]
-        second: At the second. [N, 3]
-        counted: Places that count; the others have 0. [N]
+        second: RGB at the second period. [N, 3]
+        counted: Places that count; the others get 0. [N]
 
     Returns:
         Distance of colours whose channels sum to 1. [N]
@@ -263,7 +267,7 @@ def unexplained(first: Array, second: Array, counted: Mask) -> Array:
 
 
 Compared = tuple[ChangeMap, Mapping[str, float]]
-"""A pair of periods, and the scores of its map."""
+"""The map of a pair of periods, and its scores."""
 SCORES = {
     f"{name}_{metric}_{kind}": (f"{metric.upper()} {kind}", name)
     for kind in ("geometry", "appearance")
@@ -274,25 +278,25 @@ SCORES = {
 
 
 def map_run(run: TrainedRun, scene: Scene, pairs: Sequence[tuple[int, int]]) -> Iterator[Compared]:
-    """The map of each pair of periods, and its scores where a truth is known.
+    """Yield the map of each pair of periods, with scores if ground truth is known.
 
     Args:
-        run: Renders what is compared.
-        scene: Of the run.
-        pairs: Periods in their order.
+        run: The run.
+        scene: The scene of the run.
+        pairs: Pairs of periods in their order.
 
     Raises:
         ConfigError: If its models cannot tell periods apart, or give no depth.
         ImageError: If a file of the truth is damaged.
     """
     if not (run.uses_period or run.strategy.model_per_period):
-        raise _unfit(run, "models that know the periods", "one that is not told the period")
+        raise _unfit(run, "models that know the periods", "one that does not take the period")
     if "depth" not in run.spec.outputs:
         raise _unfit(run, "a method that renders depth", "one that does not")
     store = ImageStore(scene, max_width=_width(run))
     for pair in pairs:
         frames = [frame for frame in scene.select(split="train") if frame.period in pair]
-        made = map_changes(run.render, [_shot(store, frame) for frame in frames], pair)
+        made = map_changes(run.render, [_viewpoint(store, frame) for frame in frames], pair)
         yield made, score_map(run, scene, store, made)
 
 
@@ -309,14 +313,14 @@ def _width(run: TrainedRun) -> int:
     return min(run.record.max_width, MAX_WIDTH)
 
 
-def _shot(store: ImageStore, frame: Frame) -> Shot:
-    return Shot(frame.name, store.camera(frame), frame.cam_from_world, frame.period)
+def _viewpoint(store: ImageStore, frame: Frame) -> Viewpoint:
+    return Viewpoint(frame.name, store.camera(frame), frame.cam_from_world, frame.period)
 
 
 def score_map(
     run: TrainedRun, scene: Scene, store: ImageStore, made: ChangeMap
 ) -> dict[str, float]:
-    """How well a map tells changed pixels of test views from unchanged ones.
+    """Score a map by its separation of changed and unchanged pixels of test views.
 
     The pixels of all views of the two periods are taken together. The baseline is the difference
     between the renders of both periods, with the threshold of Otsu.
@@ -332,13 +336,13 @@ def score_map(
         path = scene.root / "gt" / truth_place("change", frame.name, other)
         if frame.period not in made.periods or not path.is_file():
             continue
-        shot, mask = _shot(store, frame), store.load_mask(frame)
-        changes = load_changes(path, shot.camera.size, _width(run))
-        shown = [run.render(shot.camera, shot.cam_from_world, p) for p in made.periods]
+        viewpoint, mask = _viewpoint(store, frame), store.load_mask(frame)
+        changes = load_changes(path, viewpoint.camera.size, _width(run))
+        shown = [run.render(viewpoint.camera, viewpoint.cam_from_world, p) for p in made.periods]
         first, second = (to_bytes(prediction.rgb).astype(int) for prediction in shown)
         difference = np.abs(first - second).mean(axis=2, keepdims=True).round()
         counted = np.ones(changes.shape, bool) if mask is None else mask
-        view = np.concatenate([made.view_scores(shot, shown), difference], axis=2)
+        view = np.concatenate([made.view_scores(viewpoint, shown), difference], axis=2)
         scores.append(view[counted])
         masks.append(changes[counted])
     if not any(map(len, masks)):
@@ -361,12 +365,12 @@ def score_map(
 
 
 def changes_table(rows: Sequence[Compared], labels: Mapping[str, str], title: str) -> Table:
-    """A row for each pair of periods.
+    """Return a table with a row for each pair of periods.
 
     Args:
-        rows: From `map_run`.
-        labels: Of the periods, by their ids.
-        title: Of the table.
+        rows: Result of `map_run`.
+        labels: Labels of the periods by their ids.
+        title: Title of the table.
     """
     shown = [key for key in SCORES if any(key in scores for _, scores in rows)]
     heads = [("from", ""), ("to", ""), ("places", "")]
@@ -382,7 +386,7 @@ def changes_table(rows: Sequence[Compared], labels: Mapping[str, str], title: st
 
 
 def changes_csv(rows: Sequence[Compared]) -> str:
-    """The same with numbers of periods, shares instead of percentages, and all digits."""
+    """Return the rows as CSV: numbers of periods, shares instead of percentages, all digits."""
     columns = ("from", "to", "places", *CLASSES[1:], *SCORES)
     lines = [
         (*made.periods, len(made.xyz), *made.shares().values(), *(scores.get(k) for k in SCORES))

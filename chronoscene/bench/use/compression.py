@@ -1,4 +1,4 @@
-"""The model of a finished run in few bytes, and what that costs in quality.
+"""Compression of the model of a finished run, and its cost in quality.
 
 How finely the numbers are rounded follows from the photos of the training views. With k_c the mean
 squared change of the images per squared step of column c, and N_c its numbers, all steps together
@@ -14,7 +14,7 @@ import json
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,6 +45,7 @@ from chronoscene.compression.positions import Grid, morton
 from chronoscene.errors import CheckpointError, ConfigError
 from chronoscene.images.store import ImageStore
 from chronoscene.io.documents import read_json_document
+from chronoscene.io.log import Log
 from chronoscene.io.staging import sha256_of, staged_folder, write_text_atomic
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import Method
@@ -57,28 +58,27 @@ POSITIONS = ("anchors", "means")
 MIN_ROWS = 256
 """Tensors with fewer rows are not worth a table of symbols."""
 PROBE_VIEWS, LOSS_VIEWS = 9, 24
-"""Training views by which columns are measured, and by which the loss is; see `spread`."""
+"""Training views on which columns, and the loss, are measured; see `spread`."""
 ROUNDS, LEAST = 7, -24.0
-"""Of bisection; where it gives up, as a power of two of the first guess."""
+"""Rounds of bisection; exponent of two, relative to the first guess, at which it gives up."""
 
-Progress = Callable[[str], None]
 Arrays = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Part:
+class _SortedModel:
     """A model of a run, sorted along the Morton curve, and the views that it was trained on."""
 
     run: TrainedRun
     frames: tuple[Frame, ...]
     store: ImageStore
     scratch: Path
-    """With the sorted model; its tensors are replaced to see what others show."""
+    """Folder with the sorted model; its tensors are replaced to render others."""
     tensors: Arrays
     grids: Mapping[str, Grid]
 
     def images(self, tensors: Arrays, frames: tuple[Frame, ...]) -> list[NDArray[np.float32]]:
-        """What the model shows in some views with other tensors."""
+        """Render some views with other tensors."""
         _save(self.scratch, tensors)
         model, run = self.run.load(self.scratch), self.run
         views = [run.view(self.store.camera(f), f.cam_from_world) for f in frames]
@@ -86,7 +86,7 @@ class _Part:
         return [model.render(v, p).rgb for v, p in zip(views, periods, strict=True)]
 
     def rounded(self, rules: Mapping[str, Columns]) -> Arrays:
-        """The tensors as they come out of the file."""
+        """Return the tensors as the compressed file gives them back."""
         tensors = dict(self.tensors)
         for name in tensors.keys() - self.grids.keys():
             tensor = tensors[name]
@@ -98,7 +98,7 @@ class _Part:
         return tensors
 
     def psnr(self, tensors: Arrays) -> float:
-        """Mean over training views."""
+        """Mean PSNR over training views."""
         frames = spread(self.frames, LOSS_VIEWS)
         values = []
         for frame, image in zip(frames, self.images(tensors, frames), strict=True):
@@ -108,16 +108,14 @@ class _Part:
         return float(np.mean(values))
 
 
-def compress_run(
-    run: TrainedRun, scene: Scene, *, max_loss: float | None, progress: Progress
-) -> Path:
-    """Write a run beside another: its models compressed, its test views rendered by them, scored.
+def compress_run(run: TrainedRun, scene: Scene, *, max_loss: float | None, log: Log) -> Path:
+    """Write a run with compressed models beside another, with test views rendered and scored.
 
     Args:
-        run: What is compressed. One model, or one per period.
-        scene: The one that it was trained on.
-        max_loss: How far the PSNR of training views may fall, in dB; None for half floats and LZMA.
-        progress: Called with what is being done.
+        run: The run to compress, with one model or one per period.
+        scene: The scene that it was trained on.
+        max_loss: Largest loss of PSNR on training views in dB; None for half floats and LZMA.
+        log: Called with the name of each step.
 
     Returns:
         The folder of the new run.
@@ -145,8 +143,8 @@ def compress_run(
             with _opened(run, number or 0, frames, store) as opened:
                 rules = None
                 if max_loss is not None:
-                    rules = _fit(opened, max_loss, progress)
-                progress("encode")
+                    rules = _fit(opened, max_loss, log)
+                log("encode")
                 data = encode(opened.tensors, opened.grids, rules)
                 _write(opened.scratch, staged / CHECKPOINT / part, data)
         (staged / SOURCE_FILE).write_bytes((run.folder / SOURCE_FILE).read_bytes())
@@ -154,7 +152,7 @@ def compress_run(
         document["config"]["compressed"] = label
         document["config_hash"] = config_hash(document["config"])
         write_text_atomic(staged / CONFIG_FILE, json.dumps(document, indent=1) + "\n")
-        progress("score")
+        log("score")
         _score(replace(run, folder=staged, _models={}), scene, store, variant, out.parents[2])
     write_summary(out.parents[2])
     return out
@@ -163,7 +161,7 @@ def compress_run(
 @contextmanager
 def _opened(
     run: TrainedRun, period: int, frames: tuple[Frame, ...], store: ImageStore
-) -> Iterator[_Part]:
+) -> Iterator[_SortedModel]:
     model: Method = run.model(period)
     if not hasattr(model, "permute"):
         raise ConfigError(
@@ -181,21 +179,21 @@ def _opened(
         model.permute(np.argsort(morton(grid.codes(stored[name])), kind="stable"))
         model.save(scratch)
         tensors = load_file(scratch / TENSOR_FILE)
-        yield _Part(run, frames, store, scratch, tensors, {name: grid})
+        yield _SortedModel(run, frames, store, scratch, tensors, {name: grid})
 
 
-def _fit(part: _Part, max_loss: float, progress: Progress) -> dict[str, Columns]:
-    """The coarsest rounding by the rule above."""
+def _fit(model: _SortedModel, max_loss: float, log: Log) -> dict[str, Columns]:
+    """Return the coarsest rounding by the rule above."""
     rules = {
         name: Columns.of(_rows(tensor))
-        for name, tensor in part.tensors.items()
-        if tensor.dtype == np.float32 and len(tensor) >= MIN_ROWS and name not in part.grids
+        for name, tensor in model.tensors.items()
+        if tensor.dtype == np.float32 and len(tensor) >= MIN_ROWS and name not in model.grids
     }
     if not rules:  # a toy, whose tensors are all small
         return rules
-    sensitivity = _sensitivity(part, rules, progress)
-    counts = {name: len(part.tensors[name]) for name in rules}
-    before = part.psnr(part.tensors)
+    sensitivity = _sensitivity(model, rules, log)
+    counts = {name: len(model.tensors[name]) for name in rules}
+    before = model.psnr(model.tensors)
 
     def at(level: float) -> dict[str, Columns]:
         found = {}
@@ -208,9 +206,9 @@ def _fit(part: _Part, max_loss: float, progress: Progress) -> dict[str, Columns]
         return found
 
     def allowed(exponent: float) -> bool:
-        return before - part.psnr(part.rounded(at(start * 2**exponent))) <= max_loss
+        return before - model.psnr(model.rounded(at(start * 2**exponent))) <= max_loss
 
-    progress("find the steps")
+    log("find the steps")
     # To begin with, the noise that would lower the PSNR by this much, shared among all numbers.
     error = 10 ** (-before / 10)
     numbers = sum(counts[name] * len(rule.steps) for name, rule in rules.items())
@@ -232,25 +230,25 @@ def _fit(part: _Part, max_loss: float, progress: Progress) -> dict[str, Columns]
 
 
 def _sensitivity(
-    part: _Part, rules: Mapping[str, Columns], progress: Progress
+    model: _SortedModel, rules: Mapping[str, Columns], log: Log
 ) -> dict[str, NDArray[np.float64]]:
-    """k_c of every column, by rounding one after the other."""
-    frames = spread(part.frames, PROBE_VIEWS)
-    plain = part.images(part.tensors, frames)
+    """Measure k_c of every column, by rounding one after the other."""
+    frames = spread(model.frames, PROBE_VIEWS)
+    plain = model.images(model.tensors, frames)
     found = {}
     for name, rule in rules.items():
-        rows = _rows(part.tensors[name])
+        rows = _rows(model.tensors[name])
         found[name] = np.zeros(len(rule.steps))
         rounded = rule.codes(rows)
         exact = rule.turn(rows)
-        progress(f"measure {name}")
+        log(f"measure {name}")
         for c, step in enumerate(rule.steps):
             if step == 0:
                 continue
             one = exact.copy()
             one[:, c] = rounded[:, c] * step
-            tensor = rule.turn_back(one).reshape(part.tensors[name].shape)
-            images = part.images(part.tensors | {name: tensor}, frames)
+            tensor = rule.turn_back(one).reshape(model.tensors[name].shape)
+            images = model.images(model.tensors | {name: tensor}, frames)
             change = [float(np.mean((a - b) ** 2)) for a, b in zip(images, plain, strict=True)]
             found[name][c] = np.mean(change) / float(step) ** 2
     return found
@@ -282,7 +280,7 @@ def _score(run: TrainedRun, scene: Scene, store: ImageStore, variant: str, runs:
 
 
 def spread(frames: Sequence[Frame], count: int) -> tuple[Frame, ...]:
-    """About so many of the frames, evenly spread over those of each period; one at least."""
+    """Choose about so many frames, evenly in each period, at least one."""
     periods = sorted({frame.period for frame in frames})
     chosen: list[Frame] = []
     for period in periods:
@@ -310,7 +308,7 @@ def _write(model: Path, out: Path, data: bytes) -> None:
 
 
 def _describe(model: Path, out: Path, file: str) -> None:
-    """The description of a model that has its tensors in another file."""
+    """Write the description of a model that has its tensors in another file."""
     meta = _meta(model) | {"tensors_sha256": sha256_of(out / file)}
     write_text_atomic(out / META_FILE, json.dumps(meta, indent=2, sort_keys=True) + "\n")
 

@@ -1,7 +1,7 @@
-"""What leaks between periods: test cameras of one period rendered at all others, against the truth.
+"""Leakage between periods: test cameras rendered at all other periods, against ground truth.
 
-A model that cannot tell two periods apart shows a bit of both, or what it learned last. How much of
-that is in a picture is seen where the same camera is known at another period.
+A model that does not separate two periods shows a bit of both, or the one that it learned last. It
+is measured where the true picture of the same camera at another period is known.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ COLUMNS: dict[Key, tuple[str, int]] = {
     (ALL, "depth_rmse"): ("RMSE", 3),
     (ALL, "depth_delta"): ("delta < 1.25", 3),
 }
-"""Heading and decimals of what is measured, in the order of the table."""
+"""Heading and decimals of each measure, in the order of the table."""
 
 
 def measure_leakage(run: TrainedRun, scene: Scene, truth: Path) -> Iterator[list[ViewScore]]:
-    """What one test view after the other shows at each period.
+    """Yield the measures of one test view after the other, rendered at each period.
 
     Args:
-        run: Renders them.
-        scene: Of the run.
+        run: The run.
+        scene: The scene of the run.
         truth: Folder laid out like ``gt/`` of a generated scene; files may be missing.
 
     Raises:
@@ -92,7 +92,7 @@ def _of_view(
 def depth_values(
     depth: NDArray[np.floating], truth: NDArray[np.floating], counted: Mask
 ) -> dict[Key, float]:
-    """Errors of depth, if any is known at the size of the image: it is not resized."""
+    """Return errors of depth, if it is known at the size of the image: it is not resized."""
     if depth.shape != truth.shape or not (truth[counted] > 0).any():
         return {}
     return {(ALL, name): value for name, value in depth_errors(depth, truth, counted).items()}
@@ -101,20 +101,20 @@ def depth_values(
 def pair_values(
     own: Image, other: Image, photo: Image, truth: Image | None, changes: Image, counted: Mask
 ) -> dict[Key, float]:
-    """What two periods of one camera say about each other.
+    """Compare the renders of one camera at two periods.
 
     - ``psnr`` of the other period, where it differs from the own one and where it does not.
     - ``consistency``: PSNR of the two renders against each other where nothing changed, and
       ``consistency_truth``, the same of the two truths, which differ in their light.
     - ``ghosting``: share of the other truth in the render of the own period, where they differ.
-    - ``sensitivity``: what that share grows by when the other period is rendered.
+    - ``sensitivity``: growth of that share when the other period is rendered.
     - ``change_ap``: average precision of the difference between the renders as a change map.
 
     Args:
         own: The render at the period of the photo. [H, W, 3]
         other: The render at the other period. [H, W, 3]
-        photo: What the camera saw. [H, W, 3]
-        truth: What it would see at the other period; None if that is not known. [H, W, 3]
+        photo: The photo of the camera. [H, W, 3]
+        truth: The true picture at the other period; None if it is not known. [H, W, 3]
         changes: Change mask of the two periods. [H, W]
         counted: Pixels that count. [H, W]
     """
@@ -139,12 +139,12 @@ def pair_values(
 
 
 def leakage_table(rows: Iterable[ViewScore], labels: Mapping[str, str], title: str) -> Table:
-    """A row for each pair of periods, mean over its views; then means over the pairs.
+    """Return a table with means over the views of each pair of periods, then over the pairs.
 
     Args:
-        rows: From `measure_leakage`.
-        labels: Of the periods, by their ids.
-        title: Of the table.
+        rows: Result of `measure_leakage`.
+        labels: Labels of the periods by their ids.
+        title: Title of the table.
     """
     cells: dict[tuple[int, int], dict[Key, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:

@@ -1,4 +1,4 @@
-"""Pictures of a finished run, as a folder of PNG files or as one file that plays."""
+"""Pictures of a finished run, as a folder of PNG files or as an animation."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chronoscene.bench.files.predictions import encode_png, to_bytes
-from chronoscene.bench.use.cameras import Shot
+from chronoscene.bench.use.cameras import Viewpoint
 from chronoscene.bench.use.trained_run import TrainedRun
 from chronoscene.errors import ConfigError
 from chronoscene.images.animation import SUFFIXES, write_animation
 from chronoscene.io.staging import staged_folder
 
 
-def check_shots(
-    run: TrainedRun, shots: Sequence[Shot], out: Path, appearance_period: float | None
+def check_viewpoints(
+    run: TrainedRun, viewpoints: Sequence[Viewpoint], out: Path, appearance_period: float | None
 ) -> None:
-    """Find out before long work that it cannot be done.
+    """Check that pictures can be rendered, before long work.
 
     Raises:
-        ConfigError: If no model claims a period, or the colours of another, or a file that plays
-            is to have pictures of several sizes.
+        ConfigError: If the run has no such period, or cannot combine two, or an animation would
+            have pictures of several sizes.
         CheckpointError: If a model is missing.
     """
-    for period in {shot.period for shot in shots}:
+    for period in {viewpoint.period for viewpoint in viewpoints}:
         assert period is not None
         run.check_period(period)
         run.model(period)
     if appearance_period is not None:
         run.check_appearance(appearance_period)
-    sizes = sorted({shot.camera.size for shot in shots})
+    sizes = sorted({viewpoint.camera.size for viewpoint in viewpoints})
     if is_animation(out) and len(sizes) > 1:
         raise ConfigError(
             f"--out {out}",
@@ -43,18 +43,21 @@ def check_shots(
 
 
 def is_animation(out: Path) -> bool:
-    """Whether a path names a file that plays."""
+    """Return True if a path names an animation."""
     return out.suffix.lower() in SUFFIXES
 
 
-def render_shots(
-    run: TrainedRun, shots: Sequence[Shot], *, appearance_period: float | None = None
+def render_viewpoints(
+    run: TrainedRun, viewpoints: Sequence[Viewpoint], *, appearance_period: float | None = None
 ) -> Iterator[NDArray[np.uint8]]:
-    """One picture after the other. [H, W, 3]"""
-    for shot in shots:
-        assert shot.period is not None
+    """Yield one picture after the other. [H, W, 3]"""
+    for viewpoint in viewpoints:
+        assert viewpoint.period is not None
         prediction = run.render(
-            shot.camera, shot.cam_from_world, shot.period, appearance_period=appearance_period
+            viewpoint.camera,
+            viewpoint.cam_from_world,
+            viewpoint.period,
+            appearance_period=appearance_period,
         )
         yield to_bytes(prediction.rgb)
 

@@ -24,7 +24,7 @@ from chronoscene.bench.files.records import (
 )
 from chronoscene.bench.files.source import RunSource, _read_source
 from chronoscene.bench.files.strategies import STRATEGIES, Strategy, period_part
-from chronoscene.bench.score.views import ScoredView, read_views
+from chronoscene.bench.score.views import PredictedView, read_views
 from chronoscene.errors import CheckpointError, ConfigError, SceneError
 from chronoscene.formats import read_scene
 from chronoscene.images.store import ImageStore
@@ -53,7 +53,7 @@ class TrainedRun:
 
     folder: Path
     record: RunRecord
-    """What ``run.json`` holds; for an earlier stage, its periods are those so far."""
+    """Content of ``run.json``; for an earlier stage, its periods are those so far."""
     spec: MethodSpec
     source: RunSource
     config: Any
@@ -77,7 +77,7 @@ class TrainedRun:
     @property
     def uses_period(self) -> bool:
         """True if the period is an input of its models."""
-        return self.strategy.tells(self.spec)
+        return self.strategy.period_is_input(self.spec)
 
     @property
     def is_continuous(self) -> bool:
@@ -270,7 +270,7 @@ class TrainedRun:
         gaussians = model.to_gaussians(self.model_period(period), views)
         return gaussians.transformed(self.training_from_world.inverse())
 
-    def test_views(self) -> Iterator[ScoredView]:
+    def test_views(self) -> Iterator[PredictedView]:
         """Yield the test views with prediction and photo, as bench wrote and scored them.
 
         Neither the model nor the scene is needed.

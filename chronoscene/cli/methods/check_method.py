@@ -30,17 +30,17 @@ def check(name: str) -> None:
     from chronoscene.bench.contract import check_method
 
     look_here_for([name])
-    findings = []
-    for finding in check_method(name):
-        findings.append(finding)
-        if finding.problem is not None:
-            click.secho(f"FAILED  {finding.rule}\n        {finding.problem}", fg="red")
-        elif finding.left_out is not None:
-            click.echo(f"-       {finding.rule}: {finding.left_out}")
+    results = []
+    for result in check_method(name):
+        results.append(result)
+        if result.problem is not None:
+            click.secho(f"FAILED  {result.rule}\n        {result.problem}", fg="red")
+        elif result.left_out is not None:
+            click.echo(f"-       {result.rule}: {result.left_out}")
         else:
-            click.echo(f"ok      {finding.rule}")
-    broken = sum(finding.problem is not None for finding in findings)
-    click.echo(f"{name}: {broken} of {len(findings)} rules broken")
+            click.echo(f"ok      {result.rule}")
+    broken = sum(result.problem is not None for result in results)
+    click.echo(f"{name}: {broken} of {len(results)} rules broken")
     if broken:
         click.get_current_context().exit(SOME_FAILED)
 

@@ -34,9 +34,7 @@ def command(folder: Path, max_loss: float, plain: bool, scene: Path | None, devi
     """
     run = open_run(folder, device=device)
     announce("read the scene")
-    out = compress_run(
-        run, run.scene(scene), max_loss=None if plain else max_loss, progress=announce
-    )
+    out = compress_run(run, run.scene(scene), max_loss=None if plain else max_loss, log=announce)
     before, after = run.record, read_run(out)
     sizes = [record.checkpoint_bytes or 0 for record in (before, after)]
     lines = [f"{sizes[0]:,} bytes -> {sizes[1]:,} bytes, {sizes[1] / sizes[0]:.1%}"]

@@ -7,8 +7,13 @@ from pathlib import Path
 
 import click
 
-from chronoscene.bench.use.cameras import VIEWS, find_shots, with_periods
-from chronoscene.bench.use.rendering import check_shots, is_animation, render_shots, write_pictures
+from chronoscene.bench.use.cameras import VIEWS, find_viewpoints, with_periods
+from chronoscene.bench.use.rendering import (
+    check_viewpoints,
+    is_animation,
+    render_viewpoints,
+    write_pictures,
+)
 from chronoscene.bench.use.trained_run import open_run
 from chronoscene.cli.options import DEVICE, RUN, SCENE, STAGE
 from chronoscene.cli.output import check_file, check_place, report_written
@@ -88,9 +93,9 @@ def command(
         check_place("--out", out)
     periods = () if period is None else run.parse_periods(period)
     appearance = None if appearance_period is None else run.parse_period(appearance_period)
-    shots = with_periods(find_shots(cameras, run, scene, frames), run, periods, frames)
-    check_shots(run, shots, out, appearance)
-    images = render_shots(run, shots, appearance_period=appearance)
-    names = (shot.name for shot in shots)
-    write_pictures(out, names, tracked(images, "render", total=len(shots)), fps=fps)
+    viewpoints = with_periods(find_viewpoints(cameras, run, scene, frames), run, periods, frames)
+    check_viewpoints(run, viewpoints, out, appearance)
+    images = render_viewpoints(run, viewpoints, appearance_period=appearance)
+    names = (viewpoint.name for viewpoint in viewpoints)
+    write_pictures(out, names, tracked(images, "render", total=len(viewpoints)), fps=fps)
     report_written(out)

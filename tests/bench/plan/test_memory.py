@@ -207,10 +207,10 @@ def test_a_training_that_goes_on_with_photos_from_disk_ends_alike(make_scene, se
     folder = tmp_path / "training" / "all"
     for until in (5, 9):
         with pytest.raises(SystemExit):
-            checkpoints = Checkpoints(folder=folder, say=lambda line: None, **common)
+            checkpoints = Checkpoints(folder=folder, log=lambda line: None, **common)
             run(open_store(scene, settings), until, checkpoints=checkpoints)
     assert len(list((tmp_path / "runs" / "photos").iterdir())) == 5
-    checkpoints = Checkpoints(folder=folder, say=lambda line: None, **common)
+    checkpoints = Checkpoints(folder=folder, log=lambda line: None, **common)
     resumed = run(open_store(scene, settings), checkpoints=checkpoints)
     for name, tensor in undisturbed.stored_tensors().items():
         assert tensor.equal(resumed.stored_tensors()[name])

@@ -59,7 +59,8 @@ def test_directions(runs):
     assert directions(STUDY, study_entries(STUDY, runs)) == [
         "plaza, without a: in PSNR [dB] the direction agrees with the published one.",
         "plaza, without b: in PSNR [dB] the direction disagrees with the published one.",
-        "plaza, without c: in PSNR [dB] the direction cannot be told (the interval contains 0).",
+        "plaza, without c: in PSNR [dB] the direction cannot be determined "
+        "(the interval contains 0).",
         "plaza, twice d: nothing is published to compare with.",
     ]
 
@@ -69,9 +70,12 @@ def test_a_row_without_a_result_has_no_direction(runs):
     _, row, *_ = study_table(STUDY, entries).rows
     assert row == ["plaza", "without a", "-", "-", "24.50 (\N{MINUS SIGN}0.50)", "-", "-", "-"]
     without = directions(STUDY, entries)
-    assert without[0] == "plaza, without a: in PSNR [dB] the direction cannot be told (no result)."
+    assert (
+        without[0]
+        == "plaza, without a: in PSNR [dB] the direction cannot be determined (no result)."
+    )
     first = directions(STUDY, study_entries(STUDY, runs | {"full": []}))
-    assert "cannot be told (there is no interval)" in first[0]
+    assert "cannot be determined (there is no interval)" in first[0]
 
 
 @pytest.mark.parametrize(
@@ -80,11 +84,11 @@ def test_a_row_without_a_result_has_no_direction(runs):
         (-0.2, -0.1, False, (-1.0, -0.1), "agrees with the published one"),
         (0.1, 0.2, False, (1.0,), "agrees with the published one"),
         (0.1, 0.2, False, (-1.0,), "disagrees with the published one"),
-        (-0.1, 0.2, True, (-1.0,), "cannot be told (the interval contains 0)"),
-        (0.1, 0.2, True, (-1.0,), "cannot be told (the seeds differ as much)"),
-        (math.nan, math.nan, False, (-1.0,), "cannot be told (there is no interval)"),
-        (0.1, 0.2, False, (-1.0, 1.0), "cannot be told (the published scenes do not agree)"),
-        (0.1, 0.2, False, (0.0,), "cannot be told (the published scenes do not agree)"),
+        (-0.1, 0.2, True, (-1.0,), "cannot be determined (the interval contains 0)"),
+        (0.1, 0.2, True, (-1.0,), "cannot be determined (the seeds differ as much)"),
+        (math.nan, math.nan, False, (-1.0,), "cannot be determined (there is no interval)"),
+        (0.1, 0.2, False, (-1.0, 1.0), "cannot be determined (the published scenes do not agree)"),
+        (0.1, 0.2, False, (0.0,), "cannot be determined (the published scenes do not agree)"),
     ],
 )
 def test_direction_of_a_difference(low, high, tied, published, expected):

@@ -41,7 +41,7 @@ def make(tmp_path):
 
     def make(**changes):
         fields = {"settings": {"seed": 3}, "commit": "abc", "every": 0.0, "keep_last": False}
-        fields |= {"folder": tmp_path / "training" / "all", "start": None, "say": said.append}
+        fields |= {"folder": tmp_path / "training" / "all", "start": None, "log": said.append}
         return Checkpoints(**fields | changes)
 
     make.said = said

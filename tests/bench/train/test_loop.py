@@ -7,27 +7,23 @@ import numpy as np
 import pytest
 import torch
 
-from chronoscene.bench.plan.parts import EXTENT_MARGIN, make_parts
+from chronoscene.bench.plan.parts import make_parts
 from chronoscene.bench.plan.stop import StopRule
 from chronoscene.bench.train.checks import MethodError
 from chronoscene.bench.train.loop import (
     NOT_FINITE_LIMIT,
     PROBE_SHARES,
-    WARM_UP_STEPS,
     DivergedError,
     Stopwatch,
     TrainingError,
-    made_up_set,
     probe_frames,
     render_bytes,
     seed_everything,
     train,
-    warm_up,
 )
 from chronoscene.images.store import ImageStore
 from chronoscene.methods import StepReport, import_object, load_spec
 from chronoscene.metrics.psnr_ssim import psnr
-from chronoscene.scene.geometry import camera_centre
 
 
 @pytest.fixture
@@ -39,30 +35,6 @@ def part(make_scene):
 def toy(name="MeanColour", **options):
     config = import_object("toy_methods:Config")(**options)
     return import_object(f"toy_methods:{name}")(config)
-
-
-class FakeClock:
-    """Stands still but for what the test says."""
-
-    def __init__(self):
-        self.seconds = 100.0
-
-    def __call__(self):
-        return self.seconds
-
-    def takes(self, seconds, function):
-        """The function, which takes this long."""
-
-        def timed(*args, **kwargs):
-            self.seconds += seconds
-            return function(*args, **kwargs)
-
-        return timed
-
-
-@pytest.fixture
-def clock():
-    return FakeClock()
 
 
 def run(method, part, stop, observer=lambda *step: None, **changes):
@@ -286,48 +258,6 @@ def test_the_observer_sees_each_step(part):
 
 def test_the_toys_are_specs():
     assert load_spec("toy_methods:MEAN").period_input == "label"
-
-
-def test_a_method_is_set_up_stepped_and_rendered(monkeypatch, clock):
-    calls = []
-    cls = import_object("toy_methods:MeanColour")
-    step, render = cls.step, cls.render
-    monkeypatch.setattr(cls, "step", lambda *a: (calls.append(a[1]), step(*a))[1])
-    monkeypatch.setattr(cls, "render", lambda *a: (calls.append("render"), render(*a))[1])
-    config = import_object("toy_methods:Config")()
-    spec = load_spec("toy_methods:MEAN")
-    assert warm_up(spec, config, num_periods=3, device="cpu", now=clock) is None
-    assert calls == [*range(WARM_UP_STEPS), "render"]
-
-
-def test_slow_methods_are_cut_short(monkeypatch, clock):
-    steps = []
-    cls = import_object("toy_methods:MeanColour")
-    step = clock.takes(1.25, cls.step)
-    monkeypatch.setattr(cls, "step", lambda *a: (steps.append(1), step(*a))[1])
-    config = import_object("toy_methods:Config")()
-    spec = load_spec("toy_methods:MEAN")
-    assert warm_up(spec, config, num_periods=1, device="cpu", now=clock) is None
-    assert len(steps) == 5  # two that may compile, then three until more than three seconds passed
-
-
-def test_what_goes_wrong_is_a_notice():
-    config = import_object("toy_methods:Config")()
-    notice = warm_up(load_spec("toy_methods:RAISES"), config, num_periods=1, device="cpu")
-    assert "RuntimeError" in notice and "training clock" in notice
-
-
-@pytest.mark.parametrize("periods", [1, 2, 50])
-def test_the_made_up_set_is_a_training_set(periods):
-    train = made_up_set(periods)
-    assert [v.period for v in train.views] == [i // 3 for i in range(3 * periods)]
-    centres = camera_centre(np.stack([v.cam_from_world for v in train.views]))
-    radius = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
-    assert train.camera_extent == pytest.approx(EXTENT_MARGIN * radius)
-    for i, view in enumerate(train.views):
-        assert train.load_image(i).shape == (view.height, view.width, 3)
-        inside = train.points @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
-        assert inside[:, 2].min() > 0.5
 
 
 def test_the_stopwatch_counts_inside_only(clock):

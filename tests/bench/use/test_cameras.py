@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chronoscene.bench.use.cameras import NORMALISED, find_shots, with_periods
+from chronoscene.bench.use.cameras import NORMALISED, find_viewpoints, with_periods
 from chronoscene.bench.use.trained_run import open_run
 from chronoscene.colmap.model import write_model
 from chronoscene.errors import ConfigError, SceneError
@@ -26,25 +26,28 @@ def one_each(trained):
     return open_run(trained["4dgs"])
 
 
-def shots_of(run, source, frames=5):
-    return find_shots(str(source), run, None, frames)
+def viewpoints_of(run, source, frames=5):
+    return find_viewpoints(str(source), run, None, frames)
 
 
 @pytest.mark.parametrize(("source", "count"), [("test", 3), ("all", 8)])
 def test_cameras_of_the_scene_show_their_own_period(run, source, count):
     frames = {f"{f.name}.png": f for f in run.scene().frames}
-    shots = with_periods(shots_of(run, source), run, (), 5)
-    assert len(shots) == count
-    for shot in shots:
-        frame = frames[shot.name]
-        assert shot.period == frame.period and shot.camera.size == frame.camera.size
-        np.testing.assert_array_equal(shot.cam_from_world, frame.cam_from_world)
+    viewpoints = with_periods(viewpoints_of(run, source), run, (), 5)
+    assert len(viewpoints) == count
+    for viewpoint in viewpoints:
+        frame = frames[viewpoint.name]
+        assert viewpoint.period == frame.period and viewpoint.camera.size == frame.camera.size
+        np.testing.assert_array_equal(viewpoint.cam_from_world, frame.cam_from_world)
 
 
 def test_an_orbit_is_in_the_world_and_has_as_many_pictures_as_asked_for(run):
-    shots = shots_of(run, "orbit", 7)
-    assert shots.is_path and [shot.name for shot in shots.shots][-1] == "0006.png"
-    poses = np.stack([shot.cam_from_world for shot in shots.shots])
+    viewpoints = viewpoints_of(run, "orbit", 7)
+    assert (
+        viewpoints.is_path
+        and [viewpoint.name for viewpoint in viewpoints.viewpoints][-1] == "0006.png"
+    )
+    poses = np.stack([viewpoint.cam_from_world for viewpoint in viewpoints.viewpoints])
     cameras = camera_centre(np.stack([f.cam_from_world for f in run.scene().frames]))
     assert np.abs(camera_centre(poses)).max() < 1.5 * np.abs(cameras).max()
 
@@ -53,13 +56,13 @@ def test_a_model_of_colmap_without_distortion_and_at_most_as_wide_as_the_run(run
     frames = run.scene().frames[:2]
     wide = Camera(1, "SIMPLE_RADIAL", 4000, 3000, (3000.0, 2000.0, 1500.0, 0.05))
     write_model(tmp_path, [replace(f, camera=wide) for f in frames], Points.empty())
-    shots = shots_of(run, tmp_path).shots
-    assert [shot.name for shot in shots] == ["a/0.png.png", "a/1.png.png"]
-    for shot, frame in zip(shots, frames, strict=True):
-        assert shot.camera.is_pinhole and shot.camera.width == run.record.max_width
-        np.testing.assert_allclose(shot.cam_from_world, frame.cam_from_world, atol=1e-12)
+    viewpoints = viewpoints_of(run, tmp_path).viewpoints
+    assert [viewpoint.name for viewpoint in viewpoints] == ["a/0.png.png", "a/1.png.png"]
+    for viewpoint, frame in zip(viewpoints, frames, strict=True):
+        assert viewpoint.camera.is_pinhole and viewpoint.camera.width == run.record.max_width
+        np.testing.assert_allclose(viewpoint.cam_from_world, frame.cam_from_world, atol=1e-12)
     with pytest.raises(ConfigError, match="--period: expected a period, or a range"):
-        with_periods(shots_of(run, tmp_path), run, (), 5)
+        with_periods(viewpoints_of(run, tmp_path), run, (), 5)
 
 
 def camera_path(run, **changes):
@@ -74,14 +77,14 @@ def camera_path(run, **changes):
 def test_a_camera_path_of_nerfstudio(run, tmp_path):
     path = tmp_path / "path.json"
     path.write_text(json.dumps(camera_path(run)))
-    shots = shots_of(run, path)
-    assert shots.is_path
+    viewpoints = viewpoints_of(run, path)
+    assert viewpoints.is_path
     focal = 15 / math.tan(math.radians(30))  # of the height
-    for shot, frame in zip(shots.shots, run.scene().frames, strict=False):
-        np.testing.assert_allclose(shot.cam_from_world, frame.cam_from_world, atol=1e-12)
-        assert shot.camera.size == (40, 30)
-        np.testing.assert_allclose(shot.camera.K, [[focal, 0, 20], [0, focal, 15], [0, 0, 1]])
-    periods = [s.period for s in with_periods(shots, run, (0.0, 1.0), 99)]
+    for viewpoint, frame in zip(viewpoints.viewpoints, run.scene().frames, strict=False):
+        np.testing.assert_allclose(viewpoint.cam_from_world, frame.cam_from_world, atol=1e-12)
+        assert viewpoint.camera.size == (40, 30)
+        np.testing.assert_allclose(viewpoint.camera.K, [[focal, 0, 20], [0, focal, 15], [0, 0, 1]])
+    periods = [s.period for s in with_periods(viewpoints, run, (0.0, 1.0), 99)]
     assert periods == [0.0, 0.5, 1.0]
 
 
@@ -90,8 +93,8 @@ def test_times_of_a_camera_path_are_periods(run, tmp_path):
     for camera, time in zip(document["camera_path"], (0, 0.25, 1), strict=True):
         camera["render_time"] = time
     (tmp_path / "path.json").write_text(json.dumps(document))
-    shots = with_periods(shots_of(run, tmp_path / "path.json"), run, (), 5)
-    assert [shot.period for shot in shots] == [0, 0.25, 1]
+    viewpoints = with_periods(viewpoints_of(run, tmp_path / "path.json"), run, (), 5)
+    assert [viewpoint.period for viewpoint in viewpoints] == [0, 0.25, 1]
 
 
 def test_the_frame_of_a_model_of_nerfstudio_is_undone(run, tmp_path):
@@ -106,8 +109,8 @@ def test_the_frame_of_a_model_of_nerfstudio_is_undone(run, tmp_path):
     (tmp_path / "path.json").write_text(json.dumps(document))
     transform = np.hstack([turn, shift[:, None]]).tolist()
     (tmp_path / NORMALISED).write_text(json.dumps({"transform": transform, "scale": scale}))
-    (shot,) = shots_of(run, tmp_path / "path.json").shots
-    np.testing.assert_allclose(shot.cam_from_world, frame.cam_from_world, atol=1e-12)
+    (viewpoint,) = viewpoints_of(run, tmp_path / "path.json").viewpoints
+    np.testing.assert_allclose(viewpoint.cam_from_world, frame.cam_from_world, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -126,31 +129,31 @@ def test_the_frame_of_a_model_of_nerfstudio_is_undone(run, tmp_path):
 def test_a_camera_path_that_is_none(run, tmp_path, changes, message):
     (tmp_path / "path.json").write_text(json.dumps(camera_path(run, **changes)))
     with pytest.raises(SceneError, match=message):
-        shots_of(run, tmp_path / "path.json")
+        viewpoints_of(run, tmp_path / "path.json")
 
 
 def test_a_scene_without_test_views(run, monkeypatch):
     scene = run.scene()
     frames = [replace(frame, split="train") for frame in scene.frames]
     monkeypatch.setattr(type(run), "scene", lambda self, root: scene.with_frames(frames))
-    assert len(shots_of(run, "all").shots) == 8
+    assert len(viewpoints_of(run, "all").viewpoints) == 8
     with pytest.raises(ConfigError, match="--cameras test: expected a scene with test views"):
-        shots_of(run, "test")
+        viewpoints_of(run, "test")
 
 
 def test_a_source_that_is_none(run):
     with pytest.raises(ConfigError, match="--cameras tent: expected test, all, orbit, the folder"):
-        shots_of(run, "tent")
+        viewpoints_of(run, "tent")
 
 
 def test_each_camera_that_stands_shows_the_whole_range(run):
-    shots = with_periods(shots_of(run, "test"), run, (1.0, 0.0), 3)
-    assert [shot.period for shot in shots] == [1.0, 0.5, 0.0] * 3
-    names = [shot.name for shot in shots]
+    viewpoints = with_periods(viewpoints_of(run, "test"), run, (1.0, 0.0), 3)
+    assert [viewpoint.period for viewpoint in viewpoints] == [1.0, 0.5, 0.0] * 3
+    names = [viewpoint.name for viewpoint in viewpoints]
     assert names[:2] == ["a/2.png/0000.png", "a/2.png/0001.png"] and len(set(names)) == 9
 
 
 @pytest.mark.parametrize(("ends", "expected"), [((0, 1), [0, 0, 1, 1]), ((1, 0), [1, 1, 0, 0])])
 def test_a_range_of_whole_periods_gives_each_an_equal_share(one_each, ends, expected):
-    shots = with_periods(shots_of(one_each, "orbit", 4), one_each, ends, 99)
-    assert [shot.period for shot in shots] == expected
+    viewpoints = with_periods(viewpoints_of(one_each, "orbit", 4), one_each, ends, 99)
+    assert [viewpoint.period for viewpoint in viewpoints] == expected

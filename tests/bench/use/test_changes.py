@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from chronoscene.bench.use.cameras import Shot
+from chronoscene.bench.use.cameras import Viewpoint
 from chronoscene.bench.use.changes import (
     CLASSES,
     GEOMETRY,
@@ -35,14 +35,14 @@ LOW, HIGH = np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 2.0])  # The box
 GROUND, PATCH = np.array([0.5, 0.4, 0.3]), np.array([0.2, 0.3, 0.6])
 
 
-def shots(period, centres):
+def viewpoints(period, centres):
     up = np.array([0.0, 1.0, 0.0])
     poses = [look_at(np.array(c), np.array([*c[:2], 0]), up=up) for c in centres]
-    return [Shot("", CAMERA, pose, period) for pose in poses]
+    return [Viewpoint("", CAMERA, pose, period) for pose in poses]
 
 
 ROUND = [(x, y, 10.0) for x in (-4.0, 0.0, 4.0) for y in (-4.0, 0.0, 4.0)]
-BOTH = shots(0, ROUND) + shots(1, ROUND)
+BOTH = viewpoints(0, ROUND) + viewpoints(1, ROUND)
 
 
 def renderer(*, boxes=(), patches=(), lights=(1.0, 1.0)):
@@ -50,8 +50,8 @@ def renderer(*, boxes=(), patches=(), lights=(1.0, 1.0)):
 
     def render(camera, cam_from_world, period):
         centre = camera_centre(cam_from_world)
-        shot = Shot("", camera, cam_from_world, period)
-        rays = back_project(np.ones((camera.height, camera.width)), shot) - centre
+        viewpoint = Viewpoint("", camera, cam_from_world, period)
+        rays = back_project(np.ones((camera.height, camera.width)), viewpoint) - centre
         depth = -centre[2] / rays[:, 2]
         if period in boxes:
             with np.errstate(divide="ignore"):
@@ -94,7 +94,7 @@ def test_a_box_of_one_period(period):
 
 
 def test_the_score_is_the_change_of_depth_at_the_usual_distance():
-    straight = shots(0, [(0.0, 0.0, 10.0)] * 15) + shots(1, [(0.0, 0.0, 10.0)] * 15)
+    straight = viewpoints(0, [(0.0, 0.0, 10.0)] * 15) + viewpoints(1, [(0.0, 0.0, 10.0)] * 15)
     made = map_changes(renderer(boxes=[1]), straight, (0, 1))
     top = np.isclose(made.xyz[:, 2], 2)
     np.testing.assert_allclose(made.geometry[top], 10 * (1 / 8 - 1 / 10) * 30 / 35)
@@ -124,7 +124,7 @@ def test_a_change_of_light_is_none():
 
 def test_what_one_period_does_not_see_is_unknown():
     left, right = ([(x + side, y, 10.0) for x, y, _ in ROUND] for side in (-7.0, 7.0))
-    made = map_changes(renderer(boxes=[0]), shots(0, left) + shots(1, right), (0, 1))
+    made = map_changes(renderer(boxes=[0]), viewpoints(0, left) + viewpoints(1, right), (0, 1))
     unknown = named(made, "unknown")
     assert unknown[np.abs(made.xyz[:, 0]) > 4].all()
     assert named(made, "gone")[np.isclose(made.xyz[:, 2], 2) & (made.xyz[:, 0] > 0)].all()
@@ -134,7 +134,7 @@ def test_what_one_period_does_not_see_is_unknown():
 
 def test_periods_that_see_nothing_in_common():
     made = map_changes(
-        renderer(), shots(0, [(-50.0, 0.0, 10.0)]) + shots(1, [(50.0, 0.0, 10.0)]), (0, 1)
+        renderer(), viewpoints(0, [(-50.0, 0.0, 10.0)]) + viewpoints(1, [(50.0, 0.0, 10.0)]), (0, 1)
     )
     assert named(made, "unknown").all()
 
@@ -145,7 +145,7 @@ def test_a_period_that_shows_nothing():
     with pytest.raises(ConfigError, match="period 1: expected surfaces in its training views"):
         map_changes(lambda c, pose, p: empty if p else render(c, pose, p), BOTH, (0, 1))
     with pytest.raises(ConfigError, match="period 1: expected surfaces"):
-        map_changes(render, shots(0, ROUND), (0, 1))
+        map_changes(render, viewpoints(0, ROUND), (0, 1))
 
 
 def test_behind_what_is_gone_there_may_be_nothing():
@@ -161,9 +161,9 @@ def test_a_view_has_the_scores_of_both_surfaces():
     """Seen from above, the box hides what is unchanged below it."""
     render = renderer(boxes=[1], patches=[1])
     made = map_changes(render, BOTH, (0, 1))
-    (shot,) = shots(0, [(0.5, 0.5, 10.0)])
-    shown = [render(shot.camera, shot.cam_from_world, period) for period in (0, 1)]
-    scores = made.view_scores(shot, shown)
+    (viewpoint,) = viewpoints(0, [(0.5, 0.5, 10.0)])
+    shown = [render(viewpoint.camera, viewpoint.cam_from_world, period) for period in (0, 1)]
+    scores = made.view_scores(viewpoint, shown)
     changed = shown[0].depth - shown[1].depth > 1
     assert scores.shape == (48, 64, 2)
     assert (scores[changed, 0] > GEOMETRY).mean() > 0.95

@@ -101,14 +101,14 @@ def test_a_run_in_stages_is_refused(copied):
     run = open_run(copied("chronogs"))
     staged = replace(run, record=run.record.model_copy(update={"strategy": "sequential"}))
     with pytest.raises(ConfigError, match=r"one model, or one per period.*sequential"):
-        compress_run(staged, run.scene(), max_loss=None, progress=print)
+        compress_run(staged, run.scene(), max_loss=None, log=print)
 
 
 def test_a_loss_that_half_floats_exceed_is_refused(copied, monkeypatch):
     monkeypatch.setattr("chronoscene.bench.use.compression.MIN_ROWS", 4)
     falling = count(30, -1)
-    part = "chronoscene.bench.use.compression._Part.psnr"
+    part = "chronoscene.bench.use.compression._SortedModel.psnr"
     monkeypatch.setattr(part, lambda self, tensors: next(falling))
     run = open_run(copied("chronogs"))
     with pytest.raises(ConfigError, match=r"--max-loss 0.5: .*allow more"):
-        compress_run(run, run.scene(), max_loss=0.5, progress=print)
+        compress_run(run, run.scene(), max_loss=0.5, log=print)

@@ -7,7 +7,7 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from chronoscene.bench.contract import Finding
+from chronoscene.bench.contract import RuleResult
 from chronoscene.cli import cli
 from chronoscene.cli.methods.check_method import SKELETON
 from chronoscene.errors import ConfigError, SceneError
@@ -71,9 +71,9 @@ def test_the_example_is_short_installs_and_is_found(tmp_path):
 
 def test_rules_are_told_line_by_line(monkeypatch):
     def findings(name):
-        yield Finding("It trains")
-        yield Finding("It resumes", left_out="the method cannot be resumed")
-        yield Finding("It saves", problem="save: expected two files, found one")
+        yield RuleResult("It trains")
+        yield RuleResult("It resumes", left_out="the method cannot be resumed")
+        yield RuleResult("It saves", problem="save: expected two files, found one")
 
     monkeypatch.setattr("chronoscene.bench.contract.check_method", findings)
     result = run("check-method", "mine")

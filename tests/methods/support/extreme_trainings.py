@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.bench.contract import tiny_training
 from chronoscene.bench.plan.parts import Part, effective_strategy, make_parts
 from chronoscene.bench.plan.stop import StopRule
+from chronoscene.bench.train import painted_balls
 from chronoscene.bench.train.loop import render_bytes, train
 from chronoscene.errors import ChronoSceneError
 from chronoscene.methods import Method, MethodSpec, StepReport, build_config, import_object
@@ -108,7 +108,7 @@ class Photos:
 
 def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
     """The scene as the method gets it."""
-    centres, radii, colors = tiny_training.make_balls(extreme.periods)
+    centres, radii, colors = painted_balls.make_balls(extreme.periods)
     offset = np.array([extreme.origin, 0.0, 0.0])
     painted_size = min(extreme.size, 1.0)
     repeats = round(extreme.size / painted_size)
@@ -118,18 +118,18 @@ def make_part(extreme: Extreme, spec: MethodSpec) -> Part:
         period, number = divmod(index, extreme.photos)
         name = f"{period:02}_{number}.png"
         share = (number + period / max(extreme.periods, 2)) / extreme.photos
-        view = tiny_training.make_view(2 * np.pi * share, period, name)
+        view = painted_balls.make_view(2 * np.pi * share, period, name)
         if not extreme.cameras_apart:
             # Turned a little about the centre of the first one.
-            view = tiny_training.make_view(0.3 * share, period, name)
-            first = tiny_training.make_view(0.0, 0, "").cam_from_world
+            view = painted_balls.make_view(0.3 * share, period, name)
+            first = painted_balls.make_view(0.0, 0, "").cam_from_world
             view.cam_from_world[:3, 3] = (
                 view.cam_from_world[:3, :3] @ first[:3, :3].T @ first[:3, 3]
             )
         K = np.diag([painted_size, painted_size, 1.0]) @ view.K
         width, height = round(view.width * painted_size), round(view.height * painted_size)
         view = dataclasses.replace(view, K=K, width=width, height=height)
-        image = tiny_training.paint(view, centres, radii, colors[period])
+        image = painted_balls.paint(view, centres, radii, colors[period])
         if extreme.level is not None:
             image[:] = extreme.level
         images[name] = image.repeat(repeats, axis=0).repeat(repeats, axis=1)

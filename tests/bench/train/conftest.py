@@ -1,0 +1,27 @@
+"""A clock that tests set."""
+
+import pytest
+
+
+class FakeClock:
+    """Stands still but for what the test says."""
+
+    def __init__(self):
+        self.seconds = 100.0
+
+    def __call__(self):
+        return self.seconds
+
+    def takes(self, seconds, function):
+        """The function, which takes this long."""
+
+        def timed(*args, **kwargs):
+            self.seconds += seconds
+            return function(*args, **kwargs)
+
+        return timed
+
+
+@pytest.fixture
+def clock():
+    return FakeClock()
