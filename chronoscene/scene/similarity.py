@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import combinations, islice
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from chronoscene.arrays import Array
+from chronoscene.arrays import Array, Ints
 from chronoscene.scene.geometry import pose_from_rotation_translation
 
 NUM_SAMPLES = 200
@@ -127,6 +128,23 @@ def fit(source: Array, target: Array, *, mirror: bool = False) -> Similarity | N
     return Similarity(matrix, centre_target - matrix @ centre_source)
 
 
+def fit_samples(
+    source: Array,
+    target: Array,
+    samples: Iterable[Ints],
+    cost: Callable[[Similarity], float],
+    *,
+    mirror: bool = False,
+) -> tuple[Similarity | None, float]:
+    """Fit a similarity to each sample of rows; the one of least cost, and its cost."""
+    best, least = None, np.inf
+    for rows in samples:
+        candidate = fit(source[rows], target[rows], mirror=mirror)
+        if candidate is not None and (value := cost(candidate)) < least:
+            best, least = candidate, value
+    return best, least
+
+
 def fit_robustly(
     source: Array, target: Array, *, axes: int = 3, mirror: bool = False
 ) -> tuple[Similarity, Array] | None:
@@ -145,14 +163,12 @@ def fit_robustly(
     """
     rng = np.random.default_rng(0)
     judges = rng.permutation(len(source))[:MAX_JUDGED]
-    best, smallest = None, np.inf
-    for _ in range(NUM_SAMPLES):
-        triple = rng.choice(len(source), 3, replace=False)
-        candidate = fit(source[triple], target[triple], mirror=mirror)
-        if candidate is not None:
-            median = np.median(_distances(candidate, source[judges], target[judges], axes))
-            if median < smallest:
-                best, smallest = candidate, median
+    triples = (rng.choice(len(source), 3, replace=False) for _ in range(NUM_SAMPLES))
+
+    def median(candidate: Similarity) -> float:
+        return float(np.median(_distances(candidate, source[judges], target[judges], axes)))
+
+    best, _ = fit_samples(source, target, triples, median, mirror=mirror)
     for _ in range(3):
         if best is None:
             return None
@@ -181,16 +197,13 @@ def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | No
         return None
     used = np.ones(count, bool)
     if count >= 6:  # of five, two beside the triple could agree by chance
-        best, smallest = None, np.inf
-        for triple in islice(combinations(range(count), 3), MAX_TRIPLES):
-            rows = list(triple)
-            if _thickness(source[rows]) < MIN_THICKNESS:
-                continue
-            if (trial := fit(source[rows], target[rows])) is not None:
-                # The three points of the trial fit by construction.
-                middle = float(np.sort(_distances(trial, source, target, 3))[(count + 3) // 2])
-                if middle < smallest:
-                    best, smallest = trial, middle
+        triples = map(np.array, islice(combinations(range(count), 3), MAX_TRIPLES))
+        wide = (rows for rows in triples if _thickness(source[rows]) >= MIN_THICKNESS)
+
+        def middle(trial: Similarity) -> float:  # the points of the triple fit by construction
+            return float(np.sort(_distances(trial, source, target, 3))[(count + 3) // 2])
+
+        best, smallest = fit_samples(source, target, wide, middle)
         if best is not None:
             distance = _distances(best, source, target, 3)
             spread = 3 * SIGMA * max(smallest, 1e-4 * float(np.ptp(target, axis=0).max()))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chronoscene.scene.similarity import Sim3, fit
+from chronoscene.scene.similarity import Sim3, Similarity, fit, fit_samples
 
 TRIALS = 1_000
 MAX_JUDGED = 4_000  # Matches by which a trial is judged
@@ -86,17 +86,18 @@ def align_by_points(pairs: PointPairs, *, seed: int = 0) -> Alignment | None:
     judges = np.arange(len(pairs))
     if len(judges) > MAX_JUDGED:
         judges = rng.choice(len(judges), MAX_JUDGED, replace=False)
-    judged, judged_weights = pairs.select(judges), weights[judges]
-    best, most = None, 0.0
-    for _ in range(TRIALS):
-        sample = draw(rng, members, 3) if len(members) >= 3 else rng.choice(len(pairs), 3, False)
-        candidate = fit_sim3(pairs.source[sample], pairs.target[sample])
-        if candidate is None:
-            continue
-        agreed = float(judged_weights[residual_pixels(candidate, judged) < SEARCH_PIXELS].sum())
-        if agreed > most:
-            best, most = candidate, agreed
-    return None if best is None else _polish(pairs, best, cell)
+    judged = pairs.select(judges)
+    samples = (
+        draw(rng, members, 3) if len(members) >= 3 else rng.choice(len(pairs), 3, False)
+        for _ in range(TRIALS)
+    )
+
+    def disagreement(candidate: Similarity) -> float:
+        near = residual_pixels(candidate.to_sim3(), judged) < SEARCH_PIXELS
+        return -float(weights[judges][near].sum())
+
+    best, _ = fit_samples(pairs.source, pairs.target, samples, disagreement)
+    return None if best is None else _polish(pairs, best.to_sim3(), cell)
 
 
 def _polish(pairs: PointPairs, best: Sim3, cell: NDArray[np.int64]) -> Alignment | None:
