@@ -24,11 +24,11 @@ from chronoscene.io.staging import leads_out
 from chronoscene.metrics.registry import all_metrics
 
 MAX_BYTES = 50_000_000
-"""Of an entry. A thousand views with ten metrics and ten seeds have less than ten million."""
+"""Largest entry. A thousand views with ten metrics and ten seeds have less than ten million."""
 MAX_VALUE = 1e3
-"""Of a metric, without its sign."""
+"""Largest absolute value of a metric."""
 MAX_COST = 1e15
-"""Of any other number."""
+"""Largest absolute value of any other number."""
 KEY = (
     *("scene", "scene_hash", "split_hash", "method", "strategy", "preset", "variant"),
     *("config_hash", "max_width", "device"),
@@ -50,7 +50,7 @@ class ScoredView(BaseModel):
     view: str
     period: int
     sha256: Sha256
-    """Of the predicted image."""
+    """Hash of the predicted image."""
     values: dict[str, float]
 
 
@@ -92,7 +92,7 @@ class EntryRun(BaseModel):
 
     @property
     def rows(self) -> list[ViewScore]:
-        """The values as rows of a run."""
+        """Values as rows of a run."""
         return [
             ViewScore(v.view, v.period, v.period, ALL, metric, value)
             for v in self.views
@@ -101,7 +101,7 @@ class EntryRun(BaseModel):
 
 
 class MeasuredEntry(BaseModel):
-    """What a method reaches on a scene, in one setting and on one machine."""
+    """Results of a method on a scene, in one setting and on one machine."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -120,12 +120,12 @@ class MeasuredEntry(BaseModel):
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What tells the entry from all others."""
+        """Values that differ between entries."""
         return tuple(getattr(self.runs[0].record, name) for name in KEY)
 
     @property
     def records(self) -> list[RunRecord]:
-        """The runs, with their rows."""
+        """Runs, with their rows."""
         return [run.record.model_copy(update={"rows": run.rows}) for run in self.runs]
 
 
@@ -162,7 +162,7 @@ def read_entries(folder: Path) -> dict[Path, MeasuredEntry]:
 
 
 def refused(place: Path, found: str) -> ConfigError:
-    """The error of an entry, or of a run for one, that is not taken."""
+    """Make the error of an entry, or of a run for one, that is refused."""
     return ConfigError(
         place,
         expected="a measured entry, as chronoscene submit writes it",
@@ -172,14 +172,14 @@ def refused(place: Path, found: str) -> ConfigError:
 
 
 def reason_of(error: ValidationError) -> str:
-    """The first problem, and where it is."""
+    """Describe the first problem, and its place."""
     first = error.errors(include_url=False, include_input=False)[0]
     where = ".".join(map(str, first["loc"])) or "the file"
     return f"{first['msg'].removeprefix('Value error, ')} ({where[:200]})"
 
 
 def _leaves(value: Any) -> Iterator[Any]:
-    """All texts and numbers, the keys of mappings too."""
+    """Yield all texts and numbers, also the keys of mappings."""
     if isinstance(value, dict):
         yield from value
         value = value.values()
@@ -207,7 +207,7 @@ def _check_numbers(leaves: Iterable[Any], largest: float) -> None:
 
 
 def _agree(claimed: Any, computed: Any) -> bool:
-    """Whether two nested mappings or sequences have the same keys, and numbers but for rounding."""
+    """Return True if nested values have equal keys and, but for rounding, equal numbers."""
     if isinstance(claimed, dict):
         return claimed.keys() == computed.keys() and all(
             _agree(claimed[name], computed[name]) for name in claimed

@@ -1,4 +1,4 @@
-"""Which runs may stand side by side in one ranking.
+"""Groups of runs that are ranked together.
 
 Runs are compared if they are of the same scene and photos, test views and width, and had the same
 effort: the same time on the same device where there was a budget, else the same preset. Within such
@@ -15,7 +15,7 @@ from chronoscene.bench.files.records import RunRecord
 
 
 class Setting(NamedTuple):
-    """What the runs of a group have in common."""
+    """Common settings of the runs of a group."""
 
     scene: str
     scene_hash: str
@@ -25,7 +25,7 @@ class Setting(NamedTuple):
 
 
 def effort_of(run: RunRecord) -> str:
-    """What a run was allowed to spend, in words."""
+    """Describe the effort that a run was allowed."""
     given = [part for part in run.variant.split(",") if part.startswith(("budget=", "iterations="))]
     for part in given:
         if part.startswith("budget="):
@@ -34,12 +34,12 @@ def effort_of(run: RunRecord) -> str:
 
 
 def setting_of(run: RunRecord) -> Setting:
-    """The setting of a run."""
+    """Return the setting of a run."""
     return Setting(run.scene, run.scene_hash, run.split_hash, run.max_width, effort_of(run))
 
 
 def comparable(runs: Iterable[RunRecord]) -> dict[Setting, list[RunRecord]]:
-    """Runs by their setting, those of a scene side by side."""
+    """Group runs by their setting, those of a scene side by side."""
     groups: dict[Setting, list[RunRecord]] = {}
     for run in runs:
         groups.setdefault(setting_of(run), []).append(run)

@@ -13,11 +13,11 @@ from chronoscene.figures.fronts import Mark, Panel, panel_svg
 from chronoscene.metrics.registry import metric_info
 
 LEAST_RATIO = 1.1
-"""Of the largest cost and the smallest one in a plot."""
+"""Smallest ratio of the largest cost to the smallest one in a plot."""
 
 
 class Point(NamedTuple):
-    """A method: its number in the legend, what it costs, and what it reaches."""
+    """A method: its number in the legend, its cost and its quality."""
 
     number: int
     cost: float

@@ -16,14 +16,14 @@ from chronoscene.formats.shared.grouping import natural_key
 from leaderboard.entries import EntryRun, MeasuredEntry
 
 VIEWS = 3
-"""Of each period, spread over its test views."""
+"""Views of each period, spread over its test views."""
 WIDTH = 640
 """In pixels, at most."""
 QUALITY = 82
 
 
 def find_runs(folders: Iterable[Path], entries: Iterable[MeasuredEntry]) -> dict[Path, EntryRun]:
-    """Folders of runs whose predictions are those of an entry, of the first seed of each entry."""
+    """Find the folders of runs with the predictions of the first seed of an entry."""
     wanted = {
         frozenset((view.view, view.sha256) for view in entry.runs[0].views): entry.runs[0]
         for entry in entries
@@ -41,7 +41,7 @@ def _same(first: RunRecord, second: RunRecord) -> bool:
 
 
 def gallery(runs: Mapping[Path, str], folder: Path, place: str) -> dict[str, Any]:
-    """Copy pictures of a scene, and say what they show.
+    """Copy pictures of a scene, and describe them.
 
     Args:
         runs: Folder of each run, and the label of its method.
@@ -93,7 +93,7 @@ def gallery(runs: Mapping[Path, str], folder: Path, place: str) -> dict[str, Any
 
 
 def _own(predictions: Path) -> list[ImageEntry]:
-    """Images of the period in which their camera stood."""
+    """List the images of the period in which their camera stood."""
     images = read_manifest(predictions).images
     return [i for i in images if i.rendered_period == i.camera_period]
 

@@ -52,8 +52,8 @@ def write_site(
     """Write the site.
 
     Args:
-        entries: What was measured.
-        published: What a paper printed, to stand beside it.
+        entries: Measured results.
+        published: Printed results, to stand beside them.
         out: A new or empty folder.
         runs: Folders of runs, for the pictures of the entries that were made of them.
 
@@ -117,13 +117,13 @@ class _Site:
         (self.folder / file).write_text(page + "\n", encoding="utf-8", newline="\n")
 
     def title_of(self, method: str) -> str:
-        """Name of a method in tables."""
+        """Return the name of a method in tables."""
         printed = {name: title for title, name in self.published.methods.items()}
         measured = {record.method: record.title for record in self.records}
         return measured.get(method) or printed.get(method, method)
 
     def _parts(self) -> Iterator[dict[str, Any]]:
-        """Tables of the first page: PSNR of methods by scenes, one per part of a dataset."""
+        """Yield tables of the first page: PSNR of methods by scenes, one per part of a dataset."""
         groups = {self.parts.get(scene, "") for scene in self.scenes}
         for group in sorted(groups):  # other scenes, which were measured, come first
             scenes = [scene for scene in self.scenes if self.parts.get(scene, "") == group]
@@ -152,7 +152,7 @@ class _Site:
     def _groups(
         self, scenes: Iterable[str]
     ) -> Iterator[tuple[Setting, list[RunRecord], DataFrame]]:
-        """What was measured on some scenes in each setting: runs, and their summary."""
+        """Yield the runs on some scenes in each setting, and their summary."""
         chosen = [r for r in self.records if self.scene_of[r.scene] in {*scenes}]
         for setting, runs in comparable(chosen).items():
             yield setting, runs, summarise(runs)
@@ -200,7 +200,7 @@ class _Site:
         )
 
     def _measured(self, like: RunRecord, of_paper: dict[str, float]) -> Iterator[dict[str, Any]]:
-        """What a method reached in a setting, a row for each variant.
+        """Yield a row for each variant of a method in a setting.
 
         Args:
             like: One of the runs.
@@ -224,7 +224,7 @@ class _Site:
 
 
 def spec_of(method: str) -> MethodSpec | None:
-    """The spec of an installed method; nothing that an entry names is imported."""
+    """Load the spec of an installed method; nothing that an entry names is imported."""
     return load_spec(method) if method in installed_methods() else None
 
 
@@ -275,7 +275,7 @@ def _group(
 
 
 def _table(columns: Sequence[Column], measured: DataFrame, printed: DataFrame) -> dict[str, Any]:
-    """A table for the page of a scene."""
+    """Make a table for the page of a scene."""
     return {
         "columns": [title for _, _, title in columns],
         "lower": [q in COSTS or not metric_info(q).higher_is_better for q, _, _ in columns],
@@ -286,7 +286,7 @@ def _table(columns: Sequence[Column], measured: DataFrame, printed: DataFrame) -
 
 
 def _rows(part: DataFrame, columns: Sequence[Column], *, by: str = "label") -> list[dict[str, Any]]:
-    """Rows of a table, one per label or per scene."""
+    """Make the rows of a table, one per label or per scene."""
     rows = []
     for name, own in part.groupby(by, sort=False):
         found = {(row.quantity, row.column): row for row in own.itertuples()}
@@ -297,7 +297,7 @@ def _rows(part: DataFrame, columns: Sequence[Column], *, by: str = "label") -> l
 
 
 def _cell(row: Any) -> dict[str, Any]:
-    """A cell of a table, from a row of `summarise`."""
+    """Make a cell of a table from a row of `summarise`."""
     interval = ""
     if math.isfinite(row.low) and row.column == "macro":
         interval = f"{in_unit(row.quantity, row.low)} to {in_unit(row.quantity, row.high)}"
@@ -311,22 +311,22 @@ def _cell(row: Any) -> dict[str, Any]:
 
 
 def _order(cell: dict[str, Any] | None) -> float:
-    """Key that sorts the largest first, and what is missing last."""
+    """Sort the largest first, and missing values last."""
     return -cell["value"] if cell else math.inf
 
 
 def _falling(item: tuple[Any, dict[str, Any]]) -> float:
-    """Key that sorts rows of cells by their first."""
+    """Sort rows of cells by their first."""
     return _order(next(iter(item[1].values())))
 
 
 def _worst_last(item: tuple[Path, RunRecord]) -> float:
-    """Key that sorts runs by PSNR, where it was computed."""
+    """Sort runs by PSNR, if it was computed."""
     return -item[1].aggregates["macro"].get("psnr", -math.inf)
 
 
 def _file_names(names: Iterable[str]) -> dict[str, str]:
-    """A file name for each name: plain, and no two alike."""
+    """Make a file name for each name: plain, and no two alike."""
     found: dict[str, str] = {}
     for name in names:
         plain = re.sub(r"[^a-z0-9]+", "-", name.casefold()).strip("-")[:60] or "x"

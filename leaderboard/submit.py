@@ -1,4 +1,4 @@
-"""Finished runs into measured entries."""
+"""Measured entries from finished runs."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _runs_of(folder: Path) -> list[Path]:
 
 
 def entry_run(folder: Path) -> EntryRun:
-    """What an entry holds of a run. Errors as for `submit`."""
+    """Make the part of an entry from a run. Errors as for `submit`."""
     record = read_run(folder)
     predictions = folder / PREDICTIONS
     manifest = read_manifest(predictions)

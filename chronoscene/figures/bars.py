@@ -58,7 +58,7 @@ def _name(count: SceneCount) -> str:
 def _draw_panel(
     axes: Any, what: str, values: Sequence[Sequence[int]], colors: Sequence[str]
 ) -> None:
-    """One bar per scene, its periods side by side, and their sum at the end."""
+    """Draw one bar per scene, its periods side by side, with their sum at the end."""
     canvas.quiet_axes(axes)
     for side in ("top", "right", "left"):
         axes.spines[side].set_visible(False)
@@ -87,7 +87,7 @@ def _draw_panel(
 
 
 def _short(largest: int) -> Callable[[float, int], str]:
-    """Numbers of an axis, all in the same unit."""
+    """Return the formatter of an axis, with one unit for all numbers."""
     for size, sign in ((1_000_000, "M"), (10_000, "k")):
         if largest >= size:
             unit = 1000 if sign == "k" else size
@@ -96,7 +96,7 @@ def _short(largest: int) -> Callable[[float, int], str]:
 
 
 def _period_names(counts: Sequence[SceneCount], periods: int) -> list[str]:
-    """What the legend calls the periods: by their names if those are the same in all scenes."""
+    """Name the periods in the legend: by their titles if those are equal in all scenes."""
     names = []
     for i in range(periods):
         titles = {period_title(i, p.label, p.date) for c in counts for p in c.periods if p.id == i}
@@ -107,7 +107,7 @@ def _period_names(counts: Sequence[SceneCount], periods: int) -> list[str]:
 
 
 def _legend(figure: Any, names: Sequence[str], colors: Sequence[str], top: float) -> None:
-    """Names of the periods above the panels; of many only some."""
+    """Draw the names of the periods above the panels; of many only some."""
     fitting = int((WIDTH - 0.3) / (0.45 + 0.075 * max(map(len, names))))
     step = -(-len(colors) // min(MAX_LEGEND_ENTRIES, max(fitting, 1)))
     shown = range(0, len(colors), step)

@@ -1,4 +1,4 @@
-"""What all figures share: look, colours of periods, legend, and files that appear complete."""
+"""Common parts of figures: look, colours of periods, legend, files and pages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GRID = "#dddddd"
 
 
 def new_figure(width: float, height: float) -> Any:
-    """A matplotlib figure of a size in inches, without pyplot and its global state."""
+    """Make a matplotlib figure of a size in inches, without pyplot and its global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -38,7 +38,7 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def plain(text: str) -> str:
-    """A name as matplotlib shows it: no formula, and nothing that it cannot draw."""
+    """Escape a name for matplotlib: no formula, and no character that it cannot draw."""
     return printable(text).replace("$", r"\$")
 
 
@@ -93,7 +93,7 @@ def inline_svg(figure: Any, label: str, titles: Mapping[str, str]) -> Markup:
 
 
 def add_legend(figure: Any, entries: Sequence[tuple[str, str]], **place: Any) -> None:
-    """Names of periods beside squares of their colours; ``place`` is for `Figure.legend`."""
+    """Add names beside squares of their colours; ``place`` is for `Figure.legend`."""
     from matplotlib.patches import Patch
 
     figure.legend(
@@ -110,7 +110,7 @@ def add_legend(figure: Any, entries: Sequence[tuple[str, str]], **place: Any) ->
 
 
 def quiet_axes(axes: Any) -> None:
-    """Thin grey frame and ticks, so that the data come first."""
+    """Draw frame and ticks thin and grey."""
     for spine in axes.spines.values():
         spine.set_color("#999999")
         spine.set_linewidth(0.6)
@@ -119,7 +119,7 @@ def quiet_axes(axes: Any) -> None:
 
 
 def _choose_fonts(figure: Any) -> None:
-    """Fonts of this machine for names that the usual one lacks letters for."""
+    """Choose fonts of this machine for letters that the usual one lacks."""
     from matplotlib.font_manager import fontManager
     from matplotlib.text import Text
 
@@ -150,7 +150,7 @@ _RAMP = ("#440154", "#46327e", "#365c8d", "#277f8e", "#1fa187", "#4ac16d", "#a0d
 
 
 def period_colors(periods: int) -> list[str]:
-    """Colours of the periods as ``#rrggbb``: four or eight that are far apart, else a ramp."""
+    """Return colours as ``#rrggbb``: four or eight that are far apart, else a ramp."""
     for palette in (FOUR, EIGHT):
         if periods <= len(palette):
             return list(palette[:periods])
@@ -161,5 +161,5 @@ def period_colors(periods: int) -> list[str]:
 
 
 def rgb_of(color: str) -> NDArray[np.float64]:
-    """Red, green and blue, 0..255, of ``#rrggbb``. [3]"""
+    """Return red, green and blue, 0..255, of ``#rrggbb``. [3]"""
     return np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)], np.float64)

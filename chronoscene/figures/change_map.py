@@ -1,4 +1,4 @@
-"""Where the periods of a scene differ, seen from above: a panel for each pair of them."""
+"""Map of changes, seen from above: a panel for each pair of periods."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COLORS: Mapping[str, str] = {
     "gone": canvas.FOUR[0],
     "new": canvas.FOUR[2],
 }
-"""Of the classes of places, which are numbered in this order."""
+"""Colours of the classes of places, which are numbered in this order."""
 FAINT = 2  # Classes that the others are drawn over
 WIDTH, GAP = 3.4, 0.15  # Of a panel, and between panels, in inches
 LEFT, RIGHT, BOTTOM, TOP, TITLE = 0.62, 0.15, 0.5, 0.62, 0.26
@@ -36,15 +36,15 @@ class ChangePanel:
     xyz: Array
     """Places. [N, 3]"""
     classes: NDArray[np.int64]
-    """Of the places. [N]"""
+    """Classes of the places. [N]"""
 
 
 def draw_changes(cloud: Cloud, panels: Sequence[ChangePanel], path: Path) -> None:
     """Draw all pairs at one scale.
 
     Args:
-        cloud: Of the scene; says which part of it is shown.
-        panels: What is drawn.
+        cloud: Points of the scene, which decide what part of it is shown.
+        panels: The pairs.
         path: File to write; the suffix says the format.
     """
     box = shown_box(cloud, cameras=False)

@@ -15,12 +15,12 @@ from chronoscene.stats.counts import assign_points, period_name
 from chronoscene.stats.measures import robust_range
 
 MARGIN = 0.03  # Of the longest edge, on every side
-MIN_EDGE = 0.18  # Of the longest edge: a flat scene gets room above and below it
+MIN_EDGE = 0.18  # Of the longest edge: a flat scene gets space above and below it
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """What is shown of the world."""
+    """Box of the world that is shown."""
 
     low: Array
     """[3]"""
@@ -32,25 +32,25 @@ class Box:
         return self.high - self.low
 
     def holds(self, xyz: Array) -> NDArray[np.bool_]:
-        """Which places are inside. [n, 3] -> [n]"""
+        """Return True for places inside. [n, 3] -> [n]"""
         with np.errstate(invalid="ignore"):
             return np.asarray(((xyz >= self.low) & (xyz <= self.high)).all(axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """What is drawn of a scene."""
+    """Points and cameras of a scene."""
 
     name: str
     unit: str
     labels: tuple[str, ...]
-    """Of the periods; a number where nothing else is known."""
+    """Names of the periods; a number where nothing else is known."""
     xyz: Array
     """[P, 3]"""
     period: NDArray[np.int64]
-    """That each point is counted in; -1 for points that no image sees. [P]"""
+    """Period that each point is counted in; -1 for points that no image sees. [P]"""
     centres: Array
-    """Of the cameras. [C, 3]"""
+    """Camera centres. [C, 3]"""
     directions: Array
     """Viewing directions. [C, 3]"""
     tops: Array
@@ -60,7 +60,7 @@ class Cloud:
 
 
 def cloud_of(scene: Scene) -> Cloud:
-    """The points and cameras of a scene."""
+    """Collect the points and cameras of a scene."""
     poses = np.stack([f.cam_from_world for f in scene.frames])
     return Cloud(
         name=printable(scene.name),
@@ -76,7 +76,7 @@ def cloud_of(scene: Scene) -> Cloud:
 
 
 def shown_box(cloud: Cloud, *, cameras: bool) -> Box:
-    """Robust limits of the points (and of the cameras), wide enough for a readable panel."""
+    """Find robust limits of the points (and of the cameras), wide enough for a readable panel."""
     good = (cloud.period >= 0) & np.isfinite(cloud.xyz).all(axis=1)
     corners = robust_range(cloud.xyz[good]) if good.any() else np.zeros((0, 3))
     if cameras or not len(corners):

@@ -36,7 +36,7 @@ class Window:
 
 
 def count_points(xy: Array, group: NDArray[np.int64], groups: int, window: Window) -> Counts:
-    """Points per pixel, the first row at the top.
+    """Count points per pixel, the first row at the top.
 
     Args:
         xy: Positions; those outside of the window are not counted. [n, 2]
@@ -59,7 +59,7 @@ def count_points(xy: Array, group: NDArray[np.int64], groups: int, window: Windo
 
 
 def dot_radius(points: int, occupied: int) -> int:
-    """Radius of the dots in pixels: few points stay visible, many do not merge.
+    """Choose the radius of the dots in pixels: few points stay visible, many do not merge.
 
     Args:
         points: Number of points.
@@ -90,7 +90,7 @@ def _disc(radius: int) -> NDArray[np.bool_]:
 
 
 def shade(counts: Counts, colors: Sequence[str], *, seed: int = 0) -> NDArray[np.uint8]:
-    """Counts to colours; equal counts and seeds give equal bytes.
+    """Turn counts into colours; equal counts and seeds give equal bytes.
 
     Args:
         counts: Points of each group per pixel. [G, H, W]
@@ -115,7 +115,7 @@ def shade(counts: Counts, colors: Sequence[str], *, seed: int = 0) -> NDArray[np
 
 
 def opacity(counts: Counts) -> Counts:
-    """From `MIN_OPACITY` for one point to 1 for as many as the densest pixels have. [n]"""
+    """Compute opacities from `MIN_OPACITY` for one point to 1 in the densest pixels. [n]"""
     dark = max(float(np.quantile(counts, DARK_QUANTILE)), 2.0)
     grown = MIN_OPACITY + (1 - MIN_OPACITY) * np.log(counts) / np.log(dark)
     return np.clip(grown, MIN_OPACITY, 1.0)

@@ -33,7 +33,7 @@ class Mark:
     y: float
     x_spread: float
     y_spread: float
-    """Half of the bars on both sides."""
+    """Half lengths of the error bars."""
     on_front: bool
 
 
@@ -45,9 +45,9 @@ class Panel:
     x_label: str
     y_label: str
     marks: Sequence[Mark]
-    """Those on the front from one end of the front to the other, the cheapest first."""
+    """Marks; those on the front from one end to the other, the cheapest first."""
     lower_is_better: bool
-    """Of the quality; its axis is then drawn downwards."""
+    """True if the axis of the quality is drawn downwards."""
 
 
 def draw_fronts(
@@ -137,15 +137,15 @@ def _draw_panel(axes: Any, panel: Panel, colors: Mapping[int, str]) -> None:
 
 
 def _limits(marks: Sequence[Mark]) -> tuple[float, float]:
-    """Of a logarithmic axis: room at both ends, and at least a factor of two between them."""
+    """Limit a logarithmic axis: margins at both ends, and at least a factor of two between them."""
     low = min(max(mark.x - mark.x_spread, mark.x / 2) for mark in marks)
     high = max(mark.x + mark.x_spread for mark in marks)
-    room = max(0.14 * log(high / low), (log(2) - log(high / low)) / 2)
-    return low / exp(room), high * exp(room)
+    margin = max(0.14 * log(high / low), (log(2) - log(high / low)) / 2)
+    return low / exp(margin), high * exp(margin)
 
 
 def _draw_mark(axes: Any, mark: Mark, color: str) -> None:
-    """A disc with its number; white with a coloured rim off the front."""
+    """Draw a disc with its number; white with a coloured rim off the front."""
     face = color if mark.on_front else "white"
     # Those on the front lie above the others, and each disc with its number above the one before.
     level = 2 + mark.on_front + mark.number / 1e4
@@ -174,7 +174,7 @@ def _draw_mark(axes: Any, mark: Mark, color: str) -> None:
 
 
 def _ink(ground: str) -> str:
-    """Black or white, whichever is read more easily on a colour."""
+    """Choose black or white, whichever is read more easily on a colour."""
     if ground == "white":
         return "black"
     luma = float(canvas.rgb_of(ground) @ (0.299, 0.587, 0.114))

@@ -75,7 +75,7 @@ def draw_cloud(cloud: Cloud, path: Path, *, cameras: bool = False) -> None:
 
 
 def readable(cloud: Cloud, box: Box) -> tuple[Cloud, Box, tuple[str, ...]]:
-    """Cloud and box in numbers that fit beside an axis, and the names of the axes, which say how.
+    """Express cloud and box in numbers that fit beside an axis, and name the axes accordingly.
 
     Places far from the origin are moved, and very small or large scenes scaled.
     """
@@ -98,7 +98,7 @@ def readable(cloud: Cloud, box: Box) -> tuple[Cloud, Box, tuple[str, ...]]:
 
 
 def legend_names(labels: Sequence[str]) -> list[str]:
-    """What the legend calls the periods."""
+    """Name the periods in the legend."""
     if all(label == str(i) for i, label in enumerate(labels)):
         return [f"Period {i}" if len(labels) <= 8 else str(i) for i in range(len(labels))]
     names = [label if label == str(i) else f"{i}: {label}" for i, label in enumerate(labels)]
@@ -106,7 +106,7 @@ def legend_names(labels: Sequence[str]) -> list[str]:
 
 
 def _dot_radius(cloud: Cloud, box: Box, scale: float, planes: Iterable[Plane]) -> int:
-    """Radius of the dots in pixels, by the room for them in the middle one of the panels."""
+    """Choose the radius of the dots in pixels by the occupied area of the median panel."""
     shown = cloud.xyz[cloud.period >= 0]
     shown = shown[box.holds(shown)]
     if not len(shown):
@@ -120,7 +120,7 @@ def _dot_radius(cloud: Cloud, box: Box, scale: float, planes: Iterable[Plane]) -
 def draw_points(
     axes: Any, cloud: Cloud, box: Box, plane: Plane, size: Size, colors: Sequence[str], dots: int
 ) -> Any:
-    """The density of the points, as an image. ``dots``: their radius in pixels."""
+    """Draw the density of the points, as an image. ``dots``: their radius in pixels."""
     canvas.quiet_axes(axes)
     dpi = DPI if dots else DPI / CELL
     pixels = [max(1, round(edge * dpi)) for edge in size]
@@ -134,7 +134,7 @@ def draw_points(
 
 
 def _draw_cameras(axes: Any, cloud: Cloud, box: Box, plane: Plane, colors: Sequence[str]) -> None:
-    """A dot with a line in the viewing direction for each camera, on white."""
+    """Draw a dot with a line in the viewing direction for each camera, on white."""
     from matplotlib.collections import LineCollection
 
     crowd = float(np.clip((300 / len(cloud.centres)) ** 0.5, 0.4, 1.0))
@@ -152,7 +152,7 @@ def _draw_cameras(axes: Any, cloud: Cloud, box: Box, plane: Plane, colors: Seque
 
 
 def label_axes(axes: Any, plane: Plane, names: Sequence[str], size: Size) -> None:
-    """Ticks and names on the outer sides; panels that share an axis name it once.
+    """Put ticks and names on the outer sides; panels that share an axis name it once.
 
     There are as many ticks as fit.
     """
@@ -179,7 +179,7 @@ def _number(value: float, _: int) -> str:
 
 
 def _write_texts(figure: Any, cloud: Cloud, box: Box, corner: tuple[float, float]) -> None:
-    """The title, and in the corner what is shown and what not."""
+    """Write the title, and the numbers of points and cameras in the corner."""
     width, height = figure.get_size_inches()
     left, top = LEFT / width, 1 - 0.1 / height
     longest = int((width - LEFT) / 0.095)

@@ -36,7 +36,7 @@ def write_page(scene: Scene, path: Path, *, max_points: int = MAX_POINTS) -> Non
 
 
 def page_of(cloud: Cloud, rgb: NDArray[np.uint8], *, max_points: int = MAX_POINTS) -> str:
-    """The text of the page; see `write_page`. ``rgb``: colours of the points. [P, 3]"""
+    """Make the page; see `write_page`. ``rgb``: colours of the points. [P, 3]"""
     data = json.dumps(_page_data(cloud, rgb, max_points), ensure_ascii=False)
     # No text can end the script: JSON has "<" inside of strings only.
     page = render_page("viewer/page", title=cloud.name, data=Markup(data.replace("<", "\\u003c")))
@@ -44,7 +44,7 @@ def page_of(cloud: Cloud, rgb: NDArray[np.uint8], *, max_points: int = MAX_POINT
 
 
 def _page_data(cloud: Cloud, rgb: NDArray[np.uint8], max_points: int) -> dict[str, Any]:
-    """What the script draws. Coordinates are relative to the middle of the scene."""
+    """Collect the data of the script. Coordinates are relative to the middle of the scene."""
     good = np.flatnonzero((cloud.period >= 0) & np.isfinite(cloud.xyz).all(axis=1))
     shown = np.random.default_rng(0).permutation(good)[:max_points]
     # By period, in random order within: any first part of a period stands for all of it.
@@ -79,7 +79,7 @@ def _base64(array: NDArray[Any]) -> str:
 
 
 def home_view(cloud: Cloud, middle: Array) -> Array:
-    """Axes of the first view, right, up and towards the viewer: obliquely from above. [3, 3]
+    """Find the axes of the first view, right, up and towards the viewer: from above. [3, 3]
 
     Models need not know what is up. It is taken as the direction in which the points spread
     least, towards the cameras: right for anything that stands on the ground.

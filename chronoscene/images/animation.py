@@ -16,7 +16,7 @@ from chronoscene.io.staging import replacing
 SUFFIXES = (".mp4", ".webp")
 
 _BT709 = 1  # Its number in the tables of H.264
-_CRF = "18"  # Of x264: hardly to be told from the images
+_CRF = "18"  # Of x264: hardly visible
 _WEBP_QUALITY = 70
 
 

@@ -48,11 +48,11 @@ _DECODE_ERRORS = (
 
 
 Photo = tuple[NDArray[np.uint8], NDArray[np.bool_] | None]
-"""What `load_photo` gives: colours, and where they count. [H, W, 3], [H, W]"""
+"""Colours, and a mask of those that count; see `load_photo`. [H, W, 3], [H, W]"""
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of the stored pixels; reads only the header.
+    """Read width and height of the stored pixels from the header.
 
     Raises:
         ImageError: If the file is missing or not an image.
@@ -106,12 +106,12 @@ def load_photo(
 
 
 def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Where a mask file is not 0; errors as for `load_grey`. [H, W]"""
+    """Read a mask file: True where it is not 0; errors as for `load_grey`. [H, W]"""
     return load_grey(path, size) != 0
 
 
 def load_grey(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """The values of a mask file. [H, W]
+    """Read the values of a mask file. [H, W]
 
     Raises:
         ImageError: If it is missing, damaged, not of one channel, or of another width and height.
@@ -137,7 +137,7 @@ def _orientation(image: Image.Image) -> int:
 
 
 def _decode(image: Image.Image) -> Image.Image:
-    """The pixels as stored. Pillow turns TIFF files while it decodes them; that is undone."""
+    """Decode the pixels as stored; the rotation of TIFF files by Pillow is undone."""
     orientation = _orientation(image) if image.format == "TIFF" else 1
     image.load()
     if orientation == 1:
@@ -154,19 +154,19 @@ def _to_rgb(image: Image.Image) -> Image.Image:
 
 
 def is_transparent(image: Image.Image) -> bool:
-    """Whether it has an alpha channel, or one transparent colour."""
+    """Return True for an alpha channel, or one transparent colour."""
     return "transparency" in image.info or image.mode in ("RGBA", "LA", "PA", "RGBa", "La")
 
 
 def _opaque(image: Image.Image) -> NDArray[np.bool_] | None:
-    """Where alpha is one half or more; None where there is none. [H, W]"""
+    """Return True where alpha is one half or more; None if there is none. [H, W]"""
     if image.mode.startswith("I") or not is_transparent(image):
         return None
     return np.asarray(image.convert("RGBA"))[..., 3] >= 128
 
 
 def _from_16_bit(image: Image.Image) -> Image.Image:
-    """Grey values 0..65535 as 0..255, rounded to the nearest."""
+    """Convert grey values 0..65535 to 0..255, rounded to the nearest."""
     values = np.asarray(image).astype(np.int64)
     if values.size and not 0 <= values.min() <= values.max() <= 65535:
         raise ValueError("grey values outside 0..65535")

@@ -26,7 +26,7 @@ from chronoscene.io.staging import replacing, sha256_of
 _FORMAT = 1  # Of the files; to be raised when they, or the rules of decoding, change
 _HEADERS = 2048  # Bytes that a file has besides its arrays, at most
 UNREADABLE = (OSError, ValueError, KeyError, EOFError, RuntimeError, BadZipFile)
-"""What damaged files raise."""
+"""Exceptions that damaged files raise."""
 _NO_MASK = np.zeros((0, 0), bool)  # In files of photos that count everywhere
 
 
@@ -34,7 +34,7 @@ class DiskCache:
     """Photos at one size each, in a folder. Thread-safe."""
 
     def __init__(self, folder: Path, limit: int) -> None:
-        """Read and write nothing yet.
+        """Set up a cache; read and write nothing yet.
 
         Args:
             folder: For this purpose alone; made when it is needed.
@@ -49,7 +49,7 @@ class DiskCache:
         self._lock = threading.Lock()
 
     def load(self, path: Path, mask_path: Path | None, *, size: tuple[int, int]) -> Photo:
-        """The result of `load_photo`, with its arguments and errors."""
+        """Return the result of `load_photo`, with its arguments and errors."""
         try:
             file = self._file(path, mask_path, size)
         except OSError:
@@ -61,7 +61,7 @@ class DiskCache:
         return photo
 
     def _file(self, path: Path, mask_path: Path | None, size: tuple[int, int]) -> Path:
-        """Where the photo is, or would be; its content is looked at once."""
+        """Return the file of a photo, whose content is hashed once."""
         place = path, mask_path, size
         if place not in self._files:
             contents = sha256_of(path), sha256_of(mask_path) if mask_path else None
@@ -76,14 +76,14 @@ class DiskCache:
         with self._lock:
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)
-                if self._make_room(_HEADERS + image.nbytes + mask.nbytes):
+                if self._free(_HEADERS + image.nbytes + mask.nbytes):
                     with replacing(file) as partial, partial.open("wb") as stream:
                         np.savez(stream, image=image, mask=mask)
             except (OSError, DiskFullError):
                 return  # the photo is decoded again when it is needed again
 
-    def _make_room(self, size: int) -> bool:
-        """Delete files for one of this size; whether it has room."""
+    def _free(self, size: int) -> bool:
+        """Delete old files for a new one of this size; return True if it fits."""
         files = files_of(self.folder)
         total = sum(stat.st_size for stat in files.values())
         for path, stat in sorted(files.items(), key=lambda item: item[1].st_mtime):
@@ -95,7 +95,7 @@ class DiskCache:
 
 
 def files_of(folder: Path) -> dict[Path, os.stat_result]:
-    """The files of a cache, without those that another process deletes meanwhile."""
+    """List the files of a cache, without those that another process deletes meanwhile."""
     files = {}
     for path in folder.glob("*"):
         with suppress(FileNotFoundError):
@@ -104,7 +104,7 @@ def files_of(folder: Path) -> dict[Path, os.stat_result]:
 
 
 def _read(file: Path, size: tuple[int, int]) -> Photo | None:
-    """A photo of this size; None if it is not there or damaged, which its check sums show."""
+    """Read a photo of this size; None if it is absent or damaged, which its check sums show."""
     try:
         os.utime(file)  # It is in use
         with np.load(file) as arrays:

@@ -1,4 +1,4 @@
-"""What cameras and drones write into their photos: when, where, with which lens; orientation tags.
+"""Metadata of photos by cameras and drones: time, place, lens, orientation.
 
 Nothing is trusted: whatever is absent, damaged or absurd is None. Only the header of a file is
 read.
@@ -38,7 +38,7 @@ _DATE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class DroneData:
-    """What DJI drones add in XMP."""
+    """Data that DJI drones add in XMP."""
 
     relative_altitude: float | None = None
     """Metres above the take-off point, by barometer."""
@@ -51,7 +51,7 @@ class ExifData:
     """Metadata of a photo; None for what is missing."""
 
     date: datetime | None = None
-    """When it was taken, by the clock of the camera, without a time zone."""
+    """Time of capture by the clock of the camera, without a time zone."""
     latitude: float | None = None
     """Degrees, north positive (WGS 84)."""
     longitude: float | None = None
@@ -72,12 +72,12 @@ class ExifData:
 
     @property
     def has_position(self) -> bool:
-        """Whether latitude and longitude are known."""
+        """True if latitude and longitude are known."""
         return self.latitude is not None and self.longitude is not None
 
 
 def read_exif(path: Path) -> ExifData:
-    """Metadata in the header of a photo; empty for a file that is not an image. Never raises."""
+    """Read the metadata of a photo; empty for a file that is not an image. Never raises."""
     try:
         with warnings.catch_warnings(), Image.open(path) as image:
             warnings.simplefilter("ignore")
@@ -87,7 +87,7 @@ def read_exif(path: Path) -> ExifData:
 
 
 def exif_of(image: Image.Image) -> ExifData:
-    """Metadata in the header of an open image. Never raises."""
+    """Read the metadata of an open image. Never raises."""
     try:
         tags = Image.Image.getexif(image)  # the one of PNG files would decode the pixels
         if not tags and "xmp" not in image.info:
@@ -98,7 +98,7 @@ def exif_of(image: Image.Image) -> ExifData:
 
 
 def taken_at(path: Path, exif: ExifData) -> datetime | None:
-    """When a photo was taken: from EXIF, else from a date at the start of its file name."""
+    """Return the time of capture: from EXIF, else from a date at the start of the file name."""
     if exif.date is not None:
         return exif.date
     found = re.match(r"((?:19|20)\d{2})[-_]?(\d{2})[-_]?(\d{2})(?!\d)", path.name, re.ASCII)
@@ -109,7 +109,7 @@ def taken_at(path: Path, exif: ExifData) -> datetime | None:
 
 
 def capture_times(images: Path, names: Iterable[str]) -> dict[str, datetime | None]:
-    """When each photo in a folder was taken, by name; None where nobody knows."""
+    """Return the time of capture of each photo in a folder, by name; None if unknown."""
     return {name: taken_at(images / name, read_exif(images / name)) for name in names}
 
 
@@ -149,7 +149,7 @@ def _parse(tags: Image.Exif, drone: DroneData | None) -> ExifData:
 
 
 def _drone(xmp: Any) -> DroneData | None:
-    """DJI's attributes, found by name: untrusted XMP is not given to an XML parser."""
+    """Find DJI's attributes by name: untrusted XMP is not given to an XML parser."""
     if not isinstance(xmp, bytes) or b"drone-dji:" not in xmp[:MAX_XMP_BYTES]:
         return None
     text = xmp[:MAX_XMP_BYTES].decode("utf-8", "replace")
@@ -168,7 +168,7 @@ def _drone(xmp: Any) -> DroneData | None:
 
 
 def _date(value: Any) -> datetime | None:
-    """Date and time in the form of Exif, or in variants that other programs write.
+    """Parse date and time in the form of Exif, or in variants that other programs write.
 
     Midnight where the time of day is missing or impossible. Fractions of a second and time zones
     are ignored: clocks of cameras are not that accurate.
@@ -187,7 +187,7 @@ def _date(value: Any) -> datetime | None:
 
 
 def _gps_date(gps: Mapping[int, Any]) -> datetime | None:
-    """Date and time of a GPS fix, in UTC."""
+    """Parse date and time of a GPS fix, in UTC."""
     date, time = _date(gps.get(GPS.GPSDateStamp)), gps.get(GPS.GPSTimeStamp)
     if date is None or not isinstance(time, tuple | list) or len(time) != 3:
         return date
@@ -198,7 +198,7 @@ def _gps_date(gps: Mapping[int, Any]) -> datetime | None:
 
 
 def _degrees(value: Any, ref: Any, negative: str, limit: float) -> float | None:
-    """Degrees, minutes and seconds as one signed number."""
+    """Combine degrees, minutes and seconds in one signed number."""
     if not isinstance(value, tuple | list) or not 1 <= len(value) <= 3:
         return None
     parts = [_number(part) for part in value]
@@ -241,7 +241,7 @@ def _text(value: Any) -> str | None:
 
 
 def set_upright(data: bytes) -> bytes | None:
-    """The same JPEG with orientation 1 and no pixel touched; None if there is nothing to change.
+    """Return a JPEG with orientation 1 and equal pixels; None if there is nothing to change.
 
     Pillow would rewrite all metadata and lose what it does not know.
     """
@@ -252,7 +252,7 @@ def set_upright(data: bytes) -> bytes | None:
 
 
 def _orientation_values(data: bytes) -> Iterator[tuple[int, str]]:
-    """Offset of the 16 bits of each orientation tag in a main directory, and their byte order."""
+    """Yield the offset of the 16 bits of each orientation tag, and their byte order."""
     for start, tiff in _exif_segments(data):
         order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
         if order is None:
@@ -270,7 +270,7 @@ def _orientation_values(data: bytes) -> Iterator[tuple[int, str]]:
 
 
 def _exif_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Offset and content of the TIFF data in each Exif segment of a JPEG."""
+    """Yield offset and content of the TIFF data in each Exif segment of a JPEG."""
     at = 2 if data[:2] == b"\xff\xd8" else len(data)
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] != _START_OF_SCAN:
         end = at + 2 + struct.unpack_from(">H", data, at + 2)[0]

@@ -22,17 +22,17 @@ _REACH = 2.0
 
 
 def mask_name(name: str) -> str:
-    """Path below ``masks/`` of the mask of an image, by the image's path below ``images/``."""
+    """Return the path below ``masks/`` of the mask of an image, by its path below ``images/``."""
     return f"{name}.png"
 
 
 def mask_place(name: str) -> str:
-    """The same below the folder of the scene."""
+    """Return the path of the mask of an image below the folder of the scene."""
     return f"{MASKS}/{mask_name(name)}"
 
 
 def find_masks(parent: Path, names: Iterable[str]) -> dict[str, Path]:
-    """The mask files of the images with these names, in the folder of masks below ``parent``."""
+    """Find the mask files of images by their names, in the folder of masks below ``parent``."""
     folder = parent / MASKS
     if not folder.is_dir():
         return {}
@@ -40,7 +40,7 @@ def find_masks(parent: Path, names: Iterable[str]) -> dict[str, Path]:
 
 
 def resize_mask(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """The mask of an image that Pillow's bicubic filter resizes. [H, W] -> [H', W']
+    """Resize a mask like its image, by Pillow's bicubic filter. [H, W] -> [H', W']
 
     A pixel counts if all pixels count that its colour is made of, so nothing of what is ignored
     remains in the pixels that count.

@@ -46,14 +46,14 @@ Progress = Callable[[int, int], None]
 
 
 def evaluation_size(width: int, height: int, max_width: int = MAX_WIDTH) -> tuple[int, int]:
-    """Width and height in pixels after the resize rule."""
+    """Apply the resize rule to width and height in pixels."""
     if width <= max_width:
         return width, height
     return max_width, max(1, height * max_width // width)
 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
-    """The camera of the same image, resized; each axis is scaled by its exact ratio.
+    """Resize a camera with its image; each axis is scaled by its exact ratio.
 
     Where truncation makes the two ratios differ, a model with one focal length turns into the same
     model with two.
@@ -101,7 +101,7 @@ class ImageStore:
         decoders: int = 1,
         disk: DiskCache | None = None,
     ) -> None:
-        """Decode nothing yet.
+        """Set up the store; decode nothing yet.
 
         Args:
             scene: Where the images are.
@@ -126,15 +126,15 @@ class ImageStore:
 
     @property
     def cached_bytes(self) -> int:
-        """Bytes that the cache takes now."""
+        """Bytes in the cache."""
         return self._bytes
 
     def camera(self, frame: Frame) -> Camera:
-        """Camera of a frame at the evaluation size."""
+        """Return the camera of a frame at the evaluation size."""
         return resize_camera(frame.camera, *evaluation_size(*frame.camera.size, self._max_width))
 
     def load(self, frame: Frame) -> NDArray[np.uint8]:
-        """Image of a frame at the evaluation size. Shared: do not write to it.
+        """Return the image of a frame at the evaluation size. Shared: do not write to it.
 
         Returns:
             RGB. [H, W, 3]
@@ -145,7 +145,7 @@ class ImageStore:
         return self._photo(frame)[0]
 
     def load_mask(self, frame: Frame) -> NDArray[np.bool_] | None:
-        """Where the image of a frame counts, None where all of it does; otherwise as `load`.
+        """Return the mask of the pixels of a frame that count, None if all do; otherwise as `load`.
 
         A resized pixel counts if all pixels of the file count that its colour is made of. [H, W]
         """
@@ -157,11 +157,11 @@ class ImageStore:
         That is the first one and as many as the decoders may be ahead, but no more than fit into
         memory. An image that cannot be decoded raises its error when it is loaded.
         """
-        room = self._limit
+        free = self._limit
         with self._lock:
             for frame in frames[: 1 + self._ahead]:
-                room -= self.bytes_of(frame)
-                if room < 0:
+                free -= self.bytes_of(frame)
+                if free < 0:
                     break
                 if frame.name in self._cache:
                     self._cache.move_to_end(frame.name)  # it must not leave before it is used
@@ -169,7 +169,7 @@ class ImageStore:
                     self._coming[frame.name] = self._decoders.submit(self._fetch, frame)
 
     def bytes_of(self, frame: Frame) -> int:
-        """Memory of the image of a frame and of its mask file, as the cache has them."""
+        """Return the memory of the image of a frame and of its mask file in the cache."""
         width, height = evaluation_size(*frame.camera.size, self._max_width)
         return width * height * (4 if frame.name in self._scene.masks else 3)
 
@@ -213,7 +213,7 @@ class ImageStore:
 
 
 def _mapped(array: NDArray[Any]) -> NDArray[Any]:
-    """A copy in pages of its own, which go back to the system with it.
+    """Copy an array to pages of its own, which go back to the system with it.
 
     Blocks that decoders and libraries free in between leave holes that the allocator keeps: with
     them, photos took 1.3 times the memory of their pixels.

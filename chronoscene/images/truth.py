@@ -33,10 +33,10 @@ SUFFIXES: dict[Kind, str] = {
 
 
 def truth_place(kind: Kind, view: str, other: int | None = None) -> str:
-    """Path of a file below the folder of the truth.
+    """Return the path of a file below the folder of the truth.
 
     Args:
-        kind: What it holds.
+        kind: Content of the file.
         view: Name of the frame.
         other: The period it shows, or compares the view with; None for that of the photo.
     """
@@ -45,7 +45,7 @@ def truth_place(kind: Kind, view: str, other: int | None = None) -> str:
 
 
 def load_changes(path: Path, size: tuple[int, int], max_width: int) -> NDArray[np.uint8]:
-    """A change mask at the size of the evaluation. [H, W]
+    """Read a change mask at the size of the evaluation. [H, W]
 
     A pixel of a resized mask is unchanged if all pixels are that its colour is made of, and shows a
     change of appearance if none of them shows one of geometry.
@@ -75,7 +75,7 @@ def load_changes(path: Path, size: tuple[int, int], max_width: int) -> NDArray[n
 def changed_at_all(
     folder: Path, view: str, others: Iterable[int], size: tuple[int, int], max_width: int
 ) -> NDArray[np.bool_] | None:
-    """Where a view differs from at least one other period; None if it has no mask. [H, W]
+    """Read where a view differs from at least one other period; None without a mask. [H, W]
 
     Args:
         folder: Of the truth.
@@ -97,7 +97,7 @@ def changed_at_all(
 def load_other(
     folder: Path, view: str, period: int, size: tuple[int, int]
 ) -> NDArray[np.uint8] | None:
-    """What the camera of a view would see at another period; None if that is not known.
+    """Read the view of a camera at another period; None if that is not known.
 
     Arguments as for `changed_at_all`, errors as for `load_rgb`. [H, W, 3]
     """
@@ -106,7 +106,7 @@ def load_other(
 
 
 def load_depth(folder: Path, view: str, other: int | None) -> NDArray[np.floating] | None:
-    """Depth of a view at another period, or at its own; None if that is not known. [H, W]
+    """Read the depth of a view at another period, or at its own; None if unknown. [H, W]
 
     Raises:
         ImageError: If the file is damaged.

@@ -1,4 +1,4 @@
-"""Cameras without distortion, where pixels are in their images, and these images.
+"""Cameras without distortion, positions of pixels in their images, and these images.
 
 They are resampled with the cubic filter of Catmull and Rom, which reproduces straight lines and
 parabolas, so nothing moves. OpenCV's cubic filter (another constant, places rounded to 1/32 pixel)
@@ -44,14 +44,14 @@ class CameraChange:
 
     @property
     def is_copy(self) -> bool:
-        """Whether pixels stay as they are."""
+        """True if pixels stay as they are."""
         same_size = self.source.size == self.target.size
         same_K = np.array_equal(self.source.K, self.target.K)
         return self.source.is_pinhole and same_size and same_K
 
 
 def plan_cameras(scene: Scene, *, center: bool = False) -> list[CameraChange]:
-    """New camera of each frame; images of one camera and one size share it."""
+    """Plan the new camera of each frame; images of one camera and one size share it."""
     targets: dict[tuple[Camera, int, int], CameraChange] = {}
     used: set[int] = set()
     spare = 1 + max((f.camera.camera_id for f in scene.frames), default=0)
@@ -72,7 +72,7 @@ def plan_cameras(scene: Scene, *, center: bool = False) -> list[CameraChange]:
 
 
 def pinhole_camera(camera: Camera, *, center: bool = False) -> Camera:
-    """The PINHOLE camera for the images of a camera.
+    """Return the PINHOLE camera for the images of a camera.
 
     Raises:
         SceneError: If the camera is not perspective, or its principal point is not in the image.
@@ -88,7 +88,7 @@ def pinhole_camera(camera: Camera, *, center: bool = False) -> Camera:
 
 
 def _centred(camera: Camera) -> Camera:
-    """The largest image inside the camera's with the principal point in its centre."""
+    """Crop a camera to the largest image with the principal point in its centre."""
     fx, fy, cx, cy = camera.params
     width = 2 * math.floor(min(cx, camera.width - cx))
     height = 2 * math.floor(min(cy, camera.height - cy))
@@ -105,7 +105,7 @@ def _camera_error(camera: Camera, expected: str) -> SceneError:
 
 
 def move_observations(scene: Scene, changes: list[CameraChange]) -> tuple[Scene, int, int]:
-    """The scene with its new cameras and observations.
+    """Move the observations of a scene to its new cameras.
 
     Returns:
         The scene, the number of observations dropped because they are outside the new images, and
@@ -128,7 +128,7 @@ def move_observations(scene: Scene, changes: list[CameraChange]) -> tuple[Scene,
 
 
 def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions in the new image of pixels of the old one; NaN where none. [N, 2] -> [N, 2]"""
+    """Move pixels of the old image to the new one; NaN if outside. [N, 2] -> [N, 2]"""
     if change.is_copy or not len(xy):
         return xy
     rays = unproject_pixels(change.source, xy)
@@ -143,7 +143,7 @@ def move_pixels(change: CameraChange, xy: NDArray[np.float64]) -> NDArray[np.flo
 
 @lru_cache(maxsize=4)
 def sampling_map(change: CameraChange) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Pixel of the old image under each centre of the new one, x and y. [H, W] each"""
+    """Return the pixel of the old image at each centre of the new one, x and y. [H, W] each"""
     source, target = change.source, change.target
     fx, fy, cx, cy = target.params
     maps = np.empty((2, target.height, target.width), np.float32)
@@ -160,7 +160,7 @@ def sampling_map(change: CameraChange) -> tuple[NDArray[np.float32], NDArray[np.
 
 @inner
 def _weights(t: float, out: NDArray[np.float64]) -> None:
-    """Weights of the four neighbours of a place a share ``t`` of the way between the middle two."""
+    """Compute weights of four neighbours at a share ``t`` of the way between the middle two."""
     out[0] = t * (-0.5 + t * (1.0 - 0.5 * t))
     out[1] = 1.0 + t * t * (-2.5 + 1.5 * t)
     out[2] = t * (0.5 + t * (2.0 - 1.5 * t))
@@ -216,7 +216,7 @@ def warp(
 def warp_mask(
     mask: NDArray[np.bool_], x: NDArray[np.float32], y: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Where an image counts after `warp`: where all sixteen pixels count that may be looked at.
+    """Warp a mask as `warp` does an image: a pixel counts if all sixteen that it comes from do.
 
     Args:
         mask: Where it counts before. [H, W]

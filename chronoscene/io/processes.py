@@ -65,9 +65,9 @@ GRACE = 5.0  # Seconds that a program has to end after SIGTERM: a container is s
 
 
 def process_tree(roots: Iterable[int]) -> set[int]:
-    """Processes that run: the given ones, their descendants, and all in the session of one of them.
+    """Find the running ones of some processes, their descendants, and all in their sessions.
 
-    Who leads a session has started what is in it, also where the parent in between has ended.
+    The leader of a session has started its processes, even if the parent in between has ended.
     """
     import psutil
 
@@ -87,15 +87,15 @@ def end_processes(roots: Iterable[int], *, grace: float = GRACE) -> None:
     """End processes and what they started: SIGTERM, and SIGKILL if they still run after a while."""
     import psutil
 
-    told: set[int] = set()
+    asked: set[int] = set()
     end = time.monotonic() + grace
     while members := process_tree(roots):
         late = time.monotonic() > end
-        for pid in members if late else members - told:
+        for pid in members if late else members - asked:
             with suppress(psutil.NoSuchProcess):
                 process = psutil.Process(pid)
                 process.kill() if late else process.terminate()
-        told |= members
+        asked |= members
         time.sleep(0.05)
 
 
@@ -104,7 +104,7 @@ def end_processes(roots: Iterable[int], *, grace: float = GRACE) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a worker ended."""
+    """End of a worker."""
 
     status: int
     """Exit status; the negative number of a signal if one ended the process."""
@@ -272,7 +272,7 @@ def map_parallel(
     workers: int | None = None,
     lost: Callable[[Item], Result] | None = None,
 ) -> Iterator[Result]:
-    """Results in the order of the items, each as soon as it and those before it are there.
+    """Yield results in the order of the items, each as soon as all before it are there.
 
     A process that dies (killed for its memory, or by a fault in a library) ends the whole pool.
     Each item that is left then gets a process of its own, so only the one at fault is lost.

@@ -23,16 +23,16 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.1, 1.0
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What a program took."""
+    """Time and memory of a program."""
 
     seconds: float
     peak_memory_bytes: int | None
-    """Of all its processes together, pages that they share counted once, looked at once a second;
-    None where the system does not tell."""
+    """Sum over all its processes, shared pages counted once, sampled once a second; None if it is
+    unknown."""
 
 
 def run_program(command: Sequence[str], *, folder: Path, log: Path) -> Usage:
-    """Run a command to its end. Whatever it started ends with it, also if we are interrupted.
+    """Run a command to its end. All that it started ends with it, also on interruption.
 
     Args:
         command: The words.
@@ -86,15 +86,15 @@ def run_program(command: Sequence[str], *, folder: Path, log: Path) -> Usage:
 
 
 def log_lines(log: Path) -> list[str]:
-    """The lines of a log that are not empty, without blanks around them."""
+    """Read the lines of a log that are not empty, without blanks around them."""
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     return [line.strip() for line in lines if line.strip()]
 
 
 def memory_of(processes: set[int]) -> int:
-    """Bytes of memory that processes take, a share of what they have in common with others.
+    """Sum the memory of processes in bytes, with their shares of pages in common with others.
 
-    Where the system does not tell the share (macOS, Windows), it is what each has alone.
+    Where the share is unknown (macOS, Windows), pages in common are left out.
     """
     total = 0
     for pid in processes:

@@ -21,25 +21,25 @@ _FULL = {errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)}  # Windows has no
 
 
 def disk_full(error: OSError, place: object) -> DiskFullError | None:
-    """The error that names the place if there is no space left on its disk; None for others."""
+    """Make the error that names a place without space left on its disk; None for others."""
     if error.errno not in _FULL:
         return None
     return DiskFullError(
         place,
         expected="space for what is written there",
         found=error.strerror or str(error),
-        todo="make room on this disk, or choose a place on another one",
+        todo="free space on this disk, or choose a place on another one",
     )
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of the content of a file, in hexadecimal."""
+    """Hash the content of a file (SHA-256, in hexadecimal)."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def leads_out(name: str) -> bool:
-    """Whether a name with slashes leads out of the folder it is joined to, or names nothing."""
+    """Return True if a name with slashes leads out of the folder it is joined to, or is empty."""
     parts = set(name.split("/"))
     drive = (":" in name or "\\" in name) and PureWindowsPath(name).drive
     return bool(not parts - {"", "."} or ".." in parts or name.startswith("/") or drive)
@@ -63,14 +63,14 @@ def needing_space(place: Path) -> Iterator[None]:
 
 
 def partial_name(name: str) -> str:
-    """Temporary name of a file or folder: says which process of which machine writes it."""
+    """Return the temporary name of a file or folder, with machine and process that write it."""
     return f".{name}.{_machine()}.{_boot()}.{os.getpid()}.partial"
 
 
 def remove_abandoned(folder: Path, name: str) -> None:
-    """Remove what ended processes of this machine, or this process, left unfinished in a folder.
+    """Remove unfinished files of this process, and of ended processes of this machine.
 
-    Other machines may write to the same storage, and nobody here can see whether they still do.
+    Other machines may still write to the same storage: their files stay.
 
     Args:
         folder: Where it is.
@@ -89,7 +89,7 @@ def remove_abandoned(folder: Path, name: str) -> None:
 
 @cache
 def _machine() -> str:
-    """Name of this machine, without dots; of a long one, the beginning and a hash."""
+    """Return the name of this machine, without dots; of a long one, the beginning and a hash."""
     name = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())
     digest = hashlib.sha256(name.encode()).hexdigest()
     return name if len(name) <= 32 else f"{name[:23]}-{digest[:8]}"
@@ -97,7 +97,7 @@ def _machine() -> str:
 
 @cache
 def _boot() -> str:
-    """What tells this start of the machine from earlier ones, whose processes have ended."""
+    """Identify this start of the machine: processes of earlier ones have ended."""
     with suppress(OSError):
         return BOOT.read_text(encoding="ascii")[:8]
     return "0"
@@ -105,7 +105,7 @@ def _boot() -> str:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside a file, renamed to it if the block succeeds, else deleted.
+    """Give a temporary name beside a file, renamed to it if the block succeeds, else deleted.
 
     Args:
         path: The file to write; its folder must exist. Another file of this name is replaced.
@@ -131,7 +131,7 @@ def write_text_atomic(path: Path, text: str) -> None:
 
 @contextmanager
 def staged_folder(out: Path) -> Iterator[Path]:
-    """A temporary folder beside ``out``, renamed to it if the block succeeds, else deleted.
+    """Give a temporary folder beside ``out``, renamed to it if the block succeeds, else deleted.
 
     Folders above it are made, and a failure leaves none of these behind.
 
@@ -215,7 +215,7 @@ def check_outside(place: Path, scenes: Iterable[Path], *, option: str = "") -> N
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Contents of a folder; nothing if it cannot be read."""
+    """List the contents of a folder; nothing if it cannot be read."""
     try:
         return sorted(folder.iterdir())
     except OSError:

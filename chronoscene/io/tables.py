@@ -17,7 +17,7 @@ from typing import Any
 from chronoscene.io.wording import printable
 
 FORMATS = ("table", "csv", "markdown", "latex", "json")
-"""What commands write tables as; ``table`` is text for a terminal."""
+"""Formats of tables; ``table`` is text for a terminal."""
 
 Head = tuple[str, str]
 """Two lines; a column whose first line is empty shares that of the column before."""
@@ -26,7 +26,7 @@ LEGENDS = {
     "markdown": "**bold**, <ins>underlined</ins>, *italic*: the first three of a column",
     "latex": "bold, underlined, italic: the first three of a column",
 }
-"""What the marks of `Table.ranks` look like; those of `Table.ties` are daggers."""
+"""Descriptions of the marks of `Table.ranks`; those of `Table.ties` are daggers."""
 _RANKS = {
     "table": ("{}", "¹ {}", "² {}", "³ {}"),
     "markdown": ("{}", "**{}**", "<ins>{}</ins>", "*{}*"),
@@ -41,7 +41,7 @@ MIN_NAME_WIDTH = 12  # Characters of a name that are shown even on narrow termin
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """What is written."""
+    """Cells as they are read, with heads and marks."""
 
     heads: Sequence[Head]
     """One per column."""
@@ -72,7 +72,7 @@ def _marked(table: Table, i: int, j: int, cell: str, style: str) -> str:
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A CSV document with a header; None becomes an empty cell."""
+    """Format a CSV document with a header; None becomes an empty cell."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(columns)
@@ -81,7 +81,7 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def plain_text(table: Table) -> str:
-    """Title and aligned columns, without marks."""
+    """Format title and aligned columns, without marks."""
     lines = [table.flat_heads, *table.rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     lines.insert(1, ["-" * width for width in widths])
@@ -96,7 +96,7 @@ def plain_text(table: Table) -> str:
 
 
 def boxed_text(table: Table, *, width: int | None = None) -> str:
-    """A title and a table with rules for a terminal, without colours.
+    """Format a table with rules for a terminal, without colours.
 
     Args:
         table: What to write.
@@ -128,7 +128,7 @@ def boxed_text(table: Table, *, width: int | None = None) -> str:
 
 
 def _fitting(table: Table, sizes: Sequence[int], width: int) -> list[list[int]]:
-    """Columns of each block; what has a common head stays together."""
+    """Divide columns into blocks; those with a common head stay together."""
     groups: list[list[int]] = []
     for i in range(table.labels, len(sizes)):
         if groups and not table.heads[i][0]:
@@ -170,7 +170,7 @@ def _block(
 
 
 def markdown(table: Table, *, special: str = r"\`*<>|[]") -> str:
-    """A pipe table, under its title if it has one.
+    """Format a pipe table, under its title if it has one.
 
     Args:
         table: What to write.
@@ -193,12 +193,12 @@ def _piped(cells: Sequence[str]) -> str:
 
 
 def escape_markdown(text: str, special: str = r"\`*<>|_") -> str:
-    """Text with a backslash before each special character."""
+    """Put a backslash before each special character."""
     return re.sub(f"([{re.escape(special)}])", r"\\\1", text)
 
 
 def latex(table: Table, *, cmidrules: bool = False) -> str:
-    """A ``tabular`` for the booktabs package, its title in a comment.
+    """Format a ``tabular`` for the booktabs package, its title in a comment.
 
     Args:
         table: What to write.
@@ -220,7 +220,7 @@ def latex(table: Table, *, cmidrules: bool = False) -> str:
 
 
 def _latex_heads(heads: Sequence[Head], cmidrules: bool) -> list[str]:
-    """One row of heads, or two, where what belongs to several columns stands above all of them."""
+    """Format one row of heads, or two, where common heads of several columns stand above them."""
     if not any(second for _, second in heads):
         return [_latex_row([escape_latex(first) for first, _ in heads])]
     starts = [i for i, head in enumerate(heads) if head[0] or i == 0]
@@ -240,7 +240,7 @@ def _latex_row(cells: Iterable[str]) -> str:
 
 
 def text_of(table: Table, style: str, *, width: int | None = None, cmidrules: bool = False) -> str:
-    """A table in one of the `FORMATS` that people read; options as in the functions for them."""
+    """Format a table as ``table``, ``markdown`` or ``latex``; options as in their functions."""
     if style == "latex":
         return latex(table, cmidrules=cmidrules)
     return markdown(table) if style == "markdown" else boxed_text(table, width=width)
@@ -262,5 +262,5 @@ _LATEX = str.maketrans(
 
 
 def escape_latex(text: str) -> str:
-    """Text as LaTeX prints it."""
+    """Escape a text for LaTeX."""
     return printable(text).translate(_LATEX)

@@ -8,31 +8,31 @@ MAX_NAME_LENGTH = 120  # Characters of a name from a file that a message repeats
 
 
 def printable(text: str) -> str:
-    """Text in which characters that could disturb a terminal or an encoding are escaped."""
+    """Escape characters that could disturb a terminal or an encoding."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def quote(text: str) -> str:
-    """A name in quotes, shortened if it is very long."""
+    """Quote a name, shortened if it is very long."""
     return repr(text if len(text) <= MAX_NAME_LENGTH else text[:MAX_NAME_LENGTH] + "...")
 
 
 def shown(items: Iterable[str], limit: int = 3) -> str:
-    """The first few of some names, and how many more there are."""
+    """List the first few of some names, and the number of the others."""
     names: Sequence[str] = tuple(items)
     rest = len(names) - limit
     return ", ".join(map(quote, names[:limit])) + (f" and {rest} more" if rest > 0 else "")
 
 
 def counted(number: int, noun: str) -> str:
-    """``1 image``, ``2 images``."""
+    """Count a noun: ``1 image``, ``2 images``."""
     return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
 def in_words(size: int) -> str:
-    """``1.2 GB``, ``340 kB``."""
+    """Format a number of bytes: ``1.2 GB``, ``340 kB``."""
     for unit, bytes_each in (("GB", 10**9), ("MB", 10**6)):
         if size >= bytes_each:
             return f"{size / bytes_each:,.1f} {unit}"
@@ -40,7 +40,7 @@ def in_words(size: int) -> str:
 
 
 def format_time(seconds: float) -> str:
-    """``m:ss`` or ``h:mm:ss``."""
+    """Format seconds as ``m:ss`` or ``h:mm:ss``."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -109,14 +109,14 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether a pinhole projection describes the camera exactly: methods train on these."""
+        """True if a pinhole projection describes the camera exactly: methods train on these."""
         if self.model in POLYNOMIAL_MODELS:
             return not any(self.distortion)
         return self.model in PINHOLE_MODELS
 
     @property
     def is_usable(self) -> bool:
-        """Whether size and parameters are plausible and finite, focal lengths positive."""
+        """True if size and parameters are plausible and finite, focal lengths positive."""
         if not (1 <= self.width <= MAX_SIDE and 1 <= self.height <= MAX_SIDE):
             return False
         if not np.isfinite(self.params).all():
@@ -125,13 +125,13 @@ class Camera:
 
 
 def as_pinhole(camera: Camera) -> Camera:
-    """The same camera as a PINHOLE; it must have no distortion."""
+    """Convert a camera without distortion to a PINHOLE."""
     (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
     return replace(camera, model="PINHOLE", params=(fx, fy, cx, cy))
 
 
 def project_points(camera: Camera, xyz: Array) -> Array:
-    """Pixels at which a camera sees points, distortion included.
+    """Project points to pixels, distortion included.
 
     Args:
         camera: Any model of COLMAP.
@@ -157,7 +157,7 @@ def project_points(camera: Camera, xyz: Array) -> Array:
 
 
 def unproject_pixels(camera: Camera, xy: Array) -> Array:
-    """Points at depth 1 that a camera sees at pixels, distortion undone. [N, 2] -> [N, 2]
+    """Find points at depth 1 that a camera sees at pixels, distortion undone. [N, 2] -> [N, 2]
 
     NaN where COLMAP finds no ray. Its search may also return a point beyond the field of view of
     the model, which does not project to the pixel.
@@ -170,7 +170,7 @@ def unproject_pixels(camera: Camera, xy: Array) -> Array:
 
 
 def undistorted_camera(camera: Camera) -> Camera:
-    """The PINHOLE camera that COLMAP's undistorter would give these images, with the same id.
+    """Return the PINHOLE camera of COLMAP's undistorter for these images, with the same id.
 
     Its size is the largest for which no pixel is blank.
 
@@ -193,7 +193,7 @@ def undistorted_camera(camera: Camera) -> Camera:
 
 
 def to_pycolmap(camera: Camera) -> pycolmap.Camera:
-    """The same camera as a pycolmap object."""
+    """Convert a camera to a pycolmap object."""
     from chronoscene.io.pycolmap import pycolmap  # slow to load
 
     return pycolmap.Camera(
@@ -206,7 +206,7 @@ def to_pycolmap(camera: Camera) -> pycolmap.Camera:
 
 
 def from_pycolmap(camera: pycolmap.Camera) -> Camera:
-    """The same camera as our record."""
+    """Convert a pycolmap object to our record."""
     return Camera(
         camera_id=int(camera.camera_id),
         model=camera.model.name,

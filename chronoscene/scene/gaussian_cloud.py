@@ -1,4 +1,4 @@
-"""Gaussians as arrays: what a file of 3DGS holds."""
+"""Gaussians as arrays, as in a file of 3DGS."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ Z_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
-    """Rotation matrices of quaternions wxyz, which need not be unit. [..., 4] -> [..., 3, 3]"""
+    """Convert quaternions wxyz, of any length, to rotation matrices. [..., 4] -> [..., 3, 3]"""
     q = np.asarray(quaternion, dtype=np.float64)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     w, x, y, z = np.moveaxis(q, -1, 0)
@@ -29,7 +29,7 @@ def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
 
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Array:
-    """Unit quaternion wxyz with w >= 0 of a rotation matrix. [3, 3] -> [4]
+    """Convert a rotation matrix to a unit quaternion wxyz with w >= 0. [3, 3] -> [4]
 
     Source: Shepperd 1978; the largest of the four candidates is taken, so no division is unstable.
     """
@@ -52,7 +52,7 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Array:
 
 
 def pose_from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Array:
-    """Rigid 4x4 matrix of a rotation [3, 3] and a translation [3]."""
+    """Combine a rotation [3, 3] and a translation [3] in a rigid 4x4 matrix."""
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = translation
@@ -60,13 +60,13 @@ def pose_from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) 
 
 
 def camera_centre(cam_from_world: Array) -> Array:
-    """Camera centres in the world of poses [..., 4, 4] -> [..., 3]."""
+    """Compute camera centres in the world of poses. [..., 4, 4] -> [..., 3]"""
     rotation, translation = cam_from_world[..., :3, :3], cam_from_world[..., :3, 3]
     return -np.einsum("...ji,...j->...i", rotation, translation)
 
 
 def look_at(eye: Array, target: Array, roll: float = 0.0, up: Array = Z_AXIS) -> Array:
-    """cam_from_world of a camera at ``eye`` that looks at ``target``. [4, 4]"""
+    """Compute cam_from_world of a camera at ``eye`` that looks at ``target``. [4, 4]"""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)

@@ -1,4 +1,4 @@
-"""A path around what the cameras of a scene look at."""
+"""A path around the target of the cameras of a scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_GAP = 2 * np.pi / 3
 
 
 def find_up(poses: Array) -> Array:
-    """The direction that is up if the cameras are held level, whatever they look at. [C, 4, 4]
+    """Find the up direction of cameras that are held level. [C, 4, 4] -> [3]
 
     It is the one to which the x axes of the cameras are most nearly at right angles. Where these
     are all parallel, it is also at right angles to the plane in which the cameras are: they fly
@@ -30,15 +30,14 @@ def find_up(poses: Array) -> Array:
 
 
 def orbit(poses: Array, points: Array, count: int) -> Array:
-    """Poses around the median of the points, at the median distance and height of the cameras.
+    """Make poses around the median of the points, at median distance and height of the cameras.
 
     The path begins where the first camera is. It is a full circle if there are cameras on all
-    sides, else it swings over the side that has them, so that nothing is shown from where nobody
-    has been.
+    sides, else it swings over the side that has them.
 
     Args:
         poses: ``cam_from_world`` of the cameras. [C, 4, 4]
-        points: What they look at. [P, 3]
+        points: Points of the scene. [P, 3]
         count: Number of poses.
 
     Returns:
@@ -63,7 +62,7 @@ def orbit(poses: Array, points: Array, count: int) -> Array:
 
 
 def _turns(angles: Array, count: int) -> Array:
-    """Angles of a path, from 0 on, for cameras at these angles, 0..2 pi, sorted. [count]"""
+    """Compute angles of a path from 0 on, for cameras at sorted angles 0..2 pi. [count]"""
     share = np.arange(count) / count
     gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
     widest = int(gaps.argmax())

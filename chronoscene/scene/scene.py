@@ -52,7 +52,7 @@ class PointTable:
         return len(self.ids)
 
     def select(self, keep: NDArray[np.bool_]) -> Self:
-        """Some of the points [P], in the same order, each with all of its observations."""
+        """Keep some of the points [P], each with all of its observations."""
         track_start, observed = select_tracks(self.track_start, keep)
         of_points = {name: getattr(self, name)[keep] for name in ("ids", "xyz", "rgb", "error")}
         added = [f.name for f in fields(self) if f.name not in (*of_points, "track_start")]
@@ -82,10 +82,10 @@ class Points(PointTable):
         )
 
     def select_observations(self, keep: NDArray[np.bool_], rank: NDArray[np.int32]) -> Points:
-        """The same points with some of their observations, in frames of other indices.
+        """Keep some observations of all points, in frames of other indices.
 
         Args:
-            keep: Which observations. [M]
+            keep: Observations that stay. [M]
             rank: New index of each frame. [F]
         """
         before = np.concatenate([[0], np.cumsum(keep)])
@@ -110,7 +110,7 @@ class Period:
 
 @dataclass(frozen=True, slots=True)
 class WorldFrame:
-    """What the world coordinates mean."""
+    """Unit and reference system of the world coordinates."""
 
     unit: str = "unknown"
     """``metre``, or ``unknown``: COLMAP models have no unit of their own."""
@@ -144,7 +144,7 @@ class Scene:
         return len(self.periods)
 
     def select(self, *, split: Split | None = None, period: int | None = None) -> tuple[Frame, ...]:
-        """Frames of a split, of a period, or of both, in name order."""
+        """Return the frames of a split, of a period, or of both, in name order."""
         return tuple(
             f
             for f in self.frames
@@ -160,11 +160,11 @@ class Scene:
         return np.array([f.period for f in self.frames], np.int64)
 
     def count_views(self) -> NDArray[np.int64]:
-        """How many images of a period see a point. [P, T]"""
+        """Count the images of each period that see a point. [P, T]"""
         return count_views(*self._sightings(), (len(self.points), self.num_periods))
 
     def point_periods(self, frames: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
-        """Whether an image of the period sees the point. [P, T]
+        """Find the periods with images that see a point. [P, T]
 
         Args:
             frames: Frames that count; None for all. [F]
@@ -176,12 +176,12 @@ class Scene:
         return seen_by_period(point, period, (len(self.points), self.num_periods))
 
     def _sightings(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Point and period of each observation. [M], [M]"""
+        """Return point and period of each observation. [M], [M]"""
         points = self.points
         return track_owners(points.track_start), self.frame_periods[points.track_frame]
 
     def with_frames(self, frames: Sequence[Frame]) -> Scene:
-        """The same scene with other attributes on the same frames (same names, same order).
+        """Replace the frames by others of the same names in the same order.
 
         Tracks refer to frames by index, so frames cannot be added, removed or reordered here.
         """

@@ -44,7 +44,7 @@ class Sim3:
         return self.scale * points @ self.rotation.T + self.translation
 
     def __matmul__(self, first: Sim3) -> Sim3:
-        """First ``first``, then this: ``c_from_b @ b_from_a`` is ``c_from_a``."""
+        """Apply ``first``, then this: ``c_from_b @ b_from_a`` is ``c_from_a``."""
         return Sim3(
             self.scale * first.scale,
             self.rotation @ first.rotation,
@@ -65,12 +65,12 @@ class Sim3:
         )
 
     def to_matrix(self) -> Array:
-        """The 4x4 matrix [[scale * rotation, translation], [0, 1]]."""
+        """Return the 4x4 matrix [[scale * rotation, translation], [0, 1]]."""
         return pose_from_rotation_translation(self.scale * self.rotation, self.translation)
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Sim3:
-        """Inverse of `to_matrix`: the ``training_from_world`` of a checkpoint, for example."""
+        """Invert `to_matrix`: the ``training_from_world`` of a checkpoint, for example."""
         m = np.asarray(matrix, dtype=np.float64)
         scale = float(np.cbrt(np.linalg.det(m[:3, :3])))
         return cls(scale, m[:3, :3] / scale, m[:3, 3].copy())
@@ -97,18 +97,18 @@ class Similarity:
         return points @ self.matrix.T + self.translation
 
     def to_sim3(self) -> Sim3:
-        """The same transformation, which must not be a reflection."""
+        """Convert to a `Sim3`; it must not be a reflection."""
         scale = self.scale
         return Sim3(scale, self.matrix / scale, self.translation)
 
 
 def fit(source: Array, target: Array, *, mirror: bool = False) -> Similarity | None:
-    """Least-squares similarity of corresponding points; None where they do not determine one.
+    """Fit a similarity to corresponding points by least squares; None if they determine none.
 
     Args:
         source: At least three points, not on one line. [N, 3]
         target: Their targets. [N, 3]
-        mirror: Whether a reflection is allowed.
+        mirror: Allow a reflection.
 
     Source: Umeyama 1991, equations 40 to 42.
     """
@@ -148,7 +148,7 @@ def fit_samples(
 def fit_robustly(
     source: Array, target: Array, *, axes: int = 3, mirror: bool = False
 ) -> tuple[Similarity, Array] | None:
-    """Similarity that most points agree on, and the distance of every point to its target.
+    """Fit a similarity that most points agree on; return it and the distances to the targets.
 
     The best of many triples by median distance, then least squares over the points within 2.5
     standard deviations. Deterministic.
@@ -157,7 +157,7 @@ def fit_robustly(
         source: [N, 3]
         target: [N, 3]
         axes: Number of target axes along which distances are measured: 2 ignores heights.
-        mirror: Whether a reflection is allowed.
+        mirror: Allow a reflection.
 
     Source: least median of squares, Rousseeuw 1984.
     """
@@ -183,7 +183,7 @@ def _distances(similarity: Similarity, source: Array, target: Array, axes: int) 
 
 
 def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | None:
-    """Similarity of a few points, and which of them it uses; None if they do not determine one.
+    """Fit a similarity to a few points; return it and the points used, None if undetermined.
 
     With six points or more, wrong ones are left out: of the similarities of all triples the one
     with the smallest median distance is taken, then all points within three deviations of it.
@@ -214,6 +214,6 @@ def fit_few(source: Array, target: Array) -> tuple[Sim3, NDArray[np.bool_]] | No
 
 
 def _thickness(points: Array) -> float:
-    """Second singular value over the first: 0 on a line."""
+    """Divide the second singular value by the first: 0 on a line."""
     values = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(values[1] / values[0]) if values[0] > 0 else 0.0

@@ -1,4 +1,4 @@
-"""Who sees a point: tracks in flat form, reprojection, intersection of rays, and common view.
+"""Visibility of points: tracks in flat form, reprojection, intersection of rays, common view.
 
 Observations of point i are ``start[i]:start[i + 1]`` (P points, M observations), as in
 `chronoscene.scene.Points`. All functions take arrays, so that scenes, raw models and registrations
@@ -21,22 +21,22 @@ Two rays at an angle of 2a give sin(a)^2: this is a = 1 degree, where noise of o
 length of 1000 pixels moves the point by 3 % of its distance."""
 
 DIRECTIONS, MAX_TANGENT, STEPS = 8, 4.0, 400
-"""Where lenses are tried: so many directions, up to this hypot(x, y) / z, in so many steps."""
+"""Directions in which lenses are tried, largest hypot(x, y) / z, and steps up to it."""
 
 
 def track_owners(track_start: Ints) -> Ints:
-    """Index of the point of each observation. [P + 1] -> [M]"""
+    """Return the index of the point of each observation. [P + 1] -> [M]"""
     return np.repeat(np.arange(len(track_start) - 1), np.diff(track_start))
 
 
 def select_tracks(track_start: Ints, keep: Mask) -> tuple[Ints, Mask]:
-    """Where the tracks of the kept points [P] begin [kept + 1], and their observations. [M]"""
+    """Return the track starts of the kept points [P] [kept + 1], and their observations. [M]"""
     lengths = np.diff(track_start)
     return np.concatenate([[0], np.cumsum(lengths[keep])]), np.repeat(keep, lengths)
 
 
 def count_views(point: Ints, period: Ints, shape: tuple[int, int]) -> Ints:
-    """How many observations each period has of each point. [P, T]
+    """Count the observations that each period has of each point. [P, T]
 
     Args:
         point: Of each observation, see `track_owners`. [M]
@@ -48,14 +48,14 @@ def count_views(point: Ints, period: Ints, shape: tuple[int, int]) -> Ints:
 
 
 def seen_by_period(point: Ints, period: Ints, shape: tuple[int, int]) -> Mask:
-    """Whether an image of the period sees the point; arguments as in `count_views`. [P, T]"""
+    """Find the periods with images that see a point; arguments as in `count_views`. [P, T]"""
     seen = np.zeros(shape, bool)
     seen[point, period] = True
     return seen
 
 
 def by_image(track_image: NDArray[np.integer], images: int) -> list[Ints]:
-    """Observations of each image, in the order of the tracks. [M] -> one [m] for each image"""
+    """List the observations of each image, in the order of the tracks. [M] -> one [m] per image"""
     # Keys of 16 bits are sorted several times faster.
     keys = track_image.astype(np.uint16) if images <= 2**16 else track_image
     ends = np.cumsum(np.bincount(track_image, minlength=images))
@@ -97,7 +97,7 @@ def reproject(
 
 
 def intersect_rays(direction: Array, centre: Array, first: Ints) -> tuple[Array, Array]:
-    """Points nearest to bundles of rays: ``sum(I - d d^T) x = sum((I - d d^T) c)``.
+    """Find the points nearest to bundles of rays: ``sum(I - d d^T) x = sum((I - d d^T) c)``.
 
     Args:
         direction: Unit vectors d in the world, bundle after bundle. [R, 3]
@@ -121,7 +121,7 @@ def intersect_rays(direction: Array, centre: Array, first: Ints) -> tuple[Array,
 def common_view(
     xyz: Array, owner: Ints, views: Sequence[Sequence[tuple[Camera, Array]]], reach: Array
 ) -> Array:
-    """Share of the points of each group that the cameras of each group have in view.
+    """Compute the share of the points of each group that the cameras of each have in view.
 
     A point is in view if it lies in front of a camera, inside its image, and within reach. Whether
     something hides it is not known.
@@ -130,7 +130,7 @@ def common_view(
         xyz: Points in the world. [N, 3]
         owner: Group of each point. [N]
         views: Camera and cam_from_world of the images of each group. [T]
-        reach: Largest depth at which a group sees something; NaN where that is unknown. [T]
+        reach: Largest depth at which a group sees something; NaN if unknown. [T]
 
     Returns:
         Row a, column b: share of the points of a that b has in view; NaN if a has no points or the
@@ -147,7 +147,7 @@ def common_view(
 
 
 def _viewed(views: Sequence[tuple[Camera, Array]], xyz: Array, reach: float) -> Mask:
-    """Which points any of the images has in view. [n, 3] -> [n]"""
+    """Find the points that any of the images has in view. [n, 3] -> [n]"""
     viewed = np.zeros(len(xyz), bool)
     limits = {camera: _limit(camera) for camera in {camera for camera, _ in views}}
     with np.errstate(all="ignore"):  # absurd poses and points are in no view
@@ -161,7 +161,7 @@ def _viewed(views: Sequence[tuple[Camera, Array]], xyz: Array, reach: float) -> 
 
 
 def _limit(camera: Camera) -> float:
-    """Largest hypot(x, y) / z up to which pixels move outward as points do.
+    """Find the largest hypot(x, y) / z up to which pixels move outward as points do.
 
     Beyond it, the polynomials of lenses turn back and map points far outside into the image.
     """
@@ -177,7 +177,7 @@ def _limit(camera: Camera) -> float:
 
 
 def _inside(camera: Camera, local: Array, limit: float) -> Mask:
-    """Which points in front of a camera are in its image. [n, 3] -> [n]"""
+    """Find the points in front of a camera that are in its image. [n, 3] -> [n]"""
     u, v = project_points(camera, local).T
     inside = (u >= 0) & (v >= 0) & (u <= camera.width) & (v <= camera.height)
     if np.isfinite(limit):

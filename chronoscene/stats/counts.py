@@ -67,7 +67,7 @@ class SceneCount:
     split_rule: str
     split_hash: str
     count: CountRule
-    """How points are counted."""
+    """Rule by which points are counted."""
     periods: tuple[PeriodCount, ...]
     images: int
     points: int
@@ -85,7 +85,7 @@ class Unreadable:
 
 
 def period_name(period: int, label: str, date: str | None) -> str:
-    """Its label, and its date where the label lacks the year; the number if there is neither."""
+    """Name a period by label, and date where the label lacks the year, else by number."""
     names = [label] if label != str(period) else []
     if date is not None and date[:4] not in label:
         names.append(date)
@@ -93,13 +93,13 @@ def period_name(period: int, label: str, date: str | None) -> str:
 
 
 def period_title(period: int, label: str, date: str | None) -> str:
-    """Its number, and its name where that is more than the number."""
+    """Title a period by its number, and its name where that is more than the number."""
     name = period_name(period, label, date)
     return name if name == str(period) else f"{period}: {name}"
 
 
 def assign_points(views: Ints) -> Ints:
-    """The one period that each point is counted in: that with the most observations of it.
+    """Choose the period of each point: the one with the most observations of it.
 
     Ties go to the earliest period; -1 marks a point that no image sees. [P, T] -> [P]
     """
@@ -147,7 +147,7 @@ def _count_period(scene: Scene, period: int, points: int) -> PeriodCount:
 
 
 def count_table(counts: Sequence[SceneCount]) -> list[list[int | str | None]]:
-    """Rows of the table: scene, images and points of each period, images and points in total.
+    """List the rows of the table: scene, images and points of each period and in total.
 
     The last row holds the totals; None stands where a scene has no such period.
     """
@@ -163,13 +163,13 @@ def count_table(counts: Sequence[SceneCount]) -> list[list[int | str | None]]:
 
 
 def _period_names(counts: Sequence[SceneCount]) -> list[str]:
-    """Heads of the column pairs; periods are numbered from 0."""
+    """List the heads of the column pairs; periods are numbered from 0."""
     periods = max((len(c.periods) for c in counts), default=0)
     return [*(f"Period {i}" for i in range(periods)), "Total"]
 
 
 def _table(counts: Sequence[SceneCount], images: str, points: str) -> Table:
-    """The table as it is read."""
+    """Make the table for readers."""
     heads = [("Scene", "")]
     for name in _period_names(counts):
         heads += [(name, images), ("", points)]
@@ -187,7 +187,7 @@ def format_counts(
     width: int | None = None,
     unreadable: Sequence[Unreadable] = (),
 ) -> str:
-    """The table of counts in one of `chronoscene.io.tables.FORMATS`.
+    """Format the table of counts in one of `chronoscene.io.tables.FORMATS`.
 
     CSV has empty cells where a scene has no such period; JSON has train and test images and the
     fingerprint of the split, too.
@@ -195,7 +195,7 @@ def format_counts(
     Args:
         counts: One per scene.
         style: The format.
-        width: Of the terminal that ``table`` goes to; None for as wide as it is.
+        width: Characters of the terminal that ``table`` goes to; None for no limit.
         unreadable: Scenes that are missing, named in JSON.
     """
     if style == "json":
@@ -212,7 +212,7 @@ def format_counts(
 def document(
     scenes: Sequence[dict[str, Any]], counts: Sequence[SceneCount], unreadable: Sequence[Unreadable]
 ) -> str:
-    """JSON of some scenes. Keys are only added; the version changes when one changes meaning."""
+    """Format JSON of scenes. Keys are only added; the version changes when one changes meaning."""
     data = {
         "schema_version": SCHEMA_VERSION,
         "chronoscene_version": __version__,
@@ -224,19 +224,18 @@ def document(
 
 
 def published(name: str) -> tuple[tuple[int, int], ...] | None:
-    """Images and points of each period as printed, if a scene of this name is in the paper."""
+    """Return images and points of each period as printed, if the paper has a scene of this name."""
     return PAPER_COUNTS.get(_BY_NAME.get(name.casefold(), ""))
 
 
 def in_paper_order(folders: Sequence[Path]) -> list[Path]:
-    """Scenes of the paper as its table lists them, then all others in the order they have."""
+    """Sort the scenes of the paper as its table does, then all others in their order."""
     ranks = {name: rank for rank, name in enumerate(PAPER_COUNTS)}
     return sorted(folders, key=lambda p: ranks.get(_BY_NAME.get(p.name.casefold(), ""), len(ranks)))
 
 
 def compared(count: SceneCount) -> dict[str, Any] | None:
-    """The counts that the paper prints for a scene, and whether these are the same; None for
-    scenes that are not in it."""
+    """Compare a scene with its counts in the paper; None for scenes that are not in it."""
     paper = published(count.name)
     if paper is None:
         return None
@@ -249,7 +248,7 @@ def compared(count: SceneCount) -> dict[str, Any] | None:
 
 
 def totals(counts: Sequence[SceneCount]) -> dict[str, Any]:
-    """Images and points over all scenes, by period and in all."""
+    """Sum images and points over all scenes, by period and in all."""
     _, *sums = count_table(counts)[-1]
     pairs = [{"images": sums[i], "points": sums[i + 1]} for i in range(0, len(sums), 2)]
     return {"periods": pairs[:-1], "all": pairs[-1]}

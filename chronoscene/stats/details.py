@@ -56,9 +56,9 @@ class DetailRow:
     values: dict[str, Any]
     """By the names of `COLUMNS`, and more."""
     overlap: tuple[float | None, ...]
-    """With each period; empty for the whole scene."""
+    """Overlap with each period; empty for the whole scene."""
     in_view: tuple[float | None, ...]
-    """Of each period; empty for the whole scene."""
+    """Share in view of each period; empty for the whole scene."""
 
     @property
     def title(self) -> str:
@@ -66,7 +66,7 @@ class DetailRow:
 
 
 def rows_of(statistics: SceneStatistics) -> list[DetailRow]:
-    """A row for each period and one for the scene."""
+    """Make a row for each period and one for the scene."""
     counts = statistics.counts
     shares = zip(statistics.overlap, statistics.in_view, strict=True)
     rows = [
@@ -94,7 +94,7 @@ def format_details(
     width: int | None = None,
     unreadable: Sequence[Unreadable] = (),
 ) -> str:
-    """Everything that was measured in one of `chronoscene.io.tables.FORMATS`.
+    """Format everything that was measured in one of `chronoscene.io.tables.FORMATS`.
 
     CSV and JSON are in the stored units. Arguments as in `chronoscene.stats.counts.format_counts`.
     """
@@ -107,7 +107,7 @@ def format_details(
 
 
 def _csv(statistics: Sequence[SceneStatistics]) -> str:
-    """One line per row; empty cells where there is no value.
+    """Format one line per row, with empty cells where there is no value.
 
     The number of the period is empty for a whole scene, so that the column is of numbers.
     """
@@ -136,7 +136,7 @@ def _scene_item(statistics: SceneStatistics) -> dict[str, Any]:
 
 
 def _table(statistics: Sequence[SceneStatistics]) -> Table:
-    """The table as it is read, with a rule after each scene but the last."""
+    """Make the table for readers, with a rule after each scene but the last."""
     periods = _max_periods(statistics)
     shown = periods if 1 < periods <= MAX_SHOWN else 0
     titles = [

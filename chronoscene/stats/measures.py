@@ -17,12 +17,12 @@ CELLS = 50  # Cubes along the longest edge of a scene for its coverage
 
 @dataclass(frozen=True, slots=True)
 class Measures:
-    """Of one period, or of a whole scene. None where there is nothing to measure."""
+    """Measures of one period, or of a whole scene; None where there is nothing to measure."""
 
     points_seen: int
     """Points that images of the period see, however the points are counted."""
     observations: int
-    """Of points by images of the period."""
+    """Observations of points by images of the period."""
     track_mean: float | None
     """Images of the period that see a point, mean over the points that any of them sees."""
     track_median: float | None
@@ -51,7 +51,7 @@ class SceneStatistics:
     """Row a, column b: share of the points that period a sees which cameras of period b have in
     view, whether b sees them or not; see `in_view`. [T, T]"""
     unit: str
-    """Of the world: ``metre`` or ``unknown``."""
+    """Unit of the world: ``metre`` or ``unknown``."""
 
 
 def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatistics:
@@ -79,7 +79,7 @@ def measure_scene(scene: Scene, *, count: CountRule = "assigned") -> SceneStatis
 
 
 def _measures(views: Ints, residual: Array, baselines: Array, coverage: float | None) -> Measures:
-    """Measures of some frames; ``views``: how many of them see each point."""
+    """Summarise some frames; ``views``: how many of them see each point."""
     length = views[views > 0]
     return Measures(
         points_seen=len(length),
@@ -93,13 +93,13 @@ def _measures(views: Ints, residual: Array, baselines: Array, coverage: float | 
 
 
 class SceneReprojection(NamedTuple):
-    """Where the points of a scene lie for the cameras that see them."""
+    """Positions of the points of a scene for the cameras that see them."""
 
     residual: Array
-    """Of each observation in pixels; NaN where the point is not in front of the camera or not
+    """Error of each observation in pixels; NaN where the point is not in front of the camera or not
     finite. [M]"""
     depth: Array
-    """Of the point of each observation, in world units; NaN where it is not in front. [M]"""
+    """Depth of the point of each observation, in world units; NaN if it is not in front. [M]"""
     depth_of_frame: Array
     """Median depth of what each frame sees in front of it; NaN where it sees nothing. [frames]"""
 
@@ -122,11 +122,11 @@ def reproject(scene: Scene) -> SceneReprojection:
 
 
 def camera_baselines(scene: Scene, depths: Array) -> Array:
-    """Distance to the nearest camera of the same period over the median depth of what is seen.
+    """Divide the distance to the nearest camera of the period by the median depth seen.
 
     Args:
         scene: The scene.
-        depths: Median depth of what each frame sees. [frames]
+        depths: Median depth of the points that each frame sees. [frames]
 
     Returns:
         NaN for cameras without points, and for one that is alone in its period. [frames]
@@ -143,7 +143,7 @@ def camera_baselines(scene: Scene, depths: Array) -> Array:
 
 
 def period_overlap(seen: Mask) -> tuple[tuple[float | None, ...], ...]:
-    """Share of the points of each period that each other sees, too. [P, T] -> [T, T]"""
+    """Compute the share of the points of each period that each other sees. [P, T] -> [T, T]"""
     columns = seen.astype(np.float32)  # exact up to 16 million points
     both = (columns.T @ columns).astype(np.float64)
     return tuple(
@@ -153,7 +153,7 @@ def period_overlap(seen: Mask) -> tuple[tuple[float | None, ...], ...]:
 
 
 def period_coverage(xyz: Array, seen: Mask) -> list[float | None]:
-    """Coverage of each period; see `Measures.coverage`. [P, 3], [P, T] -> T values"""
+    """Compute the coverage of each period; see `Measures.coverage`. [P, 3], [P, T] -> T values"""
     used = seen.any(axis=1) & np.isfinite(xyz).all(axis=1)
     if not used.any():
         return [None] * seen.shape[1]
@@ -171,14 +171,14 @@ def period_coverage(xyz: Array, seen: Mask) -> list[float | None]:
 
 
 def in_view(scene: Scene, seen: Mask, depths: Array) -> tuple[tuple[float | None, ...], ...]:
-    """Share of the points of each period that the cameras of each have in view.
+    """Compute the share of the points of each period that the cameras of each have in view.
 
     A point is in view if it lies in front of a camera, inside of its image, and not much farther
     than what the camera's period sees. Whether something hides it is not known.
 
     Args:
         scene: The scene.
-        seen: Whether images of a period see a point. [P, T]
+        seen: Points that images of a period see. [P, T]
         depths: Of every observation; NaN where there is none. [M]
 
     Returns:
@@ -203,7 +203,7 @@ def in_view(scene: Scene, seen: Mask, depths: Array) -> tuple[tuple[float | None
 
 
 def _evenly(rows: Ints, count: int) -> Ints:
-    """At most ``count`` of them, evenly spread."""
+    """Choose at most ``count`` of them, evenly spread."""
     if len(rows) <= count:
         return rows
     return rows[np.linspace(0, len(rows) - 1, count).astype(np.int64)]
@@ -230,7 +230,7 @@ they could see some."""
 CORE = (10.0, 90.0)
 """Percentiles between which the middle of a scene lies, even with many outliers on every side."""
 REACH = 0.8
-"""Of the longest edge of the core, on every side: farther points are outliers. One reach for
+"""Share of the longest edge of the core, on every side: farther points are outliers. One reach for
 all axes: the towers of a flat place are not outliers."""
 ENDS, BEYOND = (2.0, 98.0), 0.08
 """Percentiles of what is left that are the ends of the scene, and what is added beyond each, as a
@@ -239,7 +239,7 @@ MAX_SAMPLE = 50_000  # Points that are looked at: an even choice of a larger clo
 
 
 def robust_range(xyz: Array) -> Array:
-    """Extent of a cloud along each axis without outliers.
+    """Find the extent of a cloud along each axis without outliers.
 
     Up to a tenth of all points on every side may be outliers.
 

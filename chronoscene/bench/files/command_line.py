@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 OPTIONS = ("iterations", "budget", "separate_iterations", "max_width")
-"""What a variant names that is an option of ``bench`` and none of the method."""
+"""Names in a variant that are options of ``bench``, not of the method."""
 
 
 def command_line(scene: str, config: Mapping[str, Any], seed: int | None = None) -> str:

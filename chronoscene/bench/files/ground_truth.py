@@ -15,7 +15,7 @@ from chronoscene.scene import Scene
 
 
 def ground_truth_folder(runs: Path, scene: str) -> Path:
-    """Where the ground truth of a scene lies."""
+    """Return the folder of the ground truth of a scene."""
     return runs / GROUND_TRUTH / safe_name(scene)
 
 

@@ -42,17 +42,16 @@ class ImageEntry(BaseModel):
     width: int
     height: int
     mask_file: str | None = None
-    """Path below the folder of the mask of a photo, 0 where the photo does not count; None where
-    all of it does."""
+    """Path below the folder of the mask, 0 where the photo does not count; None if all counts."""
     mask_sha256: str | None = None
     changed_file: str | None = None
-    """Path below the folder of where the view differs from other periods, which is where it is not
-    0; None where nobody said."""
+    """Path below the folder of the mask of changes between periods, not 0 where the view differs
+    from others; None if unknown."""
     changed_sha256: str | None = None
 
 
 class Manifest(BaseModel):
-    """What a folder of images holds and what it belongs to."""
+    """List of the images in a folder, and the scene that they belong to."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -66,12 +65,12 @@ class Manifest(BaseModel):
 
 
 def safe_name(name: str) -> str:
-    """A name as a path that every file system accepts: special characters become ``%XX``."""
+    """Make a name a path that every file system accepts: special characters become ``%XX``."""
     return _UNSAFE.sub(lambda match: f"%{ord(match.group()):02X}", name)
 
 
 def image_file(view: str) -> str:
-    """Path of a view's image below its folder.
+    """Return the path of a view's image below its folder.
 
     Raises:
         CheckpointError: If the name would lead out of the folder.
@@ -100,7 +99,7 @@ def to_bytes(rgb: ArrayLike) -> NDArray[np.uint8]:
 
 
 def encode_png(image: NDArray[np.uint8]) -> bytes:
-    """PNG bytes of an RGB image [H, W, 3], or of a grey one [H, W]."""
+    """Encode an RGB image [H, W, 3], or a grey one [H, W], as PNG."""
     import cv2
 
     done, data = cv2.imencode(
@@ -111,7 +110,7 @@ def encode_png(image: NDArray[np.uint8]) -> bytes:
 
 
 def to_grey(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A mask as an image: 255 where it is true. [H, W]"""
+    """Make an image of a mask: 255 where it is true. [H, W]"""
     return 255 * mask.astype(np.uint8)
 
 
@@ -235,12 +234,12 @@ def load_image(folder: Path, entry: ImageEntry) -> NDArray[np.uint8]:
 
 
 def load_mask(folder: Path, entry: ImageEntry) -> NDArray[np.bool_] | None:
-    """Where an image counts; None where all of it does. Errors as for `load_image`. [H, W]"""
+    """Read the mask of the pixels that count; None if all do. Errors as for `load_image`. [H, W]"""
     return _load_grey(folder, entry, entry.mask_file, entry.mask_sha256)
 
 
 def load_changed(folder: Path, entry: ImageEntry) -> NDArray[np.bool_] | None:
-    """Where a view differs from other periods; None if nobody said. Otherwise as `load_mask`."""
+    """Read the mask of changes between periods; None if unknown. Otherwise as `load_mask`."""
     return _load_grey(folder, entry, entry.changed_file, entry.changed_sha256)
 
 

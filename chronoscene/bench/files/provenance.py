@@ -1,4 +1,4 @@
-"""What results depend on: fingerprints of scene and configuration, code and machine."""
+"""Provenance of results: fingerprints of scene and configuration, code and machine."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from chronoscene.scene import Scene
 
 
 def scene_hash(scene: Scene) -> str:
-    """SHA-256 over frames, cameras, poses, periods, split, points, tracks, images and masks.
+    """Hash frames, cameras, poses, periods, split, points, tracks, images and masks (SHA-256).
 
     Poses are rounded to nine digits: what pycolmap returns may differ in the last one.
     """
@@ -53,12 +53,12 @@ def _file_hash(path: Path) -> str:
 
 
 def config_hash(config: dict[str, Any]) -> str:
-    """SHA-256 of a config in canonical JSON."""
+    """Hash a config in canonical JSON (SHA-256)."""
     return hashlib.sha256(json.dumps(config, sort_keys=True).encode()).hexdigest()
 
 
 def code_version() -> str:
-    """Commit of this code with ``-dirty`` where files differ from it, else the version."""
+    """Return the commit of this code, with ``-dirty`` if files differ from it, else the version."""
     package = Path(chronoscene.__file__).resolve().parent
     # A virtual environment may lie inside someone else's repository: ask for our own file.
     if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
@@ -79,7 +79,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def method_version(name: str) -> str:
-    """Version of the package that provides a method; ``unpackaged`` for ``module:SPEC``."""
+    """Return the version of a method's package; ``unpackaged`` for ``module:SPEC``."""
     entry = installed_methods().get(name)
     if entry is None or entry.dist is None:
         return "unpackaged"
@@ -87,7 +87,7 @@ def method_version(name: str) -> str:
 
 
 def library_versions() -> dict[str, str]:
-    """Versions of what numbers may depend on."""
+    """Return the versions of the libraries that numbers may depend on."""
     versions = {"python": platform.python_version()}
     for name in ("numpy", "numba", "torch", "gsplat", "opencv-contrib-python-headless", "pillow"):
         try:
@@ -98,7 +98,7 @@ def library_versions() -> dict[str, str]:
 
 
 def describe_device(kind: str, threads: int) -> str:
-    """The device in words: kind, processor or GPU, threads."""
+    """Describe the device: kind, processor or GPU, threads."""
     if kind == "cuda":
         import torch
 
@@ -107,7 +107,7 @@ def describe_device(kind: str, threads: int) -> str:
 
 
 def processor_name() -> str:
-    """Model of the processor as the system names it."""
+    """Return the model of the processor, as the system names it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -119,7 +119,7 @@ def processor_name() -> str:
 
 
 def peak_memory_bytes() -> int | None:
-    """Largest resident memory of this process so far; None where the system does not tell.
+    """Return the largest resident memory of this process so far; None if it is unknown.
 
     Linux carries ``ru_maxrss`` over from the parent across ``exec``, so a small worker of a big
     parent would report the parent; VmHWM belongs to this program alone.

@@ -1,4 +1,4 @@
-"""What a finished run says, and the files that hold it.
+"""Record of a finished run, and the files that hold it.
 
 ``RUNS/<scene>/<method>-<strategy>-<preset>/seed<k>/run.json`` belongs to one run,
 ``RUNS/results.json`` is the list of all. Both are read back through `RunRecord`. Infinite values
@@ -67,7 +67,7 @@ class ViewScore:
 
 
 def size_of(folder: Path) -> int:
-    """Bytes of all files below a folder; 0 where there is none."""
+    """Sum the bytes of all files below a folder; 0 if there is none."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
@@ -79,7 +79,7 @@ class RunRecord(BaseModel):
     method: str
     """Name on the command line."""
     strategy: str
-    """The one that was run, which may differ from the one asked for; see `notices`."""
+    """Strategy that was run, which may differ from the one asked for; see `notices`."""
     scene: str
     seed: int
     aggregates: dict[str, Values]
@@ -95,20 +95,20 @@ class RunRecord(BaseModel):
     """`periods` after each stage of ``sequential``, by the name of the stage; before the first one
     under `UNTRAINED`. A stage has the periods so far and the next one."""
     transfer: dict[str, Values] = {}
-    """Effect of the stages on earlier and later periods: `chronoscene.bench.score.forgetting`."""
+    """Effect of stages on earlier and later periods; see `chronoscene.bench.score.forgetting`."""
     seconds: float | None
-    """Training clock: setup and steps, without probes, rendering and scoring. What is None here and
-    below was not measured; see `absent`."""
+    """Training clock: setup and steps, without probes, rendering and scoring. None here and below:
+    not measured; see `absent`."""
     iterations: int | None
     primitives: int | None
     primitive: str = "primitives"
-    """What `primitives` counts: ``Gaussians``, ``anchors``."""
+    """Unit of `primitives`: ``Gaussians``, ``anchors``."""
     drawn: float | None = None
     """Gaussians that touch a test view, mean over the views; None if the method does not say."""
     checkpoint_bytes: int | None
     peak_memory_bytes: int | None
     """Largest resident memory of the process from the start of training to the end of rendering;
-    None where the system does not tell."""
+    None if it is unknown."""
     device: str
     commit: str
     skipped: dict[str, str]
@@ -120,10 +120,10 @@ class RunRecord(BaseModel):
     """Name of the method in tables."""
     preset: str
     variant: str = ""
-    """What differs from the preset, such as ``sh_degree=2``."""
+    """Options that differ from the preset, such as ``sh_degree=2``."""
     method_version: str
     config_hash: str
-    """Of everything that decides the result but scene, seed, device and threads."""
+    """Hash of everything that decides the result but scene, seed, device and threads."""
     scene_hash: str
     split_hash: str
     period_labels: dict[str, str]
@@ -136,7 +136,7 @@ class RunRecord(BaseModel):
     skipped_steps: int = 0
     """Steps that changed nothing since their loss or a gradient was not finite."""
     resumed: int = 0
-    """How often the training went on from a checkpoint."""
+    """Number of times that the training was resumed from a checkpoint."""
     waited_seconds: float = 0.0
     """Waiting for photos that were not decoded yet; not part of `seconds`."""
     setup_seconds: float | None
@@ -152,19 +152,19 @@ class RunRecord(BaseModel):
     """UTC, ISO 8601."""
     notices: list[str]
     rows: Sequence[ViewScore] = Field(default=(), exclude=True)
-    """What ``rows.csv`` says of single views, where that was read; no part of ``run.json``."""
+    """Content of ``rows.csv``, if it was read; not part of ``run.json``."""
     folder: Path = Field(default=Path(), exclude=True)
-    """Of the run, known where `rows` are."""
+    """Folder of the run, known if `rows` are."""
 
     @property
     def label(self) -> str:
-        """The run in words, as `Job.label`."""
+        """Name of the run, as `Job.label`."""
         names = (self.method, self.strategy, self.preset, self.variant)
         return f"{self.scene}: {' '.join(filter(None, names))} seed {self.seed}"
 
 
 class Failure(BaseModel):
-    """Why a run ended without a result."""
+    """Reason for which a run ended without a result."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -257,7 +257,7 @@ def _parse_row(line: Mapping[str, str]) -> ViewScore:
 
 
 def damaged(path: Path, error: ValidationError) -> CheckpointError:
-    """The first problem of a file that does not hold what it should."""
+    """Make the error for a file with a wrong content, with the first problem."""
     first = error.errors()[0]
     where = ".".join(map(str, first["loc"])) or "the file"
     return CheckpointError(
@@ -269,12 +269,12 @@ def damaged(path: Path, error: ValidationError) -> CheckpointError:
 
 
 def run_folders(runs: Path) -> list[Path]:
-    """Folders of all finished runs, sorted by path."""
+    """Return the folders of all finished runs, sorted by path."""
     return sorted(p.parent for p in runs.glob(f"*/*/seed*/{RUN_FILE}") if _is_final(p.parent))
 
 
 def read_failures(runs: Path) -> list[Failure]:
-    """All runs that failed when they were last tried."""
+    """Read the failures of all runs that failed when they were last tried."""
     folders = sorted(p.parent for p in runs.glob(f"*/*/seed*/{FAILURE_FILE}"))
     return [f for p in folders if _is_final(p) and (f := read_failure(p)) is not None]
 
@@ -285,7 +285,7 @@ def write_failure(folder: Path, failure: Failure) -> None:
 
 
 def read_failure(folder: Path) -> Failure | None:
-    """Why the run in a folder failed; None if it did not."""
+    """Read the failure of the run in a folder; None if it did not fail."""
     path = folder / FAILURE_FILE
     try:
         return Failure.model_validate_json(path.read_bytes()) if path.is_file() else None

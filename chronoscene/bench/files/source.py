@@ -11,18 +11,18 @@ from chronoscene.errors import CheckpointError
 
 
 class RunSource(BaseModel):
-    """Where a run comes from: what its files need besides themselves to be used again."""
+    """Method and scene of a run, which are needed to use its files again."""
 
     model_config = ConfigDict(extra="forbid")
 
     method: str
-    """What `load_spec` takes: a name or ``module:SPEC``."""
+    """Argument of `load_spec`: a name or ``module:SPEC``."""
     plugin_path: str | None
     """Folder from which ``module:SPEC`` was imported."""
     scene_root: str
     scene_format: str
     period_by: str | None = None
-    """As for `read_scene`."""
+    """Argument of `read_scene`."""
     training_from_world: list[list[float]]
     """Similarity transform as a matrix. [4, 4]"""
 
@@ -33,7 +33,7 @@ def _read_source(path: Path) -> RunSource:
     except FileNotFoundError as error:
         raise CheckpointError(
             path,
-            expected="where the run comes from",
+            expected="the scene and method of the run",
             found="no such file: an earlier version made the run",
             todo="run bench again with --overwrite",
         ) from error

@@ -9,27 +9,27 @@ from chronoscene.methods import MethodSpec
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """What distinguishes a strategy from the others."""
+    """Differences between strategies."""
 
-    tells_period: bool
-    """Whether models are told the period; else they are asked for period 0 whatever it is."""
+    gives_period: bool
+    """True if models are given the period; else they are asked for period 0, whatever it is."""
     model_per_period: bool
-    """Whether each period has a model of its own."""
+    """True if each period has a model of its own."""
     in_order: bool = False
-    """Whether one model learns the periods one after the other, in stages."""
+    """True if one model learns the periods one after the other, in stages."""
 
     def period_is_input(self, spec: MethodSpec) -> bool:
-        """Return True if the period is an input of the models of a method."""
-        return self.tells_period and spec.period_input != "none"
+        """Return True if the models of a method are given the period."""
+        return self.gives_period and spec.period_input != "none"
 
 
 STRATEGIES = {
-    "joint": Strategy(tells_period=True, model_per_period=False),
-    "pooled": Strategy(tells_period=False, model_per_period=False),
-    "separate": Strategy(tells_period=False, model_per_period=True),
-    "sequential": Strategy(tells_period=True, model_per_period=False, in_order=True),
+    "joint": Strategy(gives_period=True, model_per_period=False),
+    "pooled": Strategy(gives_period=False, model_per_period=False),
+    "separate": Strategy(gives_period=False, model_per_period=True),
+    "sequential": Strategy(gives_period=True, model_per_period=False, in_order=True),
 }
-"""``joint``: one model, told the period. ``pooled``: one model, the period hidden from it.
+"""``joint``: one model, given the period. ``pooled``: one model, the period hidden from it.
 ``separate``: one model per period, which sees the images and points of that period alone.
 ``sequential``: one model, which sees the images of one period after the other, and is told the
 period if it takes one."""

@@ -63,7 +63,7 @@ def effective_strategy(spec: MethodSpec, strategy: str) -> tuple[str, str | None
     """The strategy that a method can follow, and a notice where it is not the one asked for."""
     check_choice("--strategy", strategy, STRATEGIES)
     kind = STRATEGIES[strategy]
-    if kind.tells_period and not kind.period_is_input(spec) and not kind.in_order:
+    if kind.gives_period and not kind.period_is_input(spec) and not kind.in_order:
         notice = f"{spec.name} takes no period: {strategy} is run and recorded as pooled"
         return "pooled", notice
     return strategy, None
@@ -90,7 +90,7 @@ def make_parts(
     check_choice("--strategy", strategy, STRATEGIES)
     check_scene(scene)
     kind = STRATEGIES[strategy]
-    hide, everything = not (kind.tells_period and takes_period), range(scene.num_periods)
+    hide, everything = not (kind.gives_period and takes_period), range(scene.num_periods)
     to_training = training_frame(scene, everything[:1] if kind.in_order else everything)
     if not kind.model_per_period and not kind.in_order:
         train = _training_set(scene, store, to_training, everything, everything, hide_period=hide)

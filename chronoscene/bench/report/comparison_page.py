@@ -27,7 +27,7 @@ from chronoscene.io.pages import data_uri, render_page
 from chronoscene.io.tables import Table
 
 MAX_BYTES = 16_000_000
-"""Of the pictures in a page, so that a phone opens it and a mail carries it."""
+"""Size of the pictures in a page, so that a phone opens it and a mail carries it."""
 MAX_WIDTH = 960
 """Pixels of a picture in a page."""
 QUALITY = 85
@@ -35,12 +35,12 @@ QUALITY = 85
 
 @dataclass(frozen=True, slots=True)
 class ShownView:
-    """A photo and what methods show in its place."""
+    """A photo and its predictions by all methods."""
 
     name: str
     period: str
     photo: str
-    """As a data URI, as the pictures of the methods."""
+    """Data URI, like the pictures of the methods."""
     predictions: tuple[tuple[str, str, str], ...]
     """Method, PSNR and picture."""
 
@@ -58,15 +58,15 @@ def comparison_page(
     *,
     max_bytes: int = MAX_BYTES,
 ) -> str:
-    """The text of the page.
+    """Make the page.
 
     Args:
         runs: The folder, with predictions and ground truth.
         records: Its finished runs with their rows, as `report.summary.read_runs` returns them.
         failures: Its failed runs.
         worst: Tables of single views.
-        max_bytes: What the pictures may take. If the test views do not all fit, those in the page
-            are spread over the periods, and it says how many are left out.
+        max_bytes: Limit of the pictures. If the test views do not all fit, those in the page are
+            spread over the periods, and it says how many are left out.
     """
     entries = summarise(records)
     found = by_scene(records)
@@ -95,7 +95,7 @@ def comparison_page(
 def _shown_views(
     runs: Path, found: dict[str, list[RunRecord]], max_bytes: int
 ) -> dict[str, list[ShownView]]:
-    """Views of each scene, as many of each period as there is room for."""
+    """Return views of each scene, as many of each period as fit."""
     columns = {scene: [*map(column_of, of_scene)] for scene, of_scene in found.items()}
 
     def draw(scene: str, per_period: int) -> Iterator[ShownView]:
@@ -103,7 +103,7 @@ def _shown_views(
         for entry in chosen_views(truth, per_period):
             yield _shown_view(truth, entry, columns[scene], labels)
 
-    # The first view of each period tells how many have room.
+    # The first view of each period shows how many fit.
     size = sum(view.size for scene in found for view in draw(scene, 1))
     left = max_bytes
     shown: dict[str, list[ShownView]] = {scene: [] for scene in found}

@@ -1,4 +1,4 @@
-"""What test views and seeds leave uncertain: intervals of means over views, and of differences.
+"""Uncertainty by test views and seeds: intervals of means over views, and of differences.
 
 Neighbouring views show much the same, so ten of one place say less than ten of different places.
 The interval over views is therefore a block bootstrap: stretches of the path are drawn with
@@ -24,7 +24,7 @@ SEED = 0
 
 
 def block_length(n: int) -> int:
-    """Views in a block: the square root of their number, rounded.
+    """Return the number of views in a block: the square root of all, rounded.
 
     Blocks have to grow with n, to hold what neighbours share, and so has their number. The length
     that is best for the variance of a mean grows as n^(1/3) (Hall, Horowitz & Jing 1995). With the
@@ -35,7 +35,7 @@ def block_length(n: int) -> int:
 
 
 def resampled_means(values: Mapping[str, float], stratum: str) -> NDArray[np.float64]:
-    """Means of resampled views. [REPLICATES]
+    """Compute means of resampled views. [REPLICATES]
 
     The draws depend on ``stratum`` and the names of the views alone.
 
@@ -56,7 +56,7 @@ def resampled_means(values: Mapping[str, float], stratum: str) -> NDArray[np.flo
 
 @lru_cache(maxsize=64)
 def resampling_weights(n: int, stream: int) -> NDArray[np.float64]:
-    """Weights of the views of a path in its resampled means; those of a mean add up to 1.
+    """Compute the weights of views in resampled means of a path; those of a mean add up to 1.
 
     Circular blocks (Politis & Romano 1992) of L_1 to L_k views, n together. For independent views
     the variance of such means is the wanted one times 1 - sum L_i^2 / n^2, which the weights make
@@ -76,13 +76,13 @@ def resampling_weights(n: int, stream: int) -> NDArray[np.float64]:
 
 
 def interval(resampled: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper end of the percentile intervals. [..., REPLICATES] to [...] each"""
+    """Compute the ends of percentile intervals. [..., REPLICATES] to [...] each"""
     low, high = np.quantile(resampled, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=-1)
     return low, high
 
 
 def seed_margin(sds: ArrayLike, ns: ArrayLike, sd: float, n: int) -> NDArray[np.float64]:
-    """Differences between means over seeds that chance explains, by Welch's t-test.
+    """Compute differences between means over seeds that chance explains, by Welch's t-test.
 
     Args:
         sds: Sample standard deviations of some methods. [M]

@@ -1,4 +1,4 @@
-"""Published results, as data: what a paper printed, never what we measured."""
+"""Published results, as data: numbers that a paper printed, none of ours."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class FurtherTable(BaseModel):
 
 
 class PublishedTable(BaseModel):
-    """A published table with what must be known to read it, and the other numbers of its paper."""
+    """A published table with notes, and the other numbers of its paper."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -54,10 +54,10 @@ class PublishedTable(BaseModel):
     """Printed name of a method to its id, which is the name on the command line if there is one."""
     tables: tuple[FurtherTable, ...]
     inconsistencies: Mapping[str, str]
-    """What disagrees in the paper, or with what its authors released, by a short id."""
+    """Contradictions in the paper, or with the files of its authors, by a short id."""
 
     def mean(self, method: str, metric: str, *, group: str | None = None) -> float:
-        """Unweighted mean of a metric over the scenes of a group, or over all.
+        """Average a metric over the scenes of a group, or over all.
 
         Raises:
             KeyError: If no row matches.

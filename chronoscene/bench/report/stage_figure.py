@@ -1,4 +1,4 @@
-"""Figure of runs in stages: what each stage leaves of each period, as a heat map."""
+"""Figure of runs in stages: scores of each period after each stage, as heat maps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from chronoscene.io.staging import replacing
 from chronoscene.metrics.registry import metric_info
 
 METRICS = ("psnr", "ssim", "lpips_vgg")
-"""Those that are drawn, as far as there are values."""
+"""Metrics that are drawn, as far as there are values."""
 WRITTEN = 10
 """Periods up to which cells have numbers."""
 TITLE_WIDTH = 30  # Characters

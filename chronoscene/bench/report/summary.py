@@ -1,17 +1,17 @@
-"""What runs gave, as numbers: means and spread over seeds, intervals over views, differences."""
+"""Summary of runs in numbers: means and spread over seeds, intervals over views, differences."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, stdev
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chronoscene.arrays import Array
 from chronoscene.bench.files.records import (
     Failure,
     RunRecord,
@@ -30,15 +30,63 @@ if TYPE_CHECKING:
 
     from chronoscene.bench.report.published import PublishedTable
 
-AGGREGATES = ("macro", "micro", "worst")
 TRANSFERS = ("forgetting", "backward_transfer", "forward_transfer")
 MEASURED = "measured"
 SIZE = "checkpoint_bytes"  # What papers print as memory
 MARKED = 3  # Ranks that are marked in tables
 PAPER_METRICS = ("psnr", "ssim", "lpips_vgg_3dgs")
-"""What papers on these methods print side by side."""
+"""Metrics that papers on these methods print side by side."""
 UNKNOWN = np.full(REPLICATES, math.nan)
-"""Resampled means of what has no views, or of views that are not known."""
+"""Resampled values of numbers that come from no views, or from views that are not known."""
+
+
+class Scores(NamedTuple):
+    """One metric on the test views of a run."""
+
+    periods: Array
+    """Means over the views of each period, or resampled means. [P] or [P, REPLICATES]"""
+    views: Sequence[Array]
+    """Values of the views of each period; empty where they were not read. P arrays [n]"""
+    sign: int
+    """1 where higher is better, else -1."""
+
+
+class Aggregate(NamedTuple):
+    """A column of the tables of metrics that sums up all test views."""
+
+    name: str
+    meaning: str
+    """For the notes below tables."""
+    compute: Callable[[Scores], Any]
+    """Also called with resampled means; what does not depend on them has no interval. Values that
+    `RunRecord.aggregates` has are taken from there."""
+    for_many_periods: bool = False
+    """True if tables show the column only where periods have no columns of their own."""
+
+
+AGGREGATES = (
+    Aggregate("macro", "mean over periods", lambda s: np.mean(s.periods, axis=0)),
+    Aggregate(
+        "micro",
+        "mean over test views",
+        lambda s: np.average(s.periods, axis=0, weights=[*map(len, s.views)]),
+    ),
+    Aggregate("worst", "the worst period", lambda s: s.sign * np.min(s.sign * s.periods, axis=0)),
+    Aggregate(
+        "median of periods",
+        "of their means",
+        lambda s: np.median(s.periods, axis=0),
+        for_many_periods=True,
+    ),
+    Aggregate(
+        "best",
+        "the best period",
+        lambda s: s.sign * np.max(s.sign * s.periods, axis=0),
+        for_many_periods=True,
+    ),
+)
+"""Columns in the order of the tables. Another one is another entry here, for example the median
+over views: ``lambda s: np.median(np.concatenate(s.views))``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,19 +116,20 @@ ENTRY_COLUMNS = (
     *("quantity", "column", "mean", "sd", "n", "low", "high"),
     *("difference", "difference_low", "difference_high", "tied", "seeds", "device", "commit"),
 )
-"""Columns of CSV and JSON. ``source`` is ``measured`` or a publication; ``quantity`` is a metric,
-or a cost in the unit of `RunRecord`; ``column`` is ``period <id>``, ``macro``, ``micro``,
-``worst``, ``median`` or ``best`` (of the periods), or empty for costs; runs in stages have
-``<stage>: period <id>`` and `TRANSFERS`, too. ``sd`` is the sample
-standard deviation over ``n`` seeds, empty for one seed; ``low`` and ``high`` are the ends of the
-95 % interval over views. ``difference`` is that to the best mean of the same scene, quantity and
+"""Columns of CSV and JSON.
+
+``source`` is ``measured`` or a publication; ``quantity`` is a metric, or a cost in the unit of
+`RunRecord`; ``column`` is ``period <id>``, the name of one of `AGGREGATES`, or empty for costs;
+runs in stages have ``<stage>: period <id>`` and `TRANSFERS`, too. ``sd`` is the sample standard
+deviation over ``n`` seeds, empty for one seed; ``low`` and ``high`` are the ends of the 95 %
+interval over views. ``difference`` is that to the best mean of the same scene, quantity and
 column, with its interval over the same views; ``tied`` says that views or seeds do not tell the two
 apart.
 """
 
 
 def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
-    """All finished runs below some folders, with their rows, and the failed ones.
+    """Read all finished runs below some folders, with their rows, and the failed ones.
 
     Raises:
         CheckpointError: If a folder holds neither.
@@ -100,12 +149,12 @@ def read_runs(folders: Iterable[Path]) -> tuple[list[RunRecord], list[Failure]]:
 
 
 def read_with_rows(folder: Path) -> RunRecord:
-    """A finished run with the values of its views."""
+    """Read a finished run with the values of its views."""
     return read_run(folder).model_copy(update={"rows": read_rows(folder), "folder": folder})
 
 
 def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
-    """Runs with the scores of a region in place of those of whole images.
+    """Return runs with the scores of a region in place of those of whole images.
 
     Their scenes are called ``<scene> (<region>)`` and have the fingerprint of the change masks, so
     they stand beside no other values. Runs of scenes without change masks are left out.
@@ -138,18 +187,19 @@ def in_region(records: Iterable[RunRecord], region: str) -> list[RunRecord]:
 
 
 def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> DataFrame:
-    """Means and spread over seeds of everything that was measured, and what views leave uncertain.
+    """Compute means, spread over seeds and intervals over views of everything that was measured.
 
-    Runs that differ in seed and device only are a group. Equal names with other scenes or configs
-    stay apart, and so do devices that ran the same seed: their ``label`` says in what they differ.
+    Runs that differ in seed and device only are a group. Runs of equal names with other scenes or
+    configs stay apart, and so do devices that ran the same seed: their ``label`` says in what they
+    differ.
 
     Args:
         records: Runs of any scenes.
         metrics: Names of those wanted; none for all.
 
     Returns:
-        `ENTRY_COLUMNS`, ``label``, and what `with_texts` and `compared` add, one row per group,
-        quantity and column. What a run of a group lacks is left out.
+        `ENTRY_COLUMNS`, ``label``, and the columns that `with_texts` and `compared` add, one row
+        per group, quantity and column. What a run of a group lacks is left out.
     """
     import pandas as pd
 
@@ -183,7 +233,7 @@ def summarise(records: Sequence[RunRecord], metrics: Sequence[str] = ()) -> Data
 
 
 def with_texts(entries: DataFrame) -> DataFrame:
-    """Entries with ``number``, the mean as it reads, and ``text``, which has the spread."""
+    """Add ``number``, the mean as it is printed, and ``text``, which has the spread, too."""
     numbers, texts = [], []
     for quantity, value, sd, n in entries[["quantity", "mean", "sd", "n"]].itertuples(index=False):
         numbers.append(in_unit(quantity, value))
@@ -192,7 +242,7 @@ def with_texts(entries: DataFrame) -> DataFrame:
 
 
 def in_unit(quantity: str, value: float) -> str:
-    """A value in the unit and with the decimals in which tables show it; zero has no sign."""
+    """Format a value in the unit and with the decimals of the tables; zero has no sign."""
     if quantity in all_metrics():
         return f"{value:z.{all_metrics()[quantity].decimals}f}"
     (cost,) = (cost for cost in COSTS if cost.name == quantity)
@@ -200,16 +250,16 @@ def in_unit(quantity: str, value: float) -> str:
 
 
 def with_spread(quantity: str, value: float, sd: float | None) -> str:
-    """A mean as tables show it, with its spread if there is one."""
+    """Format a mean as in tables, with its spread if there is one."""
     return in_unit(quantity, value) + ("" if sd is None else f" ± {in_unit(quantity, sd)}")
 
 
 def compared(entries: DataFrame) -> DataFrame:
-    """Entries with intervals, and those of metrics with what tells them from the best.
+    """Add intervals to entries, and a comparison with the best to those of metrics.
 
     Adds ``low``, ``high``, ``difference``, ``difference_low``, ``difference_high`` and ``tied``, as
-    `ENTRY_COLUMNS` says, and ``rank``: 1 to `MARKED` where a table marks the entry, else 0. What
-    reads the same has the same rank, and the last of several is never marked.
+    `ENTRY_COLUMNS` says, and ``rank``: 1 to `MARKED` where a table marks the entry, else 0. Values
+    that are printed alike have the same rank, and the last of several is never marked.
     """
     low, high = interval(np.reshape([*entries.resampled], (-1, REPLICATES)))
     entries = entries.assign(low=low, high=high, tied=False, rank=0)
@@ -227,7 +277,7 @@ def compared(entries: DataFrame) -> DataFrame:
 
 
 def compare_with(entries: DataFrame, reference: Any, others: Sequence[Any]) -> None:
-    """Fill in what tells some entries from another one, all named by their index."""
+    """Fill in the comparison of some entries with another one, all named by their index."""
     first, rest = entries.loc[reference], entries.loc[others]
     difference = rest["mean"] - first["mean"]
     gaps = np.stack(rest.resampled) - first.resampled
@@ -242,7 +292,7 @@ def compare_with(entries: DataFrame, reference: Any, others: Sequence[Any]) -> N
 
 
 def over_scenes(entries: DataFrame, name: str) -> DataFrame:
-    """Means of macro and costs over all scenes, as entries of a scene of that name.
+    """Average macro means and costs over all scenes, as entries of a scene of that name.
 
     Labels that lack a scene are left out.
     """
@@ -266,7 +316,7 @@ def over_scenes(entries: DataFrame, name: str) -> DataFrame:
 
 
 def published_entries(table: PublishedTable, scenes: Iterable[str]) -> DataFrame:
-    """Entries of what a paper printed for scenes of these names, whose case does not matter.
+    """Make entries of the numbers printed for scenes of these names, whose case does not matter.
 
     The size is the printed mean over the group of the scene.
     """
@@ -293,7 +343,7 @@ def published_entries(table: PublishedTable, scenes: Iterable[str]) -> DataFrame
 
 
 def labelled(records: Sequence[RunRecord]) -> DataFrame:
-    """What tells runs apart, one row per record; ``label`` is how tables call each."""
+    """Tabulate the settings of runs, one row per record; ``label`` is its name in tables."""
     import pandas as pd
 
     fields = ("scene", "method", "strategy", "preset", "variant", "config_hash", "seed", "device")
@@ -320,55 +370,57 @@ def labelled(records: Sequence[RunRecord]) -> DataFrame:
     differ["device"] = devices.groupby(same).transform("max") > 1
     for i, columns in enumerate(differ.to_numpy()):
         if columns.any():
-            told = ", ".join(differences.loc[i, columns])
-            runs.loc[i, "label"] += f" [{told}]"
+            runs.loc[i, "label"] += f" [{', '.join(differences.loc[i, columns])}]"
     return runs
 
 
 def kind_of(run: RunRecord | Failure) -> str:
-    """Strategy and preset, and what differs from it."""
+    """Name strategy, preset and the options that differ from it."""
     return ", ".join(filter(None, (run.strategy, run.preset, run.variant.replace(",", ", "))))
 
 
-def _numbers(
-    run: RunRecord, metrics: Sequence[str]
-) -> Iterable[tuple[str, str, float, NDArray[np.float64]]]:
-    """Quantity, column, value and resampled values of everything that a run gave, in the order of
-    the tables."""
+Number = tuple[str, str, float, Array]
+"""Quantity, column, value and resampled values. The last: [REPLICATES]"""
+
+
+def _numbers(run: RunRecord, metrics: Sequence[str]) -> Iterator[Number]:
+    """Yield all numbers of a run in the order of the tables."""
     views: dict[str, dict[int, dict[str, float]]] = {}  # Metric to period to view to value
     for row in run.rows:
         if row.region == ALL and row.rendered_period == row.camera_period:
             of_metric = views.setdefault(row.metric, {})
             of_metric.setdefault(row.camera_period, {})[row.view] = row.value
     for metric in metrics:
-        higher = metric_info(metric).higher_is_better
-        over: dict[str, Callable[..., Any]] = {
-            "macro": np.mean,
-            "worst": np.min if higher else np.max,
-            "median": np.median,
-            "best": np.max if higher else np.min,
-        }
-        known = sorted((int(i), v[metric]) for i, v in run.periods.items() if metric in v)
-        values = {f"period {i}": value for i, value in known}
-        values |= {name: run.aggregates[name][metric] for name in AGGREGATES}
-        values |= {name: float(over[name]([v for _, v in known])) for name in ("median", "best")}
+        yield from _scores(run, metric, views.get(metric, {}))
         for stage, periods in run.stages.items():
-            of_stage = {f"{stage}: period {i}": v for i, v in periods.items()}
-            values |= {column: v[metric] for column, v in of_stage.items() if metric in v}
-        values |= {name: v[metric] for name, v in run.transfer.items() if metric in v}
-        resampled = {}
-        if metric in views:
-            by_period = views[metric]
-            means = {i: resampled_means(v, f"{run.scene}/{i}") for i, v in by_period.items()}
-            resampled = {f"period {i}": drawn for i, drawn in means.items()}
-            drawn, counts = list(means.values()), [len(v) for v in by_period.values()]
-            resampled |= {name: function(drawn, axis=0) for name, function in over.items()}
-            resampled["micro"] = np.average(drawn, axis=0, weights=counts)
-        for column, value in values.items():
-            yield metric, column, value, resampled.get(column, UNKNOWN)
+            for i, values in periods.items():
+                if metric in values:
+                    yield metric, f"{stage}: period {i}", values[metric], UNKNOWN
+        for name, values in run.transfer.items():
+            if metric in values:
+                yield metric, name, values[metric], UNKNOWN
     for cost in COSTS:
         if (value := getattr(run, cost.name)) is not None:
             yield cost.name, "", float(value), UNKNOWN
+
+
+def _scores(
+    run: RunRecord, metric: str, views: Mapping[int, Mapping[str, float]]
+) -> Iterator[Number]:
+    """Yield means of periods and aggregates; ``views``: values by period and name of the view."""
+    means = {int(i): values[metric] for i, values in run.periods.items() if metric in values}
+    drawn = {i: resampled_means(values, f"{run.scene}/{i}") for i, values in views.items()}
+    for i in sorted(means):
+        yield metric, f"period {i}", means[i], drawn.get(i, UNKNOWN)
+    of_views = [np.array([*values.values()]) for values in views.values()]
+    sign = 1 if metric_info(metric).higher_is_better else -1
+    scores = Scores(np.array([means[i] for i in sorted(means)]), of_views, sign)
+    resampled = Scores(np.array([*drawn.values()]), of_views, sign)
+    for name, _, compute, _ in AGGREGATES:
+        known = run.aggregates.get(name)
+        spread = compute(resampled) if drawn else UNKNOWN
+        value = float(compute(scores) if known is None else known[metric])
+        yield metric, name, value, spread if np.shape(spread) else UNKNOWN
 
 
 def _spread(values: Series) -> float:
@@ -377,7 +429,7 @@ def _spread(values: Series) -> float:
 
 
 def metric_names(records: Iterable[RunRecord], wanted: Sequence[str] = ()) -> list[str]:
-    """The metrics to show, in the order of the table of names: those wanted, or all there are."""
+    """Return the metrics to show, in the order of their registry: those wanted, or all."""
     known = [metric_info(name).name for name in wanted]
     there = {name for run in records for name in run.aggregates.get("macro", {})}
     return [name for name in all_metrics() if name in there and (not known or name in known)]

@@ -51,16 +51,16 @@ def format_runs(
     periods: bool = False,
     width: int | None = None,
 ) -> str:
-    """All tables of some runs in one of `chronoscene.io.tables.FORMATS`.
+    """Format all tables of some runs in one of `chronoscene.io.tables.FORMATS`.
 
     Args:
         records: Finished runs of any scenes, as from `chronoscene.bench.report.summary.read_runs`.
         failures: Runs that failed, for the notes.
         style: The format.
         metrics: Names of those wanted, without costs; none for all, and costs.
-        published: What a paper printed, to stand beside the runs in the overview.
-        periods: Whether to show every period of scenes with more than `MAX_PERIODS`, too.
-        width: Of the terminal that ``table`` goes to; None for as wide as it is.
+        published: Printed numbers to show beside the runs in the overview.
+        periods: Show every period of scenes with more than `MAX_PERIODS`, too.
+        width: Characters of the terminal that ``table`` goes to; None for no limit.
     """
     import pandas as pd
 
@@ -91,13 +91,13 @@ def format_runs(
 def tables_text(
     made: Sequence[Table], notes: Iterable[str], style: str, *, width: int | None = None
 ) -> str:
-    """Tables and the notes below them, in a format that people read.
+    """Format tables and the notes below them.
 
     Args:
         made: The tables.
         notes: One line each.
         style: ``table``, ``markdown`` or ``latex``.
-        width: Of the terminal that ``table`` goes to; None for as wide as it is.
+        width: Characters of the terminal that ``table`` goes to; None for no limit.
     """
     if style == "markdown":
         texts, bullet = [tables.markdown(t, special=r"\`*<>|_") for t in made], "- "
@@ -109,7 +109,7 @@ def tables_text(
 
 
 def json_entry(entry: dict[str, Any]) -> dict[str, Any]:
-    """Numbers that JSON lacks become ``Infinity`` and ``NaN``, what is not known becomes null."""
+    """Write numbers that JSON lacks as ``Infinity`` and ``NaN``, and unknown ones as null."""
     entry["sd"] = None if entry["n"] == 1 else entry["sd"]
     for key, value in entry.items():
         if isinstance(value, float) and not math.isfinite(value):
@@ -125,14 +125,13 @@ def readable_tables(
     *,
     periods: bool = False,
 ) -> list[Table]:
-    """An overview, then per scene a table of each metric, two more where there are runs in stages,
-    and one of costs.
+    """Make an overview, and per scene a table of each metric, two for runs in stages, one of costs.
 
     Args:
-        entries: What `summarise` returns for the records, and what was published.
+        entries: From `summarise` for the records, and from `published_entries`.
         records: The runs.
         metrics: Names of those wanted; none for all.
-        periods: Whether every period is shown, however many there are.
+        periods: Show every period, however many there are.
     """
     names = metric_names(records, metrics)
     made: list[Table] = []
@@ -150,14 +149,14 @@ def readable_tables(
         staged = [run for run in runs if run.stages]
         for name in names if staged else ():
             made += _stage_tables(part, name, staged, every=periods)
-        # Nobody knows what images of other programs cost.
+        # The cost of images that other programs made is unknown.
         if not metrics and (part.column == "").any():
             made.append(_cost_table(part, str(scene), [name for name in shown if name in names]))
     return made
 
 
 def cost_tables(records: Sequence[RunRecord]) -> list[Table]:
-    """What runs cost, a table per scene."""
+    """Make a table of the costs of runs for each scene."""
     return [
         _cost_table(part, str(scene))
         for scene, part in summarise(records).groupby("scene", sort=False)
@@ -165,17 +164,17 @@ def cost_tables(records: Sequence[RunRecord]) -> list[Table]:
 
 
 class _Column(NamedTuple):
-    """A column of a table; labels that it lacks have a dash."""
+    """A column of a table; a dash stands for labels without an entry."""
 
     head: Head
     entries: DataFrame
     """At most one for each label."""
     field: str = "text"
-    """What its cells show; means are marked."""
+    """Field of the entries that cells show; means are marked."""
 
 
 def _table(title: str, labels: Sequence[str], columns: Sequence[_Column], **options: Any) -> Table:
-    """Columns side by side, with a row for each label."""
+    """Put columns side by side, with a row for each label."""
     places = {label: i for i, label in enumerate(labels)}
     rows = [[label, *["-"] * len(columns)] for label in labels]
     ranks, ties = {}, set()
@@ -192,7 +191,7 @@ def _table(title: str, labels: Sequence[str], columns: Sequence[_Column], **opti
 
 
 def _overviews(entries: DataFrame, names: Sequence[str], *, size: bool) -> Iterable[Table]:
-    """Macro means side by side: methods by scenes, as papers print them, and their mean."""
+    """Make tables of macro means, methods by scenes, as papers print them, with their mean."""
     labels = entries.label.unique()
     measured = entries[entries.source == MEASURED].label.nunique()
     breaks = {measured - 1} if measured < len(labels) else ()
@@ -224,8 +223,10 @@ def _overviews(entries: DataFrame, names: Sequence[str], *, size: bool) -> Itera
 def _quality_tables(
     part: DataFrame, metric: str, runs: Sequence[RunRecord], *, every: bool
 ) -> list[Table]:
-    """One metric on one scene: methods by periods and aggregates; many periods in tables of their
-    own, if at all."""
+    """Make tables of one metric on one scene: methods by periods and aggregates.
+
+    Many periods are in tables of their own, if ``every`` asks for them.
+    """
     info, labels = metric_info(metric), part.label.unique()
     arrow = "higher" if info.higher_is_better else "lower"
     title = f"{runs[0].scene}: {info.title} ({metric}), {arrow} is better"
@@ -240,7 +241,8 @@ def _quality_tables(
     few = len(ids) <= MAX_PERIODS
     over = [
         _Column((name, ""), by_column.get(name, none))
-        for name in (*AGGREGATES, *(() if few else ("median", "best")))
+        for name, _, _, for_many in AGGREGATES
+        if not (few and for_many)
     ]
     over[1:1] = _uncertainty(by_column.get("macro", none))
     count = _Column(("n", ""), part.drop_duplicates("label"), "runs")
@@ -253,7 +255,7 @@ def _quality_tables(
 
 
 def _uncertainty(macro: DataFrame) -> Iterable[_Column]:
-    """Intervals over views of the macro means and of their differences to the best, if known."""
+    """Make columns of the intervals of macro means and of differences to the best, if known."""
     for head, prefix in (
         (("interval", "over views"), ""),
         (("difference", "to the best"), "difference_"),
@@ -265,8 +267,7 @@ def _uncertainty(macro: DataFrame) -> Iterable[_Column]:
 
 
 def interval_text(entry: Mapping[Any, Any], prefix: str = "") -> str:
-    """The interval of a mean; or, with the prefix ``difference_``, a difference and its interval,
-    if that is known."""
+    """Format the interval of a mean, or with ``difference_`` a difference and its interval."""
     low, high = (in_unit(entry["quantity"], entry[prefix + end]) for end in ("low", "high"))
     text = "" if math.isnan(entry[f"{prefix}low"]) else f"[{low}, {high}]"
     difference = in_unit(entry["quantity"], entry["difference"]) if prefix else ""
@@ -274,13 +275,13 @@ def interval_text(entry: Mapping[Any, Any], prefix: str = "") -> str:
 
 
 def period_name(period: int | str, labels: dict[str, str]) -> str:
-    """The label of a period, or its number where it has none."""
+    """Name a period by its label, or by its number where it has none."""
     label = labels.get(str(period), str(period))
     return f"period {label}" if label == str(period) else label
 
 
 def period_title(period: str, labels: dict[str, str]) -> str:
-    """Heading of the column of a period: its number, and its label if it has one."""
+    """Head the column of a period by its number, and its label if it has one."""
     name = period_name(period, labels)
     return name if name == f"period {period}" else f"{period}: {name}"
 
@@ -288,8 +289,10 @@ def period_title(period: str, labels: dict[str, str]) -> str:
 def _stage_tables(
     part: DataFrame, metric: str, runs: Sequence[RunRecord], *, every: bool
 ) -> list[Table]:
-    """One metric of the runs in stages: each period after each stage, unless there are many, and
-    what is left at last."""
+    """Make tables of one metric of runs in stages: each period after each stage, and at the end.
+
+    The first is left out where there are many periods, unless ``every`` asks for it.
+    """
     found = part[part.quantity == metric]
     texts = found.set_index(["label", "column"]).text
     labels = found.label[found.column.str.startswith(f"{period_part(0)}: ")].unique()
@@ -314,7 +317,7 @@ def _stage_tables(
 
 
 def _cost_table(part: DataFrame, scene: str, metrics: Sequence[str] = ()) -> Table:
-    """What the runs on one scene reach and cost."""
+    """Make the table of macro means and costs of the runs on one scene."""
     costs, macro = part[part.column == ""], part[part.column == "macro"]
     shown = [cost for cost in COSTS if (costs.quantity == cost.name).any()]
     columns = [_Column((metric_info(m).title, ""), macro[macro.quantity == m]) for m in metrics]
@@ -330,10 +333,10 @@ def footnotes(
     failures: Sequence[Failure],
     wanted: Sequence[str] = (),
 ) -> list[str]:
-    """What a reader must know: aggregates, spread, device, code, what is absent and why."""
-    notes = ["macro: mean over periods; micro: mean over test views; worst: the worst period"]
-    if any(len(run.periods) > MAX_PERIODS for run in records):
-        notes.append("median, best: of the means of the periods; --periods shows every period")
+    """List the notes below tables: aggregates, spread, device, code, absent values and reasons."""
+    many = any(len(run.periods) > MAX_PERIODS for run in records)
+    known = [f"{a.name}: {a.meaning}" for a in AGGREGATES if many or not a.for_many_periods]
+    notes = ["; ".join(known) + ("; --periods shows every period" if many else "")]
     if (entries.n > 1).any():
         notes.append("±: sample standard deviation over n seeds")
     if entries.low.notna().any():
@@ -350,34 +353,32 @@ def footnotes(
     mixed = entries[entries.devices > 1].label.unique()
     if len(mixed):
         notes.append(f"seeds of several devices are averaged, costs too: {'; '.join(mixed)}")
-    counted: dict[str, dict[str, None]] = {}
-    for run in records:
-        if run.primitives is not None and not wanted:
-            counted.setdefault(run.primitive, {})[run.title] = None
-    if counted:
-        units = "; ".join(f"{unit} of {', '.join(titles)}" for unit, titles in counted.items())
+    counted = [(r.primitive, r.title) for r in records if r.primitives is not None and not wanted]
+    if units := "; ".join(f"{unit} of {titles}" for unit, titles in _grouped(counted)):
         notes.append(f"primitives: {units}")
-    absent: dict[str, list[str]] = {}
+    absent = []
     for run in records:
-        skipped = {m: why for m, why in run.skipped.items() if not wanted or m in wanted}
-        shown = {} if wanted else COST_TITLES
-        costly = {shown[cost]: why for cost, why in run.absent.items() if cost in shown}
-        for name, reason in {**skipped, **costly}.items():
-            names = absent.setdefault(reason, [])
-            if name not in names:
-                names.append(name)
-    notes += [f"absent: {', '.join(names)}: {reason}" for reason, names in absent.items()]
-    notices = dict.fromkeys(notice for run in records for notice in run.notices)
-    seeds: dict[tuple[str, str], list[str]] = {}
-    for f in failures:
-        name = f"{f.scene}, {f.method} ({kind_of(f)})"
-        seeds.setdefault((name, f.reason), []).append(str(f.seed))
-    failed = [f"failed: {n}, seed {', '.join(s)}: {reason}" for (n, reason), s in seeds.items()]
-    return [*notes, *notices, *failed]
+        costs = [(COST_TITLES.get(cost), why) for cost, why in run.absent.items()]
+        for name, reason in (*run.skipped.items(), *costs):
+            if name in wanted if wanted else name:
+                absent.append((reason, name))
+    notes += [f"absent: {names}: {reason}" for reason, names in _grouped(absent)]
+    notes += dict.fromkeys(notice for run in records for notice in run.notices)
+    failed = [((f"{f.scene}, {f.method} ({kind_of(f)})", f.reason), f.seed) for f in failures]
+    notes += [f"failed: {n}, seed {seeds}: {reason}" for (n, reason), seeds in _grouped(failed)]
+    return notes
+
+
+def _grouped(pairs: Iterable[tuple[Any, Any]]) -> Iterable[tuple[Any, str]]:
+    """Return each key once, with its different values joined by commas."""
+    values: dict[Any, dict[str, None]] = {}
+    for key, value in pairs:
+        values.setdefault(key, {})[str(value)] = None
+    return [(key, ", ".join(of_key)) for key, of_key in values.items()]
 
 
 def published_notes(table: PublishedTable, records: Sequence[RunRecord]) -> list[str]:
-    """What must be known of published rows, and which scenes have none."""
+    """List the notes on published rows, and the scenes that have none."""
     known = {row.scene.casefold() for row in table.rows}
     strange = dict.fromkeys(run.scene for run in records if run.scene.casefold() not in known)
     notes = [f"published: {table.title}; {table.hardware}. {' '.join(table.notes)}"]

@@ -210,7 +210,15 @@ def test_many_scenes_are_folded(scenes, widths):
 def test_many_periods_are_folded():
     runs = [record(method, psnr=tuple(range(10, 40))) for method in "ab"]
     (table,) = grids(runs, ["psnr"])
-    assert table.flat_heads == ["method", "macro", "micro", "worst", "median", "best", "n"]
+    assert table.flat_heads == [
+        "method",
+        "macro",
+        "micro",
+        "worst",
+        "median of periods",
+        "best",
+        "n",
+    ]
     assert table.rows[0][1:] == ["24.50", "24.50", "10.00", "24.50", "39.00", "1"]
     assert any("--periods" in note for note in notes(runs, []))
     made = readable_tables(summarise(runs), runs, ["psnr"], periods=True)
