@@ -39,7 +39,7 @@ MAX_PERIODS = 100_000  # Far more than any real scene has: a mistaken id must no
 
 
 def matches(path: Path) -> bool:
-    """Whether a folder is meant to be of this format."""
+    """Return True if a folder is meant to be of this format."""
     return (path / SPLIT).is_file()
 
 
@@ -78,7 +78,7 @@ def read(path: Path, *, model: Model | None = None) -> Scene:
 
 
 def _read_model(path: Path) -> Model:
-    """The model, which this format has in one place only."""
+    """Read the model, which this format has in one place only."""
     found = find_model(path)
     if found is not None and found[0] != MODEL:
         raise SceneError(
@@ -92,7 +92,7 @@ def _read_model(path: Path) -> Model:
 
 
 def remarks(path: Path) -> list[str]:
-    """What of a folder is not part of the format."""
+    """List the content of a folder that is not part of the format."""
     names = {p.name + "/" * p.is_dir() for p in path.iterdir()}
     others = sorted(names - {"images/", "sparse/", f"{MASKS}/"})
     return [f"not part of the format, and not converted: {', '.join(others)}"] if others else []
@@ -140,7 +140,7 @@ def check_name(place: Path, name: str) -> None:
 
 
 def make_frames(model: Model, periods: dict[str, int], tests: set[str]) -> tuple[Frame, ...]:
-    """Frames of the registered images, in their order."""
+    """Make frames of the registered images, in their order."""
     return tuple(
         Frame(
             name=image.name,
@@ -155,7 +155,7 @@ def make_frames(model: Model, periods: dict[str, int], tests: set[str]) -> tuple
 
 
 def read_tests(path: Path, names: list[str], periods: dict[str, int]) -> tuple[set[str], str]:
-    """Names of the test images, and the rule that chose them in words."""
+    """Return the names of the test images, and the rule that chose them in words."""
     if not (path / TEST).exists():
         return splits.default_tests(periods), splits.DEFAULT_RULE
     entries = splits.parse_test_text(read_text(path / TEST))
@@ -165,7 +165,7 @@ def read_tests(path: Path, names: list[str], periods: dict[str, int]) -> tuple[s
 
 
 def read_periods(path: Path, count: int) -> tuple[Period, ...]:
-    """Labels and dates from ``periods.json``, or the ids where the file is absent.
+    """Read labels and dates from ``periods.json``, or the ids where the file is absent.
 
     Raises:
         SceneError: If there are more than `MAX_PERIODS`, or the file is damaged or does not have
@@ -184,7 +184,7 @@ def read_periods(path: Path, count: int) -> tuple[Period, ...]:
 
 
 def read_world(path: Path) -> WorldFrame:
-    """Unit and reference system from ``world.json``, or unknown where the file is absent."""
+    """Read unit and reference system from ``world.json``; unknown where the file is absent."""
     place = path / WORLD
     if not place.exists():
         return WorldFrame()

@@ -18,12 +18,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from chronoscene.colmap.model import PosedImage
 from chronoscene.colmap.raw_model import FoundModel
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared import colmap_layout, transforms
 from chronoscene.formats.shared.grouping import group_labels, natural_key, rule_error
 from chronoscene.formats.shared.ply import read_points
-from chronoscene.formats.shared.transforms import CameraTable, Shot
+from chronoscene.formats.shared.transforms import CameraTable
 from chronoscene.images.store import ImageSource, Progress
 from chronoscene.io.documents import read_json_document
 from chronoscene.scene import Camera, Points, Scene
@@ -32,7 +33,7 @@ from chronoscene.scene.splits import DEFAULT_RULE, TEST_EVERY, default_tests
 
 NAME = "cl-splats"
 MARKS = "images/day_<n>_* and sparse/0/, or transforms_train.json here and in add/, move/, ..."
-"""What `matches` looks for."""
+"""Description of the marks that `matches` looks for."""
 
 BASE = "base"
 CHANGES = ("add", "delete", "move", "multi")
@@ -96,7 +97,7 @@ def _read_level(path: Path, period_by: str) -> Scene:
         raise rule_error(period_by, rules)
     changes = present if period_by == "step" else [period_by.removeprefix("change:")]
     cameras = CameraTable()
-    shots: list[Shot] = []
+    images: list[PosedImage] = []
     labels: dict[str, str] = {}
     tests: set[str] = set()
     for label in (BASE, *changes):
@@ -104,15 +105,15 @@ def _read_level(path: Path, period_by: str) -> Scene:
         new = _read_file(path, folder, TRAIN, cameras)
         if (path / folder / TEST).exists():
             held_out = _read_file(path, folder, TEST, cameras)
-            tests |= {shot.name for shot in held_out}
+            tests |= {image.name for image in held_out}
             new += held_out
-        shots += new
-        labels |= {shot.name: label for shot in new}
-    transforms.check_distinct(path, shots)
+        images += new
+        labels |= {image.name: label for image in new}
+    transforms.check_distinct(path, images)
     grouped = group_labels(labels, [BASE, *changes])
     return transforms.make_scene(
         path,
-        shots,
+        images,
         grouped,
         tests or default_tests(grouped[0]),
         points=read_points(path / POINTS) if (path / POINTS).exists() else Points.empty(),
@@ -121,22 +122,22 @@ def _read_level(path: Path, period_by: str) -> Scene:
     )
 
 
-def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list[Shot]:
+def _read_file(path: Path, folder: str, file: str, cameras: CameraTable) -> list[PosedImage]:
     place = path / folder / file
     data = read_json_document(place)
-    shots = []
+    shared, images = transforms.shared_keys(data), []
     for i, frame in enumerate(transforms.read_frames(place, data)):
         where = f"{place}: frames[{i}]"
         name = transforms.image_name(where, path, folder, frame.get("file_path"))
         world_from_cam = transforms.matrix(where, frame.get("transform_matrix"))
         pose = transforms.pose_from_opengl(where, world_from_cam)
-        keys = {key: value for key, value in data.items() if key != "frames"} | frame
-        shots.append(Shot(name, cameras.camera(where, keys, path / name), pose))
-    return shots
+        camera = cameras.camera(where, {**shared, **frame}, path / name)
+        images.append(PosedImage(0, name, camera, pose))
+    return images
 
 
 def remarks(path: Path) -> list[str]:
-    """What is there and not part of a scene."""
+    """List the content that does not become part of a scene."""
     if _is_level(path) and not (path / POINTS).exists():
         return [f"the level has no {POINTS}: the scene has no points"]
     return []
@@ -164,7 +165,7 @@ def write(
 
 
 def _readable(camera: Camera) -> Camera:
-    """The same camera in a model that the loader reads."""
+    """Return the same camera in a model that the loader reads."""
     if camera.model in PINHOLE_MODELS:
         return camera
     if camera.is_pinhole:
@@ -178,7 +179,7 @@ def _readable(camera: Camera) -> Camera:
 
 
 def losses(scene: Scene) -> list[str]:
-    """What a scene has that this format, or the loader that it is for, cannot hold."""
+    """List the content of a scene that this format, or the loader that it is for, cannot hold."""
     names = _written_names(scene)
     old = {new: name for name, new in names.items()}
     order = sorted({_step(name) for name in old}, key=natural_key)
@@ -192,10 +193,10 @@ def losses(scene: Scene) -> list[str]:
 
 
 def _written_names(scene: Scene) -> dict[str, str]:
-    """Name of each image; names that say the periods already stay."""
+    """Return the name of each image; names that contain the periods already stay."""
     steps = {(f.period, _step(f.name)) for f in scene.frames if "/" not in f.name}
     ordered = [step for _, step in sorted(steps)]
-    said = all(_DAY.match(f.name) and "/" not in f.name for f in scene.frames)
-    if said and len(steps) == scene.num_periods and ordered == sorted(ordered, key=natural_key):
+    named = all(_DAY.match(f.name) and "/" not in f.name for f in scene.frames)
+    if named and len(steps) == scene.num_periods and ordered == sorted(ordered, key=natural_key):
         return {f.name: f.name for f in scene.frames}
     return {f.name: f"day_{f.period}_" + f.name.replace("/", "_") for f in scene.frames}

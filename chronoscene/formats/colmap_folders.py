@@ -53,7 +53,7 @@ def read(path: Path, *, period_by: str = "folder", model: FoundModel | None = No
 
 
 def assign(images: Path, names: list[str], *, period_by: str = "folder") -> colmap_layout.Assigned:
-    """Periods by the names of the images, or otherwise.
+    """Assign periods by the names of the images, or by another rule.
 
     Raises:
         SceneError: If an image has no period.
@@ -86,7 +86,7 @@ def _folder(images: Path, name: str) -> str:
 
 
 def _dates(images: Path, names: list[str]) -> dict[str, date]:
-    """The day on which each photo was taken."""
+    """Return the day on which each photo was taken."""
     times = capture_times(images, names)
     if lost := [name for name, time in times.items() if time is None]:
         if missing := [name for name in lost if not (images / name).is_file()]:
@@ -129,7 +129,7 @@ def write(
 
 
 def losses(scene: Scene) -> list[str]:
-    """What a scene has that this format cannot hold."""
+    """List the content of a scene that this format cannot hold."""
     labels = colmap_layout.period_folders(scene.periods)
     return colmap_layout.lost_labels(scene, labels) + colmap_layout.lost_names(_names(scene))
 

@@ -8,7 +8,7 @@
 Scenes are in metres. Blocks may be in folders; those named ``test`` hold test images, and
 ``train_dense`` is left out beside ``train``. One city has one date: blocks are one period, unless
 every block is in a further folder, as in ``<period>/<block>/transforms.json``, or
-``--period-by folder`` says that the first folders are the periods.
+``--period-by folder`` makes the first folders the periods.
 
 There are no points: the offered clouds are separate downloads.
 
@@ -25,11 +25,12 @@ from typing import Any
 
 import numpy as np
 
+from chronoscene.colmap.model import PosedImage
 from chronoscene.errors import SceneError
 from chronoscene.formats.shared import transforms
 from chronoscene.formats.shared.colmap_layout import scan
 from chronoscene.formats.shared.grouping import Grouped, group_labels, natural_key, rule_error
-from chronoscene.formats.shared.transforms import CameraTable, Shot
+from chronoscene.formats.shared.transforms import CameraTable
 from chronoscene.images.decoding import image_size
 from chronoscene.io.documents import json_error, read_json_document
 from chronoscene.scene import Period, Points, Scene, WorldFrame
@@ -37,7 +38,7 @@ from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "matrixcity"
 MARKS = "transforms.json with rot_mat, or pose/<block>/transforms_train.json"
-"""What `matches` looks for."""
+"""Description of the marks that `matches` looks for."""
 
 PERIOD_BY = ("one", "folder")  # All blocks in one period, or one period for each first folder
 
@@ -49,7 +50,7 @@ ROTATION_SCALE = 100.0
 PREPARED_UNIT = 100.0  # Metres
 
 PARTS_OF_A_CITY = ("train", "test", "train_dense", "pose", "aerial", "street")
-"""Folders that say what images are for, or how they were flown: neither blocks nor periods."""
+"""Folders named after the purpose or the flight of images: neither blocks nor periods."""
 
 MAX_DEPTH = 4
 MAX_FOLDERS = 5000  # Folders that are searched, so that a wrong path does not take forever
@@ -78,7 +79,7 @@ class PoseFile:
 
 
 def matches(path: Path) -> bool:
-    """Whether there is a raw file, or a prepared one in a folder ``pose``."""
+    """Return True if there is a raw file, or a prepared one in a folder ``pose``."""
     return any(
         file.name == RAW or "pose" in file.parts for files, _ in _walk(path) for file in files
     )
@@ -93,19 +94,19 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     """
     path = Path(path)
     cameras = CameraTable()
-    shots: dict[str, Shot] = {}
+    images: dict[str, PosedImage] = {}
     labels: dict[str, list[str]] = {}
     tests: set[str] = set()
     for file in _pose_files(path):
-        for shot in _read_file(path, file, cameras):
-            _check_same(path, shots.setdefault(shot.name, shot), shot)
-            labels.setdefault(shot.name, file.labels)
+        for image in _read_file(path, file, cameras):
+            _check_same(path, images.setdefault(image.name, image), image)
+            labels.setdefault(image.name, file.labels)
             if file.is_test:
-                tests.add(shot.name)
+                tests.add(image.name)
     grouped = _group(path, labels, period_by)
     scene = transforms.make_scene(
         path,
-        list(shots.values()),
+        list(images.values()),
         grouped,
         tests or default_tests(grouped[0]),
         points=Points.empty(),
@@ -115,7 +116,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     return replace(scene, world=WorldFrame("metre"))
 
 
-def _check_same(path: Path, first: Shot, second: Shot) -> None:
+def _check_same(path: Path, first: PosedImage, second: PosedImage) -> None:
     """Refuse two poses of an image: files may repeat it, as merged ones do, but must agree."""
     # Metres, or entries of a rotation: prepared files are rounded.
     if np.abs(first.cam_from_world - second.cam_from_world).max() > 0.01:
@@ -128,7 +129,7 @@ def _check_same(path: Path, first: Shot, second: Shot) -> None:
 
 
 def remarks(path: Path) -> list[str]:
-    """What is there and not part of a scene."""
+    """List the content that does not become part of a scene."""
     found = ["the poses come without points, so the scene has none"]
     read = _pose_files(path)
     if left := [file for files, _ in _walk(path) for file in files if file not in read]:
@@ -180,10 +181,10 @@ def _pose_files(path: Path) -> list[PoseFile]:
     return chosen
 
 
-def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[Shot]:
+def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[PosedImage]:
     place = path / file.folder / file.name
     data = read_json_document(place)
-    shots: list[Shot] = []
+    shared, images = transforms.shared_keys(data), list[PosedImage]()
     for i, frame in enumerate(transforms.read_frames(place, data)):
         where = f"{place}: frames[{i}]"
         if file.name == RAW:
@@ -195,15 +196,16 @@ def _read_file(path: Path, file: PoseFile, cameras: CameraTable) -> list[Shot]:
             world_from_cam[:3, 3] *= PREPARED_UNIT
             file_path = frame.get("file_path")
         name = transforms.image_name(where, path, file.folder, file_path)
-        keys = {key: value for key, value in data.items() if key != "frames"} | frame
+        keys = shared | frame
         if "w" not in keys or "h" not in keys:  # images of a block are of one size
-            known = shots[0].camera if shots else None
+            known = images[0].camera if images else None
             size = (known.width, known.height) if known else image_size(path / name)
             keys |= {"w": size[0], "h": size[1]}
         camera = cameras.camera(where, keys, path / name)
-        shots.append(Shot(name, camera, transforms.pose_from_opengl(where, world_from_cam)))
-    transforms.check_distinct(place, shots)
-    return shots
+        pose = transforms.pose_from_opengl(where, world_from_cam)
+        images.append(PosedImage(0, name, camera, pose))
+    transforms.check_distinct(place, images)
+    return images
 
 
 def _raw_file_path(where: str, frame: dict[str, Any]) -> str:
@@ -214,7 +216,7 @@ def _raw_file_path(where: str, frame: dict[str, Any]) -> str:
 
 
 def _group(path: Path, labels: dict[str, list[str]], by: str | None) -> Grouped:
-    """Periods of images by the folders of their files."""
+    """Group images into periods by the folders of their files."""
     if by is None:
         by = "folder" if all(len(parts) >= 2 for parts in labels.values()) else "one"
     if by == "one":

@@ -5,7 +5,7 @@
 - Frames whose image is missing are left out: the fox of instant-ngp comes with such frames.
 - Frames in ``test_filenames`` or ``val_filenames`` are test images. Frames that are in no list are
   left out where there is a ``train_filenames``, as nerfstudio does.
-- ``applied_transform`` and ``applied_scale`` say what was done to the original world; both are
+- ``applied_transform`` and ``applied_scale`` are what was done to the original world; both are
   undone, so scenes are in the original world. ``ply_file_path`` is in the world of the file.
   Without the first, and with the model in ``colmap/sparse/0``, the axes were swapped as old
   versions did it.
@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.colmap.model import PosedImage
 from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.chronoscene import MAX_COORDINATE, MAX_PERIODS, check_name
 from chronoscene.formats.matrixcity import RAW_KEY
@@ -38,7 +39,7 @@ from chronoscene.formats.shared.json_values import (
     world_item,
 )
 from chronoscene.formats.shared.ply import read_points, write_points
-from chronoscene.formats.shared.transforms import CameraTable, Shot
+from chronoscene.formats.shared.transforms import CameraTable
 from chronoscene.images.masks import mask_place
 from chronoscene.images.store import ImageSource, Progress, place_images
 from chronoscene.io.documents import json_error, number, read_json_document
@@ -65,7 +66,7 @@ HISTORICAL = ((0, 1, 0, 0), (1, 0, 0, 0), (0, 0, -1, 0))
 
 
 def matches(path: Path) -> bool:
-    """Whether a folder has a ``transforms.json`` that is not a raw file of MatrixCity."""
+    """Return True if a folder has a ``transforms.json`` that is not a raw file of MatrixCity."""
     place = path / FILE
     if (path / "sparse/split.txt").exists() or not place.is_file():
         return False
@@ -84,11 +85,11 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
     data = read_json_document(place)
     frames = transforms.read_frames(place, data)
     named = _by_name(path, frames)
-    shots, tests, rule = _apply_lists(path, data, _read_shots(path, data, named), named)
-    grouped = _group(place, data, {shot.name: named[shot.name][1] for shot in shots}, period_by)
+    images, tests, rule = _apply_lists(path, data, _read_images(path, data, named), named)
+    grouped = _group(place, data, {image.name: named[image.name][1] for image in images}, period_by)
     scene = transforms.make_scene(
         path,
-        shots,
+        images,
         grouped,
         default_tests(grouped[0]) if tests is None else tests,
         points=_read_points(path, data),
@@ -104,7 +105,7 @@ def read(path: Path, *, period_by: str | None = None) -> Scene:
 
 
 def remarks(path: Path) -> list[str]:
-    """What is there and not part of a scene."""
+    """List the content that does not become part of a scene."""
     data = read_json_document(path / FILE)
     frames = transforms.read_frames(path / FILE, data)
     depths = sum("depth_file_path" in frame for frame in frames)
@@ -119,17 +120,17 @@ def remarks(path: Path) -> list[str]:
             )
         found.append(f"{COLMAP} is not read, which has observations of points")
     named = _by_name(path, frames)
-    shots = _read_shots(path, data, named)
-    if len(shots) < len(frames):
-        found.append(f"{len(frames) - len(shots)} frames are left out, as their image is missing")
-    kept, _, _ = _apply_lists(path, data, shots, named)
-    if len(kept) < len(shots):
-        found.append(f"{len(shots) - len(kept)} frames are left out, as no list names them")
+    images = _read_images(path, data, named)
+    if len(images) < len(frames):
+        found.append(f"{len(frames) - len(images)} frames are left out, as their image is missing")
+    kept, _, _ = _apply_lists(path, data, images, named)
+    if len(kept) < len(images):
+        found.append(f"{len(images) - len(kept)} frames are left out, as no list names them")
     return found
 
 
 def _by_name(path: Path, frames: list[dict[str, Any]]) -> dict[str, tuple[str, dict[str, Any]]]:
-    """Place, for messages, and keys of each frame, by the path of its image."""
+    """Map the path of each image to the place, for messages, and the keys of its frame."""
     named: dict[str, tuple[str, dict[str, Any]]] = {}
     for i, frame in enumerate(frames):
         place = f"{path / FILE}: frames[{i}]"
@@ -143,7 +144,7 @@ def _by_name(path: Path, frames: list[dict[str, Any]]) -> dict[str, tuple[str, d
 def _find_masks(
     path: Path, scene: Scene, named: Mapping[str, tuple[str, dict[str, Any]]]
 ) -> dict[str, Path]:
-    """The mask of each frame that names one."""
+    """Return the mask of each frame that names one."""
     masks = {}
     for frame in scene.frames:
         place, keys = named[scene.image_path(frame).relative_to(path).as_posix()]
@@ -156,50 +157,44 @@ def _find_masks(
     return masks
 
 
-def _read_shots(
+def _read_images(
     path: Path, data: Mapping[str, Any], named: Mapping[str, tuple[str, dict[str, Any]]]
-) -> list[Shot]:
-    """The frames whose image is there, of which there must be one."""
-    cameras, shots = CameraTable(), []
-    shared = {key: value for key, value in data.items() if key != "frames"}
+) -> list[PosedImage]:
+    """Read the frames whose image is there, of which there must be one."""
+    cameras, shared, images = CameraTable(), transforms.shared_keys(data), []
     for name, (place, frame) in named.items():
         if not os.path.isfile(path / name):
             continue
         world_from_cam = transforms.matrix(place, frame.get("transform_matrix"), (3, 4))
+        camera = cameras.camera(place, {**shared, **frame}, path / name)
+        pose = transforms.pose_from_opengl(place, world_from_cam)
         image_id = frame.get("colmap_im_id")
-        shots.append(
-            Shot(
-                name=name,
-                camera=cameras.camera(place, {**shared, **frame}, path / name),
-                cam_from_world=transforms.pose_from_opengl(place, world_from_cam),
-                image_id=image_id if type(image_id) is int else 0,
-            )
-        )
-    if not shots:
+        images.append(PosedImage(image_id if type(image_id) is int else 0, name, camera, pose))
+    if not images:
         missing = path / next(iter(named))
         raise SceneError(
             missing, expected="an image", found="nothing", todo="copy the images there"
         )
-    return shots
+    return images
 
 
 def _apply_lists(
-    path: Path, data: Mapping[str, Any], shots: list[Shot], known: Collection[str]
-) -> tuple[list[Shot], set[str] | None, str]:
-    """Frames that are used, and the test images with the rule in words; None for the default."""
+    path: Path, data: Mapping[str, Any], images: list[PosedImage], known: Collection[str]
+) -> tuple[list[PosedImage], set[str] | None, str]:
+    """Return the images that are used, the test images (None for the default), and the rule."""
     place = path / FILE
     lists = {key: _names(path, data, f"{key}_filenames", known) for key in ("train", "val", "test")}
     if all(names is None for names in lists.values()):
-        return shots, None, DEFAULT_RULE
+        return images, None, DEFAULT_RULE
     tests = (lists["val"] or set()) | (lists["test"] or set())
     train = lists["train"]
     if train is not None:
         if both := sorted(train & tests):
             raise json_error(place, "train and test lists without common names", repr(both[0]))
-        shots = [shot for shot in shots if shot.name in train | tests]
-        if not shots:
+        images = [image for image in images if image.name in train | tests]
+        if not images:
             raise json_error(place, "frames that are in the lists of names", "none")
-    return shots, tests, "the lists of file names in transforms.json"
+    return images, tests, "the lists of file names in transforms.json"
 
 
 def _names(
@@ -219,7 +214,7 @@ def _names(
 def _group(
     place: Path, data: Mapping[str, Any], frames: Mapping[str, Mapping[str, Any]], by: str | None
 ) -> grouping.Grouped:
-    """Periods of the frames by the keys that they have, or as the option says."""
+    """Group the frames into periods by their keys, or by the rule of the option."""
     if by is None:
         keys = (key for key in ("period", "time") if any(key in f for f in frames.values()))
         by = next(keys, None)
@@ -328,7 +323,7 @@ def write(
 
 
 def losses(scene: Scene) -> list[str]:
-    """What a scene has that this format cannot hold."""
+    """List the content of a scene that this format cannot hold."""
     lost = []
     if len(scene.points.track_frame):
         lost.append("the observations of points, their ids and errors")
@@ -342,7 +337,7 @@ def losses(scene: Scene) -> list[str]:
 
 
 def _finite(points: Points) -> NDArray[np.bool_]:
-    """Which points a cloud can hold. [P]"""
+    """Return True for the points that a cloud can hold. [P]"""
     return np.asarray(np.isfinite(points.xyz).all(axis=1))
 
 

@@ -2,8 +2,7 @@
 
 Dates stand at the beginning of the file names (``2012-05-03_...``). Photos whose name begins with
 ``none`` have no date and are left out, as are those in ``trash.txt``, and those that are not in
-``train.txt`` where there is one. Hundreds of dates must be grouped into periods: by year, unless
-told otherwise.
+``train.txt`` where there is one. Hundreds of dates become periods, by default years.
 
 The authors publish no list of test images; the evaluation in their configuration takes every 10th
 image of ``train.txt``. We take the images 0, 10, 20, ... of that list (else of all in name order)
@@ -35,7 +34,7 @@ NAME = "neusc"
 MARKS = "dense/images/ with dates in the names, and dense/sparse/"  # What `matches` looks for
 
 PERIOD_BY = ("year", "month", "day", "gap:DAYS", "count:N")
-"""How dates become periods; by year unless told otherwise."""
+"""Rules by which dates become periods; by year by default."""
 
 TEST_EVERY = 10
 
@@ -81,7 +80,7 @@ def read(path: Path, *, period_by: str = "year") -> Scene:
 
 
 def remarks(path: Path) -> list[str]:
-    """What is there and not part of a scene."""
+    """List the content that does not become part of a scene."""
     model, _ = _read_images(path)
     left_out = len(model.images) - len([n for n in _used_names(path, model) if _date(path, n)])
     found = []
@@ -109,7 +108,7 @@ def _read_images(path: Path) -> tuple[Model, Path]:
 
 
 def _used_names(path: Path, model: Model) -> list[str]:
-    """Registered images in the order of ``train.txt``, or of their names, without the trash."""
+    """List registered images as in ``train.txt``, or sorted by name, without the trash."""
     names = [image.name for image in model.images]
     trash = set(_listed(path, "trash.txt", names) or [])
     train = _listed(path, "train.txt", names)
@@ -122,7 +121,7 @@ def _lists(path: Path, file: str) -> list[Path]:
 
 
 def _listed(path: Path, file: str, names: list[str]) -> list[str] | None:
-    """Registered images that a list names, in its order; None without such a list."""
+    """Return the registered images that a list names, in its order; None without such a list."""
     places = _lists(path, file)
     if not places:
         return None
@@ -142,7 +141,7 @@ def _listed(path: Path, file: str, names: list[str]) -> list[str] | None:
 
 
 def _date(path: Path, name: str) -> date | None:
-    """Date at the beginning of a file name; None where it says ``none``."""
+    """Return the date at the beginning of a file name; None for ``none``."""
     prefix = PurePosixPath(name).name.split("_")[0]
     if prefix.lower() == "none":
         return None

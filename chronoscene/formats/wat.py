@@ -8,7 +8,7 @@ Every image keeps the camera that the model gives it, with its distortion. The l
 uses the first camera for all images and ignores distortion; results that are to be compared with
 its own need images undistorted to one camera.
 
-Nothing in these files says that they are WAT, so the names of its ten scenes are the mark. A scene
+Nothing in these files marks them as WAT, so the names of its ten scenes are the mark. A scene
 of another name in the same layout is `colmap-folders`, which reads the same where the folders are
 in natural order.
 
@@ -31,7 +31,7 @@ from chronoscene.scene.splits import DEFAULT_RULE, default_tests
 
 NAME = "wat"
 MARKS = "images/<task>/ and sparse/0/ in a folder named as a scene of WAT"
-"""What `matches` looks for."""
+"""Description of the marks that `matches` looks for."""
 
 READ_MODELS = ("SIMPLE_RADIAL", "PINHOLE", "OPENCV")
 """Camera models that the loader of CLNeRF reads; it ignores distortion."""
@@ -60,7 +60,7 @@ def read(path: Path, *, model: FoundModel | None = None) -> Scene:
 
 
 def assign(images: Path, names: list[str]) -> colmap_layout.Assigned:
-    """Periods and test images by the names of the images.
+    """Assign periods and test images by the names of the images.
 
     Raises:
         SceneError: If an image is in no folder.
@@ -77,7 +77,7 @@ def _task(images: Path, name: str) -> str:
             images,
             expected="every image in the folder of its task",
             found=repr(name),
-            todo="if this is no scene of WAT, name its --dataset-format (colmap-folders, say)",
+            todo="if this is no scene of WAT, name its --dataset-format, such as colmap-folders",
         )
     return folder
 
@@ -106,7 +106,7 @@ def write(
 
 
 def _one_camera(scene: Scene, out: Path) -> Camera:
-    """The camera that all images have, as number 1 and in a model that the loader reads."""
+    """Return the camera of all images, as number 1 and in a model that the loader reads."""
     cameras = {replace(frame.camera, camera_id=1) for frame in scene.frames}
     camera = cameras.pop()
     if camera.is_pinhole and camera.model not in READ_MODELS:
@@ -125,7 +125,7 @@ def _one_camera(scene: Scene, out: Path) -> Camera:
 
 
 def losses(scene: Scene) -> list[str]:
-    """What a scene has that this format, or the loader that it is for, cannot hold."""
+    """List the content of a scene that this format, or the loader that it is for, cannot hold."""
     names = _names(scene)
     old = {new: name for name, new in names.items()}
     taken = default_tests({names[f.name]: f.period for f in scene.frames})

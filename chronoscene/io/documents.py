@@ -37,7 +37,7 @@ def read_text(path: Path, *, error: type[ChronoSceneError] = SceneError) -> str:
 
 
 def decode_text(data: bytes) -> str:
-    """Decode UTF-8 or, where a byte order mark says so, UTF-16 (as some Windows shells write)."""
+    """Decode UTF-8 or, after its byte order mark, UTF-16 (as some Windows shells write)."""
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16")
     return data.decode("utf-8-sig")

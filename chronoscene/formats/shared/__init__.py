@@ -1,1 +1,1 @@
-"""What several formats share. No format is imported here but our own."""
+"""Parts that several formats share. No format is imported here but our own."""

@@ -1,7 +1,7 @@
-"""What the formats share that are a COLMAP model beside a folder of images.
+"""Reading and writing of formats that are a COLMAP model beside a folder of images.
 
-All that is known of a period in such formats is a part of the image names: a folder, or a prefix.
-Writers give the images new names.
+In such formats a period is a part of the image names: a folder, or a prefix. Writers give the
+images new names.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from chronoscene.scene.splits import IMAGE_SUFFIXES
 
 @dataclass(frozen=True, slots=True)
 class Assigned:
-    """What a format knows of the images of a model by their names."""
+    """Periods and tests that a format assigns to the images of a model by their names."""
 
     grouped: Grouped
     tests: set[str] | None = None
@@ -39,7 +39,7 @@ class Assigned:
 
 
 def scan(folder: Path) -> tuple[list[str], list[str]]:
-    """Names of the folders and of the images directly in a folder, sorted.
+    """List the folders and the images directly in a folder, sorted.
 
     A folder that is not there, or may not be looked into, counts as empty.
     """
@@ -57,7 +57,7 @@ def scan(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def is_in_folders(images: Path) -> bool:
-    """Whether there are folders of images, and no image beside them."""
+    """Return True if there are folders of images, and no image beside them."""
     folders, files = scan(images)
     return bool(folders) and not files
 
@@ -114,7 +114,7 @@ def read_images(path: Path, found: FoundModel | None) -> tuple[Model, Path]:
 
 
 def keep_images(model: Model, names: Collection[str]) -> Model:
-    """The model without the other images and their observations; points stay."""
+    """Drop the other images of a model and their observations; points stay."""
     kept = [i for i, image in enumerate(model.images) if image.name in names]
     rank = np.full(len(model.images), -1, np.int32)
     rank[kept] = np.arange(len(kept), dtype=np.int32)
@@ -133,7 +133,7 @@ def make_scene(
     rule: str,
     format: str,
 ) -> Scene:
-    """A scene from a model whose images have their periods."""
+    """Make a scene of a model whose images have their periods."""
     periods, table = grouped
     return Scene(
         name=path.resolve().name,
@@ -159,8 +159,8 @@ def write_renamed(
 ) -> Path:
     """Write ``images/`` and ``sparse/0`` with other image names; complete or not at all.
 
-    ``names`` has the new name of each image, which is found by its old one; ``test_list`` says
-    whether to write ``sparse/0/test.txt``. The rest is as for `chronoscene.formats.chronoscene`.
+    ``names`` maps old to new names of images; with ``test_list``, ``sparse/0/test.txt`` is written.
+    The rest is as for `chronoscene.formats.chronoscene`.
 
     Raises:
         SceneError: If ``out`` is in use, an image is missing, or two new names are equal.
@@ -191,7 +191,7 @@ def write_renamed(
 
 
 def _renamed(scene: Scene, names: Mapping[str, str]) -> Scene:
-    """The same scene with other image names: frames sorted again, tracks following them.
+    """Rename the images of a scene: frames are sorted again, and tracks follow them.
 
     The files keep their names, so `Scene.image_path` of the result is invalid.
     """
@@ -206,7 +206,7 @@ def _renamed(scene: Scene, names: Mapping[str, str]) -> Scene:
 def period_folders(
     periods: tuple[Period, ...], order: Callable[[str], Any] = natural_key
 ) -> list[str]:
-    """A folder for each period, such that those sorted by ``order`` are in the periods' order."""
+    """Name a folder for each period, so that ``order`` sorts them as the periods."""
     labels = [period.label for period in periods]
     plain = all(re.fullmatch(r"\w[\w.+ -]*(?<! )", label) for label in labels)
     if plain and labels == sorted(set(labels), key=order):
@@ -216,7 +216,7 @@ def period_folders(
 
 
 def new_names(scene: Scene, folders: list[str], *, deep: bool) -> dict[str, str]:
-    """Name of each image in the folder of its period; unchanged if all are there already.
+    """Name each image in the folder of its period; unchanged if all are there already.
 
     With ``deep``, the folder of a period may have subfolders.
     """

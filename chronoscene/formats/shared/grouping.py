@@ -1,4 +1,4 @@
-"""Periods from dates, times, folders or a table: the answers to ``--period-by``.
+"""Periods from dates, times, folders or a table: the values of ``--period-by``.
 
 A value of the option is ``year``, ``month``, ``day`` (dates only), ``gap:X`` (a new period where
 two neighbours are more than X apart: days, or the unit of the times), ``count:N`` (N periods, cut
@@ -33,21 +33,21 @@ NAME_PERIODS = (
     "name the periods: --period-by year, month or day (dates of the photos), or --period-by "
     "table:FILE (a CSV file with the columns file and period)"
 )
-"""What to do about a COLMAP project that says nothing of periods."""
+"""Advice on a COLMAP project without periods."""
 
 _CALENDAR = {"year": 4, "month": 7, "day": 10}
 """Characters of an ISO date that images of one period share."""
 
 
 def absolute_rule(rule: str | None) -> str | None:
-    """The same answer to ``--period-by``, from whatever folder it is read."""
+    """Make a value of ``--period-by`` independent of the current folder."""
     if rule is None or not rule.startswith(TABLE):
         return rule
     return f"{TABLE}{Path(rule.removeprefix(TABLE)).resolve()}"
 
 
 def natural_key(text: str) -> tuple[tuple[tuple[int, int | str], ...], str]:
-    """Sorts ``t2`` before ``t10``; texts that differ in leading zeros alone by the text."""
+    """Sort key with ``t2`` before ``t10``; texts that differ in leading zeros alone by the text."""
     parts = re.findall(r"[0-9]{1,18}|[^0-9]+", text)
     numbers = tuple((0, int(part)) if part[0] in "0123456789" else (1, part) for part in parts)
     return numbers, text
@@ -90,7 +90,7 @@ def group_times(times: Mapping[str, float], by: str) -> Grouped:
 
 
 def group_labels(labels: Mapping[str, str], order: Sequence[str]) -> Grouped:
-    """One period for each label, in the given order; a label that is a date is the date too."""
+    """Make a period of each label, in the given order; a label that is a date is the date too."""
     index = {label: i for i, label in enumerate(order)}
     periods = tuple(Period(i, label, label_date(label)) for i, label in enumerate(order))
     return {name: index[label] for name, label in labels.items()}, periods
@@ -104,7 +104,7 @@ def label_date(label: str) -> str | None:
 def read_table(
     path: Path, images: Sequence[str] = ("file",), label: str = "period"
 ) -> list[tuple[str, str, str]]:
-    """Place for messages, image and label of each row of a CSV file.
+    """Read place for messages, image and label of each row of a CSV file.
 
     Args:
         path: Of the file.
@@ -131,7 +131,7 @@ def read_table(
 
 
 def group_by_table(names: Sequence[str], path: Path) -> Grouped:
-    """Periods from a CSV file; labels are sorted naturally, so numbers and dates are in order.
+    """Read periods from a CSV file; labels are sorted naturally, so numbers and dates are in order.
 
     Raises:
         SceneError: If the file is damaged, or an image is missing or ambiguous in it.
@@ -173,7 +173,7 @@ def _group_numbers(
     *,
     rules: tuple[str, ...],
 ) -> Grouped:
-    """Cut the sorted distinct values where the rule says, and number the pieces."""
+    """Cut the sorted distinct values by the rule, and number the pieces."""
     distinct = sorted(set(values.values()))
     pieces = _pieces(distinct, by, rules)
     index = {value: i for i, piece in enumerate(pieces) for value in piece}

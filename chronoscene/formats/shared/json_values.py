@@ -15,7 +15,7 @@ from chronoscene.scene import Period, WorldFrame
 
 
 def parse_periods(place: Path, items: list[Any], count: int) -> tuple[Period, ...]:
-    """Periods from the content of ``periods.json``.
+    """Parse the content of ``periods.json``.
 
     Raises:
         SceneError: If they are damaged, or their ids are not 0 to ``count - 1``.
@@ -44,7 +44,7 @@ def period_items(periods: Iterable[Period]) -> list[dict[str, Any]]:
 
 
 def is_iso_date(text: str) -> bool:
-    """Whether a text is a calendar date: year, year-month or year-month-day."""
+    """Return True for a calendar date: year, year-month or year-month-day."""
     if not re.fullmatch(r"[0-9]{4}(-[0-9]{2}){0,2}", text):
         return False
     try:
@@ -55,7 +55,7 @@ def is_iso_date(text: str) -> bool:
 
 
 def parse_world(place: Path, data: dict[str, Any]) -> WorldFrame:
-    """World frame from the content of ``world.json``.
+    """Parse the content of ``world.json``.
 
     Raises:
         SceneError: If it is damaged.

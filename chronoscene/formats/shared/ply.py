@@ -78,7 +78,7 @@ def write_vertices(
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[bool, int, np.dtype]:
-    """Whether the file is text, number of vertices, their record; stops at the first vertex."""
+    """Return True for text, the number of vertices, their record; stop at the first vertex."""
     start = file.read(MAX_HEADER_BYTES)
     if not re.match(rb"ply\s*\n", start):
         raise _error(path, 'a PLY file, whose first line is "ply"', "a different first line")

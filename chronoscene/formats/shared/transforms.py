@@ -2,7 +2,7 @@
 
 Files of this family hold camera-to-world matrices with OpenGL axes (+x right, +y up, looking along
 -z) and intrinsics for all frames or for each. They are not trusted: numbers are checked, and image
-paths must stay inside the scene folder.
+paths must stay inside the scene folder. Frames become `PosedImage`, with 0 for an unknown id.
 """
 
 from __future__ import annotations
@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 import os
 import posixpath
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chronoscene.colmap.model import PosedImage
 from chronoscene.formats.chronoscene import MAX_COORDINATE
 from chronoscene.formats.shared.grouping import Grouped
 from chronoscene.images.decoding import image_size
@@ -27,7 +28,7 @@ from chronoscene.scene.cameras import CAMERA_MODELS, MAX_SIDE
 from chronoscene.scene.splits import IMAGE_SUFFIXES, split_of
 
 EXTENSIONS = (".png", *(s for s in IMAGE_SUFFIXES if s != ".png"), *map(str.upper, IMAGE_SUFFIXES))
-"""Of images whose names have none, in the order in which they are tried: loaders take .png."""
+"""Extensions of images whose names have none, in the order of trial: loaders take .png."""
 
 _NOT_RIGID = 1e-3
 """Deviation from a rotation beyond which a matrix is refused; below, the nearest is taken."""
@@ -43,29 +44,21 @@ MODEL_KEYS = {
 _LIST_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")  # Order of ``distortion_params``
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Shot:
-    """One frame of such a file."""
-
-    name: str
-    """Path below the scene folder."""
-    camera: Camera
-    cam_from_world: NDArray[np.float64]
-    """[4, 4]"""
-    image_id: int = 0
-    """0 where the file does not say."""
-
-
 def read_frames(place: Path, data: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The list ``frames``, which has at least one object."""
+    """Return the list ``frames``, which has at least one object."""
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise json_error(place, "a list of frames", "none")
     return frames
 
 
+def shared_keys(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a file that hold for all frames."""
+    return {key: value for key, value in data.items() if key != "frames"}
+
+
 def head_has(path: Path, text: str) -> bool:
-    """Whether the first bytes of a file have a text."""
+    """Return True if the first bytes of a file contain a text."""
     try:
         if not path.is_file():  # a pipe would never end
             return False
@@ -76,7 +69,7 @@ def head_has(path: Path, text: str) -> bool:
 
 
 def file_name(place: object, folder: str, file_path: object) -> str:
-    """Path below the scene folder of a file that another file names.
+    """Return the path below the scene folder of a file that another file names.
 
     Args:
         place: For the message.
@@ -98,7 +91,7 @@ def file_name(place: object, folder: str, file_path: object) -> str:
 
 
 def image_name(place: object, root: Path, folder: str, file_path: object) -> str:
-    """Path of an image below the scene folder; arguments and errors as for `file_name`.
+    """Return the path of an image below the scene folder; see `file_name`.
 
     A missing extension is found, so ``a.1`` may mean ``a.1.png``.
     """
@@ -111,7 +104,7 @@ def image_name(place: object, root: Path, folder: str, file_path: object) -> str
 
 
 def matrix(place: object, value: object, rows: tuple[int, ...] = (4,)) -> NDArray[np.float64]:
-    """A finite matrix with four columns and one of the given numbers of rows, filled up to 4x4."""
+    """Check a matrix with four columns and one of these numbers of rows; fill it up to 4x4."""
     try:
         array = np.asarray(value, np.float64)
     except (ValueError, TypeError, OverflowError):
@@ -130,7 +123,7 @@ def matrix(place: object, value: object, rows: tuple[int, ...] = (4,)) -> NDArra
 
 
 def nearest_rotation(place: object, block: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation nearest to a matrix that is a rotation up to rounding. [3, 3]
+    """Return the rotation nearest to a matrix that is a rotation up to rounding. [3, 3]
 
     Raises:
         SceneError: If it is scaled, mirrored or skewed.
@@ -168,7 +161,7 @@ def opengl_from_pose(cam_from_world: NDArray[np.float64]) -> NDArray[np.float64]
 
 def make_scene(
     path: Path,
-    shots: Sequence[Shot],
+    images: Sequence[PosedImage],
     grouped: Grouped,
     tests: set[str],
     *,
@@ -176,25 +169,26 @@ def make_scene(
     rule: str,
     format: str,
 ) -> Scene:
-    """A scene from shots of different names.
+    """Make a scene of images of different names, which are paths below the scene folder.
 
     Where all names are below ``images/``, that is the folder of images, and cut off the names.
+    Images with the id 0 are numbered.
     """
-    prefix = "images/" if all(shot.name.startswith("images/") for shot in shots) else ""
-    ids = [shot.image_id for shot in shots]
+    prefix = "images/" if all(image.name.startswith("images/") for image in images) else ""
+    ids = [image.image_id for image in images]
     known = min(ids) > 0 and max(ids) < 2**31 and len(set(ids)) == len(ids)
-    ordered = sorted(shots, key=lambda shot: shot.name)
+    ordered = sorted(images, key=lambda image: image.name)
     period_of, periods = grouped
     frames = tuple(
         Frame(
-            name=shot.name.removeprefix(prefix),
-            image_id=shot.image_id if known else i,
-            camera=shot.camera,
-            cam_from_world=shot.cam_from_world,
-            period=period_of[shot.name],
-            split=split_of(shot.name, tests),
+            name=image.name.removeprefix(prefix),
+            image_id=image.image_id if known else i,
+            camera=image.camera,
+            cam_from_world=image.cam_from_world,
+            period=period_of[image.name],
+            split=split_of(image.name, tests),
         )
-        for i, shot in enumerate(ordered, start=1)
+        for i, image in enumerate(ordered, start=1)
     )
     return Scene(
         name=path.resolve().name,
@@ -208,28 +202,26 @@ def make_scene(
     )
 
 
-def check_distinct(place: object, shots: Sequence[Shot]) -> None:
+def check_distinct(place: object, images: Sequence[PosedImage]) -> None:
     """Refuse two frames of one image."""
-    seen: set[str] = set()
-    for shot in shots:
-        if shot.name in seen:
-            raise json_error(place, "each image once", f"{shot.name!r} twice")
-        seen.add(shot.name)
+    twice, times = Counter(image.name for image in images).most_common(1)[0]
+    if times > 1:
+        raise json_error(place, "each image once", f"{twice!r} twice")
 
 
 class CameraTable:
-    """Cameras of a file; frames with equal intrinsics share one."""
+    """Cameras of a scene; frames with equal intrinsics share one."""
 
     def __init__(self) -> None:
         self._ids: dict[tuple[Any, ...], int] = {}
 
     def camera(self, place: object, data: Mapping[str, Any], image: Path) -> Camera:
-        """Camera of a frame.
+        """Return the camera of a frame.
 
         Args:
             place: For messages.
             data: Keys of the file, overridden by those of the frame.
-            image: Where the size is found if the file does not say it.
+            image: File from which the size is read if the keys lack it.
         """
         width, height = _size(place, data, image)
         fx, fy = _focals(place, data, width, height)
