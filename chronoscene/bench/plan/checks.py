@@ -91,13 +91,6 @@ def check_stages(run: ResolvedRun) -> None:
             found="one of them",
             todo="train anew with --iterations",
         )
-    if teachers := getattr(run.config, "teachers", 0):
-        raise ConfigError(
-            f"{spec.name} --strategy {job.strategy}: teachers",
-            expected="0, as they would have to learn each further period as well",
-            found=str(teachers),
-            todo="set teachers=0, or use another strategy",
-        )
 
 
 def check_run(run: ResolvedRun) -> None:

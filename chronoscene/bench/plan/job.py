@@ -57,8 +57,6 @@ class Job:
     """Of the code that runs it, which the worker asks for."""
     reports: bool = False
     """True if progress is sent to the bench, which runs several jobs at a time, and not shown."""
-    moved: dict[str, str] = field(default_factory=dict)
-    """Places that the job names, to those where the machine that runs it has a copy."""
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> Job:
@@ -73,10 +71,6 @@ class Job:
     def with_settings(self, **changes: Any) -> Job:
         """Return the job with other values of some of its `RunSettings`."""
         return replace(self, settings=replace(self.settings, **changes))
-
-    def here(self, place: str) -> str:
-        """Return where this machine has something that the job names."""
-        return self.moved.get(place, place)
 
     @property
     def folder(self) -> Path:

@@ -109,10 +109,9 @@ def open_store(scene: Scene, settings: RunSettings) -> ImageStore:
 
 
 def read_scene_of(job: Job) -> Scene:
-    """Read the scene of a job, from where this machine has it."""
+    """Read the scene of a job."""
     rule = job.settings.period_by
-    rule = None if rule is None else job.here(rule)
-    return read_scene(job.here(job.scene_root), format=job.scene_format, period_by=rule)
+    return read_scene(Path(job.scene_root), format=job.scene_format, period_by=rule)
 
 
 def check_room(

@@ -134,10 +134,9 @@ def score_stages(folder: Path, record: RunRecord, truth: Path, scorers: Scorers)
 
 def score_job(job: Job, record: RunRecord) -> None:
     """Score the run of a job with all metrics that are available."""
-    weights = job.settings.lpips_weights
-    weights = Path(job.here(str(weights))) if weights else None
+    scorers = make_scorers(lpips_weights=job.settings.lpips_weights)
     truth = ground_truth_folder(job.settings.runs, job.scene)
-    score_run(Path(job.staging), record, truth, make_scorers(lpips_weights=weights))
+    score_run(Path(job.staging), record, truth, scorers)
 
 
 def score_pair(

@@ -236,7 +236,6 @@ def _run_part(
 def _checkpoints(run: ResolvedRun, part: Part, parts: int, display: ProgressDisplay) -> Checkpoints:
     """Return the checkpoints of one model of the run."""
     job = run.job
-    start = job.here(job.continues)
     return Checkpoints(
         folder=job.training / part.name,
         settings=run.document,
@@ -244,7 +243,7 @@ def _checkpoints(run: ResolvedRun, part: Part, parts: int, display: ProgressDisp
         every=job.settings.checkpoint_seconds,
         # With several models, those that are done must not be trained again.
         keep_last=job.settings.keep_training or parts > 1,
-        start=Path(start) / records.TRAINING / part.name if start else None,
+        start=Path(job.continues) / records.TRAINING / part.name if job.continues else None,
         log=display.log,
     )
 

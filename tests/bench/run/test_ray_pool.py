@@ -6,7 +6,6 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import psutil
@@ -23,32 +22,23 @@ from ..plan.test_job import JOB
 from ..train.test_interruption import wait_for
 
 pytest.importorskip("ray")
-APART = Path(__file__).parents[1] / "plugins" / "apart"
-APART_ALONE = 2 * 10**9  # Bytes of memory that only the machine apart has, Ray is told
 NODE = {"object_store_memory": 80_000_000, "include_dashboard": False}
 
 
 @pytest.fixture(scope="module")
 def cluster(toys, tmp_path_factory):
-    """A machine that shares our files, and one that does not; one processor each."""
+    """Two machines with one processor each, which share our files."""
     from ray.cluster_utils import Cluster
 
-    path = os.pathsep.join([str(APART), os.environ["PYTHONPATH"]])
-    cache = tmp_path_factory.mktemp("cache")
-    apart = {
-        "PYTHONPATH": path,
-        "HIDDEN": str(tmp_path_factory.getbasetemp()),
-        "SHOWN": str(cache),
-        "CHRONOSCENE_CACHE": str(cache),
-    }
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory(prefix="ray") as place:
         patch.setenv("RAY_TMPDIR", place)  # names of sockets are short
-        patch.setenv("TOY_HOLD", f"7:{cache / 'hold'}")
+        hold = tmp_path_factory.mktemp("hold") / "hold"
+        patch.setenv("TOY_HOLD", f"7:{hold}")
         cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **NODE})
         try:
-            cluster.add_node(num_cpus=1, memory=APART_ALONE // 2, **NODE)
-            cluster.add_node(num_cpus=1, memory=APART_ALONE, env_vars=apart, **NODE)
-            cluster.cache = cache
+            for _ in range(2):
+                cluster.add_node(num_cpus=1, memory=10**9, **NODE)
+            cluster.hold = hold
             yield cluster
         finally:
             cluster.shutdown()
@@ -94,18 +84,12 @@ def files_of(folder):
     return {n: p.name in timed or p.read_bytes() for n, p in files.items()}
 
 
-def test_results_are_those_of_a_local_run_with_and_without_shared_files(
-    on_ray, cluster, scene_folder, tmp_path
-):
+def test_results_are_those_of_a_local_run(on_ray, scene_folder, tmp_path):
     names = {"methods": ("toy_methods:DRAWING", "3dgs"), "iterations": 12, "keep_training": True}
     outcome, said = on_ray(**names)
     assert outcome.failures == ()
-    assert sorted("files travel" in line for line in said if " seed 0: on " in line) == [
-        False,
-        True,
-    ]
+    assert sum(" seed 0: on " in line for line in said) == 2
     assert not list(tmp_path.rglob("*.partial")) and not list(tmp_path.rglob("*.token"))
-    assert not list(cluster.cache.glob("runs/*/ring/*/*"))
     local = {"scenes": (scene_folder,), "runs": tmp_path / "local", "threads": 1}
     for found in outcome.finished:
         method = names["methods"]["3dgs" in found.parent.name]
@@ -116,9 +100,8 @@ def test_results_are_those_of_a_local_run_with_and_without_shared_files(
         ours, theirs = read_run(one), read_run(found)
         assert theirs.aggregates == ours.aggregates and theirs.commit == ours.commit
     begun = {**names, "methods": names["methods"][:1], "iterations": None}
-    longer, said = on_ray(**begun, continue_to=20, job_memory=APART_ALONE)
+    longer, _ = on_ray(**begun, continue_to=20)
     assert longer.failures == () and read_run(longer.finished[0]).iterations == 20
-    assert sum("files travel" in line for line in said) == 1
 
 
 def test_a_run_that_fails_stops_nobody_else(on_ray):
@@ -144,6 +127,12 @@ def test_other_code_is_told_and_another_version_refused(on_ray, monkeypatch):
     monkeypatch.setattr(ray_pool.chronoscene, "__version__", "0.0")
     with pytest.raises(ConfigError, match=r"expected chronoscene 0\.0 on every machine, found"):
         on_ray("BLIND")
+
+
+def test_a_machine_that_does_not_see_the_runs_is_refused(on_ray, monkeypatch):
+    monkeypatch.setattr(ray_pool, "write_text_atomic", lambda path, text: None)
+    with pytest.raises(ConfigError, match=r"expected a machine that sees .*runs, found one that"):
+        on_ray("MEAN")
 
 
 SCRIPT = """
@@ -175,17 +164,14 @@ def workers():
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_runs_end_with_their_bench_on_any_machine(number, on_ray, cluster, scene_folder, tmp_path):
-    runs, hold = tmp_path / "runs", cluster.cache / "hold"
+def test_runs_end_with_their_bench(number, on_ray, cluster, scene_folder, tmp_path):
+    runs, hold = tmp_path / "runs", cluster.hold
     hold.touch()
     driver = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(scene_folder), str(runs), cluster.address]
     )
-    places = [runs / "ring", *cluster.cache.glob("runs")]
     try:
-        wait_for(
-            lambda: sum(len(list(p.rglob(".seed7.*.partial/config.json"))) for p in places) == 2
-        )
+        wait_for(lambda: len(list(runs.rglob(".seed7.*.partial/config.json"))) == 2)
         started = workers()
     finally:
         driver.send_signal(number)
