@@ -46,7 +46,6 @@ from benchmarks.training.gpu_trace import Summary, summary
 from chronogs import SPEC
 from chronogs.config import ChronoGSConfig
 from chronogs.method import ChronoGS
-from chronoscene.anchors import trainer as anchor_trainer
 from chronoscene.anchors.decode.function import Decode
 from chronoscene.anchors.density import DensityStatistics
 from chronoscene.anchors.model import AnchorModel
@@ -95,7 +94,7 @@ GPU_PARTS: tuple[Timed, ...] = (
     ("deformation", deformed_model, "deform"),
     ("spherical harmonics", gaussian_model, "evaluate"),
     ("rasterize", drawing, "rasterize"),
-    ("loss", anchor_trainer, "photometric_loss"),
+    ("loss", losses, "photometric_loss"),
     ("loss", gaussian_trainer, "photometric_loss"),
     ("backward", torch.Tensor, "backward"),
     ("check of gradients", gradients, "all_finite"),

@@ -29,6 +29,7 @@ from chronoscene.training.devices import to_device
 from chronoscene.training.drawing import Splats, draw, step_background
 from chronoscene.training.exposure import Exposure
 from chronoscene.training.gradients import collect_gradients, mask_tensor
+from chronoscene.training.losses import training_loss
 from chronoscene.training.optimizers.adam import Adam
 from chronoscene.training.photometric import photometric_loss
 from chronoscene.training.schedules import log_linear
@@ -146,10 +147,10 @@ class GaussianTrainer:
         )
         mask = mask_tensor(self.train, number, self.background.device)
         self.optimizer.zero_grad()
-        loss, skipped = collect_gradients(
+        loss, skipped, not_finite = collect_gradients(
             self.loss(raster, number, mask) + self._regulariser(splats),
             raster.info,
-            [self.optimizer, *self.exposure.tables],
+            lambda: self.optimizer.gradients() | self.exposure.gradients(),
             mask,
         )
         if skipped:
@@ -163,7 +164,7 @@ class GaussianTrainer:
         self._update(due)
         if not skipped:
             self._move_at_random(index, due)
-        return StepReport(loss, len(self.model), skipped)
+        return StepReport(loss, len(self.model), skipped, not_finite)
 
     def state(self) -> TrainingState:
         """Everything that the steps to come depend on; methods may add to it."""
@@ -206,7 +207,15 @@ class GaussianTrainer:
         """Photometric loss against the photo of view ``number``; methods may add terms."""
         # A copy, as cached images are not ours to write to, which torch cannot promise.
         photo = to_device(self.train.load_image(number).copy(), raster.image.device)
-        return self.compare(self.exposure.apply(raster.image[0], number), photo, mask)
+        return training_loss(
+            raster,
+            photo,
+            mask,
+            number=number,
+            exposure=self.exposure,
+            config=self.config,
+            compare=self.compare,
+        )
 
     def compare(self, image: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
         """Photometric loss; arguments as of `photometric_loss`."""

@@ -41,6 +41,8 @@ class StepReport:
     """Why nothing was learned, so that no parameter and no moment of the optimiser changed:
     ``empty``, the view shows no primitive, or its mask ignores all of the image; ``not finite``,
     the loss or a gradient was not."""
+    not_finite: tuple[str, ...] = ()
+    """Names of the tensors whose gradients were not finite, if the method knows them."""
 
 
 @dataclass(frozen=True, slots=True)

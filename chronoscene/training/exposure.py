@@ -68,8 +68,13 @@ class Exposure:
             image = transformed(image, table.fetch(self._rows[number : number + 1])[0])
         return image
 
+    def gradients(self) -> dict[str, Tensor]:
+        """Return the gradient of the transforms, if there is one."""
+        gradient = self.tables[0].gradient() if self.tables else None
+        return {} if gradient is None else {"exposure": gradient}
+
     def step(self, progress: float) -> None:
-        """One step of Adam; ``progress`` is the share of the training that is over."""
+        """Do one step of Adam; ``progress`` is the share of the training that is over."""
         for table in self.tables:
             table.step(log_linear(progress, *LEARNING_RATE))
 

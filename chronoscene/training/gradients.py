@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,52 +11,61 @@ from torch import Tensor
 from chronoscene.methods import Skipped, TrainingSet
 from chronoscene.rasterizer import RasterInfo
 from chronoscene.training.devices import to_device
-from chronoscene.training.optimizers.adam import Adam, DenseTable, all_finite
-from chronoscene.training.optimizers.row_adam import RowAdam
+from chronoscene.training.optimizers.adam import all_finite
+
+
+class BackwardPass(NamedTuple):
+    """Outcome of the backward pass of a training step."""
+
+    loss: float
+    skipped: Skipped | None
+    """Reason to skip the step, if there is one: no optimiser may use its gradients then."""
+    not_finite: tuple[str, ...] = ()
+    """Names of the tensors whose gradients are not finite; ``loss`` where it is not finite."""
 
 
 def collect_gradients(
     loss: Tensor,
     info: RasterInfo,
-    optimizers: Iterable[Adam | DenseTable | RowAdam],
+    gradients: Callable[[], Mapping[str, Tensor]],
     mask: Tensor | None = None,
-) -> tuple[float, Skipped | None]:
-    """The backward pass of a training step. What it returns is all that the host waits for.
+) -> BackwardPass:
+    """Do the backward pass of a training step. The host waits for nothing but its outcome.
 
     Args:
-        loss: What to minimise.
-        info: Of the rasterization.
-        optimizers: Those that step after it.
+        loss: Scalar to minimise.
+        info: Details of the rasterization.
+        gradients: Gives the gradients of all optimisers after the pass, by name.
         mask: Where the photo counts; None for everywhere. bool [H, W]
-
-    Returns:
-        loss: The same as a number.
-        skipped: Why the step must be skipped, if it must: the optimisers may not use what they have
-            then.
     """
     sees = (info.radii > 0).any()
     if mask is not None:
         sees = sees & mask.any()
     loss.backward()
     loss = loss.detach()
-    gradients = [gradient for optimizer in optimizers for gradient in optimizer.gradients()]
-    finite = all_finite([loss, *gradients])
+    found = {"loss": loss, **gradients()}
+    finite = all_finite(list(found.values()))
     value, seen, sound = torch.stack([loss, sees.to(loss), finite.to(loss)]).tolist()
     if not seen:
-        return value, "empty"
-    return value, None if sound else "not finite"
+        return BackwardPass(value, "empty")
+    if sound:
+        return BackwardPass(value, None)
+    names = (name for name, tensor in found.items() if not all_finite([tensor]))
+    return BackwardPass(value, "not finite", tuple(names))
 
 
 def centre_gradients(info: RasterInfo) -> Tensor:
-    """Of the projected centres after ``backward``, in pixels; absolute ones if they were asked for.
-    [N, 2]"""
+    """Return the gradients of the projected centres after ``backward``, in pixels. [N, 2]
+
+    They are absolute ones if these were asked for.
+    """
     assert info.means2d.grad is not None
     found: Tensor = getattr(info.means2d, "absgrad", info.means2d.grad)[0]
     return found
 
 
 def centres_count(means2d: Tensor, mask: Tensor) -> Tensor:
-    """Whether projected centres lie where a photo counts, or outside of it. [N, 2] -> [N]
+    """Return True for projected centres where a photo counts, or outside of it. [N, 2] -> [N]
 
     Args:
         means2d: Places in pixels; pixel (0, 0) is centred at (0.5, 0.5).
@@ -68,6 +78,6 @@ def centres_count(means2d: Tensor, mask: Tensor) -> Tensor:
 
 
 def mask_tensor(train: TrainingSet, index: int, device: str | torch.device) -> Tensor | None:
-    """Where the photo of a training view counts; None for everywhere. bool [H, W]"""
+    """Return where the photo of a training view counts; None for everywhere. bool [H, W]"""
     mask = train.load_mask(index)
     return None if mask is None else to_device(mask.copy(), device)

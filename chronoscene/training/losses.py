@@ -1,7 +1,12 @@
-"""Losses of a training step."""
+"""Terms of the loss of a training step.
+
+`training_loss` is what both trainers minimise, `AnchorTrainer` and `GaussianTrainer`; each adds
+the terms of its own kind of models, such as `mean_volume`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,14 +15,53 @@ from numba import prange
 from torch import Tensor
 
 from chronoscene.kernels.compilation import kernel
+from chronoscene.rasterizer import Rasterization
 from chronoscene.training import devices
+from chronoscene.training.config import SplattingConfig
+from chronoscene.training.exposure import Exposure
+from chronoscene.training.photometric import photometric_loss
 
 _CHUNK = 4096
 """Gaussians summed one after the other; fixed, so the sum does not depend on the threads."""
 
 
+def training_loss(
+    raster: Rasterization,
+    photo: Tensor,
+    mask: Tensor | None,
+    *,
+    number: int,
+    exposure: Exposure,
+    config: SplattingConfig,
+    compare: Callable[[Tensor, Tensor, Tensor | None], Tensor] | None = None,
+) -> Tensor:
+    """Compute the loss that all methods share, for one training view.
+
+    A term for all methods is added here, and its weight as an option of `SplattingConfig`. One of
+    the depth needs ``render_depth`` in both trainers' calls of `draw`.
+
+    Args:
+        raster: The view as it was drawn.
+        photo: uint8 0..255. [H, W, 3]
+        mask: Where the photo counts; None for everywhere. bool [H, W]
+        number: Of the view.
+        exposure: Has the transform of the colours of the view.
+        config: Has the weights of the terms.
+        compare: Compares image, photo and mask in place of `photometric_loss`.
+
+    Returns:
+        A scalar.
+    """
+    image = exposure.apply(raster.image[0], number)
+    if compare is not None:
+        return compare(image, photo, mask)
+    return photometric_loss(image, photo, ssim_weight=config.ssim_weight, mask=mask)
+
+
 def mean_volume(scales: Tensor, opacities: Tensor) -> Tensor:
-    """Mean product of the scales of the Gaussians with an opacity above 0: keeps them small.
+    """Compute the mean product of the scales of the Gaussians with an opacity above 0.
+
+    As a term of the loss, it keeps them small.
 
     Args:
         scales: [N, 3]

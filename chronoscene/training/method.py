@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -21,16 +21,34 @@ from chronoscene.methods import MethodSize, Prediction, StepReport, TrainingSet,
 from chronoscene.rasterizer import Rasterization
 from chronoscene.scene.gaussian_cloud import GaussianCloud
 from chronoscene.training.checkpoint import TRAINING, TrainingState, load_tensors, save_tensors
+from chronoscene.training.config import SplattingConfig
 from chronoscene.training.drawing import Splats, camera_centre_tensor, prediction_of
-from chronoscene.training.exposure import exposed, of_period
+from chronoscene.training.exposure import Exposure, exposed, of_period
 from chronoscene.training.periods import with_new_periods
 from chronoscene.training.spherical_harmonics import MAX_DEGREE, evaluate
 
 _EXPOSURE = "exposure"  # Name of the stored transforms
 
 
+class Trainer(Protocol):
+    """What trains a model by single steps."""
+
+    exposure: Exposure
+
+    def step(self, index: int, progress: float) -> StepReport:
+        """Do one training step; arguments as of `chronoscene.methods.Method.step`."""
+
+    def state(self) -> TrainingState:
+        """Return everything that the steps to come depend on."""
+
+    def load_state(self, state: TrainingState) -> None:
+        """Go on from what `state` gave, in a trainer that was made alike."""
+
+
 class SplattingMethod(ABC):
-    """Fulfils `chronoscene.methods.Method`; a subclass says how a model starts and is drawn.
+    """Base class that fulfils `chronoscene.methods.Method` for models of Gaussians.
+
+    A subclass says how a model starts and is drawn.
 
     `AnchorMethod` and `GaussianMethod` are the two kinds of models that there are.
 
@@ -46,22 +64,18 @@ class SplattingMethod(ABC):
     primitive: ClassVar[str]
     """Name of a stored tensor with one row per primitive."""
 
-    def __init__(self, config: Any) -> None:
+    def __init__(self, config: SplattingConfig) -> None:
         self.config = config
         self.background = torch.zeros(3)
         self.meta: dict[str, Any] = {}
         """Content of ``model.json``; subclasses add what `restore` needs."""
-        self.trainer: Any = None
-        """What `start` gave, which has an `Exposure` as ``exposure``; None after `load`."""
+        self.trainer: Trainer | None = None
+        """The trainer that `start` gave; None after `load`."""
         self._exposure: Tensor | None = None
 
     @abstractmethod
-    def start(self, train: TrainingSet, *, seed: int, device: str) -> Any:
-        """Build the initial model; returns what trains it by ``step``, arguments as there.
-
-        Where the method can be resumed, it gives a `TrainingState` by ``state`` and takes one by
-        ``load_state``.
-        """
+    def start(self, train: TrainingSet, *, seed: int, device: str) -> Trainer:
+        """Build the initial model; return its trainer."""
 
     @abstractmethod
     def draw_splats(self, splats: Splats, view: View) -> Rasterization:
@@ -69,15 +83,15 @@ class SplattingMethod(ABC):
 
     @abstractmethod
     def splats(self, view: View, period: float, appearance_period: float) -> Splats:
-        """What is drawn in a view: the geometry of one period in the colours of another."""
+        """Return what is drawn in a view: the geometry of one period, the colours of another."""
 
     @abstractmethod
     def static_gaussians(self, period: float, views: Sequence[View]) -> GaussianCloud:
-        """`to_gaussians` without the exposure."""
+        """Return what `to_gaussians` does, without the exposure."""
 
     @abstractmethod
     def stored_tensors(self) -> dict[str, Tensor]:
-        """The model as it goes to disk, by name."""
+        """Return the tensors of the model as they go to disk, by name."""
 
     @abstractmethod
     def restore(self, folder: Path, tensors: dict[str, Tensor], device: str) -> None:
@@ -97,7 +111,7 @@ class SplattingMethod(ABC):
         }
         self.trainer = self.start(train, seed=seed, device=device)
 
-    def go_on(self, train: TrainingSet, trainer: Any) -> None:
+    def go_on(self, train: TrainingSet, trainer: Trainer) -> None:
         """Put another trainer in place of the one before: the last part of `extend`.
 
         Exposures go on, too; a new period starts with that of the last one.
@@ -144,14 +158,13 @@ class SplattingMethod(ABC):
         return prediction_of(self.draw_splats(splats, view))
 
     def exposure(self) -> Tensor | None:
-        """The transform of colours of each period, if the training learns any. [T, 3, 4]"""
+        """Return the transform of colours of each period, if any are learned. [T, 3, 4]"""
         if self.trainer is None:
             return self._exposure
-        transforms: Tensor | None = self.trainer.exposure.by_period()
-        return transforms
+        return self.trainer.exposure.by_period()
 
     def _all_tensors(self) -> dict[str, Tensor]:
-        """All that is stored, by name."""
+        """Return all tensors that are stored, by name."""
         exposure = self.exposure()
         return self.stored_tensors() | ({} if exposure is None else {_EXPOSURE: exposure})
 
@@ -168,11 +181,13 @@ class SplattingMethod(ABC):
         self.trainer = None
 
     def save_training(self, folder: Path) -> None:
+        assert self.trainer is not None, "setup comes first"
         state = self.trainer.state()
         meta = {"method": self.name, "version": self.version, "values": state.values}
         save_tensors(folder, state.tensors, meta, stem=TRAINING)
 
     def load_training(self, folder: Path) -> None:
+        assert self.trainer is not None, "setup comes first"
         tensors, meta = load_tensors(folder, method=self.name, stem=TRAINING)
         try:
             self.trainer.load_state(TrainingState(tensors, meta["values"]))
@@ -185,7 +200,7 @@ class SplattingMethod(ABC):
             ) from error
 
     def size(self) -> MethodSize:
-        """Number of primitives, and of all stored numbers."""
+        """Count the primitives and all stored numbers."""
         tensors = self._all_tensors()
         count, parameters = len(tensors[self.primitive]), sum(t.numel() for t in tensors.values())
         unit = "anchors" if self.primitive == "anchors" else "Gaussians"

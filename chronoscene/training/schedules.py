@@ -1,12 +1,19 @@
-"""Schedules: learning rates as functions of the progress of a training."""
+"""Schedules: learning rates as functions of the progress of a training.
+
+A schedule for all methods is added here. Each method names the rates of its tensors:
+`AnchorMethod.rates` and `GaussianMethod.learning_rates`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+
+_COOLED = 0.1  # Factor of the learning rates at the end of a cooldown
 
 
 def log_linear(progress: float, start: float, end: float) -> float:
-    """A learning rate that falls log-linearly: ``start^(1 - p) * end^p``.
+    """Compute a learning rate that falls log-linearly: ``start^(1 - p) * end^p``.
 
     Args:
         progress: Share of the training that is over; clamped to 0..1.
@@ -22,3 +29,21 @@ def log_linear(progress: float, start: float, end: float) -> float:
     if p in (0.0, 1.0):
         return end if p else start
     return math.exp((1.0 - p) * math.log(start) + p * math.log(end))
+
+
+def learning_rates(
+    rates: Mapping[str, tuple[float, float]], progress: float, *, cooldown: float = 0.0
+) -> dict[str, float]:
+    """Compute the learning rates of a step, by name.
+
+    Args:
+        rates: Value at the start and at the end of each rate, which falls log-linearly.
+        progress: Share of the training that is over.
+        cooldown: Share of the training, its last, in which all rates fall further, to a tenth of
+            what they would be.
+    """
+    found = {name: log_linear(progress, *rate) for name, rate in rates.items()}
+    if not cooldown:
+        return found
+    factor = log_linear(1.0 - (1.0 - progress) / cooldown, 1.0, _COOLED)
+    return {name: rate * factor for name, rate in found.items()}

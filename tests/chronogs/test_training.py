@@ -65,7 +65,7 @@ def test_learning_rates_follow_the_share_that_is_done(
     made = method(cooldown=cooldown)
     trainer = made.trainer
     assert trainer is not None
-    optimizer, table = trainer.optimizer, trainer.tables["offsets"]
+    optimizer, table = trainer.optimizer.adam, trainer.optimizer.tables["offsets"]
     taken: dict[str, float] = {}
     step, table_step = optimizer.step, table.step
     monkeypatch.setattr(optimizer, "step", lambda rates: (taken.update(rates), step(rates)))
@@ -85,13 +85,14 @@ def rounds(config: ChronoGSConfig, train_set: TrainingSet, total: int) -> list[i
     made.setup(train_set, seed=0, device="cpu")
     trainer = made.trainer
     assert trainer is not None
-    trainer.statistics = object()  # type: ignore[assignment]
-    trainer._grow = lambda statistics: None  # type: ignore[method-assign]
-    trainer._prune = lambda statistics: None  # type: ignore[method-assign]
+    density = trainer.density
+    density.statistics = object()  # type: ignore[assignment]
+    density._grow = lambda statistics: None  # type: ignore[method-assign]
+    density._prune = lambda statistics: None  # type: ignore[method-assign]
     return [
         index + 1
         for index in range(total)
-        if trainer._densify_if_due(index, trainer._progress_after(index, index / total))
+        if density._densify_if_due(index, trainer._progress_after(index, index / total))
     ]
 
 
@@ -149,10 +150,11 @@ def test_faint_anchors_go_but_never_all(noise_set: Callable[[int], TrainingSet])
     statistics.opacity_sum[::2] = 50.0
     with torch.no_grad():
         made.model.log_scales[0] = 3.0
-    trainer._prune(statistics)
+    trainer.density._prune(statistics)
     torch.testing.assert_close(made.model.anchors, before[::2], rtol=0, atol=0)
     for name in ("offsets", "features", "log_scales"):
-        assert trainer.tables[name].value.data_ptr() == getattr(trainer.model, name).data_ptr()
+        table, tensor = trainer.optimizer.tables[name], getattr(trainer.model, name)
+        assert table.value.data_ptr() == tensor.data_ptr()
         assert len(getattr(made.model, name)) == len(before[::2]) == len(statistics.visits)
     assert made.model.log_scales[0].tolist() == pytest.approx(
         [3.0] * 3
@@ -160,7 +162,7 @@ def test_faint_anchors_go_but_never_all(noise_set: Callable[[int], TrainingSet])
     )
     statistics.visits[:] = 100.0
     statistics.opacity_sum[:] = 0.0
-    trainer._prune(statistics)
+    trainer.density._prune(statistics)
     assert len(made.model) == len(before[::2])
 
 

@@ -140,7 +140,7 @@ def test_between_periods_transforms_are_mixed():
 
 
 def test_a_wrong_kind_is_refused():
-    with pytest.raises(ConfigError, match="image, none, period"):
+    with pytest.raises(ConfigError, match="'none', 'image' or 'period'"):
         SplattingConfig(exposure="view")
 
 

@@ -180,12 +180,14 @@ def _was_finite(report: StepReport, state: LoopState) -> bool:
 
 def _diverged(report: StepReport, part: Part, last_good: int) -> TrainingError:
     todo = "lower the learning rates, or report this with the scene"
+    names = ", ".join(report.not_finite)
     if report.skipped:
         todo = f"the model of iteration {last_good} is kept in checkpoint; {todo}"
     return (DivergedError if report.skipped else TrainingError)(
         f"model {part.name}, iteration {last_good + NOT_FINITE_LIMIT}",
         expected="a finite loss and finite gradients",
-        found=f"{NOT_FINITE_LIMIT} steps in a row without",
+        found=f"{NOT_FINITE_LIMIT} steps in a row without"
+        + (f", the last one in {names}" if names else ""),
         todo=todo,
     )
 

@@ -75,9 +75,9 @@ class Adam:
         for value in self.params.values():
             value.grad = None
 
-    def gradients(self) -> list[Tensor]:
-        """All gradients that there are."""
-        return [value.grad for value in self.params.values() if value.grad is not None]
+    def gradients(self) -> dict[str, Tensor]:
+        """Return all gradients that there are, by the names of their parameters."""
+        return {n: value.grad for n, value in self.params.items() if value.grad is not None}
 
     @torch.no_grad()
     def step(self, lrs: Mapping[str, float], skip: Collection[str] = ()) -> None:
@@ -195,7 +195,7 @@ def adam_blocks(values, grads, means, squares, rate, root, eps):  # type: ignore
 
 
 def all_finite(tensors: Sequence[Tensor]) -> Tensor:
-    """Whether no number is nan or infinite; costs far less than an update of the same size.
+    """Return True if no number is nan or infinite; far cheaper than an update of the same size.
 
     Returns:
         A scalar on the device of the tensors. bool
@@ -252,10 +252,9 @@ class DenseTable:
         """The table; up to date after `flush`."""
         return self._adam.params["table"].detach()
 
-    def gradients(self) -> list[Tensor]:
-        """The gradient that `step` will use, if there is one."""
-        grad = None if self._fetched is None else self._fetched[1].grad
-        return [] if grad is None else [grad]
+    def gradient(self) -> Tensor | None:
+        """Return the gradient that `step` will use, if there is one."""
+        return None if self._fetched is None else self._fetched[1].grad
 
     def fetch(self, rows: Tensor) -> Tensor:
         """Copies of some rows, up to date, as a leaf that collects a gradient. [M, ...]

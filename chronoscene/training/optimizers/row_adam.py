@@ -91,9 +91,8 @@ class RowAdam:
         self._fetched = rows, out.requires_grad_()
         return out
 
-    def gradients(self) -> list[Tensor]:
-        grad = None if self._fetched is None else self._fetched[1].grad
-        return [] if grad is None else [grad]
+    def gradient(self) -> Tensor | None:
+        return None if self._fetched is None else self._fetched[1].grad
 
     def step(self, rate: float) -> None:
         root = (1 - BETA2 ** (self.steps + 1)) ** -0.5
