@@ -25,6 +25,7 @@ from baselines.gaussian_in_the_wild.networks import (
 )
 from baselines.gaussian_in_the_wild.trainer import WildTrainer, central_views
 from chronoscene.bench.contract import tiny_training
+from chronoscene.bench.train import painted_balls
 from chronoscene.errors import ConfigError
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import TrainingSet, View, build_config
@@ -369,7 +370,7 @@ def test_a_period_without_photos_reads_zeros() -> None:
 
 def test_test_photos_change_no_bit_of_a_prediction(tmp_path: Path) -> None:
     """Noise in their place, or nothing that could be loaded at all once the model is saved."""
-    images, views = [], tiny_training.make_training_set(3).views
+    images, views = [], painted_balls.make_training_set(3).views
     for noise in (False, True):
         data = tiny_training.training_set_on_disk(SPEC, tmp_path, noisy_tests=noise)
         assert len(data.views) == 12 and len(views) == 15

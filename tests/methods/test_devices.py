@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from chronoscene.bench.contract import tiny_training
+from chronoscene.bench.train import painted_balls
 from chronoscene.errors import CheckpointError
 from chronoscene.methods import (
     Method,
@@ -63,8 +64,8 @@ class Compiled:
 )
 def compiled(request: pytest.FixtureRequest) -> Compiled:
     spec = load_spec(request.param)
-    data = tiny_training.make_training_set(tiny_training.periods_for(spec))
-    mask = np.ones((tiny_training.HEIGHT, tiny_training.WIDTH), bool)
+    data = painted_balls.make_training_set(tiny_training.periods_for(spec))
+    mask = np.ones((painted_balls.HEIGHT, painted_balls.WIDTH), bool)
     mask[8:20, 5:18] = False
     return Compiled(spec, dataclasses.replace(data, load_mask=lambda i: mask))
 

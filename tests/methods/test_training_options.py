@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from chronoscene.bench.contract import tiny_training
+from chronoscene.bench.train import painted_balls
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import build_config, import_object, load_spec
 from chronoscene.training.views import downscale_view
@@ -58,7 +59,7 @@ def saved(method, folder):
 
 @pytest.mark.parametrize(("name", "options"), OPTIONS, ids=OPTIONS_IDS)
 def test_a_training_with_options_ends_the_same_when_interrupted(name, options, tmp_path):
-    data = tiny_training.make_training_set(tiny_training.periods_for(load_spec(name)))
+    data = painted_balls.make_training_set(tiny_training.periods_for(load_spec(name)))
     whole = start(name, data, **options)
     reports = train(whole)
     first = start(name, data, **options)
@@ -80,7 +81,7 @@ def test_a_training_with_options_ends_the_same_when_interrupted(name, options, t
 
 @pytest.mark.parametrize("name", ["3dgs", "chronogs"])
 def test_the_next_photos_are_named_before_they_are_loaded(name):
-    data, said, loaded = tiny_training.make_training_set(1), [], []
+    data, said, loaded = painted_balls.make_training_set(1), [], []
 
     def load(index):
         loaded.append(index)
@@ -93,8 +94,8 @@ def test_the_next_photos_are_named_before_they_are_loaded(name):
 @pytest.mark.parametrize("name", ["3dgs", "scaffold-gs"])
 def test_a_random_background_leaves_no_hole_where_photos_are_as_dark_as_it(name):
     """Black photos need no Gaussians before black; before any colour they need opaque ones."""
-    data = tiny_training.make_training_set(1)
-    black = np.zeros((tiny_training.HEIGHT, tiny_training.WIDTH, 3), np.uint8)
+    data = painted_balls.make_training_set(1)
+    black = np.zeros((painted_balls.HEIGHT, painted_balls.WIDTH, 3), np.uint8)
     data = replace(data, load_image=lambda index: black)
     drawn = []
     for random in (False, True):
@@ -107,7 +108,7 @@ def test_a_random_background_leaves_no_hole_where_photos_are_as_dark_as_it(name)
 @pytest.mark.parametrize("name", ["3dgs", "4dgs", "scaffold-gs", "chronogs"])
 def test_antialiased_models_are_as_opaque_in_small_images(name):
     """At a quarter of the size the blur enlarges everything, unless opacities make up for it."""
-    data = tiny_training.make_training_set(tiny_training.periods_for(load_spec(name)))
+    data = painted_balls.make_training_set(tiny_training.periods_for(load_spec(name)))
     errors, losses = [], []
     for antialiased in (False, True):
         method = start(name, data, antialiased=antialiased)

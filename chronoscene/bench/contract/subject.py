@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 
 from chronoscene.bench.contract import tiny_training
+from chronoscene.bench.train import painted_balls
 from chronoscene.bench.train.checks import refuse
 from chronoscene.methods import (
     Method,
@@ -50,7 +51,7 @@ class Subject:
 
     @cached_property
     def data(self) -> TrainingSet:
-        return tiny_training.make_training_set(tiny_training.periods_for(self.spec))
+        return painted_balls.make_training_set(tiny_training.periods_for(self.spec))
 
     @cached_property
     def _trained(self) -> tuple[Method, list[StepReport]]:

@@ -16,7 +16,9 @@ from chronoscene.bench.contract.subject import (
     python,
     same_files,
 )
+from chronoscene.bench.train import painted_balls
 from chronoscene.bench.train.checks import check_prediction, check_step
+from chronoscene.bench.train.loop import seed_everything
 from chronoscene.kernels.runtime import set_threads
 from chronoscene.methods import Method, TrainingSet, build_config, import_object
 
@@ -42,7 +44,7 @@ def the_unit_of_the_scene_does_not_matter(subject: Subject) -> None:
             data = dataclasses.replace(subject.data, training_from_world=frame)
             config = build_config(subject.spec, preset=preset, overrides={"iterations": 3})
             method = import_object(subject.spec.method)(config)
-            tiny_training.seed_everything(0)
+            seed_everything(0)
             method.setup(data, seed=0, device="cpu")
             for index in range(3):
                 method.step(index, index / 3)
@@ -127,7 +129,7 @@ def test_photos_change_nothing(subject: Subject) -> None:
 def the_training_set_is_left_alone(subject: Subject) -> None:
     """Training does not write into the training set."""
     _ = subject.method
-    fresh = tiny_training.make_training_set(subject.data.num_periods)
+    fresh = painted_balls.make_training_set(subject.data.num_periods)
     for field in ("points", "colors", "point_periods", "background"):
         same = np.array_equal(getattr(subject.data, field), getattr(fresh, field))
         demand(same, f"TrainingSet.{field}", "what it was before the training")
@@ -141,7 +143,7 @@ def the_training_set_is_left_alone(subject: Subject) -> None:
 
 def one_period_is_enough(subject: Subject) -> None:
     """A scene with a single period is trained and rendered."""
-    data = tiny_training.make_training_set(1)
+    data = painted_balls.make_training_set(1)
     method, reports = tiny_training.train(subject.spec, data, steps=5)
     demand(all(np.isfinite(r.loss) for r in reports), "StepReport.loss", "finite numbers")
     check_prediction(method.render(data.views[0], 0.0), data.views[0], "one period")
@@ -175,7 +177,7 @@ def masked_pixels_change_nothing(subject: Subject) -> None:
 def hidden(data: TrainingSet, seed: int) -> TrainingSet:
     """Return the set with a rectangle of noise in every photo, which masks ignore; they also ignore
     the whole last photo."""
-    mask = np.ones((tiny_training.HEIGHT, tiny_training.WIDTH), bool)
+    mask = np.ones((painted_balls.HEIGHT, painted_balls.WIDTH), bool)
     mask[8:20, 5:18] = False
     rng = np.random.default_rng(seed)
     noise = rng.integers(0, 256, (len(data.views), *mask.shape, 3), np.uint8)
