@@ -132,7 +132,7 @@ class _RecordError(Exception):
 
 
 class _Reader:
-    """Reads a file from start to end; errors name the record in which it ends."""
+    """Reader of a file from start to end; errors name the record in which it ends."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data
@@ -145,7 +145,7 @@ class _Reader:
         """Number of parts that the current record announces, for messages."""
 
     def records(self, kind: str, min_size: int) -> Iterator[None]:
-        """One step per record, which the caller reads before it asks for the next."""
+        """Iterate over the records; the caller reads each before it asks for the next."""
         count = self.start(kind, min_size)
         for self.index in range(count):
             self.parts = ""
@@ -153,7 +153,7 @@ class _Reader:
         self.finish()
 
     def start(self, kind: str, min_size: int) -> int:
-        """Number of records, each of at least ``min_size`` bytes; refuses more than can fit."""
+        """Read the number of records of at least ``min_size`` bytes; refuse more than fit."""
         (count,) = self.unpack(_COUNT)
         if count * min_size > len(self.data) - self.at:
             raise _RecordError(f"{count} records announced in {len(self.data)} bytes")
@@ -166,7 +166,7 @@ class _Reader:
             raise _RecordError(f"{len(self.data) - self.at} bytes after the last record")
 
     def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
-        """The next values of a layout."""
+        """Read the next values of a layout."""
         return layout.unpack_from(self.data, self.skip(layout.size))
 
     def skip(self, size: int) -> int:
@@ -178,7 +178,7 @@ class _Reader:
         return begin
 
     def text(self) -> bytes:
-        """The bytes up to the next zero byte, which is skipped."""
+        """Read up to the next zero byte, which is skipped."""
         begin, end = self.at, self.data.find(b"\0", self.at)
         if end < 0:
             raise self.ends()
@@ -186,7 +186,7 @@ class _Reader:
         return self.data[begin:end]
 
     def ends(self) -> _RecordError:
-        """The error that the file ends too early."""
+        """Error for a file that ends too early."""
         if self.index is None:
             return _RecordError("a file that ends inside the number of its records")
         announced = f", which announces {self.parts}" if self.parts else ""
@@ -195,7 +195,7 @@ class _Reader:
 
 @contextmanager
 def _records_of(path: Path) -> Iterator[_Reader]:
-    """Reads a file, whose errors name the path."""
+    """Open a file to read its records; errors name the path."""
     try:
         yield _Reader(path.read_bytes())
         return
@@ -247,7 +247,7 @@ def _sensor(reader: _Reader) -> Sensor:
 
 
 def _point_offsets(reader: _Reader) -> list[int]:
-    """Offsets of the records, and of the end of the last, in a loop that does nothing else."""
+    """Offsets of the records, and of the end of the last."""
     count = reader.start("point", POINT_HEAD.itemsize)
     data, end, at = reader.data, len(reader.data), reader.at
     unpack, head, offsets = _COUNT.unpack_from, POINT_HEAD.itemsize, [at]
@@ -298,6 +298,6 @@ def _gather_points(
 
 
 def _at_every_byte(data: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """A view of the values that begin at each byte; one index takes records out of it."""
+    """View of the values that begin at each byte; indexing it takes out records."""
     count = max(0, len(data) - dtype.itemsize + 1)
     return np.ndarray((count,), dtype, data, strides=(1,))

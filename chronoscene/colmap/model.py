@@ -131,8 +131,11 @@ def read_poses(folder: Path, images: RawImages) -> tuple[PosedImage, ...]:
     """Registered images of a binary model as COLMAP understands them, sorted by name.
 
     pycolmap checks everything that a pose depends on: cameras, rigs, frames, names. It gets the
-    model without points and keypoints, which takes a fraction of the time. ``images`` is what
-    ``images.bin`` says.
+    model without points and keypoints, which takes a fraction of the time.
+
+    Args:
+        folder: Of the model.
+        images: Content of its ``images.bin``.
 
     Raises:
         SceneError: If pycolmap refuses the model, or an id or a name occurs twice.
@@ -190,7 +193,7 @@ def write_model(folder: Path, frames: Sequence[Frame], points: Points) -> None:
 
 
 def copy_poses(source: Path, folder: Path) -> int:
-    """Give the images of a model the poses of the same images in another, to the last bit.
+    """Copy the poses of images from one model to another, to the last bit.
 
     Reading a pose as a matrix and writing it as a quaternion may change its last bits.
 
@@ -268,7 +271,7 @@ def _posed_images(folder: Path, model: pycolmap.Reconstruction) -> tuple[PosedIm
 
 
 def _pose(rigid: pycolmap.Rigid3d) -> NDArray[np.float64]:
-    """The same pose as a matrix, NaN for quaternions without a direction. [4, 4]
+    """Convert a pose to a matrix, NaN for quaternions without a direction. [4, 4]
 
     Text with few digits has quaternions that are not quite unit; the matrices that pycolmap makes
     of them are not rotations.

@@ -30,7 +30,7 @@ PLACES = {
     "sfm": "images",
     "": "images",
 }
-"""Where programs leave models in a project, and where the images are that these belong to.
+"""Folders of models in a project by program, each with the folder of its images.
 
 The model is in the folder itself or in a numbered one inside of it, which comes first."""
 
@@ -115,7 +115,7 @@ class Damage:
 
 
 class DamagedError(Exception):
-    """Carries damages out of a reader."""
+    """Error with all damages that a reader found."""
 
     def __init__(self, *damages: Damage) -> None:
         super().__init__("; ".join(f"{d.file}: {d.found}" for d in damages))
@@ -124,7 +124,7 @@ class DamagedError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class RawModel:
-    """The parts of a model; None for a part that is absent or damaged."""
+    """Contents of a model; None for a file that is absent or damaged."""
 
     folder: Path
     files: dict[str, str]
@@ -166,7 +166,7 @@ def model_kind(folder: Path) -> Literal["binary", "text"] | None:
 
 
 def find_model(project: Path) -> FoundModel | None:
-    """The model of a project and the folder of its images, both below the project; None if none.
+    """Find the model of a project and the folder of its images, below the project; None if none.
 
     Of several models the first in the order of `PLACES`, complete or not.
     """
@@ -182,7 +182,7 @@ def find_model(project: Path) -> FoundModel | None:
 
 
 def find_stray_model(project: Path) -> str | None:
-    """A complete model below a project, in a place where nobody would look."""
+    """Find a complete model below a project, in an unusual place."""
     deep = ("/".join("*" * depth) for depth in range(1, 5))
     files = (file for stars in deep for file in sorted(project.glob(f"{stars}/cameras.*")))
     folders = (file.parent for file in files if model_kind(file.parent))

@@ -64,7 +64,7 @@ def read_cameras(path: Path) -> tuple[Camera, ...]:
 
 
 def _camera(fields: list[str]) -> Camera | str:
-    """The camera of a line, or what was expected."""
+    """Parse the camera of a line; a string is the form that was expected."""
     if len(fields) < 4 or fields[1] not in CAMERA_MODELS:
         return '"<id> <model> <width> <height> <parameters>" with a model of COLMAP'
     count = len(CAMERA_MODELS[fields[1]].params)
@@ -202,7 +202,7 @@ def _lines(path: Path) -> Iterator[Line]:
 
 
 def _records(lines: Iterator[Line]) -> Iterator[Line]:
-    """Lines where a record begins; the caller may take more lines from the same iterator."""
+    """Iterate over lines that begin a record; the caller may take more lines from ``lines``."""
     for number, line in lines:
         if line and not line.startswith("#"):
             yield number, line
@@ -215,7 +215,7 @@ def _numbers(
     fits: Callable[[int], bool],
     damages: list[Damage],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """All numbers of some lines, one after the other, and how many each line has.
+    """Parse all numbers of some lines, one after the other, and count those of each line.
 
     Lines that are not numbers, or of a number that does not fit, are added to ``damages``.
     """
@@ -235,7 +235,7 @@ def _numbers(
 
 
 def _integers(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Cast without a warning; what is not finite becomes a number that is no valid id."""
+    """Cast without a warning; values that are not finite become numbers that are no valid ids."""
     with np.errstate(invalid="ignore"):
         return values.astype(np.int64)
 

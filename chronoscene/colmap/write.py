@@ -63,7 +63,7 @@ def posed_images(
     camera_ids: NDArray[np.int64],
     observations: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]],
 ) -> tuple[RawImages, NDArray[np.int64]]:
-    """Images whose keypoints are the given observations, in the order of these.
+    """Make images whose keypoints are the given observations, in their order.
 
     Args:
         ids: [I]
@@ -120,7 +120,7 @@ def _images(images: RawImages) -> bytes:
 
 
 def _points(points: RawPoints) -> bytes:
-    """Heads and tracks are scattered into the file as whole columns."""
+    """Serialise points; heads and tracks are scattered into the file as whole columns."""
     lengths = np.diff(points.track_start)
     heads = np.empty(len(points), POINT_HEAD)
     heads["id"], heads["xyz"], heads["rgb"] = points.ids, points.xyz, points.rgb

@@ -57,7 +57,7 @@ class Options:
         return (self.work or Path(f"{out.resolve()}.work")).resolve()
 
     def record(self) -> dict[str, Any]:
-        """The options that are set, for the log."""
+        """Options that are set, for the log."""
         values = {name: getattr(self, name) for name in self.__slots__}
         return {
             name: str(value) if isinstance(value, Path) else value
@@ -93,7 +93,7 @@ class Context:
 
     @property
     def mapping_database(self) -> Path:
-        """The same without held-out matches."""
+        """Database without held-out matches."""
         return self.work / "mapping.db"
 
     @property

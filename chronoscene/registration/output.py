@@ -71,7 +71,7 @@ def as_scene(registered: Registered, name: str) -> Scene:
 
 
 def as_points(registered: Registered) -> Points:
-    """The points with their errors."""
+    """Convert the points, with their reprojection errors."""
     return Points(
         ids=np.arange(1, len(registered.points) + 1),
         xyz=registered.points,
@@ -118,7 +118,7 @@ def check_free(out: Path, *, overwrite: bool) -> None:
 
 
 def write_scene(scene: Scene, staged: Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Undistort a scene into a staging folder; counts for the log."""
+    """Undistort a scene into a staging folder, and count images and points for the log."""
     shutil.rmtree(staged, ignore_errors=True)
     done = undistort(scene, staged, progress=progress)
     return {
@@ -130,7 +130,7 @@ def write_scene(scene: Scene, staged: Path, *, progress: Progress | None = None)
 
 
 def write_extras(staged: Path, registered: Registered, log: Mapping[str, Any]) -> None:
-    """Log and georeference."""
+    """Write the log and the georeference."""
     write_text_atomic(staged / LOG, json.dumps(log, indent=1, ensure_ascii=False) + "\n")
     if registered.georeference is not None:
         frame = asdict(registered.georeference) | {"crs": registered.georeference.crs}

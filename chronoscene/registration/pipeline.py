@@ -129,7 +129,7 @@ def _stage_scene(registered: Registered, inputs: Inputs, name: str, context: Con
 
 
 def _log(registered: Registered, inputs: Inputs, context: Context) -> dict[str, Any]:
-    """All decisions, as JSON."""
+    """Collect all decisions, as JSON."""
     return {
         "schema_version": SCHEMA_VERSION,
         "captures": str(inputs.captures.root),

@@ -38,7 +38,7 @@ class CrossMatches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutTracks:
-    """The observations of held-out tracks in registered images, flat and grouped by track.
+    """Observations of held-out tracks in registered images, grouped by track.
 
     A track has at most one observation an image and is seen in at least two periods, so that it
     can be triangulated in one and projected into another.
@@ -109,7 +109,7 @@ class Registered:
         return "unknown" if self.georeference is None else "metre"
 
     def counts(self, totals: Sequence[int]) -> list[dict[str, Any]]:
-        """Photos of each period, of ``totals`` in all, for the log."""
+        """Count the photos of each period, of ``totals`` in all, for the log."""
         return [
             {
                 "period": i,

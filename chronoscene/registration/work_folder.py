@@ -1,4 +1,4 @@
-"""Stages that are done once, so that a killed command continues where it was.
+"""The work folder: stages are done once, so that a killed command continues where it was.
 
 A stage stores a record when it has succeeded: a fingerprint of all its inputs, its result, and its
 remarks. The record is written last, to a temporary name that is renamed. A stage whose record has
@@ -38,7 +38,7 @@ PATIENCE = 5.0  # Seconds; a step ends within one second after its command was k
 
 
 def fingerprint(*parts: Any) -> str:
-    """SHA-256 of what JSON can hold."""
+    """SHA-256 of values, which JSON can hold."""
     text = json.dumps(parts, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -62,7 +62,7 @@ class Stages:
         *,
         chained: bool = True,
     ) -> Any:
-        """Do a stage unless it was done with the same inputs before; return its result.
+        """Run a stage unless it was done with the same inputs before; return its result.
 
         Args:
             name: Of the stage, and of its record.
@@ -100,7 +100,7 @@ class Stages:
 
 
 def read_record(path: Path) -> dict[str, Any] | None:
-    """A dictionary from a JSON file; None if there is none that can be read."""
+    """Read a dictionary from a JSON file; None if there is none that can be read."""
     try:
         record: dict[str, Any] = read_json_document(path)
     except SceneError:
@@ -230,8 +230,7 @@ def run_step(
 
 
 def _check_space(folder: Path) -> None:
-    """Raise an error if there is hardly any space: libraries abort where they cannot write, and the
-    log does not give the reason."""
+    """Raise an error if the disk is full: libraries abort there, and the log gives no reason."""
     free = shutil.disk_usage(folder).free
     if free < LEAST_SPACE:
         raise DiskFullError(

@@ -53,7 +53,7 @@ def build_tracks(
     matches: Mapping[tuple[int, int], NDArray[np.int64]],
     keypoints: Mapping[int, NDArray[np.float64]],
 ) -> Tracks:
-    """Connected components of matches.
+    """Join matches to tracks: the connected components of keypoints.
 
     SIFT gives several keypoints at one pixel where it finds several orientations. They count as
     one, or the mapper would know a held-out track by its other keypoints.
@@ -84,7 +84,7 @@ def build_tracks(
 
 
 def first_at_place(xy: NDArray[np.float64]) -> NDArray[np.int64]:
-    """For each keypoint, the first one at the same pixel position. [K, 2] -> [K]"""
+    """Index of the first keypoint at the position of each keypoint. [K, 2] -> [K]"""
     if not len(xy):
         return np.zeros(0, np.int64)
     _, first, inverse = np.unique(xy, axis=0, return_index=True, return_inverse=True)
@@ -92,7 +92,7 @@ def first_at_place(xy: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def eligible_tracks(tracks: Tracks, period_of: Mapping[int, int]) -> NDArray[np.int64]:
-    """Tracks of at least two periods without two keypoints in one image, which are mismatched."""
+    """Tracks of two periods or more, without two keypoints in one image, which are mismatched."""
     images, slot = np.unique(tracks.image, return_inverse=True)
     period = np.array([period_of[i] for i in images.tolist()], np.int64)
     count = int(tracks.track.max(initial=-1)) + 1
@@ -104,7 +104,7 @@ def eligible_tracks(tracks: Tracks, period_of: Mapping[int, int]) -> NDArray[np.
 
 
 def hold_out(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
-    """Write the database for mapping and the file of what was held out.
+    """Write the database for mapping, and the file of held-out observations.
 
     Arguments: ``database``, ``out`` (database), ``held_out`` (npz), ``periods`` (by name),
     ``share``, ``seed``.
@@ -138,7 +138,7 @@ def hold_out(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 def _cross_counts(
     matches: Mapping[tuple[int, int], NDArray[np.int64]], period_of: Mapping[int, int]
 ) -> dict[tuple[int, int], tuple[int, int]]:
-    """Pairs of images and matches between every two periods."""
+    """Count pairs of images and their matches between every two periods."""
     counts: dict[tuple[int, int], tuple[int, int]] = {}
     for (i, j), pairs in matches.items():
         a, b = sorted((period_of[i], period_of[j]))
@@ -182,7 +182,7 @@ def _first_column(geometry: pycolmap.TwoViewGeometry) -> NDArray[np.int64]:
 
 
 def _copy_database(source: Path, target: Path) -> None:
-    """Copy a database with what its log still holds."""
+    """Copy a database, including what is still in its journal."""
     import sqlite3
 
     with sqlite3.connect(source) as a, sqlite3.connect(target) as b:
@@ -193,7 +193,7 @@ def _copy_database(source: Path, target: Path) -> None:
 
 
 def _remove_journals(database: Path) -> None:
-    """Remove what is left of them when all connections are closed, or when the disk is full."""
+    """Remove journals that remain after the last connection is closed, or when the disk is full."""
     for suffix in ("-wal", "-shm"):
         Path(f"{database}{suffix}").unlink(missing_ok=True)
 
@@ -206,7 +206,7 @@ def _write_held_out(
     points: Mapping[int, NDArray[np.float64]],
     names: Mapping[int, str],
 ) -> None:
-    """Observations of the held-out tracks: track, name of the image, pixels."""
+    """Write the observations of held-out tracks: track, image and pixels."""
     mine = held[tracks.track] if len(held) else np.zeros(0, bool)
     order = np.flatnonzero(mine)[np.argsort(tracks.track[mine], kind="stable")]
     image, keypoint = tracks.image[order], tracks.keypoint[order]

@@ -33,8 +33,7 @@ are done ten times as soon."""
 
 
 def match_photos(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
-    """Choose pairs, match them, and hold out tracks: one process, because starting three takes
-    longer than what two of them do.
+    """Choose pairs, match them, and hold out tracks, in one process: starting three takes longer.
 
     Arguments and results: those of `choose_pairs`, `match` and `hold_out`.
     """
@@ -43,7 +42,7 @@ def match_photos(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]
 
 
 def match(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
-    """Match and verify pairs of images that are not in the database yet.
+    """Match and verify pairs of images, except those that are verified already.
 
     Arguments: ``database``, ``pairs`` (text file with two names a line), ``threads``,
     ``scratch`` (folder).
@@ -107,7 +106,7 @@ def _store_matches(
 
 
 def _drop_others(database: str, pairs: Sequence[tuple[str, str]]) -> None:
-    """Drop pairs that are not listed: an earlier list may have had others."""
+    """Drop pairs of an earlier list that are not in this one."""
     with pycolmap.Database.open(database) as opened:
         ids = {str(image.name): image.image_id for image in opened.read_all_images()}
         listed = {pycolmap.image_pair_to_pair_id(ids[a], ids[b]) for a, b in pairs}

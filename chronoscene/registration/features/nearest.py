@@ -20,8 +20,7 @@ Integers = NDArray[np.int32]
 MAX_RATIO = 0.8
 """COLMAP's, of the distance to the nearest descriptor and that to the second nearest."""
 
-MAX_DISTANCE = 0.7
-"""COLMAP's, in lengths of a descriptor, which is 512."""
+MAX_DISTANCE = 0.7  # COLMAP's, in lengths of a descriptor, which is 512
 
 PAIRS = 64  # Pairs of numbers in a descriptor
 COLUMNS = 2 * LANES  # Descriptors that a product reads side by side

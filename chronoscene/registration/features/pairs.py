@@ -78,7 +78,7 @@ def _ordered(pairs: Iterable[Pair]) -> set[Pair]:
 
 
 def spatial_pairs(enu: NDArray[np.float64], periods: NDArray[np.int64]) -> set[Pair]:
-    """Each image with its nearest in every period, on the map: heights of GPS are poor."""
+    """Pair images with their nearest in every period, in plan view: GPS heights are poor."""
     from scipy.spatial import cKDTree  # takes longer to load than few images to pair
 
     found: list[Pair] = []
@@ -95,7 +95,7 @@ def spatial_pairs(enu: NDArray[np.float64], periods: NDArray[np.int64]) -> set[P
 
 
 def sequential_pairs(images: Sequence[Mapping[str, Any]], periods: NDArray[np.int64]) -> set[Pair]:
-    """Each image with those taken next in its period; by name where times are unknown."""
+    """Pair images with those taken next in their period; by name where times are unknown."""
     found: list[Pair] = []
     for period in np.unique(periods).tolist():
         members = np.flatnonzero(periods == period).tolist()
@@ -107,7 +107,7 @@ def sequential_pairs(images: Sequence[Mapping[str, Any]], periods: NDArray[np.in
 
 
 def similar_pairs(descriptors: NDArray[np.float32], periods: NDArray[np.int64]) -> set[Pair]:
-    """Each image with the most similar ones of every period, by unit vectors [N, D]."""
+    """Pair images with the most similar ones of every period, by unit vectors [N, D]."""
     found: list[Pair] = []
     similarity = descriptors @ descriptors.T
     np.fill_diagonal(similarity, -np.inf)
@@ -120,7 +120,7 @@ def similar_pairs(descriptors: NDArray[np.float32], periods: NDArray[np.int64]) 
 
 
 def global_descriptors(database: str | Path, names: Sequence[str]) -> NDArray[np.float32]:
-    """A unit vector for each image; zero for one without features. [N, WORDS * 128]"""
+    """Global descriptors of images, unit length, zero without features. [N, WORDS * 128]"""
     local = [_local(database, name) for name in names]
     words = visual_words(np.concatenate(local))
     return np.stack([vlad(descriptors, words) for descriptors in local])
@@ -141,7 +141,7 @@ def _local(database: str | Path, name: str) -> NDArray[np.float32]:
 
 
 def visual_words(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Centres of clusters of descriptors (Lloyd's algorithm, fixed seed). [K, 128]"""
+    """Cluster centres of descriptors, by Lloyd's algorithm with a fixed seed. [K, 128]"""
     rng = np.random.default_rng(0)
     if len(descriptors) > MAX_TRAINING:
         descriptors = descriptors[rng.choice(len(descriptors), MAX_TRAINING, replace=False)]
@@ -165,7 +165,7 @@ def assign(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDAr
 
 
 def vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The vector of an image. [WORDS * 128]"""
+    """Global descriptor of an image. [WORDS * 128]"""
     sums = np.zeros_like(words)
     if len(descriptors):
         nearest = assign(descriptors, words)

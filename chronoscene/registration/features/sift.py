@@ -83,7 +83,7 @@ def sift_features(
 
 
 def _in_colmap(found: Sequence[cv2.KeyPoint], zoom: tuple[float, float]) -> NDArray[np.float32]:
-    """Keypoints [K, 6] in a photo that is larger by these factors, horizontally and vertically."""
+    """Convert keypoints to COLMAP's form, in a photo larger by ``zoom`` (x, y). [K, 6]"""
     x, y = ((np.array([k.pt for k in found]) + 0.5) * zoom).T
     scale = np.array([k.size for k in found]) / 2 * sum(zoom) / 2
     angle = np.radians([k.angle for k in found])
@@ -92,7 +92,7 @@ def _in_colmap(found: Sequence[cv2.KeyPoint], zoom: tuple[float, float]) -> NDAr
 
 
 def root_sift(histograms: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """RootSIFT in bytes from descriptors of any length. [K, 128]"""
+    """Convert SIFT descriptors of any length to RootSIFT in bytes. [K, 128]"""
     sums = histograms.sum(axis=1, keepdims=True, dtype=np.float64)
     roots = np.rint(LENGTH * np.sqrt(histograms / np.maximum(sums, 1e-12)))
     return np.minimum(roots, 255).astype(np.uint8)

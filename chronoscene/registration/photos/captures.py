@@ -59,7 +59,7 @@ class _Listed:
 
 
 def find_captures(path: Path, table: Path | None) -> tuple[Path, Path | None]:
-    """The folder of the photos and the table of their periods; arguments as in `read_captures`."""
+    """Find the folder of photos and the table of periods; arguments as in `read_captures`."""
     if path.is_dir():
         return path, table
     if table is None and path.suffix.lower() == ".csv" and path.is_file():
@@ -89,7 +89,7 @@ def read_captures(path: Path, *, table: Path | None = None) -> Captures:
 
 
 def _photos_in(folder: Path) -> list[Path]:
-    """Image files below a folder, sorted; hidden files and folders are skipped."""
+    """List image files below a folder, sorted, without hidden files and folders."""
     found = [
         p
         for p in folder.rglob("*")
@@ -101,7 +101,7 @@ def _photos_in(folder: Path) -> list[Path]:
 
 
 def _period_folders(root: Path) -> list[_Listed]:
-    """Photos in subfolders; empty if there are photos in the root, or only one subfolder."""
+    """List photos by subfolder; none if there are photos in the root, or only one subfolder."""
     photos = _photos_in(root)
     tops = {p.relative_to(root).parts[0] for p in photos if len(p.relative_to(root).parts) > 1}
     if len(tops) < 2 or any(p.parent == root for p in photos):
@@ -112,7 +112,7 @@ def _period_folders(root: Path) -> list[_Listed]:
 
 
 def _from_table(root: Path, table: Path) -> list[_Listed]:
-    """Rows ``image, period`` of a CSV, in any order of columns."""
+    """Read rows ``image, period`` of a CSV, in any order of columns."""
     listed: dict[str, _Listed] = {}
     for place, name, label in read_table(table, ("image", "file", "name")):
         file = _in_root(root, name)
@@ -135,7 +135,7 @@ def _from_table(root: Path, table: Path) -> list[_Listed]:
 
 
 def _in_root(root: Path, name: str) -> Path | None:
-    """The file of a table entry, in the folder or its ``images/``; None if it is outside."""
+    """Find the file of a table entry in the folder or its ``images/``; None if it is outside."""
     pure = PurePosixPath(name)
     if pure.is_absolute() or ".." in pure.parts or not pure.parts:
         return None
@@ -144,7 +144,7 @@ def _in_root(root: Path, name: str) -> Path | None:
 
 
 def _by_date(root: Path, photos: list[Path]) -> tuple[list[_Listed], list[str]]:
-    """Photos of one folder, split into periods at gaps of `PERIOD_GAP_DAYS` between dates."""
+    """Split photos of one folder into periods, at gaps of `PERIOD_GAP_DAYS` between dates."""
     times = {p: taken_at(p, read_exif(p)) for p in photos}
     dated = sorted((t, p) for p, t in times.items() if t is not None)
     if not dated or len(dated) < len(photos):
@@ -192,7 +192,7 @@ def _assemble(root: Path, listed: Sequence[_Listed], remarks: list[str]) -> Capt
 
 
 def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
-    """Labels by the dates of their photos if all have one, else in natural order."""
+    """Sort labels by the dates of their photos if all have one, else in natural order."""
     by_label: dict[str, list[Path]] = {}
     for item in listed:
         by_label.setdefault(item.label, []).append(item.path)
@@ -207,7 +207,7 @@ def _ordered_labels(listed: Iterable[_Listed]) -> list[str]:
 
 
 def _period_date(label: str, captures: Sequence[Capture]) -> str | None:
-    """The day, month or year that all photos of a period share."""
+    """Find the day, month or year that all photos of a period share."""
     days = sorted({c.taken.date() for c in captures if c.taken is not None})
     if not days:
         return label if is_iso_date(label) else None

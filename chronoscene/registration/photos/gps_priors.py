@@ -38,7 +38,7 @@ class Positions:
 
 
 def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Positions:
-    """Put the positions of captures into one local frame.
+    """Transform the GPS positions of captures into one local frame.
 
     Gross errors (kilometres among hundreds of metres, or another continent) are found by their
     distance from the median; smaller ones are left to the comparison with poses.
@@ -81,14 +81,14 @@ def locate(captures: Sequence[Capture], frame: Georeference | None = None) -> Po
 
 
 def _stated(captures: Sequence[Capture], name: str) -> NDArray[np.float64]:
-    """A field of the GPS of each photo; NaN where it states none. [N]"""
+    """Collect a field of the GPS of each photo; NaN where there is none. [N]"""
     return np.array([getattr(c.gps, name, None) for c in captures], np.float64)
 
 
 def _heights(
     captures: Sequence[Capture], has: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], HeightKind, list[str]]:
-    """One kind of height for all photos: mixing kinds would tilt or distort the frame."""
+    """Choose one kind of height for all photos: mixing kinds would tilt or distort the frame."""
     stated, relative = (_stated(captures, name) for name in ("altitude", "relative_altitude"))
     if np.isfinite(stated[has]).all():
         return stated, "as stated", []
@@ -117,7 +117,7 @@ def _plausible(
 
 
 def _sigma(capture: Capture, kind: HeightKind) -> NDArray[np.float64]:
-    """Standard deviations east, north, up, in metres."""
+    """Standard deviations of a position east, north and up, in metres."""
     if capture.gps is None:
         return np.full(3, np.nan)
     sigma = np.array(capture.gps.sigma)

@@ -35,18 +35,9 @@ _ORIENTATION = 0x0112
 _PLAIN_MODES = ("RGB", "L")
 
 
-@dataclass(frozen=True, slots=True)
-class Prepared:
-    """Captures without those that are copies of others."""
-
-    captures: tuple[Capture, ...]
-    refused: tuple[tuple[str, int, str], ...]
-    remarks: tuple[str, ...]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
-    """Photos as they go into feature extraction, including those of a scene that is extended."""
+    """Photos for feature extraction, including those of a scene that is extended."""
 
     captures: Captures
     scene: Scene | None
@@ -100,23 +91,21 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
     stages = context.stages
     refused = [f"{name}: {reason}" for name, _, reason in captures.refused]
     stages.remark("captures", *captures.remarks, *refused)
-    digests = content_digests(captures.images)
-    unique = drop_copies(captures.images, digests)
-    _check_enough(captures, unique.captures, scene, context)
+    digests = {capture.name: sha256_of(capture.path) for capture in captures.images}
+    unique, copies, notes = drop_copies(captures.images, digests)
+    _check_enough(captures, unique, scene, context)
     label, date = _new_period(captures)
-    source = unique.captures
-    if scene is not None:
-        source = _as_new_period(unique.captures, scene, label)
+    source = unique if scene is None else _as_new_period(unique, scene, label)
     inputs = [
         [c.name, str(c.path.resolve()), digests[original.name], *_mask_inputs(c.mask)]
-        for c, original in zip(source, unique.captures, strict=True)
+        for c, original in zip(source, unique, strict=True)
     ]
     if scene is not None:
         inputs += [
             [f.name, str(scene.image_path(f)), *_mask_inputs(scene.masks.get(f.name))]
             for f in scene.frames
         ]
-    names = stages.run("photos", inputs, lambda: _place(source, scene, unique.remarks, context))
+    names = stages.run("photos", inputs, lambda: _place(source, scene, notes, context))
     images = renamed(source, names)
     periods = {f.name: f.period for f in (scene.frames if scene else ())}
     positions, georeference = _locate(images, scene, context)
@@ -135,7 +124,7 @@ def gather(captures: Captures, scene: Scene | None, context: Context) -> Inputs:
         dates=dates,
         refused={
             name: (period if last is None else last, reason)
-            for name, period, reason in (*captures.refused, *unique.refused)
+            for name, period, reason in (*captures.refused, *copies)
         },
         positions=positions,
         georeference=georeference,
@@ -164,7 +153,7 @@ def _check_enough(
 
 
 def _new_period(captures: Captures) -> tuple[str, str | None]:
-    """Label and date of all captures together: the date as far as they share it."""
+    """Label and date of all captures as one period: the date as far as they share it."""
     periods = captures.periods
     label = periods[0].label if len(periods) == 1 else captures.root.name
     days = sorted(c.taken.date().isoformat() for c in captures.images if c.taken is not None)
@@ -174,7 +163,7 @@ def _new_period(captures: Captures) -> tuple[str, str | None]:
 
 
 def _as_new_period(captures: Sequence[Capture], scene: Scene, label: str) -> tuple[Capture, ...]:
-    """Captures as the one period after those of a scene, under names that it does not have."""
+    """Renumber captures as the period after those of a scene, under names new to the scene."""
     taken = {f.name for f in scene.frames}
     new = []
     for capture in captures:
@@ -189,7 +178,7 @@ def _as_new_period(captures: Sequence[Capture], scene: Scene, label: str) -> tup
 def _place(
     captures: Sequence[Capture], scene: Scene | None, remarks: Sequence[str], context: Context
 ) -> tuple[list[str], list[str]]:
-    """Put photos, those of the scene, and their masks where the steps find them."""
+    """Place photos, those of the scene, and their masks in the work folder."""
     for folder in (context.photos, context.work / MASKS):
         shutil.rmtree(folder, ignore_errors=True)
     names, notes = place_photos(captures, context.photos)
@@ -210,7 +199,7 @@ def _place(
 def _locate(
     images: Sequence[Capture], scene: Scene | None, context: Context
 ) -> tuple[Positions, Georeference | None]:
-    """Positions in the frame of the scene if it is georeferenced, else in one of their own."""
+    """Locate photos in the frame of the scene if it is georeferenced, else in their own."""
     frame = from_crs(scene.world.crs) if scene and scene.world.unit == "metre" else None
     positions = locate(images, frame)
     context.stages.remark("positions", *positions.remarks)
@@ -230,16 +219,22 @@ def _check_pinhole(scene: Scene, frame: Frame) -> None:
         )
 
 
-def content_digests(captures: Sequence[Capture]) -> dict[str, str]:
-    """SHA-256 of each file by name."""
-    return {capture.name: sha256_of(capture.path) for capture in captures}
-
-
-def drop_copies(captures: Sequence[Capture], digests: dict[str, str]) -> Prepared:
-    """Keep one of each photo: the one of the earliest period.
+def drop_copies(
+    captures: Sequence[Capture], digests: dict[str, str]
+) -> tuple[tuple[Capture, ...], list[tuple[str, int, str]], list[str]]:
+    """Keep one copy of each photo, that of the earliest period.
 
     A photo belongs to one date. The same file in two periods would link them by meaningless
     matches.
+
+    Args:
+        captures: Photos of all periods.
+        digests: SHA-256 of their files, by name.
+
+    Returns:
+        kept: Captures, sorted by name.
+        refused: Name, period and reason of each copy.
+        remarks: For the log.
     """
     first: dict[str, Capture] = {}
     kept, refused = [], []
@@ -254,11 +249,11 @@ def drop_copies(captures: Sequence[Capture], digests: dict[str, str]) -> Prepare
     kept.sort(key=lambda c: c.name)
     across = sum("earlier period" in reason for *_, reason in refused)
     remarks = [f"{across} photos are copies of photos from an earlier period"] if across else []
-    return Prepared(tuple(kept), tuple(refused), tuple(remarks))
+    return tuple(kept), refused, remarks
 
 
 def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], list[str]]:
-    """Put all captures below a folder.
+    """Place all captures below a folder.
 
     Returns:
         The name of each capture there, and remarks. Names differ only where a file is converted,
@@ -296,7 +291,7 @@ def place_photos(captures: Sequence[Capture], folder: Path) -> tuple[list[str], 
 
 
 def plain_names(names: Sequence[str]) -> list[str]:
-    """Names without blanks, which COLMAP's lists and other loaders cannot hold; still unique."""
+    """Replace blanks, which COLMAP's lists and other loaders do not allow, in unique names."""
     taken, plain = set(names), []
     for name in names:
         new = re.sub(r"\s", "_", name)
@@ -311,7 +306,7 @@ def plain_names(names: Sequence[str]) -> list[str]:
 
 
 def renamed(captures: Sequence[Capture], names: Sequence[str]) -> tuple[Capture, ...]:
-    """Captures under the names that `place_photos` gave, sorted."""
+    """Rename captures as `place_photos` did, and sort them."""
     changed = [replace(c, name=name) for c, name in zip(captures, names, strict=True)]
     return tuple(sorted(changed, key=lambda c: c.name))
 

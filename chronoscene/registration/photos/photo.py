@@ -22,7 +22,7 @@ MAX_ASPECT = 3.0  # Wider images are panoramas, which no perspective camera mode
 
 @dataclass(frozen=True, slots=True)
 class Gps:
-    """The position that a photo states."""
+    """GPS position in the metadata of a photo."""
 
     latitude: float
     """Degrees."""
@@ -54,7 +54,7 @@ class Capture:
 
 
 def open_photo(path: Path, name: str, period: int) -> Capture | str:
-    """The capture, or why it is unusable. Every file is decoded: truncated files are common."""
+    """Read a capture; the reason if it is unusable. All files are decoded: many are truncated."""
     try:
         with Image.open(path) as image:
             width, height = image.size

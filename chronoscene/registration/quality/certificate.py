@@ -42,7 +42,7 @@ AGREES = 3.0  # Pixels within which a held-out observation agrees with the regis
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeriodFigures:
-    """One period."""
+    """Figures of one period."""
 
     period: int
     label: str
@@ -82,7 +82,7 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairFigures:
-    """Two periods."""
+    """Figures of two periods."""
 
     a: int
     b: int
@@ -100,7 +100,7 @@ class PairFigures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Certificate:
-    """All that was measured."""
+    """All measurements of a registration."""
 
     route: str
     unit: str
@@ -142,7 +142,7 @@ def certify(model: Registered) -> Certificate:
 
 
 def scene_extent(model: Registered) -> float:
-    """Diagonal of the box around the cameras; a tenth of that of the points if that is more."""
+    """Diagonal of the box around the cameras; at least a tenth of that of the points."""
     size = 0.0
     if len(model.points):
         low, high = np.percentile(model.points, [5, 95], axis=0)
@@ -211,7 +211,7 @@ def _pair(
 def _all_transfers(
     model: Registered, evidence: Evidence, a: int, b: int
 ) -> tuple[Transfers, Placed, Placed]:
-    """By held-out tracks and a sample of the ties of two periods, under numbers of their own."""
+    """Transfers of held-out tracks and of a sample of the ties, with distinct track numbers."""
     held_out, ties = evidence.held_out, evidence.ties
     ties = ties.where(np.isin(model.periods[ties.image], (a, b)))
     tracks, number = np.unique(ties.track, return_inverse=True)

@@ -32,7 +32,7 @@ class Excess:
 
 @dataclass(frozen=True, slots=True)
 class Localisation:
-    """Difference between the poses of the model and those found from the other period."""
+    """Differences between poses of the model and poses by the points of the other period."""
 
     images: int
     """Images that were localised."""
@@ -49,7 +49,7 @@ class Localisation:
 
 
 def localise(rays: TrackRays, placed: Placed) -> Localisation | str:
-    """Compare the pose of each image by the points of the other period with its pose in the model.
+    """Localise images by the points of the other period, and compare with their poses.
 
     Args:
         rays: Observations by the images of the period that is localised.
@@ -88,7 +88,7 @@ def localise(rays: TrackRays, placed: Placed) -> Localisation | str:
 
 
 def _excess(size: Array, noise: Array) -> Excess:
-    """Root of the median square after the expected square is subtracted.
+    """Root of the median square beyond the expected square.
 
     Args:
         size: Differences of the images. [n]
@@ -129,7 +129,7 @@ def _project(rays: TrackRays, xyz: Array, pose: Array) -> tuple[Array, Array, Ar
 
 
 def _localise_one(rays: TrackRays, xyz: Array) -> tuple[Array, Ints] | None:
-    """Pose by PnP with RANSAC, refined on its inliers, and which they are.
+    """Estimate a pose by PnP with RANSAC, refined on its inliers; the pose and the inliers.
 
     The pose in the model is not used. Inliers are those of the pose that RANSAC returns: those of
     the few points it was drawn from would pull the pose to them.

@@ -30,7 +30,7 @@ NOISE_FLOOR = 0.1  # Pixels: no feature is located better, even if a few residua
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transfers:
-    """Points placed in one period at the rays of another (O observations)."""
+    """Points placed by one period, with the rays of another (O observations)."""
 
     rays: TrackRays
     xyz: Array
@@ -46,7 +46,7 @@ class Transfers:
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """A non-negative size and its 95% interval."""
+    """Non-negative quantity with its 95% interval."""
 
     value: float
     low: float
@@ -55,7 +55,7 @@ class Interval:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Misalignment:
-    """The similarity between two periods according to tracks; the identity if they are aligned."""
+    """Similarity between two periods, measured on tracks; the identity if they are aligned."""
 
     tracks: int
     """Tracks that agree with it."""
@@ -65,14 +65,12 @@ class Misalignment:
     """Degrees."""
     shift: Interval
     """Median displacement of the cameras of both periods, in world units."""
-    scale: Interval
-    """``abs(log(scale ratio))``."""
 
 
 def transfers(
     rays: TrackRays, period: Ints, a: int, b: int, placed: tuple[Placed, Placed] | None = None
 ) -> tuple[Transfers, Placed, Placed]:
-    """Tracks of two periods in both directions, and the points as each of them places them.
+    """Transfer tracks between two periods in both directions; also the points of each period.
 
     Args:
         rays: Observations of tracks.
@@ -122,7 +120,7 @@ def transfer_variance(jacobian: Array, covariance: Array) -> Array:
 def measure(
     moved: Transfers, placed_a: Placed, placed_b: Placed, centres: Array
 ) -> Misalignment | None:
-    """The similarity between two periods, with its spread.
+    """Estimate the similarity between two periods, with its uncertainty.
 
     Weights are those of a Cauchy distribution; the spread is that of a sandwich estimator whose
     groups are tracks, so that ten images of one point do not count as ten points.
@@ -159,7 +157,7 @@ def measure(
 
 
 def _begin(moved: Transfers, placed_a: Placed, placed_b: Placed) -> Sim3:
-    """Identity, or the similarity between their points if the periods are far apart."""
+    """Start from the identity, or from a fit to the points if the periods are far apart."""
     error = transfer_errors(moved)[0]
     if np.median(error) < GROSS_PIXELS:
         return Sim3.identity()
@@ -247,14 +245,13 @@ def _describe(
         similarity=similarity,
         rotation=_interval(lambda m: rotation_angle(m.rotation), similarity, drawn, noise_only),
         shift=_interval(lambda m: _displacement(m, centres), similarity, drawn, noise_only),
-        scale=_interval(lambda m: abs(float(np.log(m.scale))), similarity, drawn, noise_only),
     )
 
 
 def _sandwich(track: Ints, residual: Array, jacobian: Array, weight: Array) -> Array | None:
     """Covariance of the seven parameters, grouped by track."""
     residual, jacobian = np.nan_to_num(residual), np.nan_to_num(jacobian)
-    normal = np.einsum("nki,n,nkj->ij", jacobian, weight, jacobian)
+    normal, _ = _sum(residual, jacobian, weight)
     _, slot = np.unique(track, return_inverse=True)
     groups = int(slot.max()) + 1
     score = np.einsum("nki,n,nk->ni", jacobian, weight, residual)
@@ -271,7 +268,7 @@ def _sandwich(track: Ints, residual: Array, jacobian: Array, weight: Array) -> A
 def _interval(
     size: Callable[[Sim3], float], estimate: Sim3, drawn: Sequence[Sim3], noise: Sequence[Sim3]
 ) -> Interval:
-    """A size cannot be negative: the lower end is what noise alone does not explain."""
+    """Interval of a non-negative quantity; its lower end is the excess over noise alone."""
     value = size(estimate)
     high = float(np.percentile([size(m) for m in drawn], 97.5))
     chance = float(np.percentile([size(m) for m in noise], 95))

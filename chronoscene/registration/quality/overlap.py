@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,8 +31,6 @@ class TieSpread:
     tied_a: float
     """Share of the images of the first period that see `TIES_OF_IMAGE` tie points or more."""
     tied_b: float
-    loose: tuple[int, ...]
-    """Images without so many."""
     gaps: Array
     """Centres of overlap cells without a tie point, the fullest first. [G, 3]"""
 
@@ -60,7 +59,7 @@ def tie_spread(
     ]
     in_overlap = overlap[cell] & (seen[:, a] | seen[:, b]) if len(cell) else tie
     whole = _hull_area(plan[in_overlap | tie])
-    loose, (tied_a, tied_b) = _tied_images(model, tie, (a, b))
+    tied_a, tied_b = _tied_images(model, tie, (a, b))
     return TieSpread(
         points=int(tie.sum()),
         cells=int(overlap.sum()),
@@ -68,7 +67,6 @@ def tie_spread(
         hull=_hull_area(plan[tie]) / whole if whole > 0 else 0.0,
         tied_a=tied_a,
         tied_b=tied_b,
-        loose=loose,
         gaps=np.array(middles).reshape(-1, 3),
     )
 
@@ -100,15 +98,10 @@ def _hull_area(plan: Array) -> float:
         return 0.0
 
 
-def _tied_images(
-    model: Registered, tie: Mask, periods: tuple[int, int]
-) -> tuple[tuple[int, ...], tuple[float, float]]:
+def _tied_images(model: Registered, tie: Mask, periods: tuple[int, int]) -> Iterator[float]:
+    """Share of the images of each period that see enough tie points."""
     of_tie = select_tracks(model.track_start, tie)[1]
     count = np.bincount(model.track_image[of_tie], minlength=len(model.names))
-    enough = count >= TIES_OF_IMAGE
-    shares = []
     for period in periods:
-        mine = model.periods == period
-        shares.append(float(enough[mine].mean()) if mine.any() else 0.0)
-    loose = np.flatnonzero(np.isin(model.periods, periods) & ~enough)
-    return tuple(int(i) for i in loose), (shares[0], shares[1])
+        mine = count[model.periods == period]
+        yield float((mine >= TIES_OF_IMAGE).mean()) if len(mine) else 0.0

@@ -31,7 +31,7 @@ measured, and those whose error is taken: a sample where there are more."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackRays:
-    """Observations grouped by track (O observations)."""
+    """Observations grouped by track, as rays (O observations)."""
 
     track: Ints
     """Ascending. [O]"""
@@ -100,19 +100,19 @@ class Placed:
 
 
 def rays_at(model: Registered, track: Ints, image: Ints, xy: Array) -> TrackRays:
-    """TrackRays of observations; NaN where COLMAP finds none. [O], [O], [O, 2]"""
+    """Rays of observations; NaN where COLMAP finds none. [O], [O], [O, 2]"""
     uv, focal = unproject(model.cameras, image, xy)
     return TrackRays(track, image, model.cam_from_world[image], uv, focal)
 
 
 def model_rays(model: Registered) -> TrackRays:
-    """TrackRays of the points of a model; a track is the index of a point."""
+    """Rays of the points of a model; a track is the index of a point."""
     track = track_owners(model.track_start)
     return rays_at(model, track, model.track_image, model.track_xy).finite()
 
 
 def held_out_rays(model: Registered) -> TrackRays:
-    """TrackRays of the tracks that took no part in the estimation."""
+    """Rays of the tracks that took no part in the estimation."""
     tracks = model.held_out_tracks
     return rays_at(model, track_owners(tracks.start), tracks.image, tracks.xy).finite()
 
@@ -183,7 +183,7 @@ def sampson_distance(
 
 
 def place(rays: TrackRays) -> Placed:
-    """Points of tracks by their rays: those seen by two images or more, with parallax, that fit.
+    """Triangulate tracks, except those of one image, without parallax, or with large residuals.
 
     First the point nearest to all rays, then three Gauss-Newton steps on the residuals in pixels.
     """
@@ -256,7 +256,7 @@ class Evidence:
 
 
 def gather(model: Registered) -> Evidence:
-    """Unproject every observation that is used, and place every point once in each period."""
+    """Unproject the observations in use, and triangulate every point once for each period."""
     periods = range(model.num_periods)
     point, period = track_owners(model.track_start), model.periods[model.track_image]
     seen = seen_by_period(point, period, (len(model.points), model.num_periods))
@@ -295,7 +295,7 @@ def gather(model: Registered) -> Evidence:
 
 
 def _sample(points: Ints, length: Ints, max_observations: int) -> Ints:
-    """Every n-th of some points, so that they have about ``max_observations`` observations."""
+    """Thin out points until they have about ``max_observations`` observations."""
     return points[:: int(length[points].sum()) // max_observations + 1]
 
 

@@ -15,8 +15,7 @@ from chronoscene.scene.cameras import project_points
 from chronoscene.scene.splits import default_tests, split_of
 from chronoscene.scene.tracks import track_owners
 
-SAME_PIXELS = 1.0
-"""Observations in one image that are nearer to each other can be of one point."""
+SAME_PIXELS = 1.0  # Observations in one image that are nearer to each other can be of one point
 
 SAME_ERROR = 4.0
 """Pixels. They are of one point if it projects this near to where the new images see it."""

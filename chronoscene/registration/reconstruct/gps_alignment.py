@@ -24,7 +24,7 @@ LINE_RATIO = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Priors:
-    """Positions by image name."""
+    """GPS positions by image name."""
 
     enu: Mapping[str, Sequence[float]]
     """Metres."""
@@ -61,7 +61,7 @@ class GpsAlignment:
 def align_to_gps(
     poses: NDArray[np.float64], enu: NDArray[np.float64], usable: NDArray[np.bool_]
 ) -> GpsAlignment | None:
-    """Robust similarity from camera centres to GPS positions.
+    """Fit a robust similarity from camera centres to GPS positions.
 
     Args:
         poses: ``cam_from_world`` of the model. [N, 4, 4]
@@ -99,7 +99,7 @@ def align_to_gps(
 
 
 def _first_guess(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
-    """Similarity on which most positions agree, whatever it does around a line."""
+    """Fit a similarity on which most positions agree; on a line, its rotation may be wrong."""
     centres = camera_centre(poses)
     result = fit_robustly(centres, enu)
     if result is not None:
@@ -128,7 +128,7 @@ def is_line(positions: NDArray[np.float64]) -> bool:
 
 
 def _fit_with_horizon(poses: NDArray[np.float64], enu: NDArray[np.float64]) -> Sim3 | None:
-    """Similarity in which the photos also stand upright, or else look straight down.
+    """Fit a similarity in which the photos also are upright, or look straight down.
 
     Each camera gets a second point above it, as far up as the cameras are spread along the line.
     Photos of one heading fit both; the bends of the line decide.
@@ -156,7 +156,7 @@ def _fit_upwards(
 
 
 def upright_direction(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vector that is up, if photos are taken without roll. [3]
+    """Upward unit vector, for photos taken without roll. [3]
 
     The horizontal axes of all images lie in the horizontal plane; where they are all parallel, the
     mean upward axis of the images decides.

@@ -71,7 +71,7 @@ class Job:
         return cls(database, photos, out, scratch, threads, report, [])
 
     def finish(self, model: pycolmap.Reconstruction, **result: Any) -> dict[str, Any]:
-        """Write the model; the result of the step as JSON holds it."""
+        """Write the model, and return the result of the step, as JSON."""
         write_model(model, self.out, self.photos)
         return {
             "remarks": self.remarks,
@@ -84,7 +84,7 @@ class Job:
 
 
 def map_images(job: Job, names: Sequence[str], *, label: str = "") -> list[pycolmap.Reconstruction]:
-    """Models of some images, the largest first; the best of several settings.
+    """Map images with several settings; the best result, its largest model first.
 
     Args:
         job: The step.
@@ -109,7 +109,7 @@ def map_images(job: Job, names: Sequence[str], *, label: str = "") -> list[pycol
 
 
 def pipeline_options(job: Job) -> pycolmap.IncrementalPipelineOptions:
-    """Options that all mapping shares."""
+    """Options of all mapping runs."""
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = MIN_MODEL_SIZE
     options.max_num_models = 20
@@ -125,7 +125,7 @@ def pipeline_options(job: Job) -> pycolmap.IncrementalPipelineOptions:
 def _run(
     job: Job, out: Path, options: pycolmap.IncrementalPipelineOptions, total: int
 ) -> list[pycolmap.Reconstruction]:
-    """Disjoint models of a mapping run, the largest first."""
+    """Run the mapper; disjoint models, the largest first."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     count = _counter(job.report, "mapping", total)
@@ -136,7 +136,7 @@ def _run(
 
 
 def _counter(report: Report, what: str, total: int) -> Callable[[], None]:
-    """Reports one more image at each call."""
+    """Return a function that reports one more image at each call."""
     done = 0
 
     def count() -> None:
@@ -149,7 +149,7 @@ def _counter(report: Report, what: str, total: int) -> Callable[[], None]:
 
 
 def _disjoint(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """Models without the images that a larger one has: COLMAP lets models overlap."""
+    """Remove images that a larger model has, too: COLMAP lets models overlap."""
     taken: set[int] = set()
     kept = []
     for model in models:
@@ -194,7 +194,7 @@ def register_rest(
 
 
 def triangulate(model: pycolmap.Reconstruction, job: Job, folder: str) -> pycolmap.Reconstruction:
-    """Points of a model triangulated again from all matches; poses and cameras do not change."""
+    """Triangulate points again from all matches; poses and cameras do not change."""
     scratch = job.scratch / folder
     scratch.mkdir(parents=True, exist_ok=True)
     return pycolmap.triangulate_points(
@@ -214,7 +214,7 @@ def adjust(
     constant: Collection[int] = (),
     threads: int = 1,
 ) -> str:
-    """Bundle adjustment with a robust loss, after which bad observations are dropped.
+    """Adjust a model with a robust loss, then drop bad observations.
 
     Args:
         model: Changed in place.

@@ -35,12 +35,12 @@ def sorted_ids(model: pycolmap.Reconstruction) -> list[int]:
 
 
 def as_pycolmap(sim: Sim3) -> pycolmap.Sim3d:
-    """The same similarity as a pycolmap object."""
+    """Convert a similarity to pycolmap."""
     return pycolmap.Sim3d(np.column_stack([sim.scale * sim.rotation, sim.translation]))
 
 
 def known_images(database: str | Path) -> pycolmap.Reconstruction:
-    """A model with the cameras and images of a database, none of them registered."""
+    """Make a model of the cameras and images of a database, none of them registered."""
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = True
     with pycolmap.Database.open(str(database)) as opened:
@@ -64,7 +64,7 @@ def write_model(model: pycolmap.Reconstruction, folder: Path, photos: str) -> No
 
 
 def summary(model: pycolmap.Reconstruction) -> dict[str, Any]:
-    """Numbers for the log."""
+    """Counts and mean error for the log."""
     return {
         "images": int(model.num_reg_images()),
         "points": int(model.num_points3D()),

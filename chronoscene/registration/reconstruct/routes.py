@@ -76,7 +76,7 @@ def separate(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 def _merged(
     submodels: Sequence[Submodel], arguments: Mapping[str, Any], job: Job
 ) -> dict[str, Any]:
-    """Align, merge, adjust and write submodels; the result of the step."""
+    """Align, merge, adjust and write submodels, and return the result of the step."""
     if not submodels:
         also = "; tie points align models, they do not create them"
         raise RegistrationError(
@@ -135,7 +135,7 @@ def _settled(
 
 
 def _complete(model: pycolmap.Reconstruction, total: int, job: Job) -> pycolmap.Reconstruction:
-    """Register what its own period could not: other periods may have the points for it."""
+    """Register images that their own period could not: other periods may have points for them."""
     before = int(model.num_reg_images())
     if before == total or not model.num_points3D():
         return model
@@ -230,7 +230,7 @@ def refine(arguments: Mapping[str, Any], report: Report) -> dict[str, Any]:
 
 
 def _set_poses(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> set[int]:
-    """Register images at their poses; their ids."""
+    """Register images at their poses, and return their ids."""
     ids = {str(image.name): int(i) for i, image in model.images.items()}
     for name, pose in poses.items():
         set_pose(model, ids[name], pycolmap.Rigid3d(np.array(pose, np.float64)))
@@ -238,7 +238,7 @@ def _set_poses(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> set[
 
 
 def _max_change(model: pycolmap.Reconstruction, poses: Mapping[str, Any]) -> float:
-    """Largest change of any number in the poses of the scene's images: a check on the solver."""
+    """Largest change of any entry of the poses of the scene's images, to check the solver."""
     changes = [
         np.abs(image.cam_from_world().matrix() - np.array(poses[str(image.name)])).max()
         for i in model.reg_image_ids()

@@ -106,7 +106,7 @@ def combine(
 
 
 def merge(frames: Mapping[Submodel, Sim3], database: str | Path) -> pycolmap.Reconstruction:
-    """One model of several that share no image, each transformed by its similarity.
+    """Merge models that share no image, each transformed by its similarity.
 
     Every image and camera gets its id in the database, whatever its id in its own submodel; images
     are found by name. Points are left out: they are triangulated again from all matches, which
@@ -141,7 +141,7 @@ def _describe(a: Submodel, b: Submodel, link: Alignment) -> str:
 def find_links(
     submodels: Sequence[Submodel], matches: Mapping[tuple[int, int], NDArray[np.int64]]
 ) -> dict[tuple[int, int], Alignment]:
-    """Alignment of submodel j to submodel i, for i < j with enough matches."""
+    """Align submodel j to submodel i, for i < j with enough matches."""
     owner = {n: k for k, submodel in enumerate(submodels) for n in submodel.model.reg_image_ids()}
     between: dict[tuple[int, int], list[tuple[int, int, NDArray[np.int64]]]] = {}
     for (a, b), pairs in matches.items():
@@ -164,7 +164,7 @@ def point_pairs(
     target: pycolmap.Reconstruction,
     items: Sequence[tuple[int, int, NDArray[np.int64]]],
 ) -> PointPairs | None:
-    """Points of two models that matches join, each pair once; None if they are too few.
+    """Pairs of points of two models that matches join, each once; None if they are too few.
 
     Args:
         source: Model of the second image of each item.
@@ -202,7 +202,7 @@ def _views(model: pycolmap.Reconstruction, image: pycolmap.Image) -> dict[int, t
 def place_by_links(
     count: int, root: int, links: Mapping[tuple[int, int], Alignment]
 ) -> dict[int, Sim3]:
-    """Frame of the root from that of each submodel, along a maximum spanning tree (Prim)."""
+    """Place submodels in the frame of the root, along a maximum spanning tree (Prim)."""
     placed = {root: Sim3.identity()}
     while len(placed) < count:
         best: tuple[int, int, Alignment, bool] | None = None
@@ -228,7 +228,7 @@ def _place_by_gps(
     priors: Priors,
     remarks: list[str],
 ) -> None:
-    """Place what no link reaches, if its positions and those of the root are good enough."""
+    """Place submodels without links, if their positions and those of the root are good enough."""
     missing = [i for i in range(len(submodels)) if i not in placed]
     if not missing or not priors.enu:
         return

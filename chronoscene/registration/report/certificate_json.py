@@ -45,7 +45,7 @@ class Figure:
 
     @property
     def text(self) -> str:
-        """For people."""
+        """Value with unit and interval, for people."""
         if self.value is None:
             return f"absent: {self.absent}"
         number = f"{self.value:,.0f}" if abs(self.value) >= 1000 else f"{self.value:.3g}"
@@ -56,7 +56,7 @@ class Figure:
 
 
 def period_figures(certificate: Certificate, period: PeriodFigures) -> Iterator[Figure]:
-    """Lines of one period."""
+    """Figures of one period."""
     photos = f"{period.photos} photos"
     yield Figure("registered images", period.registered, "", photos)
     if period.error is None:
@@ -89,7 +89,7 @@ def period_figures(certificate: Certificate, period: PeriodFigures) -> Iterator[
 
 
 def pair_figures(certificate: Certificate, pair: PairFigures) -> Iterator[Figure]:
-    """Lines of two periods."""
+    """Figures of two periods."""
     names = certificate.labels[pair.a], certificate.labels[pair.b]
     unit = "m" if certificate.unit == "metre" else "units"
     ties = pair.ties
@@ -228,7 +228,7 @@ def _similarity(pair: PairFigures) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """Without numpy, tuples and numbers that JSON lacks."""
+    """Convert numpy values and tuples, and numbers that JSON lacks to null."""
     if isinstance(value, dict):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

@@ -37,7 +37,7 @@ def render_report(
     ties: TieAlignment | None = None,
     title: str = "Registration",
 ) -> str:
-    """The page as text.
+    """Render the page.
 
     Args:
         model: The registration; its photos are read from ``images_root`` where they exist.
@@ -139,7 +139,7 @@ def _flickers(model: Registered, certificate: Certificate, photos: Photos) -> li
 def _clicks(
     model: Registered, certificate: Certificate, verdict: Verdict
 ) -> list[tuple[str, list[list[tuple[str, str, float, float]]]]]:
-    """For each pair of periods that did not pass: where to click next."""
+    """Suggest places to click, for each pair of periods that did not pass."""
     found = []
     seen = certificate.evidence.seen
     for pair in certificate.pairs:

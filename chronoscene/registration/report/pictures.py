@@ -86,7 +86,7 @@ class Photos:
 
 
 def patch_grid(model: Registered, spot: Spot) -> Array:
-    """Places on the plane of a spot, upright in its first image. [PATCH, PATCH, 3]"""
+    """Grid on the plane of a spot, upright in its first image. [PATCH, PATCH, 3]"""
     pose, camera = model.cam_from_world[spot.a], model.cameras[spot.a]
     depth = float((pose[:3, :3] @ spot.xyz + pose[:3, 3])[2])
     step = depth / float(camera.K[0, 0]) / MAGNIFIED
@@ -118,7 +118,7 @@ class MapCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMap:
-    """Everything that is drawn."""
+    """Map of the cameras, in units of the drawing."""
 
     width: float
     height: float
@@ -176,7 +176,7 @@ def camera_map(model: Registered) -> CameraMap:
 
 
 def _axes(model: Registered, centres: Array) -> Array:
-    """Right and up of the map in the world. [2, 3]"""
+    """Directions of right and up on the map, in the world. [2, 3]"""
     if model.georeference is not None:
         return np.eye(3)[:2]
     # Up is against the mean of the cameras' down, which drones and walkers keep roughly level.

@@ -85,7 +85,7 @@ def spots(
 
 
 def _spread(points: Array, count: int) -> list[int]:
-    """Indices of points that lie far from each other: farthest point sampling."""
+    """Choose points that lie far from each other, by farthest point sampling; their indices."""
     if not len(points):
         return []
     chosen = [int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))]

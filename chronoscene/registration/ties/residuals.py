@@ -77,7 +77,7 @@ def moved(rays: TrackRays, model: Registered) -> TrackRays:
 
 
 def place_clicks(rays: TrackRays) -> Placed:
-    """Points of clicks, without the bad click of a point that only fits without it."""
+    """Triangulate clicks; a single bad click is left out if the point fits without it."""
     placed = place(rays)
     missing = np.setdiff1d(rays.track, placed.track)
     rescued = [p for t in missing if (p := _without_one(rays.where(rays.track == t)))]
@@ -85,7 +85,7 @@ def place_clicks(rays: TrackRays) -> Placed:
 
 
 def _without_one(rays: TrackRays) -> Placed | None:
-    """A point placed without the click that fits worst; None if nothing fits."""
+    """Triangulate a point without the click that fits worst; None if nothing fits."""
     if len(rays) < 4:
         return None
     trials = [place(rays.where(np.delete(np.arange(len(rays)), i))) for i in range(len(rays))]
@@ -109,7 +109,7 @@ def misfit(model: Registered, clicks: Clicks) -> float:
 
 
 def with_tie_tracks(model: Registered, tie_points: TiePoints) -> Registered:
-    """The same model with the tie points as points, so that bundle adjustment uses them.
+    """Add the tie points to the points of a model, so that bundle adjustment uses them.
 
     Points that cannot be placed, and outliers, are left out.
     """

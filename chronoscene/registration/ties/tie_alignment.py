@@ -42,7 +42,7 @@ GOOD_PIXELS = 10.0  # Median residual up to which mode ``auto`` keeps the existi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TieAlignment:
-    """A registration after tie points."""
+    """Result of checking or aligning a registration by tie points."""
 
     model: Registered
     replaced: bool
@@ -206,14 +206,14 @@ def tie(model: Registered, points: TiePoints, refine: Refine) -> TieAlignment:
 
 
 def _unless_placed(result: TieAlignment, before: Registered) -> TieAlignment:
-    """Without the frame if there was no control to move the model into it."""
+    """Drop the georeference if there was no control to move the model into its frame."""
     if result.controlled or before.georeference is not None:
         return result
     return replace(result, model=replace(result.model, georeference=None))
 
 
 def control_frame(points: TiePoints) -> Georeference | None:
-    """A local frame at the ground control; None without control in a reference system."""
+    """Local frame around the ground control; None without control in a reference system."""
     if points.crs is None or not any(p.world is not None for p in points.points):
         return None
     anywhere = Georeference(latitude=0.0, longitude=0.0, height=0.0, height_kind="as stated")

@@ -222,7 +222,7 @@ def _is_projection(line: str) -> bool:
 
 
 def _projection(path: Path, line: str) -> str:
-    """The first line of ``gcp_list.txt``: PROJ, EPSG, or ``WGS84 UTM 32N``."""
+    """Read the first line of ``gcp_list.txt``: PROJ, EPSG, or ``WGS84 UTM 32N``."""
     if utm := re.fullmatch(r"WGS84\s+UTM\s+(\d{1,2})\s*([NS])", line, re.IGNORECASE):
         zone = int(utm[1])
         if 1 <= zone <= 60:
@@ -265,7 +265,7 @@ def _geodetic(path: Path, crs: str, xyz: Array) -> Array:
 
 
 def match_images(tie_points: TiePoints, names: Sequence[str]) -> dict[str, int | None]:
-    """Index of the model's image for each image that is clicked in; None for those it lacks.
+    """Index of the model's image for each image with clicks; None where the model lacks it.
 
     An image may be named by its whole path or by the end of it, where that is unique.
 

@@ -285,7 +285,7 @@ def test_limits_of_the_overlap_and_of_tied_images(good: Registered) -> None:
     assert (found.points, found.cells, found.occupied) == (3, 2, 0.5)
     every = np.ones((len(cell), 2), bool)
     found = tie_spread(model, every, 0, 1, (points[:, :2], cell))
-    assert (found.tied_a, found.tied_b, found.loose) == (1.0, 0.0, (1,))
+    assert (found.tied_a, found.tied_b) == (1.0, 0.0)
 
 
 def tracks_of(points: np.ndarray, seen: Sequence[range]) -> dict[str, np.ndarray]:

@@ -34,7 +34,7 @@ Change = Callable[[Certificate, float], Certificate]
 
 def misalignment(rotation: float = 0.03, shift: float = 0.03) -> Misalignment:
     """Intervals from 0 to twice the value. Degrees and world units."""
-    sizes = (Interval(x, 0.0, 2 * x) for x in (rotation, shift, 1e-3))
+    sizes = (Interval(x, 0.0, 2 * x) for x in (rotation, shift))
     return Misalignment(40, Sim3.identity(), *sizes)
 
 
