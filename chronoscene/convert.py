@@ -21,12 +21,12 @@ class Conversion:
     """The result of a conversion."""
 
     scene: Scene
-    """As it was read."""
+    """The scene that was read."""
     out: Path
     target: str
     """Name of the format written."""
     warnings: tuple[str, ...]
-    """What was lost, and what prevents the result from being used."""
+    """Losses, and reasons that prevent the use of the result."""
 
 
 def convert(
@@ -64,19 +64,19 @@ def convert(
 
 
 def remarks_on(scene: Scene) -> list[str]:
-    """What the source contains that is not read."""
+    """List the content of the source that is not read."""
     module = load_format(scene.format)
-    said = list(module.remarks(scene.root)) if hasattr(module, "remarks") else []
+    found = list(module.remarks(scene.root)) if hasattr(module, "remarks") else []
     if scene.images_root != scene.root and (count := _unused_images(scene)):
         where = scene.images_root.relative_to(scene.root)
-        said.append(
+        found.append(
             f"{count} image files in {where}/ are not part of the scene and were not converted"
         )
-    return said
+    return found
 
 
 def _unused_images(scene: Scene) -> int:
-    """Number of files in the image folder that no frame uses."""
+    """Count the files in the image folder that no frame uses."""
     used = {os.path.normpath(scene.image_path(frame)) for frame in scene.frames}
     found = (
         os.path.normpath(os.path.join(folder, file))
@@ -88,14 +88,14 @@ def _unused_images(scene: Scene) -> int:
 
 
 def losses(scene: Scene, target: str) -> list[str]:
-    """What the scene contains that the format cannot store."""
+    """List the content of a scene that a format cannot store."""
     module = load_format(target)
     lost = module.losses(scene) if hasattr(module, "losses") else []
     return [f"{target} cannot store {item}" for item in lost]
 
 
 def obstacles(scene: Scene) -> list[str]:
-    """Why a benchmark would refuse the scene as it is."""
+    """List the reasons for which a benchmark would refuse the scene as it is."""
     found = []
     cameras = {f.camera.camera_id: f.camera for f in scene.frames}.values()
     distorted = sorted({camera.model for camera in cameras if not camera.is_pinhole})

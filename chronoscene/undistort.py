@@ -29,7 +29,7 @@ JPEG_QUALITY = 95
 WRITABLE = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 MAX_EXIF_BYTES = 65533
-"""What a JPEG file can store. Some cameras write two blocks, which Pillow reads as a longer one."""
+"""Limit of a JPEG file. Some cameras write two blocks, which Pillow reads as a longer one."""
 
 _KEPT_TAGS = (0x010F, 0x0110, 0x0112, 0x0132)
 """Make, model, orientation and time: the other tags of a TIFF describe its pixels."""
@@ -62,8 +62,8 @@ def undistort(
     """Write a scene in the ChronoScene format whose cameras are all PINHOLE.
 
     Poses, periods and split stay. Where a file has another size than its camera, the camera is
-    scaled to the file first. Masks are resampled with their images; what transparent pixels say
-    goes to the masks of images that change.
+    scaled to the file first. Masks are resampled with their images; transparent pixels of images
+    that change become part of their masks.
 
     Args:
         scene: Any scene.
@@ -178,7 +178,7 @@ def _tiff_metadata(image: Image.Image) -> Image.Exif:
 
 
 def _fits(tag: int, value: Any, block: int | None = None) -> bool:
-    """Whether Pillow can write a tag that it has read; it cannot if the type is wrong."""
+    """Return True if Pillow can write a tag that it has read: not if the type is wrong."""
     probe = Image.Exif()
     if block is None:
         probe[tag] = value

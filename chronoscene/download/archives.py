@@ -23,7 +23,7 @@ from chronoscene.io.wording import quote
 
 ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz")
 _BROKEN = (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError, RuntimeError)
-"""What the libraries raise for damage, and for ways of packing that they do not know."""
+"""Errors of the libraries for damage, and for unknown ways of packing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +38,14 @@ class Member:
 
 
 def archive_stem(path: str) -> str:
-    """Name of an archive without its folder and ending; empty if it is none."""
+    """Return the name of an archive without folder and ending; empty if it is none."""
     name = path.rpartition("/")[2]
     return next((name.removesuffix(end) for end in ARCHIVES if name.endswith(end)), "")
 
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[list[Member]]:
-    """The files in an archive, in their order there.
+    """Open an archive and list its files, in their order there.
 
     Raises:
         DownloadError: If it is damaged or of another kind, or has members that a dataset has no use

@@ -17,14 +17,14 @@ class Dataset:
 
     title: str
     page: str
-    """Where its authors describe it."""
+    """Page on which its authors describe it."""
     host: str
     licence: str
     format: str
-    """What reads its scenes, as ``--dataset-format`` names it."""
+    """Format of its scenes, as ``--dataset-format`` names it."""
     citation: str
     by_hand: str
-    """How to get it without this command, to follow on "by hand:"."""
+    """Way to get it without this command, to follow on "by hand:"."""
     repo: str = ""
     """``owner/name`` of a dataset on the Hugging Face hub; empty if it is elsewhere."""
     scene_file: str = ""

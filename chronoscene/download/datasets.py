@@ -1,7 +1,7 @@
 """Scenes of a public dataset in a folder on this machine.
 
-How a dataset is laid out on its host is found out: scenes may be folders, at any depth, or be in
-archives, one for each scene or one for all of them.
+The layout on the host is detected: scenes may be folders, at any depth, or be in archives, one for
+each scene or one for all of them.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from chronoscene.download.hub import list_files, request_headers
 from chronoscene.download.transfer import RemoteFile, check_space, fetch, missing_bytes
 from chronoscene.errors import ConfigError, DownloadError, SceneError
 from chronoscene.io.documents import read_json_document
+from chronoscene.io.log import Log
 from chronoscene.io.processes import Report
 from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.wording import counted, in_words, shown
@@ -32,7 +33,7 @@ LISTED = 40  # Names of scenes that a message lists
 
 @dataclass(frozen=True, slots=True)
 class _Record:
-    """What was downloaded into a folder before."""
+    """Record of earlier downloads into a folder."""
 
     scenes: dict[str, str]
     """Name of a scene to the commit that it is from."""
@@ -42,7 +43,7 @@ class _Record:
 
 @dataclass(frozen=True, slots=True)
 class _Choice:
-    """What of a dataset is to be fetched."""
+    """Selection of the files of a dataset that are to be fetched."""
 
     folders: dict[str, str]
     """Scenes that are folders: name to the path in the repository, with a slash at its end."""
@@ -54,12 +55,7 @@ class _Choice:
 
 
 def download_scenes(
-    dataset: Dataset,
-    out: Path,
-    scenes: Collection[str],
-    *,
-    report: Report,
-    say: Callable[[str], None],
+    dataset: Dataset, out: Path, scenes: Collection[str], *, report: Report, log: Log
 ) -> None:
     """Bring scenes of a dataset on the Hugging Face hub into a folder.
 
@@ -70,7 +66,7 @@ def download_scenes(
         out: Gets a folder for each scene, complete or not at all.
         scenes: Names of scenes, or of archives that hold several; none for all.
         report: Called with the progress of each step.
-        say: Called with the size before anything is fetched.
+        log: Called with the size before anything is fetched.
 
     Raises:
         ConfigError: If there is no scene of this name; lists those that there are.
@@ -81,13 +77,13 @@ def download_scenes(
     record = _read_record(out)
     choice = _choose(dataset, files, scenes, out, record)
     if not choice.files:
-        say(f"{dataset.title}: all of it is in {out}")
+        log(f"{dataset.title}: all of it is in {out}")
         return
     unfinished = out / UNFINISHED
     unfinished.mkdir(parents=True, exist_ok=True)
     missing = sum(missing_bytes(file, unfinished) for file in choice.files)
     packed = sum(file.size for file in choice.archives)
-    say(
+    log(
         f"{dataset.title}: {in_words(missing)} in {counted(len(choice.files), 'file')} to download"
         + (f", {in_words(packed)} in archives to unpack" if packed else "")
     )
@@ -112,7 +108,7 @@ def download_scenes(
 
 
 def find_scenes(dataset: Dataset, paths: Iterable[str], whole: str) -> dict[str, str]:
-    """Name to folder, with a slash at its end, of each scene among the paths of files.
+    """Find the scenes among the paths of files: name to folder, with a slash at its end.
 
     Args:
         dataset: Says by which file a scene is known. Of folders in each other the outermost counts.
@@ -127,7 +123,7 @@ def find_scenes(dataset: Dataset, paths: Iterable[str], whole: str) -> dict[str,
             folders.append(folder)
     names = [folder.rstrip("/").rpartition("/")[2] or whole for folder in folders]
     return {
-        # Two folders of one name, of two resolutions perhaps, are told apart by their paths.
+        # Two folders of one name, of two resolutions perhaps, are distinguished by their paths.
         name if names.count(name) == 1 else folder.rstrip("/").replace("/", "_"): folder
         for name, folder in zip(names, folders, strict=True)
     }
@@ -174,7 +170,7 @@ def _choose(
 
 
 def _is_there(archive: RemoteFile, scenes: Collection[str], out: Path, record: _Record) -> bool:
-    """Whether all that is wanted of an archive was unpacked before."""
+    """Return True if all that is wanted of an archive was unpacked before."""
     names = record.archives.get(archive.checksum)
     if names is None:
         return False
@@ -182,7 +178,7 @@ def _is_there(archive: RemoteFile, scenes: Collection[str], out: Path, record: _
 
 
 def _wanted(archive: RemoteFile, names: Iterable[str], scenes: Collection[str]) -> list[str]:
-    """Those scenes of an archive that were asked for, by their names or by its own."""
+    """Return the requested scenes of an archive, by their names or by its own."""
     whole = not scenes or archive_stem(archive.path) in scenes
     return [name for name in names if whole or name in scenes]
 
@@ -197,7 +193,7 @@ def _remove_others(folder: Path, listed: Collection[Path]) -> None:
 def _unpack(
     dataset: Dataset, archive: RemoteFile, scenes: Collection[str], out: Path, report: Report
 ) -> tuple[list[str], list[str]]:
-    """Unpack the scenes that are wanted; names of all that the archive has, and of these."""
+    """Unpack the wanted scenes; return the names of all in the archive, and of these."""
     stem = archive_stem(archive.path)
     with open_archive(out / UNFINISHED / archive.path) as members:
         found = find_scenes(dataset, (member.name for member in members), stem)

@@ -1,4 +1,4 @@
-"""What a dataset on the Hugging Face hub consists of."""
+"""List of the files of a dataset on the Hugging Face hub."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +29,7 @@ class RemoteFile:
     """A file on a host, and how to know that it has arrived as it is there."""
 
     path: str
-    """Where it goes below a folder, with slashes."""
+    """Path below the folder that it goes to, with slashes."""
     url: str
     size: int
     """Bytes."""
@@ -79,7 +78,7 @@ def fetch(
 
 
 def missing_bytes(file: RemoteFile, folder: Path) -> int:
-    """How much of a file is still to be fetched."""
+    """Return the number of bytes of a file that are still to be fetched."""
     whole, part = folder / file.path, _part(file, folder)
     there = next((path.stat().st_size for path in (whole, part) if path.is_file()), 0)
     return max(file.size - there, 0)
@@ -101,7 +100,7 @@ def check_space(folder: Path, needed: int) -> None:
             folder,
             expected=f"{in_words(needed)} of free space",
             found=in_words(free),
-            todo="make room on this disk, choose a place on another one, or name fewer scenes",
+            todo="free space on this disk, choose a place on another one, or name fewer scenes",
         )
 
 
@@ -162,7 +161,7 @@ class _Metered(BufferedWriter):
 
 
 def _part(file: RemoteFile, folder: Path) -> Path:
-    """Where a file is until it is whole; files of other contents do not continue each other."""
+    """Path of a file until it is complete; files of other contents do not continue each other."""
     whole = folder / file.path
     return whole.with_name(f"{whole.name}.{file.checksum[:8]}.part")
 
@@ -211,8 +210,6 @@ def _check(files: Sequence[RemoteFile], folder: Path, report: Report) -> None:
 
 
 def _checksum(path: Path, digits: int) -> str:
-    if digits == SHA256_DIGITS:
-        return sha256_of(path)
-    begin = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, lambda: begin).hexdigest()
+    from huggingface_hub.utils.sha import git_hash
+
+    return sha256_of(path) if digits == SHA256_DIGITS else git_hash(path.read_bytes())

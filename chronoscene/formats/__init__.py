@@ -43,7 +43,7 @@ ENTRY_POINT_GROUP = "chronoscene.formats"
 USUAL = ("sparse/0", "sparse")  # Where everybody looks for a COLMAP model
 
 COLMAP = "colmap-folders"
-"""Format of a COLMAP project where ``--period-by`` says what its periods are."""
+"""Format of a COLMAP project whose periods ``--period-by`` defines."""
 
 FAR_UP = 4
 """Levels above a wrong folder at which the right one may be: ``dense/0/sparse/0`` has four."""

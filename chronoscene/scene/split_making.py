@@ -9,7 +9,7 @@ are to the training views, because close ones make a split easy.
   and whole blocks are held out. No camera of any period trains inside a test block.
 - ``date``: in each period, the images taken last are held out: whole days where a period has
   several.
-- ``periods``: all images of some periods are held out; methods see nothing of these periods.
+- ``periods``: all images of some periods are held out; methods see no image of these periods.
 - ``none``: no images are held out: methods are trained on all of them and cannot be scored.
 """
 
@@ -37,7 +37,7 @@ FRACTION = 1 / 8
 
 @dataclass(frozen=True, slots=True)
 class SplitSettings:
-    """How to choose test images."""
+    """Settings of the choice of test images."""
 
     strategy: Strategy = "stratified"
     fraction: float = FRACTION
@@ -93,7 +93,7 @@ class NewSplit:
 
 
 Times = Mapping[str, datetime | None]
-"""When each image was taken, by name; None where nobody knows."""
+"""Time of capture of each image, by name; None if unknown."""
 
 
 def make_split(scene: Scene, settings: SplitSettings, times: Times | None = None) -> NewSplit:
@@ -101,7 +101,7 @@ def make_split(scene: Scene, settings: SplitSettings, times: Times | None = None
 
     Args:
         scene: Its images are not opened.
-        settings: How to choose test images.
+        settings: Choice of the test images.
         times: Needed by ``date`` only.
 
     Raises:
@@ -162,7 +162,7 @@ STRATEGIES: Mapping[Strategy, Callable[[Scene, SplitSettings, Times], set[str]]]
     "periods": lambda scene, s, _: whole_periods(scene, s.periods),
     "none": lambda scene, s, _: set(),
 }
-"""By name, what chooses the test images of a scene."""
+"""Functions that choose the test images of a scene, by name of the strategy."""
 
 
 def _distances(scene: Scene, *, same_period: bool) -> tuple[float, float] | None:

@@ -1,4 +1,4 @@
-"""What a rule is, the table that rules register in, and what comes out of a validation as data.
+"""Rules, the table that they register in, and the results of a validation as data.
 
 A rule is a small function in `chronoscene.validation.rules` with a decorator for its severity. Its
 parameters name the attributes of `RawScene` that it looks at (``scene`` is the scene itself); it is
@@ -9,7 +9,7 @@ skipped if one of them is None, or what it is read from, and yields a `Hit` for 
         '''A quaternion does not have unit length.'''
         ...
 
-The docstring says what is wrong; the name is that of the function, here ``quaternion-not-unit``.
+The docstring describes the fault; the name is that of the function, here ``quaternion-not-unit``.
 Codes are stable and never reused (`RETIRED`). ``docs/reference/validation-rules.md``
 lists all rules.
 """
@@ -80,9 +80,9 @@ class Rule:
     name: str
     severity: Severity
     what: str
-    """What is wrong, in one or two sentences: the docstring of ``check``. Markdown."""
+    """Fault that the rule finds, in one or two sentences: the docstring of ``check``. Markdown."""
     remedy: str
-    """What to do, in the imperative, without a full stop."""
+    """Remedy in the imperative, without a full stop."""
     bad: str
     """Short example of a scene that breaks the rule. Markdown."""
     parameters: tuple[str, ...]
@@ -190,7 +190,7 @@ class PeriodSummary:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What is in a scene; None for what cannot be read."""
+    """Counts of the content of a scene; None for parts that cannot be read."""
 
     images: int | None
     cameras: int | None
@@ -231,7 +231,7 @@ class SceneReport:
 
 
 def explain(finding: Finding) -> str:
-    """What is wrong in general: what the rule says, if there is one of this code."""
+    """Describe the fault in general: as the rule of this code does, if there is one."""
     return RULES[finding.code].what if finding.code in RULES else finding.expected
 
 
@@ -242,6 +242,6 @@ def counts(reports: Iterable[SceneReport]) -> dict[Severity, int]:
 
 
 def is_valid(reports: Iterable[SceneReport], *, strict: bool) -> bool:
-    """Whether the scenes have no error and, with ``strict``, no warning."""
+    """Return True if the scenes have no error and, with ``strict``, no warning."""
     total = counts(reports)
     return not total["error"] and not (strict and total["warning"])

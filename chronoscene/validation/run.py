@@ -221,7 +221,7 @@ def _validate(scene: RawScene, rules: Sequence[Rule]) -> SceneReport:
             findings.append(_failure(f"rule {rule.code}", expected, found, todo))
     try:
         summary = _summarise(scene)
-    except Exception:  # the rules that need the same part have said so
+    except Exception:  # the rules that need the same part report it
         summary = UNKNOWN
     findings.sort(key=lambda f: (SEVERITIES.index(f.severity), f.code))
     skipped.sort(key=lambda s: s.code)
@@ -291,6 +291,6 @@ def _labels(scene: RawScene) -> dict[int, str]:
     """Labels of the periods that are more than their ids; none if they cannot be read."""
     try:
         periods = scene.period_table()
-    except ChronoSceneError:  # a rule says so
+    except ChronoSceneError:  # a rule reports it
         return {}
     return {p.id: printable(p.label) for p in periods if p.label != str(p.id)}

@@ -34,7 +34,7 @@ def packed(files):
 
 def download(out, *scenes):
     said = []
-    download_scenes(CHRONOSCENE, out, scenes, report=lambda *step: None, say=said.append)
+    download_scenes(CHRONOSCENE, out, scenes, report=lambda *step: None, log=said.append)
     return said
 
 

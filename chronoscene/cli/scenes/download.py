@@ -61,7 +61,7 @@ def _download_dataset(dataset: Dataset, scenes: tuple[str, ...], out: Path) -> N
     check_place("--out", out)
     try:
         with progress_bar(f"list {dataset.page}") as bar:
-            download_scenes(dataset, out, scenes, report=bar, say=click.echo)
+            download_scenes(dataset, out, scenes, report=bar, log=click.echo)
     except DownloadError:
         click.echo(f"by hand: {dataset.by_hand}", err=True)
         raise

@@ -31,7 +31,7 @@ NOT_VALID = 1  # Exit status when there are errors
 
 
 def _explain(context: click.Context, option: click.Parameter, value: str | None) -> None:
-    """Print what is known about some rules, and end."""
+    """Print the descriptions of some rules, and end."""
     if value is not None:
         rules = choose_rules(_codes([value]), place="--explain")
         emit("\n".join(map(describe_rule, rules)), None)
@@ -110,7 +110,7 @@ def command(
     """
     read = ReadOptions(dataset_format, period_by)
     check = partial(_check, _codes(select), _codes(ignore), decode, read)
-    choose_rules(_codes(select), _codes(ignore))  # whatever is wrong with them is said first
+    choose_rules(_codes(select), _codes(ignore))  # errors in these options come first
     folders = find_folders(folder)
     for option, file in (("--out", out), ("--sarif", sarif), ("--html", html)):
         if file is not None:
@@ -143,14 +143,14 @@ def _check(
     *,
     track: Track = no_progress,
 ) -> SceneReport:
-    """One scene, perhaps in a process of its own, which is given names of rules, not rules."""
+    """Check one scene, perhaps in a process of its own, which gets names of rules, not rules."""
     keep_freed_memory()  # arrays as large as the model come and go
     rules = choose_rules(select, ignore)
     return validate_scene(path, rules=rules, decode=decode, track=track, options=options)
 
 
 def _fix(folder: Path, scenes: Sequence[Path], out: Path, options: ReadOptions) -> list[Path]:
-    """Corrected copies of the scenes; what was done goes to standard error."""
+    """Write corrected copies of the scenes; list the corrections on standard error."""
     copies = []
     for scene in scenes:
         copy = out if scene == folder else out / scene.name
@@ -164,5 +164,5 @@ def _fix(folder: Path, scenes: Sequence[Path], out: Path, options: ReadOptions) 
 
 
 def _codes(values: Iterable[str]) -> list[str]:
-    """Options may be repeated, and each may have several codes with commas."""
+    """Split the values of a repeated option at commas."""
     return [code for value in values for code in value.split(",")]

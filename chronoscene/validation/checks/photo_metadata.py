@@ -1,4 +1,4 @@
-"""What the photos and `sparse/periods.json` say about dates, and the photos about positions."""
+"""Dates of photos and of `sparse/periods.json`, and GPS positions of photos."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MIN_SPREAD = 10.0  # Metres; smaller spreads of positions are the noise of the r
 
 @derived
 def dates_of(scene: RawScene) -> dict[str, datetime]:
-    """When the images that have a period were taken."""
+    """Times of capture of the images that have a period."""
     dates = {n: scene.headers[n].exif.date for n in scene.periods or () if n in scene.headers}
     return {name: taken for name, taken in dates.items() if taken is not None}
 

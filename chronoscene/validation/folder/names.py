@@ -1,4 +1,4 @@
-"""Names of images: which are safe and portable, and which one a misspelt name means."""
+"""Names of images: safe ones, and the meaning of misspelt ones."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PUNCTUATION = "\"'`,;"  # What tables put around and after a name
 
 
 def is_safe(name: str) -> bool:
-    """Whether an image name stays below ``images/``."""
+    """Return True if an image name stays below ``images/``."""
     try:
         check_name(Path(), name)
     except SceneError:
@@ -22,7 +22,7 @@ def is_safe(name: str) -> bool:
 
 
 def spelling(name: str) -> str:
-    """A key that ignores case, the two Unicode spellings of accented letters, and backslashes."""
+    """Return a key without case, spelling of accented letters in Unicode, and backslashes."""
     return unicodedata.normalize("NFC", name).casefold().replace("\\", "/")
 
 
@@ -36,7 +36,7 @@ class Spellings:
                 table.setdefault(key, set()).add(name)
 
     def find(self, text: str) -> str | None:
-        """The name with the same full name, else file name, else file name without extension.
+        """Return the name with the same full name, else file name, else without extension.
 
         None if the first of these that matches any name matches several.
         """

@@ -31,7 +31,7 @@ class Observations:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """Whether both image and keypoint exist. [M]"""
+        """True if both image and keypoint exist. [M]"""
         return self.keypoint >= 0
 
     def by_image(self, images: RawImages) -> Iterator[tuple[int, NDArray[np.int64]]]:
@@ -68,7 +68,7 @@ def observe(images: RawImages, points: RawPoints) -> Observations:
 
 
 def _look_up(ids: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of each wanted id, -1 for none. Of equal ids the first counts."""
+    """Return the index of each wanted id, -1 for none. Of equal ids the first counts."""
     low, high = int(ids.min()), int(ids.max())
     if high - low < 2 * MAX_TABLE + 4 * len(ids):  # ten times faster than a search
         table = np.full(high - low + 3, -1, np.int64)  # both ends stand for ids out of range
@@ -93,7 +93,7 @@ class Reprojection(NamedTuple):
 
 
 def good_poses(images: RawImages) -> NDArray[np.bool_]:
-    """Which poses are finite and have a non-zero quaternion. [I]"""
+    """Return True for finite poses with a non-zero quaternion. [I]"""
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(images.quaternions, axis=1)
     return np.isfinite(norm) & (norm > 0) & np.isfinite(images.translations).all(axis=1)
@@ -128,7 +128,7 @@ def reproject(
 
 
 def _transform(rotation: Array, translation: Array, x: Array, y: Array, z: Array) -> Array:
-    """Points at ``x, y, z`` [m] in the world in the frame of a camera. [3, m]"""
+    """Transform points at ``x, y, z`` [m] from the world to the frame of a camera. [3, m]"""
     local = np.empty((3, len(x)))
     for i, (row, shift) in enumerate(zip(rotation.tolist(), translation.tolist(), strict=True)):
         local[i] = row[0] * x + row[1] * y + row[2] * z + shift

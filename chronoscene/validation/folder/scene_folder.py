@@ -1,6 +1,6 @@
 """A scene folder as it is on disk: read lazily, part by part, with nothing repaired.
 
-A part that cannot be read is None, and `RawScene.reason` says why; rules that need it are skipped
+A part that cannot be read is None, and `RawScene.reason` explains; rules that need it are skipped
 with that reason. Nothing here raises for what is on disk.
 """
 
@@ -91,22 +91,22 @@ class RawScene:
 
     root: Path
     decode: bool = False
-    """Whether rules may decode all images."""
+    """True if rules may decode all images."""
     track: Track = no_progress
     """Shows the progress of slow parts."""
     origin: Origin | None = None
     memory: dict[Callable[[RawScene], Any], Any] = field(default_factory=dict, init=False)
-    """What `derived` functions have computed of this scene."""
+    """Results of `derived` functions of this scene."""
 
     def reason(self, attribute: str) -> str:
-        """Why an attribute is None."""
+        """Reason why an attribute is None."""
         if self.is_project and attribute in ("split", "split_text"):
             return f"{SPLIT} is no part of a COLMAP project"
         return _REASONS[attribute]
 
     @property
     def is_project(self) -> bool:
-        """Whether this is a COLMAP project without ``split.txt``."""
+        """True for a COLMAP project without ``split.txt``."""
         return self.origin is not None and self.origin.is_project
 
     @property
@@ -115,7 +115,7 @@ class RawScene:
 
     @property
     def period_place(self) -> str:
-        """Where the periods of the images stand."""
+        """File or folder that defines the periods of the images."""
         return "images" if self.is_project else SPLIT
 
     def period_table(self) -> tuple[Period, ...]:
@@ -136,7 +136,7 @@ class RawScene:
 
     @cached_property
     def model_place(self) -> str | None:
-        """Where the model is, relative to the scene folder; None if there is none."""
+        """Folder of the model, relative to the scene folder; None if there is none."""
         return None if self._found is None else self._found[0]
 
     @cached_property
@@ -147,7 +147,7 @@ class RawScene:
 
     @property
     def model_images(self) -> str:
-        """Where the images are that a model in a wrong place is of."""
+        """Folder of the images of a model in a wrong place."""
         return "images" if self._found is None else self._found[1]
 
     @cached_property
@@ -212,7 +212,7 @@ class RawScene:
 
     @cached_property
     def is_posed(self) -> NDArray[np.bool_]:
-        """Which images have a camera centre. [I]"""
+        """True for images with a camera centre. [I]"""
         return np.isfinite(self.centres[:, 0])
 
     @cached_property
@@ -268,7 +268,7 @@ class RawScene:
 
     @property
     def has_own_tests(self) -> bool:
-        """Whether the format decides by itself what test images are."""
+        """True if the format itself defines the test images."""
         return self._by_format is not None and self._by_format.tests is not None
 
     @cached_property
@@ -305,7 +305,7 @@ class RawScene:
 
     @cached_property
     def point_periods(self) -> NDArray[np.bool_] | None:
-        """Whether a point is seen by an image of a period; columns as `period_ids`. [P, T]"""
+        """True if a point is seen by an image of a period; columns as `period_ids`. [P, T]"""
         points, seen = self.points, self.observations
         if points is None or seen is None or self.periods is None:
             return None
@@ -373,7 +373,7 @@ class RawScene:
 
 
 def derived(compute: Callable[[RawScene], T]) -> Callable[[RawScene], T]:
-    """Decorator of a function of a scene that is called by several rules: computed once."""
+    """Compute a function of a scene once, although several rules call it."""
 
     @wraps(compute)
     def remembered(scene: RawScene) -> T:
@@ -398,7 +398,7 @@ def _image_files(top: Path) -> list[str]:
 
 
 def read_text_file(path: Path) -> TextFile | None:
-    """A small text file, or None if it is absent, not a regular file, or not text."""
+    """Read a small text file; None if it is absent, not a regular file, or not text."""
     try:
         if not path.is_file():  # a pipe would block
             return None

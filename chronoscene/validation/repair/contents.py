@@ -22,7 +22,7 @@ from chronoscene.validation.rules.cs1_poses import UNIT_TOLERANCE
 
 MIN_KEPT = 0.5
 """Share of the points that must have two observations; otherwise points without tracks are what the
-model consists of (a laser scan, say), and stay."""
+model consists of, as in a laser scan, and stay."""
 
 
 class Repair(NamedTuple):

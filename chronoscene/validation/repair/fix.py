@@ -11,10 +11,11 @@ from pathlib import Path
 
 from chronoscene.colmap.raw_model import FORMS, MODEL_FILES, RawModel
 from chronoscene.colmap.write import write_raw_model
-from chronoscene.errors import ConfigError
+from chronoscene.errors import ConfigError, SceneError
 from chronoscene.formats.chronoscene import MODEL, PERIODS, SPLIT, TEST, WORLD
 from chronoscene.images.exif import set_upright
 from chronoscene.images.masks import MASKS, mask_place
+from chronoscene.io.documents import read_json_document
 from chronoscene.io.staging import check_outside, staged_folder, write_text_atomic
 from chronoscene.io.wording import counted, shown
 from chronoscene.scene.splits import parse_split_text, parse_test_text
@@ -130,14 +131,13 @@ class _Fix:
 
     def _number_periods(self, new_ids: dict[int, int]) -> None:
         """Renumber the labels of the periods, if they have exactly the old ids."""
-        text = read_text_file(self._scene.root / PERIODS)
         try:
-            items = json.loads(text.text) if text else []
+            items = read_json_document(self._scene.root / PERIODS, list)
             if [item["id"] for item in items] != sorted(new_ids):
                 return
             items = [{**item, "id": new_ids[item["id"]]} for item in items]
-        except (ValueError, TypeError, KeyError, RecursionError):
-            return  # has its own rule
+        except (SceneError, TypeError, KeyError):
+            return  # absent, or has its own rule
         self._write(PERIODS, json.dumps(items, indent=1, ensure_ascii=False) + "\n")
 
     def _test(self, names: list[str] | None) -> None:

@@ -29,7 +29,7 @@ add one.
 
 
 def describe_rule(rule: Rule) -> str:
-    """What a rule looks for, with an example and what to do."""
+    """Describe a rule, with an example and a remedy."""
     head = click.style(f"{rule.severity} {rule.code}", fg=COLOURS[rule.severity])
     lines = (f"{head} {rule.name}: {rule.what}", f"  for example: {rule.bad}")
     return "\n".join([*lines, f"  to do: {rule.remedy}"]) + "\n"

@@ -157,7 +157,7 @@ def _polynomial(scene: RawScene) -> list[Camera]:
 
 
 def displacement(camera: Camera) -> float:
-    """Largest distance in pixels by which distortion moves a pixel on the border of the image."""
+    """Largest distance in pixels by which distortion moves a pixel on the image border."""
     along = np.linspace(0.0, 1.0, 65)
     edges = [(along, 0 * along), (along, 0 * along + 1), (0 * along, along), (0 * along + 1, along)]
     pixels = np.concatenate(edges, axis=1).T * [camera.width, camera.height]
@@ -201,7 +201,7 @@ def rigs_inconsistent(scene: RawScene, model: RawModel) -> Iterator[Hit]:
 
 @derived
 def _contradictions(scene: RawScene) -> dict[str, set[str]]:
-    """What rigs and frames should refer to, and which references are broken."""
+    """Map the expected references of rigs and frames to those that are broken."""
     raw = scene.model.rigs if scene.model else None
     if raw is None or scene.images is None or scene.cameras is None:
         return {}

@@ -41,7 +41,7 @@ MEANINGS = (
     "camera centres in place of the translations",
     "rotations from camera to world",
 )
-"""What rotation and translation mean; the first is what COLMAP writes."""
+"""Meanings of rotation and translation; COLMAP writes the first."""
 
 AXES = {"": np.ones(3), "OpenGL axes (y up, z backwards)": np.array([1.0, -1.0, -1.0])}
 
@@ -131,7 +131,7 @@ def pose_convention(scene: RawScene) -> Iterator[Hit]:
 
 @derived
 def other_convention(scene: RawScene) -> str | None:
-    """Description of the convention that explains poses most of which do not fit."""
+    """Describe the convention that explains poses most of which do not fit."""
     errors = image_errors(scene)
     looked_at = [r for r in scene.reprojections or () if len(r.rows)]
     limits = {r.image: pose_limit(scene, r.image) for r in looked_at}

@@ -132,7 +132,7 @@ def _sizes(scene: RawScene) -> Iterator[tuple[str, tuple[int, int], Camera]]:
 
 
 def _same_shape(size: tuple[int, ...], camera: Camera) -> bool:
-    """Whether the aspect ratios are equal up to rounding of one side to whole pixels."""
+    """Return True if the aspect ratios are equal up to rounding of one side to whole pixels."""
     width, height = size
     exact_height = width * camera.height / camera.width
     exact_width = height * camera.width / camera.height

@@ -75,7 +75,7 @@ def exif_period_order(scene: RawScene) -> Iterator[Hit]:
 
 
 def _dates_place(scene: RawScene) -> str:
-    """Where the dates of the periods stand."""
+    """Return the file that has the dates of the periods."""
     return scene.period_place if scene.is_project else PERIODS
 
 
@@ -250,7 +250,7 @@ def names_other_period(scene: RawScene, periods: dict[str, int]) -> Iterator[Hit
 
 
 def _folder_or_begin(name: str) -> str | None:
-    """What images of one period may have in common."""
+    """Return the folder or the beginning of a name, which images of a period may share."""
     folder, _, file = name.rpartition("/")
     begin = _BEGIN.match(file)
     return f"{folder}/" if folder else begin[0] if begin else None

@@ -1,4 +1,4 @@
-"""CS231: whether the photos are those that the model was made from, judged by their colours.
+"""CS231: photos that are not those that the model was made from, judged by their colours.
 
 A point of the model has the mean colour of the pixels that see it. In the right photo, the
 brightness of the pixels correlates with that of the points; in another or a rotated photo, it does
@@ -110,7 +110,7 @@ def _whole_periods(scene: RawScene, looked_at: list[str], wrong: set[str]) -> di
 
 
 def _what_fits(sight: Sight, name: str, suspects: Greys) -> tuple[str, tuple[str, ...]]:
-    """Description of what would fit instead, and its name if it is another photo."""
+    """Describe the photo that would fit instead; return its name, too, if it is another one."""
     for words, turn in TURNS.items():
         if sight.correlation(suspects[name][turn]) >= USUAL:
             return f"; it fits {words}", ()
@@ -122,7 +122,7 @@ def _what_fits(sight: Sight, name: str, suspects: Greys) -> tuple[str, tuple[str
 
 
 class Sight(NamedTuple):
-    """What an image should show at its m observations."""
+    """Brightness that an image should show at its m observations."""
 
     image: int
     """Index into the images."""

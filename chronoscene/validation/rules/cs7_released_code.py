@@ -1,4 +1,4 @@
-"""CS7: what the released ChronoGS code would fail on. ChronoScene itself is fine with it.
+"""CS7: scenes on which the released ChronoGS code would fail. ChronoScene itself reads them.
 
 `--ignore CS7` skips all of these rules. Facts on the released loader (commit e73bc9c): DATASET.md.
 """
@@ -67,7 +67,7 @@ def official_split_line(scene: RawScene, split_text: TextFile) -> Iterator[Hit]:
 
 
 def official_failure(line: str) -> str | None:
-    """Why the official parser fails on a line: it strips it, then splits at single spaces."""
+    """Describe why the official parser fails on a line, which it splits at single spaces."""
     fields = line.strip().split(" ")
     if fields == [""]:
         return "an empty line"
@@ -180,7 +180,7 @@ def official_units(scene: RawScene, points: RawPoints) -> Iterator[Hit]:
 
 
 def _is_small(xyz: NDArray[np.float64]) -> bool:
-    """Whether this many points could share voxels at all: avoids sorting large scenes."""
+    """Return True if this many points could share voxels: avoids sorting large scenes."""
     if len(xyz) < 2:
         return False
     low, high = np.percentile(xyz[:: len(xyz) // SAMPLE + 1], [5, 95], axis=0)
