@@ -29,12 +29,12 @@ def change_scores(
 ) -> Image:
     """Score of change of each pixel, 0 for none; the mean of two scales.
 
-        chromaticity + structure_weight (1 - structure) + brightness_weight brightness
+        chromaticity + structure_weight (1 - structure)
 
     Chromaticity is the sum over the channels of |l - mean l|, with l the difference of the
-    logarithms of both images in a window; brightness is |mean l|. Structure is the last factor of
-    SSIM. Before, gain and offset of each channel of the render are fitted to the photo, so that a
-    change of exposure or white balance is none of the scene.
+    logarithms of both images in a window: neither shadows nor darker surfaces are changes.
+    Structure is the last factor of SSIM. Before, gain and offset of each channel of the render are
+    fitted to the photo, so that a change of exposure or white balance is none of the scene.
 
     Args:
         render: 0..1. [H, W, 3]
@@ -53,9 +53,7 @@ def change_scores(
         sigma = config.patch * scale * photo.shape[1]
         logs = [np.log(_blur(x, sigma).clip(0) + _DARK) for x in (truth, image)]
         difference = logs[0] - logs[1]
-        shift = difference.mean(-1)
-        total += np.abs(difference - shift[..., None]).sum(-1)
-        total += config.brightness_weight * np.abs(shift)
+        total += np.abs(difference - difference.mean(-1, keepdims=True)).sum(-1)
         # What a short training leaves blurred is no change of structure.
         grey = [_blur(x, sigma / 2).mean(-1) for x in (truth, image)]
         total += config.structure_weight * (1 - _structure(grey[0], grey[1], sigma))

@@ -63,7 +63,7 @@ class WildTrainer(GaussianTrainer):
         view, self._visible = self.train.views[number], None
         rows = self.model.rows_in(view)
         dynamic, _, stages = self._read(self._reference(number), rows)
-        if stages and self._visibility_counts():
+        if self._visibility_counts():
             self._visible = see(stages, self.model.shared, view.height, view.width)
         generator = np.random.default_rng((self.seed, _STREAM, self.sampler.drawn))
         kept = uniform(generator, tuple(dynamic.shape), dynamic) >= config.dropout
@@ -144,9 +144,6 @@ class WildTrainer(GaussianTrainer):
         """Features of some Gaussians from a training photo, as `read_features`, and the stages."""
         model, train = self.model, self.train
         p, device = model.parameters, self.background.device
-        if self.config.reference == "none":
-            nothing = torch.zeros(len(rows), model.networks.dynamic, device=device)
-            return nothing, torch.zeros_like(rows, dtype=torch.bool), []
         photo = small_photo(
             train.load_image(number), train.load_mask(number), self.config.reference_size
         )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import sqrt
-from typing import ClassVar, Self
+from typing import Literal, Self
 
-from chronoscene.checks import check_choice
+from pydantic import NonNegativeFloat, PositiveInt
+
 from chronoscene.gaussians.config import GaussianConfig
 
 
@@ -18,30 +17,24 @@ class Realtime4DGSConfig(GaussianConfig):
     Times are in units of the time from the first period to the last.
     """
 
-    start_times: str = "uniform"
+    densification: Literal["adaptive"] = "adaptive"
+    """The other kind moves and shrinks Gaussians in space alone."""
+    start_times: Literal["uniform", "seen"] = "uniform"
     """Time centres at the start. ``uniform``: anywhere from 0.1 before the first period to 0.1
     after the last. ``seen``: the mean of the periods whose photos see the sparse point."""
-    initial_time_scale: float = sqrt(0.2)
+    initial_time_scale: NonNegativeFloat = 0.2**0.5
     """Standard deviations in time at the start."""
-    wave_cycle: float = 1.0
+    wave_cycle: NonNegativeFloat = 1.0
     """Length of the longest wave of the colours in time. 1: each Gaussian has the same colour in
     the first period and in the last, as in the released code."""
-    wave_interval: int = 1_000
+    wave_interval: PositiveInt = 1_000
     """Moments from one order of the waves to the next; they begin after the spherical harmonics."""
 
     # Learning rates
-    time_lr: float = 1.6e-4
+    time_lr: NonNegativeFloat = 1.6e-4
     """Learning rate of the time centres, times the extent of the cameras in `length_unit`."""
-    wave_dc_lr: float = 0.000125
+    wave_dc_lr: NonNegativeFloat = 0.000125
     """Learning rate of the waves of the constant coefficients."""
-
-    minima: ClassVar[Mapping[str, int]] = {**GaussianConfig.minima, "wave_interval": 1}
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice("start_times", self.start_times, ("uniform", "seen"))
-        # What moves and shrinks there are Gaussians in space.
-        check_choice("densification", self.densification, ("adaptive",))
 
     def in_training_frame(self, training_from_world: float) -> Self:
         config = super().in_training_frame(training_from_world)

@@ -5,11 +5,11 @@ Defaults are those of the 2023 release of 3D Gaussian Splatting (Kerbl et al.).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import ClassVar, Self
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, Self
 
-from chronoscene.checks import check_at_least, check_choice
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
+
 from chronoscene.errors import ConfigError
 from chronoscene.training.config import SplattingConfig
 
@@ -18,109 +18,91 @@ from chronoscene.training.config import SplattingConfig
 class GaussianConfig(SplattingConfig):
     """Shared options. A *moment* is an iteration of the schedule; see `stretch`."""
 
-    iterations: int = 30_000
+    iterations: PositiveInt = 30_000
     """Training steps; one image each."""
     stretch: bool = False
     """False: moment i is step i, as published, so a training longer than `schedule_length` leaves
     the schedule as it is. True: the whole schedule is stretched or squeezed to the length of the
     training."""
-    schedule_length: int = 30_000
+    schedule_length: PositiveInt = 30_000
     """Moments that the schedule was made for; the learning rate of the positions falls over
     them."""
 
     # Colour
-    sh_degree: int = 3
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = 3
     """Highest degree of the spherical harmonics, 0 to 3."""
-    sh_interval: int = 1_000
+    sh_interval: PositiveInt = 1_000
     """Moments from one degree to the next."""
 
     # Learning rates of Adam
-    position_lr_initial: float = 1.6e-4
+    position_lr_initial: NonNegativeFloat = 1.6e-4
     """Initial learning rate of positions, times the extent of the cameras."""
-    position_lr_final: float = 1.6e-6
+    position_lr_final: NonNegativeFloat = 1.6e-6
     """Final learning rate of positions, reached log-linearly at the end of the schedule."""
-    sh_dc_lr: float = 0.0025
+    sh_dc_lr: NonNegativeFloat = 0.0025
     """Learning rate of the constant coefficients."""
-    sh_rest_lr: float = 0.000125
+    sh_rest_lr: NonNegativeFloat = 0.000125
     """Learning rate of the other coefficients."""
-    opacity_lr: float = 0.05
+    opacity_lr: NonNegativeFloat = 0.05
     """Learning rate of the logit of the opacity. Late 2024 releases have 0.025."""
-    scale_lr: float = 0.005
+    scale_lr: NonNegativeFloat = 0.005
     """Learning rate of the logarithm of the scale."""
-    rotation_lr: float = 0.001
+    rotation_lr: NonNegativeFloat = 0.001
     """Learning rate of the quaternion."""
 
     # Densification
-    densification: str = "adaptive"
+    densification: Literal["adaptive", "mcmc"] = "adaptive"
     """``adaptive``: Gaussians with large gradients are cloned and split, faint ones pruned, and
     opacities reset, as published. ``mcmc``: faint ones move to where others are, the set grows by
     `mcmc_growth` in each round until it has `max_gaussians`, which must be given, and all
     positions move at random: `chronoscene.gaussians.mcmc`. Its authors train so with
     ``densify_until=25000``, ``initial_opacity=0.5`` and ``initial_scale=0.1``."""
-    initial_opacity: float = 0.1
+    initial_opacity: NonNegativeFloat = 0.1
     """Opacity of each Gaussian at the start."""
-    initial_scale: float = 1.0
+    initial_scale: NonNegativeFloat = 1.0
     """Scale of each Gaussian at the start, times the distance of the points around it."""
-    densify_from: int = 500
+    densify_from: NonNegativeInt = 500
     """Moment after which Gaussians are added and pruned."""
-    densify_until: int = 15_000
+    densify_until: NonNegativeInt = 15_000
     """Moment from which the set of Gaussians is final."""
-    densify_interval: int = 100
+    densify_interval: PositiveInt = 100
     """Steps, not moments, from one round to the next: a round needs views, not time."""
-    gradient_threshold: float = 0.0002
+    gradient_threshold: NonNegativeFloat = 0.0002
     """Mean norm of the gradient of the projected centre, in half image sizes (tau_pos)."""
-    clone_scale: float = 0.01
+    clone_scale: NonNegativeFloat = 0.01
     """Gaussians up to this scale, times the extent of the cameras, are copied; others split."""
-    split_factor: float = 1.6
+    split_factor: Annotated[float, Field(ge=1)] = 1.6
     """Each of the two halves is smaller by this (phi)."""
-    min_opacity: float = 0.005
+    min_opacity: NonNegativeFloat = 0.005
     """Gaussians below it are pruned (epsilon_alpha)."""
-    max_scale: float = 0.1
+    max_scale: NonNegativeFloat = 0.1
     """Gaussians above this scale, times the extent of the cameras, are pruned."""
-    prune_large_from: int = 3_000
+    prune_large_from: NonNegativeInt = 3_000
     """Moment after which `max_scale` counts."""
-    reset_interval: int = 3_000
+    reset_interval: PositiveInt = 3_000
     """Moments from one opacity reset to the next, while the set of Gaussians grows."""
-    reset_opacity: float = 0.01
+    reset_opacity: NonNegativeFloat = 0.01
     """No opacity is above it after a reset."""
-    max_gaussians: int = 0
+    max_gaussians: NonNegativeInt = 0
     """No round grows the set beyond this; the largest gradients come first. 0: no limit."""
-    grow_below: int = 0
+    grow_below: NonNegativeInt = 0
     """Rounds grow only sets that are smaller than this. 0: all."""
-    prune_above: int = 0
+    prune_above: NonNegativeInt = 0
     """Rounds prune only sets that are larger than this."""
 
     # Densification of kind mcmc
-    mcmc_growth: float = 0.05
+    mcmc_growth: NonNegativeFloat = 0.05
     """Share of the set that a round adds."""
-    mcmc_noise: float = 5e5
+    mcmc_noise: NonNegativeFloat = 5e5
     """Strength of the random moves of positions, times their learning rate; one over
     `length_unit` squared."""
-    mcmc_opacity_weight: float = 0.01
+    mcmc_opacity_weight: NonNegativeFloat = 0.01
     """Weight of the mean opacity in the loss."""
-    mcmc_scale_weight: float = 0.01
+    mcmc_scale_weight: NonNegativeFloat = 0.01
     """Weight of the mean scale, in `length_unit`, in the loss."""
 
-    minima: ClassVar[Mapping[str, int]] = dict.fromkeys(
-        (
-            "iterations",
-            "schedule_length",
-            "sh_interval",
-            "densify_interval",
-            "reset_interval",
-            "split_factor",
-        ),
-        1,
-    )
-    """Smallest value of options, where it is not 0."""
-
     def __post_init__(self) -> None:
-        check_choice("sh_degree", str(self.sh_degree), ("0", "1", "2", "3"))
-        check_choice("densification", self.densification, ("adaptive", "mcmc"))
         super().__post_init__()
-        for name, value in asdict(self).items():
-            if not isinstance(value, str):
-                check_at_least(name, value, self.minima.get(name, 0))
         if self.densification == "mcmc" and not self.max_gaussians:
             raise ConfigError(
                 "max_gaussians",

@@ -129,16 +129,6 @@ def test_an_equal_image_has_not_changed_nor_has_its_exposure(gain: float) -> Non
     assert not change_mask(scores, options).any()
 
 
-def test_brightness_counts_where_that_is_asked_for() -> None:
-    image = picture()
-    photo = as_photo(np.where(np.arange(160)[:, None] < 40, 0.4 * image, image))
-    left = [
-        change_scores(image, photo, None, config(structure_weight=0.0, brightness_weight=w))[:, :30]
-        for w in (0.0, 1.0)
-    ]
-    assert left[0].mean() < 0.1 and left[1].mean() > 0.5
-
-
 def test_ignored_pixels_neither_change_nor_matter() -> None:
     image, options = picture(), config()
     counts = np.ones((120, 160), bool)

@@ -262,26 +262,21 @@ def test_photos_are_read_small_and_grey_where_they_do_not_count() -> None:
 # Training
 
 
-def test_without_reference_photos_a_model_is_its_static_part() -> None:
+def test_with_features_of_zero_a_model_is_its_static_part() -> None:
     """The colours are those of the network with features of zero, at all periods."""
     scene = two_periods()
-    static, wild = begun(scene, 3, reference="none"), begun(scene, 3)
-    assert not static.stored_tensors()["period_features"].any()
-    wild.model.period_features = torch.zeros_like(wild.stored_tensors()["period_features"])
-    for method in (static, wild):
-        model, view = method.model, scene.views[3]
-        p = model.parameters
-        intrinsic = torch.cat([p["sh_dc"], p["sh_rest"].flatten(1)], 1).double()
-        centre = torch.tensor(-view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3])
-        zero = torch.zeros(len(model), model.networks.dynamic, dtype=torch.float64)
-        tensors = {name: tensor.double() for name, tensor in model.shared.items()}
-        truth = colors_of(p["means"].double(), intrinsic, zero, centre, tensors, model.networks)
-        for period in (0, 1):
-            colors = method.splats(view, period, period).colors
-            np.testing.assert_allclose(colors.detach(), truth.detach(), atol=1e-5)
-    photo = [name for name in static.model.shared if name.startswith("photo.")]
-    start = begun(scene)
-    assert all(torch.equal(static.model.shared[n], start.model.shared[n]) for n in photo)
+    method = begun(scene, 3)
+    method.model.period_features = torch.zeros_like(method.stored_tensors()["period_features"])
+    model, view = method.model, scene.views[3]
+    p = model.parameters
+    intrinsic = torch.cat([p["sh_dc"], p["sh_rest"].flatten(1)], 1).double()
+    centre = torch.tensor(-view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3])
+    zero = torch.zeros(len(model), model.networks.dynamic, dtype=torch.float64)
+    tensors = {name: tensor.double() for name, tensor in model.shared.items()}
+    truth = colors_of(p["means"].double(), intrinsic, zero, centre, tensors, model.networks)
+    for period in (0, 1):
+        colors = method.splats(view, period, period).colors
+        np.testing.assert_allclose(colors.detach(), truth.detach(), atol=1e-5)
 
 
 @pytest.mark.parametrize("reference", ["image", "period"])

@@ -254,4 +254,4 @@ def test_times_are_learned_at_the_extent_in_the_unit_that_was_asked_for() -> Non
 )
 def test_impossible_options_are_named(name: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=name):
-        Realtime4DGSConfig(**{name: value, "max_gaussians": 10})
+        Realtime4DGSConfig(**{name: value})
