@@ -5,9 +5,15 @@ Written from the documentation and the sources of the programs; `Runner.tested` 
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 
 from chronoscene.methods import MethodSpec, ProgramConfig, Runner
+
+
+def _words(command: str) -> tuple[str, ...]:
+    return tuple(shlex.split(command))
+
 
 _TESTED = "untested but for its loader, which reads the exported data as it is"
 
@@ -43,36 +49,30 @@ SPLATFACTO = MethodSpec(
     runner=Runner(
         exports="nerfstudio",
         prepare="baselines.external.prepare:splatfacto",
-        train=(
-            *("ns-train", "splatfacto", "--output-dir", "{output}", "--experiment-name", "run"),
-            *("--timestamp", "run", "--max-num-iterations", "{iterations}"),
+        train=_words(
+            "ns-train splatfacto --output-dir {output} --experiment-name run --timestamp run "
             # The default, a viewer, would wait for its user after the training.
-            *("--machine.seed", "{seed}", "--vis", "tensorboard"),
-            *("nerfstudio-data", "--data", "{data}", "--load-3D-points", "True"),
+            "--max-num-iterations {iterations} --machine.seed {seed} --vis tensorboard "
+            "nerfstudio-data --data {data} --load-3D-points True"
         ),
         render=(
-            (
-                *(
-                    "ns-render",
-                    "dataset",
-                    "--load-config",
-                    "{output}/run/splatfacto/run/config.yml",
-                ),
-                *("--output-path", "{output}/renders", "--split", "test"),
-                *("--rendered-output-names", "rgb", "--image-format", "png"),
+            _words(
+                "ns-render dataset --load-config {output}/run/splatfacto/run/config.yml "
+                "--output-path {output}/renders --split test "
+                "--rendered-output-names rgb --image-format png"
             ),
-            (
-                *("ns-export", "gaussian-splat", "--output-dir", "{output}/export"),
-                *("--load-config", "{output}/run/splatfacto/run/config.yml"),
+            _words(
+                "ns-export gaussian-splat --output-dir {output}/export "
+                "--load-config {output}/run/splatfacto/run/config.yml"
             ),
         ),
         images="renders/test/rgb/{name}.png",
         model="export/splat.ply",
         primitives="export/splat.ply",
         unit="Gaussians",
-        version=(
-            *("python", "-c"),
-            "from importlib.metadata import version; print('nerfstudio', version('nerfstudio'))",
+        version=_words(
+            'python -c "from importlib.metadata import version; '
+            "print('nerfstudio', version('nerfstudio'))\""
         ),
         tested=_TESTED,
     ),
@@ -92,21 +92,16 @@ CHRONOGS = MethodSpec(
     runner=Runner(
         exports="chronoscene",
         prepare="baselines.external.prepare:chronogs",
-        train=(
-            *("python", "{source}/train.py", "--config", "{output}/config.yaml"),
-            *("--source_path", "{data}", "--model_path", "{output}/model"),
+        train=_words(
+            "python {source}/train.py --config {output}/config.yaml "
+            "--source_path {data} --model_path {output}/model"
         ),
-        render=(
-            (
-                *("python", "{source}/render.py", "-m", "{output}/model", "-s", "{data}"),
-                "--skip_train",
-            ),
-        ),
+        render=(_words("python {source}/render.py -m {output}/model -s {data} --skip_train"),),
         images="model/test/ours_{iterations}/renders/{index:05d}.png",
         model="model/point_cloud/iteration_{iterations}/*",
         primitives="model/point_cloud/iteration_{iterations}/point_cloud.ply",
         unit="anchors",
-        version=("git", "-C", "{source}", "rev-parse", "HEAD"),
+        version=_words("git -C {source} rev-parse HEAD"),
         tested=_TESTED,
     ),
 )
@@ -125,22 +120,22 @@ FOUR_D_GAUSSIANS = MethodSpec(
     runner=Runner(
         exports="nerfstudio",
         prepare="baselines.external.prepare:four_d_gaussians",
-        train=(
-            *("python", "{source}/train.py", "-s", "{data}", "--model_path", "{output}/model"),
+        train=_words(
+            "python {source}/train.py -s {data} --model_path {output}/model "
             # Only on the command line: what a file says of iterations is read after this list.
-            *("--configs", "{output}/config.py", "--save_iterations", "{iterations}"),
+            "--configs {output}/config.py --save_iterations {iterations}"
         ),
         render=(
-            (
-                *("python", "{source}/render.py", "--model_path", "{output}/model"),
-                *("--configs", "{output}/config.py", "--skip_train", "--skip_video"),
+            _words(
+                "python {source}/render.py --model_path {output}/model "
+                "--configs {output}/config.py --skip_train --skip_video"
             ),
         ),
         images="model/test/ours_{iterations}/renders/{index:05d}.png",
         model="model/point_cloud/iteration_{iterations}/*",
         primitives="model/point_cloud/iteration_{iterations}/point_cloud.ply",
         unit="Gaussians",
-        version=("git", "-C", "{source}", "rev-parse", "HEAD"),
+        version=_words("git -C {source} rev-parse HEAD"),
         tested=_TESTED,
     ),
 )

@@ -75,16 +75,11 @@ def check_inputs(inputs: Inputs, finite: bool) -> None:
     """
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
     arrays = {name: getattr(inputs, name) for name in names}
-    _check_sizes(inputs.width, inputs.height)
+    for name, size in (("width", inputs.width), ("height", inputs.height)):
+        todo = "correct the argument, or render a larger image in parts"
+        _require(1 <= size <= SIZE_MAX, name, f"1 to {SIZE_MAX} pixels", size, todo)
     _check_shapes(arrays, inputs.backgrounds)
-    _check_options(inputs.near_plane, inputs.far_plane, inputs.eps2d)
-    if inputs.absgrad and (inputs.colors.shape[1] != 3 or inputs.render_depth):
-        raise ShapeError(
-            "absgrad",
-            expected="three channels without depth",
-            found=f"{inputs.colors.shape[1]} channels, render_depth={inputs.render_depth}",
-            todo="render the others in a call of their own",
-        )
+    _check_options(inputs)
     if finite:
         if inputs.backgrounds is not None:
             arrays["backgrounds"] = inputs.backgrounds
@@ -92,23 +87,16 @@ def check_inputs(inputs: Inputs, finite: bool) -> None:
         _check_cameras(inputs.viewmats, inputs.Ks, inputs.width, inputs.height)
 
 
-def _check_sizes(width: int, height: int) -> None:
-    for name, size in (("width", width), ("height", height)):
-        if not 1 <= size <= SIZE_MAX:
-            raise ShapeError(
-                name,
-                expected=f"1 to {SIZE_MAX} pixels",
-                found=str(size),
-                todo="correct the argument, or render a larger image in parts",
-            )
+def _require(holds: bool, place: str, expected: str, found: object, todo: str) -> None:
+    if not holds:
+        raise ShapeError(place, expected=expected, found=str(found), todo=todo)
 
 
 def _check_shapes(arrays: dict[str, Tensor], backgrounds: Tensor | None) -> None:
     for name, array in arrays.items():
-        if not array.is_floating_point():
-            raise ShapeError(
-                name, expected="floating point", found=str(array.dtype), todo="call .float()"
-            )
+        _require(
+            array.is_floating_point(), name, "floating point", array.dtype, todo="call .float()"
+        )
     count, cameras = len(arrays["means"]), len(arrays["viewmats"])
     shapes: dict[str, tuple[int | None, ...]] = {
         "means": (count, 3),
@@ -125,19 +113,24 @@ def _check_shapes(arrays: dict[str, Tensor], backgrounds: Tensor | None) -> None
         check_shape("backgrounds", backgrounds, (cameras, arrays["colors"].shape[1]))
 
 
-def _check_options(near_plane: float, far_plane: float, eps2d: float) -> None:
-    """0 < near < far, within limits, and the blur is not negative."""
-    if not 1 / DEPTH_MAX <= near_plane < far_plane <= DEPTH_MAX:
-        raise ShapeError(
-            "near_plane, far_plane",
-            expected=f"{1 / DEPTH_MAX:g} <= near_plane < far_plane <= {DEPTH_MAX:g}",
-            found=f"{near_plane}, {far_plane}",
-            todo="correct the arguments",
-        )
-    if not 0 <= eps2d < EXTENT_MAX:
-        raise ShapeError(
-            "eps2d", expected=f"0 to {EXTENT_MAX:g}", found=str(eps2d), todo="correct the argument"
-        )
+def _check_options(inputs: Inputs) -> None:
+    near, far, channels = inputs.near_plane, inputs.far_plane, inputs.colors.shape[1]
+    _require(
+        1 / DEPTH_MAX <= near < far <= DEPTH_MAX,
+        "near_plane, far_plane",
+        f"{1 / DEPTH_MAX:g} <= near_plane < far_plane <= {DEPTH_MAX:g}",
+        f"{near}, {far}",
+        todo="correct the arguments",
+    )
+    limits = f"0 to {EXTENT_MAX:g}"
+    _require(0 <= inputs.eps2d < EXTENT_MAX, "eps2d", limits, inputs.eps2d, "correct the argument")
+    _require(
+        not inputs.absgrad or (channels == 3 and not inputs.render_depth),
+        "absgrad",
+        "three channels without depth",
+        f"{channels} channels, render_depth={inputs.render_depth}",
+        todo="render the others in a call of their own",
+    )
 
 
 def _check_finite(arrays: dict[str, Tensor]) -> None:
@@ -165,26 +158,27 @@ def _all_finite(data: Tensor) -> bool:
 def _check_cameras(viewmats: Tensor, Ks: Tensor, width: int, height: int) -> None:
     """No camera may be mirrored, too wide or singular."""
     focals = Ks.detach().double().cpu().numpy()[:, [0, 1], [0, 1]]
-    for camera in np.flatnonzero((focals <= 0).any(-1))[:1]:
-        raise ShapeError(
+    least = FOCAL_MIN * np.array([width, height])
+    volumes = np.linalg.det(viewmats.detach().double().cpu().numpy()[:, :3, :3])
+    for camera, (focal, volume) in enumerate(zip(focals, volumes, strict=True)):
+        _require(
+            (focal > 0).all(),
             f"Ks[{camera}]",
-            expected="positive focal lengths",
-            found=str(focals[camera].tolist()),
+            "positive focal lengths",
+            focal.tolist(),
             todo="mirror the camera by its pose, not by its intrinsics",
         )
-    sizes = np.array([width, height])
-    for camera in np.flatnonzero((focals < FOCAL_MIN * sizes).any(-1))[:1]:
-        raise ShapeError(
+        _require(
+            (focal >= least).all(),
             f"Ks[{camera}]",
-            expected=f"focal lengths of at least {FOCAL_MIN:g} of the image's width and height",
-            found=f"{focals[camera].tolist()} for {width} x {height} pixels",
+            f"focal lengths of at least {FOCAL_MIN:g} of the image's width and height",
+            f"{focal.tolist()} for {width} x {height} pixels",
             todo="give intrinsics in pixels",
         )
-    volumes = np.linalg.det(viewmats.detach().double().cpu().numpy()[:, :3, :3])
-    for camera in np.flatnonzero(volumes == 0)[:1]:
-        raise ShapeError(
+        _require(
+            volume != 0,
             f"viewmats[{camera}]",
-            expected="a rotation in the upper left 3 x 3",
-            found="a singular matrix",
+            "a rotation in the upper left 3 x 3",
+            "a singular matrix",
             todo="pass world-to-camera transforms",
         )

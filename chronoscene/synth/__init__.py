@@ -6,14 +6,17 @@ Importing this package is cheap; `generate` imports the ray caster when it is ca
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from chronoscene.synth.settings import PRESETS, SynthSettings, preset
+
+if TYPE_CHECKING:
+    from chronoscene.synth.generation import Progress
 
 __all__ = ["PRESETS", "SynthSettings", "generate", "preset"]
 
 
-def generate(out: Path | str, settings: SynthSettings, progress: Any = None) -> None:
+def generate(out: Path | str, settings: SynthSettings, progress: Progress | None = None) -> None:
     """Generate a scene folder with images, COLMAP model, split and ground truth.
 
     The same settings give the same bytes, whatever the number of threads.

@@ -20,8 +20,6 @@ def _within(low: float, high: float, default: float) -> Any:
 class SynthSettings:
     """All inputs of a synthetic scene. Lengths are metres."""
 
-    preset: str = "custom"
-    """Name of the preset these settings came from; informative."""
     kind: str = "aerial"
     """``aerial``: oblique orbits and grids. ``street``: walks along the roads."""
     periods: int = _within(1, 50, 3)
@@ -70,7 +68,6 @@ class SynthSettings:
 
 PRESETS: dict[str, SynthSettings] = {
     "tiny": SynthSettings(
-        preset="tiny",
         periods=2,
         width=64,
         height=48,
@@ -80,9 +77,8 @@ PRESETS: dict[str, SynthSettings] = {
         block_size=22.0,
         probe_spacing=4.0,
     ),
-    "demo": SynthSettings(preset="demo", off_centre=True),
+    "demo": SynthSettings(off_centre=True),
     "city": SynthSettings(
-        preset="city",
         periods=4,
         width=640,
         height=480,

@@ -1,4 +1,4 @@
-"""Textures of roads, squares, lawns, fields and roofs; see `chronoscene.synth.render.textures`."""
+"""Textures of roads, squares, lawns, fields, foliage and roofs; see `textures`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from chronoscene.synth.render.noise import (
     scaled,
     smooth,
     span,
+    value_noise_3d,
     weather,
 )
 
@@ -202,3 +203,22 @@ def fields(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
 def water(s, x, y, seed, fw):  # type: ignore[no-untyped-def]
     c0, c1, _ = colors(s)
     return mix(c0, c1, smooth(-0.4, 0.6, fbm(x, y, 0.9, 4, seed, fw)))
+
+
+@inner
+def leaves(s, x, y, z, seed, fw):  # type: ignore[no-untyped-def]
+    """Foliage: cells of leaf size in clumps of light and dark. Numbers: leaf size, accents."""
+    c0, c1, c2 = colors(s)
+    size = s[10]
+    near, middle = fade(size, 0.8 * fw), fade(4.0 * size, fw)
+    # Cells are rotated and distorted, so that the leaves do not form rows.
+    wx = (0.8 * x - 0.6 * y) / size + 0.9 * math.sin(2.3 * z / size)
+    wy = (0.6 * x + 0.8 * y) / size + 0.9 * math.sin(1.9 * z / size + 1.0)
+    wz = z / size + 0.8 * math.sin(2.1 * (x + 0.4 * y) / size)
+    ix, iy, iz = math.floor(wx), math.floor(wy), math.floor(wz)
+    pick = hash01(ix, iy, seed + 1 + 977 * iz)
+    coarse = value_noise_3d(wx / 9.0, wy / 9.0, wz / 9.0, seed)
+    clump = middle * value_noise_3d(wx / 3.5, wy / 3.5, wz / 3.5, seed + 3)
+    color = mix(c0, c1, min(1.0, max(0.0, 0.5 + 0.7 * coarse + 0.6 * near * (pick - 0.5))))
+    color = mix(color, c2, lottery(hash01(ix, iy, seed + 2 + 977 * iz), s[11], near))
+    return scaled(color, max(0.2, 0.9 + 0.45 * clump + 0.2 * coarse + 0.6 * near * (pick - 0.5)))

@@ -1,4 +1,4 @@
-"""Textures of walls, windows, doors and signs; see `chronoscene.synth.render.textures`."""
+"""Textures of walls, openings, signs, wood, paint and solar panels; see `textures`."""
 
 from __future__ import annotations
 
@@ -170,3 +170,30 @@ def corrugated(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
         color = mix(color, c2, letter * inside * there)
     rust = smooth(0.55 - s[11], 0.8 - s[11], fbm(u * 1.5, v * 0.6, 1.0, 4, seed + 1, fw) + 0.2)
     return weather(mix(color, c1, 0.8 * rust), u, v, seed, fw, 0.15)
+
+
+@inner
+def wood(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
+    """Boards along u. Numbers: board width, gap."""
+    c0, c1, _ = colors(s)
+    board = math.floor(v / s[10])
+    color = mix(c0, c1, 0.3 + 0.5 * hash01(board, 0, seed))
+    color = scaled(color, 1.0 + 0.35 * fbm(u * 0.4, v * 5.0, 0.5, 3, seed + 1, fw))
+    return scaled(color, 1.0 - 0.75 * pulse(v, s[10], s[11], fw))
+
+
+@inner
+def paint(s, u, v, su, sv, seed, fw):  # type: ignore[no-untyped-def]
+    """Smooth paint with darker edges and dust (c2). Numbers: dust."""
+    c0, _, c2 = colors(s)
+    edge = min(min(u, su - u), min(v, sv - v))
+    color = scaled(c0, 0.8 + 0.2 * smooth(0.0, 0.12, edge))
+    dust = s[10] * (0.5 + 0.6 * fbm(u, v, 0.8, 4, seed, fw))
+    return mix(color, c2, min(1.0, max(0.0, dust)))
+
+
+@inner
+def solar(s, u, v, seed, fw):  # type: ignore[no-untyped-def]
+    c0, c1, c2 = colors(s)
+    color = mix(c0, c1, max(pulse(u, 0.16, 0.02, fw), pulse(v, 0.16, 0.02, fw)))
+    return mix(color, c2, max(pulse(u + 0.02, 1.0, 0.05, fw), pulse(v + 0.02, 1.6, 0.05, fw)))
