@@ -39,24 +39,36 @@ def misalignment(rotation: float = 0.03, shift: float = 0.03) -> Misalignment:
 
 
 def made(count: int = 2) -> Certificate:
-    """A registration that passes with room in every figure."""
+    """A registration that passes with a margin in every figure."""
     gps = GpsFit(
         positions=20, median=3.0, largest=9.0, outliers=0,
         scale=1.0, scale_error=0.01, turn=0.0, turn_error=0.5,
         offset=np.zeros(3), offset_error=np.array([0.3, 0.1, 50.0]),
     )  # fmt: skip
-    local = Localisation(10, 10, 0.01, 0.01, Excess(0.01, 0.0), Excess(0.01, 0.0))
+    local = Localisation(
+        images=10, tried=10, rotation=0.01, centre=0.01,
+        rotation_excess=Excess(0.01, 0.0), centre_excess=Excess(0.01, 0.0),
+    )  # fmt: skip
     pair = PairFigures(
         a=0,
         b=1,
-        ties=TieSpread(500, 90, 0.8, 0.9, 1.0, 1.0, (), np.zeros((0, 3))),
-        held_out=HeldOut(40, 300, 0.5, 1.2, 0.5, 0.95, 0.01, 0.02, 20, 0.4, 200),
+        ties=TieSpread(
+            points=500, cells=90, occupied=0.8, hull=0.9, tied_a=1.0, tied_b=1.0,
+            gaps=np.zeros((0, 3)),
+        ),
+        held_out=HeldOut(
+            tracks=40, observations=300, median=0.5, p90=1.2, noise=0.5, agreeing=0.95,
+            distance=0.01, gap=0.02, gap_tracks=20, epipolar=0.4, matches=200,
+        ),
         misalignment=misalignment(),
         by_all=misalignment(),
         localised_b=local,
         localised_a=local,
-        surfaces=SurfaceDistance(900, 800, 0.01, 0.03, 0.05, Interval(0.01, 0.0, 0.02)),
-    )
+        surfaces=SurfaceDistance(
+            cores=900, stable=800, median=0.01, level=0.03, beyond=0.05,
+            shift=Interval(0.01, 0.0, 0.02),
+        ),
+    )  # fmt: skip
     labels = ("May 2016", "May 2017", "May 2018", "May 2019")[:count]
     return Certificate(
         route="joint",
