@@ -58,7 +58,7 @@ def _command(name: str) -> str:
     """One command: usage, description, options."""
     command = cli.get_command(click.Context(cli), name)
     assert command is not None
-    context = click.Context(command, info_name=f"chronoscene {name}")
+    context = click.Context(command, info_name=f"chronoscene {name}", show_default=True)
     usage = " ".join([context.info_name or "", *command.collect_usage_pieces(context)])
     records = [
         record

@@ -42,6 +42,9 @@ COMMANDS = {
 }
 """Command name to ``module:attribute``."""
 
+SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
+"""Settings of all commands."""
+
 USAGE_ERROR = 2  # Exit status for wrong usage and for input that cannot be read at all
 
 
@@ -59,7 +62,9 @@ class LazyGroup(click.Group):
         return command
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(
+    cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "show_default": True}
+)
 @click.version_option(__version__, prog_name="chronoscene")
 def cli() -> None:
     """Prepare datasets of multi-period scenes and benchmark reconstruction methods on them."""

@@ -13,6 +13,12 @@ import click
 from chronoscene.errors import ConfigError
 from chronoscene.formats import format_names, load_format
 
+PATH = click.Path(path_type=Path)
+FILE = click.Path(path_type=Path, dir_okay=False)
+FOLDER = click.Path(path_type=Path, file_okay=False)
+EXISTING_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+EXISTING_FOLDER = click.Path(path_type=Path, exists=True, file_okay=False)
+
 
 def _period_help() -> str:
     known = {name: getattr(load_format(name), "PERIOD_BY", ()) for name in format_names()}
@@ -28,14 +34,7 @@ def reading_options(scene: str) -> Callable[[Any], Any]:
     return lambda command: format_option(period_option(command))
 
 
-RUNS = click.argument(
-    "folders",
-    metavar="RUNS...",
-    nargs=-1,
-    required=True,
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-)
-
+RUNS = click.argument("folders", metavar="RUNS...", nargs=-1, required=True, type=EXISTING_FOLDER)
 
 LPIPS_WEIGHTS = click.option(
     "--lpips-weights",
@@ -43,14 +42,7 @@ LPIPS_WEIGHTS = click.option(
     help="Folder or file with the weights of LPIPS.",
 )
 
-
-RUNS_OUT = click.option(
-    "--out",
-    type=click.Path(path_type=Path, file_okay=False),
-    default=Path("runs"),
-    show_default=True,
-    help="Folder for the runs.",
-)
+RUNS_OUT = click.option("--out", type=FOLDER, default=Path("runs"), help="Folder for the runs.")
 
 
 def split_list(option: str, text: str) -> tuple[str, ...]:
@@ -67,15 +59,11 @@ def split_list(option: str, text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(items))
 
 
-RUN = click.argument("folder", metavar="RUN", type=click.Path(path_type=Path))
-
+RUN = click.argument("folder", metavar="RUN", type=PATH)
 
 SCENE = click.option(
-    "--scene",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    help="Folder of the scene of the run, if it has moved.",
+    "--scene", type=EXISTING_FOLDER, help="Folder of the scene of the run, if it has moved."
 )
-
 
 STAGE = click.option(
     "--stage",
@@ -84,27 +72,16 @@ STAGE = click.option(
     "[default: the last]",
 )
 
-
 DEVICE = click.option(
-    "--device",
-    type=click.Choice(["cpu", "cuda"]),
-    default="cpu",
-    show_default=True,
-    help="Device to render on.",
+    "--device", type=click.Choice(["cpu", "cuda"]), default="cpu", help="Device to render on."
 )
 
-
-FOLDER = click.Path(path_type=Path, file_okay=False)
-
-
 _TRAINING = (
-    click.option("--preset", default="balanced", show_default=True, help="Preset of the methods."),
+    click.option("--preset", default="balanced", help="Preset of the methods."),
     click.option(
         "--iterations", type=click.IntRange(min=1), help="Stop after this many iterations."
     ),
-    click.option(
-        "--seeds", type=click.IntRange(min=1), default=1, show_default=True, help="Number of seeds."
-    ),
+    click.option("--seeds", type=click.IntRange(min=1), default=1, help="Number of seeds."),
     click.option(
         "--set",
         "assignments",
@@ -138,7 +115,6 @@ _TRAINING = (
         "--device",
         type=click.Choice(["auto", "cpu", "cuda"]),
         default="auto",
-        show_default=True,
         help="Device to train and render on.",
     ),
 )

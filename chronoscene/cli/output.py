@@ -18,14 +18,9 @@ from chronoscene.io.staging import write_text_atomic
 from chronoscene.io.tables import FORMATS
 from chronoscene.io.wording import printable
 
-FILE = "a file that can be written"
+A_FILE = "a file that can be written"
 FORMAT = click.option(
-    "--format",
-    "style",
-    type=click.Choice(FORMATS),
-    default="table",
-    show_default=True,
-    help="Output format.",
+    "--format", "style", type=click.Choice(FORMATS), default="table", help="Output format."
 )
 OUT_FILE = click.option(
     "--out", type=click.Path(path_type=Path), help="Write to this file instead of the terminal."
@@ -50,7 +45,7 @@ def emit(text: str, out: Path | None, *, option: str = "--out") -> None:
         click.echo(text.encode(encoding, "backslashreplace").decode(encoding), nl=False)
         return
     whole = click.unstyle(text).encode("utf-8", "backslashreplace").decode()  # names may be bytes
-    with writing_to(option, out, expected=FILE):
+    with writing_to(option, out, expected=A_FILE):
         write_text_atomic(out, whole)
     report_written(out)
 
@@ -106,7 +101,7 @@ def check_file(option: str, file: Path | None) -> None:
     """
     if file is None:
         return
-    with writing_to(option, file, expected=FILE):
+    with writing_to(option, file, expected=A_FILE):
         if file.is_dir():
             raise IsADirectoryError(EISDIR, strerror(EISDIR))
         with TemporaryFile(dir=file.absolute().parent):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import look_here_for
+from chronoscene.cli.options import FOLDER, look_here_for
 from chronoscene.errors import ConfigError
 from chronoscene.io.staging import staged_folder
 
@@ -47,11 +47,7 @@ def check(name: str) -> None:
 
 @click.command("new-method")
 @click.argument("name")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="New folder for the package.  [default: NAME]",
-)
+@click.option("--out", type=FOLDER, help="New folder for the package.  [default: NAME]")
 def new(name: str, out: Path | None) -> None:
     """Create the package of a new method.
 

@@ -11,7 +11,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from chronoscene.cli.options import look_here_for
+from chronoscene.cli.options import FOLDER, look_here_for
 from chronoscene.cli.output import emit
 from chronoscene.methods import (
     PROGRAM_GROUP,
@@ -28,9 +28,8 @@ from chronoscene.methods import (
 @click.argument("name", required=False)
 @click.option(
     "--runs",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     default=Path("runs"),
-    show_default=True,
     help="Folder of finished runs, which say what the method NAME costs.",
 )
 @click.option("--all", "everything", is_flag=True, help="Show all options of the method NAME.")

@@ -10,8 +10,9 @@ from chronoscene.bench.report.comparison_figure import draw_figures
 from chronoscene.bench.report.comparison_page import comparison_page
 from chronoscene.bench.report.single_views import view_scores, worst_views
 from chronoscene.bench.report.summary import read_runs
+from chronoscene.cli.options import EXISTING_FOLDER, FILE
 from chronoscene.cli.output import (
-    FILE,
+    A_FILE,
     check_file,
     emit,
     report_written,
@@ -24,31 +25,25 @@ from chronoscene.metrics.registry import metric_info
 
 
 @click.command("compare")
-@click.argument("runs", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("runs", type=EXISTING_FOLDER)
 @click.option(
     "--views",
     type=click.IntRange(min=1),
     default=1,
-    show_default=True,
     help="Test views of each period in the figures.",
 )
-@click.option("--metric", default="psnr", show_default=True, help="Metric of the table.")
+@click.option("--metric", default="psnr", help="Metric of the table.")
 @click.option(
     "--format",
     "style",
     type=click.Choice(["table", "csv"]),
     default="table",
-    show_default=True,
     help="Format of the table; csv has every view, not the worst alone.",
 )
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="Write the table to this file instead of the terminal.",
-)
+@click.option("--out", type=FILE, help="Write the table to this file instead of the terminal.")
 @click.option(
     "--html",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FILE,
     help="Also write one page of all runs to this file: tables, quality against time, and sliders "
     "between the photos and what methods show. It needs no other file.",
 )
@@ -76,6 +71,6 @@ def command(
         report_written(*draw_figures(runs, records, views_per_period=views))
     if html is not None:
         text = comparison_page(runs, records, failures, worst)
-        with writing_to("--html", html, expected=FILE):
+        with writing_to("--html", html, expected=A_FILE):
             write_text_atomic(html, text)
         report_written(html)

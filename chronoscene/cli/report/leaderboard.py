@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from chronoscene.bench.report.published import load_published
-from chronoscene.cli.options import RUNS
+from chronoscene.cli.options import EXISTING_FOLDER, FOLDER, RUNS
 from chronoscene.cli.output import check_place, report_written, writing_to
 from leaderboard.entries import read_entries
 from leaderboard.site import write_site
@@ -18,7 +18,7 @@ from leaderboard.submit import submit
 @RUNS
 @click.option(
     "--to",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     required=True,
     help="Folder of entries, such as leaderboard/entries/measured.",
 )
@@ -35,17 +35,12 @@ def submit_command(folders: tuple[Path, ...], to: Path) -> None:
 
 
 @click.command("leaderboard")
-@click.argument("entries", type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, file_okay=False),
-    required=True,
-    help="New folder for the site.",
-)
+@click.argument("entries", type=EXISTING_FOLDER)
+@click.option("--out", type=FOLDER, required=True, help="New folder for the site.")
 @click.option(
     "--runs",
     multiple=True,
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    type=EXISTING_FOLDER,
     help="Folder of the runs that entries were made of: pictures of their test views come from "
     "there. May be repeated.",
 )

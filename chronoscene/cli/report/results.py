@@ -15,7 +15,7 @@ from chronoscene.bench.report.summary import in_region, read_runs
 from chronoscene.bench.report.tables import MAX_PERIODS, format_runs
 from chronoscene.bench.score.regions import ALL, REGIONS, freeze_change_masks
 from chronoscene.bench.score.scoring import rescore
-from chronoscene.cli.options import LPIPS_WEIGHTS, RUNS, split_list
+from chronoscene.cli.options import EXISTING_FOLDER, LPIPS_WEIGHTS, RUNS, split_list
 from chronoscene.cli.output import FORMAT, OUT_FILE, emit, terminal_width
 from chronoscene.cli.progress import progress_bar
 from chronoscene.metrics.registry import METRICS, make_scorers, metric_info
@@ -24,7 +24,7 @@ SOME_FAILED = 1  # Exit status when a run could not be scored
 
 
 @click.command("score")
-@click.argument("runs", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("runs", type=EXISTING_FOLDER)
 @click.option(
     "--metric",
     "metrics",
@@ -35,7 +35,7 @@ SOME_FAILED = 1  # Exit status when a run could not be scored
 )
 @click.option(
     "--truth",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    type=EXISTING_FOLDER,
     help="Also score what changes between periods, and what does not, apart: by the change masks "
     "in this folder, which is laid out like the gt/ of a generated scene; or in SCENE/gt/ of a "
     "folder of scenes.",
@@ -92,7 +92,6 @@ def print_runs(out: Path) -> None:
     "--region",
     type=click.Choice(REGIONS),
     default=ALL,
-    show_default=True,
     help="Part of the images that is scored; see chronoscene score --truth.",
 )
 @click.option(

@@ -29,7 +29,7 @@ from chronoscene.bench.report.tradeoff import (
     front_points,
     front_tables,
 )
-from chronoscene.cli.options import RUNS
+from chronoscene.cli.options import FOLDER, RUNS
 from chronoscene.cli.output import (
     FORMAT,
     OUT_FILE,
@@ -51,7 +51,7 @@ FIGURE = "tradeoff.png"
 @OUT_FILE
 @click.option(
     "--figures",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FOLDER,
     help=f"Folder for {FIGURE}.  [default: {FIGURES}/ in the first of RUNS]",
 )
 @click.option(

@@ -47,7 +47,6 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
     "--strategy",
     "strategies",
     default="joint",
-    show_default=True,
     help=f"One or several of {', '.join(STRATEGIES)}, separated by commas.",
 )
 @reading_options("the scenes")
@@ -56,7 +55,6 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
     "--seed",
     type=click.IntRange(min=0),
     default=0,
-    show_default=True,
     help="First seed. Equal seeds give equal models on one machine's CPU, but not with --budget.",
 )
 @click.option(
@@ -72,7 +70,6 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
 @click.option(
     "--checkpoint-every",
     default="5m",
-    show_default=True,
     help="Time between checkpoints, from which a run that was stopped goes on.",
 )
 @click.option(
@@ -84,7 +81,6 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
     "--separate-iterations",
     type=click.Choice(SHARING),
     default=SHARING[0],
-    show_default=True,
     help="Whether the models of strategy separate, or the stages of strategy sequential, share "
     "iterations and budget or each get them.",
 )
@@ -92,21 +88,18 @@ SOME_FAILED = 1  # Exit status when a run failed; the others have their results
     "--max-width",
     type=click.IntRange(min=1),
     default=MAX_WIDTH,
-    show_default=True,
     help="Scale wider images down to this width in pixels, for training and evaluation.",
 )
 @click.option(
     "--photo-memory",
     type=click.FloatRange(min=0),
     default=PHOTO_MEMORY / 1e9,
-    show_default=True,
     help="Memory for training photos in GB, the decoding of them included.",
 )
 @click.option(
     "--photo-disk",
     type=click.FloatRange(min=0),
     default=PHOTO_DISK / 1e9,
-    show_default=True,
     help="Disk space below --out in GB for decoded photos, if they do not fit into memory.",
 )
 @LPIPS_WEIGHTS

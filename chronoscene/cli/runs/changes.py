@@ -11,7 +11,7 @@ import numpy as np
 
 from chronoscene.bench.use.changes import ChangeMap, changes_csv, changes_table, map_run
 from chronoscene.bench.use.trained_run import TrainedRun, open_run
-from chronoscene.cli.options import DEVICE, RUN, SCENE
+from chronoscene.cli.options import DEVICE, PATH, RUN, SCENE
 from chronoscene.cli.output import emit, report_written, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
@@ -29,7 +29,7 @@ _ALL_PAIRS = 4  # Periods of which all pairs are compared unless the user choose
 @RUN
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     required=True,
     help="New folder for the point clouds, the picture and the table.",
 )

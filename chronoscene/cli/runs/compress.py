@@ -20,7 +20,6 @@ from chronoscene.cli.progress import announce
     "--max-loss",
     type=click.FloatRange(min=0, min_open=True),
     default=0.1,
-    show_default=True,
     help="Largest loss of PSNR on training views, in dB.",
 )
 @click.option("--plain", is_flag=True, help="Use half floats and LZMA only.")

@@ -8,7 +8,7 @@ import click
 
 from chronoscene.bench.use.export import measure_loss
 from chronoscene.bench.use.trained_run import open_run
-from chronoscene.cli.options import DEVICE, RUN, SCENE, STAGE
+from chronoscene.cli.options import DEVICE, FILE, RUN, SCENE, STAGE
 from chronoscene.cli.output import check_file, emit, report_written
 from chronoscene.cli.progress import announce
 from chronoscene.formats.shared.gaussian_ply import write_gaussians
@@ -19,12 +19,7 @@ from chronoscene.io.wording import counted
 @click.command("export")
 @RUN
 @click.option("--period", required=True, help="Period to export: number, label or fraction.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path, dir_okay=False),
-    required=True,
-    help="PLY file to write.",
-)
+@click.option("--out", type=FILE, required=True, help="PLY file to write.")
 @SCENE
 @STAGE
 @DEVICE

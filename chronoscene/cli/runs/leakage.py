@@ -10,7 +10,7 @@ import click
 from chronoscene.bench.files.records import ROW_COLUMNS
 from chronoscene.bench.use.leakage import COLUMNS, leakage_table, measure_leakage
 from chronoscene.bench.use.trained_run import open_run
-from chronoscene.cli.options import DEVICE, RUN, SCENE
+from chronoscene.cli.options import DEVICE, EXISTING_FOLDER, RUN, SCENE
 from chronoscene.cli.output import OUT_FILE, check_file, emit, terminal_width
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
@@ -21,7 +21,7 @@ from chronoscene.io import tables
 @RUN
 @click.option(
     "--truth",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    type=EXISTING_FOLDER,
     help="Folder laid out like the gt/ of a generated scene.  [default: gt/ of the scene]",
 )
 @click.option(
@@ -29,7 +29,6 @@ from chronoscene.io import tables
     "style",
     type=click.Choice(["table", "csv", "markdown", "latex"]),
     default="table",
-    show_default=True,
     help="Output format; csv has every view.",
 )
 @OUT_FILE

@@ -15,7 +15,7 @@ from chronoscene.bench.use.rendering import (
     write_pictures,
 )
 from chronoscene.bench.use.trained_run import open_run
-from chronoscene.cli.options import DEVICE, RUN, SCENE, STAGE
+from chronoscene.cli.options import DEVICE, PATH, RUN, SCENE, STAGE
 from chronoscene.cli.output import check_file, check_place, report_written
 from chronoscene.cli.progress import tracked
 from chronoscene.errors import ConfigError
@@ -26,14 +26,13 @@ from chronoscene.io.staging import check_outside
 @RUN
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     required=True,
     help="New folder for PNG files, or an animation (.mp4 or .webp).",
 )
 @click.option(
     "--cameras",
     default="test",
-    show_default=True,
     help=f"{', '.join(VIEWS)}, the folder of a COLMAP model, or a JSON camera path of nerfstudio. "
     "Poses are in the world of the scene; a dataparser_transforms.json beside a camera path is "
     "undone.",
@@ -48,14 +47,12 @@ from chronoscene.io.staging import check_outside
     "--frames",
     type=click.IntRange(min=1),
     default=120,
-    show_default=True,
     help="Number of pictures of an orbit or a range of periods.",
 )
 @click.option(
     "--fps",
     type=click.FloatRange(min=0.1, max=240),
     default=24,
-    show_default=True,
     help="Pictures per second of an animation.",
 )
 @SCENE

@@ -8,7 +8,14 @@ import click
 
 from chronoscene.bench.files.records import write_summary
 from chronoscene.bench.score.images import score_images
-from chronoscene.cli.options import LPIPS_WEIGHTS, RUNS_OUT, reading_options
+from chronoscene.cli.options import (
+    EXISTING_FILE,
+    EXISTING_FOLDER,
+    LPIPS_WEIGHTS,
+    PATH,
+    RUNS_OUT,
+    reading_options,
+)
 from chronoscene.cli.output import check_place
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.report.results import print_runs
@@ -19,20 +26,19 @@ from chronoscene.metrics.registry import make_scorers
 
 
 @click.command("score-images")
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.argument("folder", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("scene", type=PATH)
+@click.argument("folder", type=EXISTING_FOLDER)
 @click.option("--name", required=True, help="Name of the program, as tables show it.")
 @click.option(
     "--map",
     "table",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=EXISTING_FILE,
     help="CSV file with the columns file and view, where files are not named like the views.",
 )
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
     default=0,
-    show_default=True,
     help="Seed of the training; tables show mean and spread over several.",
 )
 @reading_options("the scene")
@@ -40,7 +46,6 @@ from chronoscene.metrics.registry import make_scorers
     "--max-width",
     type=click.IntRange(min=1),
     default=MAX_WIDTH,
-    show_default=True,
     help="Scale wider images down to this width in pixels, as bench does.",
 )
 @LPIPS_WEIGHTS

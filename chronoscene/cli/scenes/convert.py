@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import reading_options
+from chronoscene.cli.options import PATH, reading_options
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import LINKS, describe, describe_period, show_note
@@ -17,15 +17,14 @@ from chronoscene.scene.splits import split_hash
 
 
 @click.command("convert")
-@click.argument("source", type=click.Path(path_type=Path), metavar="SRC")
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("source", type=PATH, metavar="SRC")
+@click.argument("out", type=PATH)
 @reading_options("SRC")
 @click.option(
     "--to",
     "target",
     type=click.Choice(writable_formats()),
     default="chronoscene",
-    show_default=True,
     help="Format of OUT.",
 )
 @click.option(

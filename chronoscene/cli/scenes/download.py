@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from chronoscene.cli.options import PATH
 from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.download.catalogue import DATASETS, Dataset
@@ -24,7 +25,7 @@ BY_HAND = 1  # Exit status when a host lets only people download
 @click.argument("scenes", nargs=-1)
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Folder for the scenes.  [default: data/NAME, for weights torch's cache]",
 )
 def command(name: str | None, scenes: tuple[str, ...], out: Path | None) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from chronoscene.cli.options import EXISTING_FILE, PATH
 from chronoscene.cli.output import check_place, emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.formats import read_scene
@@ -24,17 +25,17 @@ FAILED = 1  # Exit status if the verdict is fail
 
 
 @click.command("register")
-@click.argument("captures", type=click.Path(path_type=Path))
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("captures", type=PATH)
+@click.argument("out", type=PATH)
 @click.option(
     "--table",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=EXISTING_FILE,
     help="CSV with the columns image and period; paths are relative to CAPTURES.",
 )
 @click.option(
     "--into",
     "scene",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Add CAPTURES as a new period to this scene, whose poses and cameras do not change.",
 )
 @click.option(
@@ -45,7 +46,7 @@ FAILED = 1  # Exit status if the verdict is fail
 )
 @click.option(
     "--work",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Folder for features, matches and models, from which a later run continues.  "
     "[default: OUT.work]",
 )
@@ -54,42 +55,36 @@ FAILED = 1  # Exit status if the verdict is fail
     "--max-image-size",
     type=click.IntRange(200),
     default=DEFAULTS.max_image_size,
-    show_default=True,
     help="Pixels; larger photos are downscaled for feature extraction.",
 )
 @click.option(
     "--max-features",
     type=click.IntRange(100),
     default=DEFAULTS.max_features,
-    show_default=True,
     help="Keep at most this many features of each photo.",
 )
 @click.option(
     "--exhaustive-limit",
     type=click.IntRange(0),
     default=DEFAULTS.exhaustive_limit,
-    show_default=True,
     help="Match all pairs if there are at most this many photos, else likely pairs.",
 )
 @click.option(
     "--held-out",
     type=click.FloatRange(0, 0.5),
     default=DEFAULTS.held_out,
-    show_default=True,
     help="Share of the tracks across periods that are used only to test the result.",
 )
 @click.option(
     "--camera-model",
     type=click.Choice(["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]),
     default=DEFAULTS.camera_model,
-    show_default=True,
     help="Camera model of COLMAP that is fitted to the photos.",
 )
 @click.option(
     "--calibration",
     type=click.Choice(CALIBRATIONS),
     default=DEFAULTS.calibration,
-    show_default=True,
     help="Whether a camera is calibrated anew for each period; auto: for periods more than a day "
     f"apart that have at least {MIN_PHOTOS} of its photos.",
 )
@@ -100,7 +95,7 @@ FAILED = 1  # Exit status if the verdict is fail
 )
 @click.option(
     "--tie-points",
-    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    type=EXISTING_FILE,
     help="CSV of point, image, x, y and optional world coordinates, or ODM's gcp_list.txt: points "
     "that check the alignment, and replace one that failed.",
 )
@@ -108,7 +103,6 @@ FAILED = 1  # Exit status if the verdict is fail
     "--tie-scale",
     type=click.FloatRange(0, min_open=True),
     default=DEFAULTS.tie_scale,
-    show_default=True,
     help="Size of these photos divided by that of the photos that were clicked in.",
 )
 @click.option(

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from chronoscene.cli.options import reading_options
+from chronoscene.cli.options import PATH, reading_options
 from chronoscene.cli.output import check_place, emit, writing_to
 from chronoscene.cli.progress import announce, progress_bar
 from chronoscene.cli.scenes.reading import describe_period, read_and_note
@@ -21,13 +21,12 @@ from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, Split
 
 
 @click.command("split")
-@click.argument("source", type=click.Path(path_type=Path), metavar="SCENE")
-@click.argument("out", type=click.Path(path_type=Path), required=False)
+@click.argument("source", type=PATH, metavar="SCENE")
+@click.argument("out", type=PATH, required=False)
 @click.option(
     "--strategy",
     type=click.Choice(STRATEGIES),
     default="stratified",
-    show_default=True,
     help="How to choose. stratified: one of every 8 images in name order, in each period. blocked: "
     "all cameras in some blocks of space, the same in all periods. date: the images of each period "
     "that were taken last. periods: all images of some periods. none: no images; methods are then "
@@ -43,7 +42,6 @@ from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, Split
     "--offset",
     type=int,
     default=0,
-    show_default=True,
     help="For stratified: index of the first test image in each period.",
 )
 @click.option(
@@ -62,7 +60,7 @@ from chronoscene.scene.split_making import FRACTION, STRATEGIES, NewSplit, Split
 )
 @click.option(
     "--scene-out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Also write the scene with the new split to this new folder. Images are hard-linked where "
     "the file system allows it.",
 )

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import click
 
-from chronoscene.cli.options import reading_options
+from chronoscene.cli.options import PATH, reading_options
 from chronoscene.cli.output import (
     FORMAT,
     OUT_FILE,
@@ -73,14 +73,11 @@ class StatsRequest:
 
 
 @click.command("stats")
-@click.argument(
-    "folders", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="DIR..."
-)
+@click.argument("folders", nargs=-1, required=True, type=PATH, metavar="DIR...")
 @click.option(
     "--layout",
     type=click.Choice(["full", "paper"]),
     default="full",
-    show_default=True,
     help="full: everything that is measured, by period. paper: the table of images and points in "
     "the paper.",
 )
@@ -88,14 +85,13 @@ class StatsRequest:
     "--count",
     type=click.Choice(COUNT_RULES),
     default="assigned",
-    show_default=True,
     help="How to count points. assigned: each once. seen: in every period whose images see it.",
 )
 @FORMAT
 @OUT_FILE
 @click.option(
     "--figures",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="OUT",
     help="Draw the counts of all scenes, and the points of each scene, into this folder.",
 )
@@ -103,13 +99,12 @@ class StatsRequest:
     "--figure-format",
     type=click.Choice(FIGURE_FORMATS),
     default="png",
-    show_default=True,
     help="File format of the figures.",
 )
 @click.option("--cameras", is_flag=True, help="Also draw the cameras in the figures.")
 @click.option(
     "--pages",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="OUT",
     help="Write an interactive page of each scene, for a browser, to this folder.",
 )

@@ -9,6 +9,7 @@ from typing import Any
 import click
 from rich.console import Console
 
+from chronoscene.cli.options import PATH
 from chronoscene.cli.progress import progress_bar
 from chronoscene.errors import ConfigError
 from chronoscene.synth import PRESETS, generate, preset
@@ -16,8 +17,8 @@ from chronoscene.synth.settings import KINDS
 
 
 @click.command("synth")
-@click.argument("out", type=click.Path(path_type=Path))
-@click.option("--preset", "name", default="demo", show_default=True,
+@click.argument("out", type=PATH)
+@click.option("--preset", "name", default="demo",
               help=f"Sizes: {', '.join(PRESETS)}.")  # fmt: skip
 @click.option("--periods", type=int, help="Number of dates of capture.")
 @click.option("--kind", help=f"Cameras: {' or '.join(KINDS)}.")

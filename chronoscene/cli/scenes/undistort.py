@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import reading_options
+from chronoscene.cli.options import PATH, reading_options
 from chronoscene.cli.output import emit
 from chronoscene.cli.progress import progress_bar
 from chronoscene.cli.scenes.reading import LINKS, describe, read_and_note
@@ -18,8 +18,8 @@ from chronoscene.undistort import Undistortion, undistort
 
 
 @click.command("undistort")
-@click.argument("source", type=click.Path(path_type=Path), metavar="SCENE")
-@click.argument("out", type=click.Path(path_type=Path))
+@click.argument("source", type=PATH, metavar="SCENE")
+@click.argument("out", type=PATH)
 @click.option(
     "--center", is_flag=True, help="Crop the images so that the principal point is in their centre."
 )

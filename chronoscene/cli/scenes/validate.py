@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from chronoscene.cli.options import reading_options
+from chronoscene.cli.options import PATH, reading_options
 from chronoscene.cli.output import OUT_FILE, check_file, check_place, emit
 from chronoscene.cli.progress import announce, tracked
 from chronoscene.io.processes import map_parallel
@@ -39,22 +39,17 @@ def _explain(context: click.Context, option: click.Parameter, value: str | None)
 
 
 @click.command("validate")
-@click.argument("folder", type=click.Path(path_type=Path), metavar="DIR")
+@click.argument("folder", type=PATH, metavar="DIR")
 @click.option(
     "--format",
     "output_format",
     type=click.Choice(sorted(WRITERS)),
     default="text",
-    show_default=True,
     help="Output format.",
 )
 @OUT_FILE
-@click.option(
-    "--sarif", type=click.Path(path_type=Path), help="Also write a SARIF report to this file."
-)
-@click.option(
-    "--html", type=click.Path(path_type=Path), help="Also write an HTML page to this file."
-)
+@click.option("--sarif", type=PATH, help="Also write a SARIF report to this file.")
+@click.option("--html", type=PATH, help="Also write an HTML page to this file.")
 @click.option(
     "--select",
     multiple=True,
@@ -74,12 +69,11 @@ def _explain(context: click.Context, option: click.Parameter, value: str | None)
 @click.option(
     "--decode/--no-decode",
     default=False,
-    show_default=True,
     help="Decode all images, which finds damaged and duplicate ones but takes time.",
 )
 @click.option(
     "--fix",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="OUT",
     help="Write a corrected copy to this new folder and report what remains.",
 )
