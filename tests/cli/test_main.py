@@ -68,7 +68,7 @@ def test_a_full_disk_is_one_line_too(monkeypatch, capsys):
     assert stopped.value.code == 2
     told = capsys.readouterr().err
     assert told.startswith("error: runs/results.json: expected space for what is written there, ")
-    assert "found No space left on device; make room" in told
+    assert "found No space left on device; free space" in told
     assert told.count("\n") == 1
 
 
